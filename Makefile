@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # Two processes. A file's tests run in one process and share its fixtures; a process without tests takes some of the other's.
 PYTEST := python -m pytest -n 2 --dist worksteal
 
-.PHONY: demo test test-slow test-all test-lowest benchmark docs clean
+.PHONY: demo test test-slow test-all test-lowest docs clean
 
 demo: $(VENV)/installed
 	$(BIN)/retrieve demo
@@ -26,9 +26,6 @@ test-all: test test-slow
 test-lowest:
 	$(MAKE) VENV=.venv-lowest CONSTRAINTS=.ci/lowest.txt .venv-lowest/installed
 	.venv-lowest/bin/$(PYTEST)
-
-benchmark: $(VENV)/installed
-	$(BIN)/python -m benchmarks
 
 # Open site/index.html. The site's search needs a server: `python3 -m http.server -d site`.
 docs: $(VENV)/installed

@@ -69,7 +69,7 @@ retrieve check recording/                                   # before training
 An importer reads a public data set in its published layout, or your own pictures, and writes a
 [recording](formats.md#recording) for training, evaluation and search. It processes one grasp at a time, so memory
 grows only with names, not with pictures: 100,000 rows instead of 10,000 take 15 to 67 MB more, depending on the
-importer ([bags](#rosbag): by their messages; `python -m benchmarks.importers_memory`). At the end, memory also holds
+importer ([bags](#rosbag): by their messages). At the end, memory also holds
 the recording's lines, one per grasp. An interrupted import continues when you run it again. Unreadable items are
 skipped, counted by reason and reported. `recording.json` stores the counts under `skipped`, the licence with its
 terms, the citation, and under `objects` the data set's own information on them. Pictures that many grasps share, such

@@ -1,5 +1,9 @@
-"""Rerank candidates with stored partial activations: compared with the whole network, and without late interaction."""
+"""Rerank candidates with stored partial activations: compared with the whole network, and without late interaction.
 
+python -m benchmarks.rerank [--tower resnet50]
+"""
+
+import argparse
 import dataclasses
 import time
 from collections.abc import Iterator
@@ -8,7 +12,7 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from benchmarks.common import REPETITIONS, ResultLine, as_text, duration, in_turns, matcher_of, random_images
+from benchmarks.common import REPETITIONS, ResultLine, as_text, config_of, duration, in_turns, matcher_of, random_images
 from retrieval.model.checkpoint_info import read_checkpoint_info
 from retrieval.model.config import Config
 from retrieval.model.encode import encode_photos, encode_touches, to_batch, touch_batch
@@ -117,3 +121,15 @@ def measure_cells(config: Config, candidates: int = 1000, repetitions: int = REP
         },
         times.seconds,
     )
+
+
+def main() -> None:
+    """Print the lines of a tower with random weights, and that of the shipped checkpoint's sizes."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--tower", default="mobilenet_v2")
+    for line in (*measure(config_of(parser.parse_args().tower)), *measure_shipped()):
+        print(line)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,7 +1,7 @@
 """The tests, `<package>/<folder>/test_<module>.py`, and their helpers.
 
     indexes, robot, retrieval                   tests of the packages, in the same folders
-    benchmarks, project                         tests of `benchmarks/`; of documentation, imports and packaging
+    benchmarks, models, project                 of these folders; of documentation, imports and packaging
     integrations                                tests of `integrations/`, with stubs of the other programs
     conftest                                    pictures and models that several files use
     synthetic, labelled_pictures                synthetic pictures

@@ -1,7 +1,7 @@
 """The loader: worker threads decode images ahead of the caller.
 
 It uses threads, not processes: decoding and resizing a picture release the GIL, and a thread's images need no copy from
-another process. docs/training.md has the rates of both; `python -m benchmarks.loader` measures them.
+another process.
 """
 
 import os

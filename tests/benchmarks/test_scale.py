@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import needed, scale, several
+from benchmarks import scale
 from benchmarks.common import matcher_of
-from indexes.store.folder import IndexStore
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.fusion import scorer_of
 from tests.conftest import TINY
@@ -94,48 +93,3 @@ def test_the_slope_of_a_power_of_n_is_its_exponent():
         for n in (10**3, 10**4, 10**6)
     ]
     assert dict(scale.slopes(sizes)) == pytest.approx({"exhaustive_s": 0.7, "flat search_s": 1.0})
-
-
-def test_exhaustive_top1_by_blocks_equals_that_of_the_whole_catalogue(crowd, monkeypatch):
-    """Scored in bfloat16, and in float32 where bfloat16 could choose wrongly."""
-    monkeypatch.setattr(scale, "BLOCK", 64)
-    sizes, touches = [100, 300], np.concatenate([crowd.touches, crowd.held_out])
-    cosines, _ = needed.exhaustive_top1(crowd, touches, sizes)
-    found = needed.ranks_of(crowd, touches, sizes, cosines)
-    blocks = [*crowd.blocks(0, 100, 0), *crowd.blocks(100, 300, 0)]
-    partials, photos = (
-        np.concatenate(part) for part in zip(*((b.arrays["partials"], b.embeddings) for b in blocks), strict=True)
-    )
-    for size, places in zip(sizes, found, strict=True):
-        for touch, query, place in zip(touches, crowd.embeddings(touches, "touch"), places, strict=True):
-            scores = photos[:size] @ query
-            top1_score = scores[crowd.scorer.logits(touch[None], partials[:size]).argmax()]
-            assert place == 1 + (scores > top1_score + 1e-6).sum()
-
-
-def test_candidates_are_four_times_as_many_as_the_choosing_touches_need():
-    """Of touches 1 to 3 the worst needs 5; the two that evaluate need 20 and 21."""
-    line = next(needed.lines([1000], np.array([[1, 5, 2, 20, 21]]), choosing=3))
-    assert (line["needed_by_chosen"], line["taken"], line["found"], line["worst"]) == (5, 20, 0.5, 21)
-
-
-def test_two_ways_to_find_candidates_of_several_grasps_are_compared(crowd, tmp_path, monkeypatch):
-    made = IndexStore(tmp_path / "index").write_blocks(crowd.blocks(0, 300, 0), fingerprint={}, kind="flat")
-    sets = several.sets_of(np.array([0, 0, 0, 1, 1, 1, 1, 2]), 3, maximum=5)
-    assert len(sets) == 5
-    assert all(set(row) <= {0, 1, 2} or set(row) <= {3, 4, 5, 6} for row in sets.tolist())
-    together, each = several.measure(crowd, made, crowd.touches, sets, k=20)
-    assert (together["photos"], together["grasps"], together["sets"], together["reranked"]) == (300, 3, 5, 20)
-    assert 20 <= each["reranked"] <= 60
-    for figures in (together, each):
-        assert 1 <= figures["needed"] <= figures["worst"] <= 300
-        assert 0 <= figures["low"] <= figures["found"] <= figures["high"] <= 1
-        assert "300 photos, 3 grasps, nearest to " in several.line(figures)
-
-
-def test_the_exhaustive_top1_of_several_grasps_has_the_greatest_sum_of_logits():
-    """Of four photos the third is between both grasps and has the greatest logit."""
-    grasps = np.eye(2, dtype=np.float32)
-    photos = np.array([[1, 0], [0, 1], [0.7, 0.7], [0.8, 0]], dtype=np.float32)
-    found = several.ranks_by_way(grasps, photos, lambda rows: np.array([0, 1, 5, 2])[rows])
-    assert found == {"together": 1, "each": 2}  # for the second grasp only one photo is nearer

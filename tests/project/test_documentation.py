@@ -67,7 +67,7 @@ def of_program(name, *pages):
 @pytest.fixture
 def home(tmp_path, recording, catalogue, model, monkeypatch):
     """A folder with all files that the commands name: catalog/, gel images, recording/, billets/, data/, pictures/,
-    bags/, model.safetensors, rig.toml, gels.toml, mobilenet_v2.pth, benchmarks/models/shipped_*.toml."""
+    bags/, model.safetensors, rig.toml, gels.toml, mobilenet_v2.pth, models/shipped_*.toml."""
     shutil.copytree(recording, tmp_path / "recording")
     shutil.copytree(catalogue, tmp_path / "catalog")
     photos = min(folder for folder in catalogue.iterdir() if folder.is_dir())
@@ -89,9 +89,9 @@ def home(tmp_path, recording, catalogue, model, monkeypatch):
     real_data_sets.write_billets(tmp_path / "data" / "billets")
     physiclear.write(tmp_path / "data" / "physiclear")
     rosbag.write(tmp_path / "bags")
-    (tmp_path / "benchmarks" / "models").mkdir(parents=True)
-    for rig in (ROOT / "benchmarks" / "models").glob("shipped_*.toml"):
-        shutil.copy(rig, tmp_path / "benchmarks" / "models")
+    (tmp_path / "models").mkdir()
+    for rig in (ROOT / "models").glob("shipped_*.toml"):
+        shutil.copy(rig, tmp_path / "models")
     (tmp_path / "points.csv").write_text(POINTS)
     (tmp_path / "gels.toml").write_text('rig = "sim"\ngels = 2\n')
     (tmp_path / "grey.toml").write_text(next(block for block in blocks("toml") if "grey" in block))

@@ -51,14 +51,14 @@ def packages_of(path):
 
 @pytest.mark.parametrize("package", ["indexes", "robot"])
 def test_indexes_and_robot_import_no_other_package(package):
-    others = set(PACKAGES) - {package} | {"tests", "benchmarks", "notebooks"}
+    others = set(PACKAGES) - {package} | {"tests", "benchmarks", "models", "notebooks"}
     for path in modules(package):
         assert not packages_of(path) & others, path
 
 
 def test_retrieval_does_not_import_tests_or_benchmarks():
     for path in modules("retrieval"):
-        assert not packages_of(path) & {"tests", "benchmarks", "notebooks"}, path
+        assert not packages_of(path) & {"tests", "benchmarks", "models", "notebooks"}, path
 
 
 def test_the_common_package_imports_only_python_and_msgspec():

@@ -43,6 +43,7 @@ def test_only_our_packages_are_installed():
         *ours,
         "tests",
         "benchmarks",
+        "models",
     }
 
 

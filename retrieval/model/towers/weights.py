@@ -65,7 +65,7 @@ def gel_tower() -> Path:
     """Return the file of the package's touch tower for real gels: MobileNetV2 with the output "stages".
 
     It was trained on simulated presses of random surfaces by gel sensors of any make
-    (`python -m benchmarks.models.gel_tower`).
+    (`python -m models.gel_tower`).
     """
     return Path(str(resources.files("retrieval") / "shipped" / "gel-tower.safetensors"))
 

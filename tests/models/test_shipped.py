@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 
-from benchmarks.models import shipped
+from models import shipped
 from retrieval.data.images import to_float
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import touch_features

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.models import gel_tower, random_surfaces
-from benchmarks.models.random_surfaces import BODIES, GRID, RandomSurface, presses
+from models import gel_tower, random_surfaces
+from models.random_surfaces import BODIES, GRID, RandomSurface, presses
 from retrieval.model.checkpoint import read_tensors
 from retrieval.model.towers import build_tower
 from retrieval.model.towers.weights import gel_tower as packaged_gel_tower

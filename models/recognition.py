@@ -1,6 +1,6 @@
 """Recognition of one object among 10, 100 and 1,000, and of objects that the catalogue lacks.
 
-    python -m benchmarks.models.recognition RECORDING --distractors PHOTOS --out FOLDER --model old=A --model new=B
+    python -m models.recognition RECORDING --distractors PHOTOS --out FOLDER --model old=A --model new=B
 
 RECORDING holds grasps of objects that no model was trained on; rows with five grasps and three photos need eight of
 each. PHOTOS is a folder of `retrieve collect --photos-only`: one photo of each further object of the catalogue. Every

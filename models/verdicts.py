@@ -1,10 +1,10 @@
 """Accuracy of "match", "none of these", "no contact" and "not a gel image" for the shipped checkpoint.
 
-    python -m benchmarks.models.verdicts FOLDER
+    python -m models.verdicts FOLDER
         writes FOLDER/verdicts.md, verdicts.json and risk.png; continues an interrupted run
 
 The objects and gels have seeds that the checkpoint was not trained on: 120 touched objects (the recording of `python -m
-benchmarks.models.shipped score FOLDER`), and 880 photo-only objects, so that catalogues of up to 1,000 objects can be
+models.shipped score FOLDER`), and 880 photo-only objects, so that catalogues of up to 1,000 objects can be
 searched with the queried object and without it. Then it tests inputs that are not touches. Pictures of real sensors and
 things are tested if the variable TOUCH_DATA names a folder that has them. Results on simulated touches do not predict
 those on real sensors.
@@ -26,8 +26,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
-from benchmarks.models import shipped
-from benchmarks.models.recognition import interval
+from models import shipped
+from models.recognition import interval
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import load_grasps
 from retrieval.data.images import read_rgb

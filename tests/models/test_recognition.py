@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks.models import recognition
+from models import recognition
 from retrieval.data.dataset import load_grasps
 from retrieval.metrics.protocols import k_way
 from retrieval.metrics.table import ScoreTable

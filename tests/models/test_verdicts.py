@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from benchmarks.models import verdicts
+from models import verdicts
 
 
 @pytest.mark.slow

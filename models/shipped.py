@@ -1,12 +1,12 @@
 """The checkpoints of the package: their training, and their accuracy on unseen objects.
 
-    python -m benchmarks.models.shipped make FOLDER --init WEIGHTS
+    python -m models.shipped make FOLDER --init WEIGHTS
         collect grasps on simulated rigs, photos and presses of other objects; pretrain both towers on relief, train
         them together in three rounds, train a head for two fingers and one for one finger, calibrate both, and store
         them in FOLDER
-    python -m benchmarks.models.shipped calibrate FOLDER
+    python -m models.shipped calibrate FOLDER
         calibrate the shipped checkpoints again; keep their weights
-    python -m benchmarks.models.shipped score FOLDER
+    python -m models.shipped score FOLDER
         collect other objects into FOLDER/recording, and evaluate the shipped checkpoint on them: FOLDER/report; with
         --fingers 1 that for one finger, in FOLDER/report-one-finger
 

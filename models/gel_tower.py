@@ -1,6 +1,6 @@
 """The gel tower of the package: a touch tower for real gels (`retrieval.model.towers.weights.gel_tower`).
 
-    python -m benchmarks.models.gel_tower FOLDER --init WEIGHTS [--steps N]
+    python -m models.gel_tower FOLDER --init WEIGHTS [--steps N]
         press random surfaces into simulated sensors of any make, press labelled objects, train the tower from ImageNet
         weights, and write FOLDER/gel-tower.safetensors
 
@@ -25,8 +25,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from _touch_retrieval.files import atomic_file, write_atomically
-from benchmarks.models.random_surfaces import RandomSurface, presses
-from benchmarks.models.shipped import retrieve
+from models.random_surfaces import RandomSurface, presses
+from models.shipped import retrieve
 from retrieval.console.interruption import interruption
 from retrieval.console.memory import keep_freed_memory
 from retrieval.console.output import say
@@ -306,7 +306,7 @@ class GelTowerTraining:
             f"* Trained on: presses of {SURFACES} random surfaces into each of {len(self.sensors)} sensors, and",
             f"  {len(self.labelled)} simulated presses with labels of relief and shape; no real image",
             f"* Steps: {steps}",
-            "* Made by: `python -m benchmarks.models.gel_tower`",
+            "* Made by: `python -m models.gel_tower`",
         )
         return "\n".join((*lines, ""))
 

@@ -1,1 +1,0 @@
-"""Programs that train the shipped models and measure their accuracy."""
