@@ -44,8 +44,6 @@ if TYPE_CHECKING:
     from retrieval.search.build.build_report import BuildReport as BuildReport
     from retrieval.search.defaults import shipped_model as shipped_model
     from retrieval.search.embeddings import embed_photos as embed_photos
-    from retrieval.search.query.agreement import Agreement as Agreement
-    from retrieval.search.query.agreement import agreement as agreement
     from retrieval.search.query.answer import Match as Match
     from retrieval.search.query.answer import QueryResult as QueryResult
     from retrieval.search.query.neighbours import Neighbour as Neighbour
@@ -59,7 +57,6 @@ if TYPE_CHECKING:
 
 _MODULES = {
     "Adaptation": "adaptation.recipe:Adaptation",
-    "Agreement": "search.query.agreement:Agreement",
     "BadInput": "errors:BadInput",
     "BuildReport": "search.build.build_report:BuildReport",
     "Checkpoint": "model.checkpoint:Checkpoint",
@@ -78,7 +75,6 @@ _MODULES = {
     "Tower": "model.towers.tower:Tower",
     "Verification": "search.query.verification:Verification",
     "adapt": "adaptation.recipe:adapt",
-    "agreement": "search.query.agreement:agreement",
     "benchmark": "evaluation.real.benchmark:benchmark",
     "build_index": "search.build.build_index:build_index",
     "check_recording": "data.check.recording:check_recording",

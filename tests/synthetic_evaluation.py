@@ -166,24 +166,6 @@ def method(rng, name, grasps, split):
     }
 
 
-def next_grasp():
-    """Return the accuracy by policy; only the upper bound reaches 80 %."""
-    needed = {"value": 1.5, "low": 1.2, "high": 1.9}
-    return {
-        "candidates": 80,
-        "objects": 78,
-        "sequences": 600,
-        "policies": {
-            policy: {
-                "accuracy": [[0.6 + gain * grasps, 0.5, 0.95] for grasps in range(5)],
-                "grasps_needed": needed if policy == "upper_bound" else dict.fromkeys(needed),
-                "relative_to_random": dict.fromkeys(needed),
-            }
-            for policy, gain in {"spread": 0.04, "random": 0.03, "repeated": 0.0, "upper_bound": 0.08}.items()
-        },
-    }
-
-
 def verification(rng):
     """Return error rates of verification that fall with the number of grasps; the lowest rate is refused."""
 
@@ -273,7 +255,6 @@ def synthetic_results(recording, methods=tuple(SKILL), seed=0):
             },
         },
         "verification": verification(np.random.default_rng([seed, 1])),
-        "next_grasp": next_grasp(),
         "comparisons": [
             {
                 "a": methods[0],

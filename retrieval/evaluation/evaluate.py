@@ -28,7 +28,6 @@ from retrieval.evaluation.controls import (
 from retrieval.evaluation.data import EvaluationData, prepare
 from retrieval.evaluation.experiment import Experiment
 from retrieval.evaluation.low_contact import find_low_contact_touches, score_low_contact
-from retrieval.evaluation.next_grasp import score_next_grasp
 from retrieval.evaluation.predictions import Predictions
 from retrieval.evaluation.queries import draw_queries
 from retrieval.evaluation.scoring import Measures, MethodScores, score_method
@@ -141,12 +140,6 @@ def evaluate(
             score_verification(experiment, predictions["late_fusion"], jobs["late_fusion"], seed)
             if "late_fusion" in jobs
             else None
-        ),
-        "next_grasp": score_next_grasp(
-            queries,
-            predictions.get("late_fusion", []),
-            [data.grasps[row].height_mm for row in queries.touches],
-            seed,
         ),
         **controls_and_ceilings,
     }

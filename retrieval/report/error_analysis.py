@@ -166,15 +166,3 @@ def verification(builder: Builder) -> Iterator[Block | None]:
             "the one whose photos have the most similar embeddings. A FAR is refused if the trials would contain fewer "
             f"than {ERRORS_NEEDED} errors (rule of 30)."
         )
-
-
-def next_grasp(builder: Builder) -> Iterator[Block | None]:
-    """Yield the accuracy of late fusion by the choice of the next grasp."""
-    if found := builder.results.data.get("next_grasp"):
-        yield tables.next_grasp(builder.results)
-        yield Text(
-            f"{found['sequences']:,} sequences of recorded grasps of {found['objects']} unseen objects, ranked among "
-            f"{found['candidates']} objects with one photo each. Spread: the recorded grasp whose height differs most "
-            "from those of the earlier grasps. Upper bound: the grasp after which the true object leads by the largest "
-            "margin, chosen with the answer known."
-        )

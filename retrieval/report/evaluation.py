@@ -138,7 +138,6 @@ SECTIONS: dict[str, Callable[[Builder], Iterator[Block | None]]] = {
     "Calibration": error_analysis.calibration,
     "Is the object in the catalogue?": error_analysis.reject,
     "Is it the expected object?": error_analysis.verification,
-    "Where to grasp next?": error_analysis.next_grasp,
     "Settings": _setting,
     "All measures": _everything,
 }

@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from retrieval.evaluation.next_grasp import ACCURACY
 from retrieval.methods import TRIVIAL_BASELINES
 from retrieval.metrics.registry import METRICS
 from retrieval.model.posterior import FORMULA
@@ -269,33 +268,8 @@ def _supported_rate(rate: Mapping[str, Any]) -> str:
     return "refused: no errors" if needed is None else f"refused: needs {needed:,} objects"
 
 
-def next_grasp(results: Results) -> Table:
-    """Return top-1 accuracy after each number of grasps, and the grasps to a fixed accuracy, by policy."""
-    policies = results.data["next_grasp"]["policies"]
-    rows = [
-        (
-            policy.replace("_", " "),
-            *(_percent_interval(*row) for row in one["accuracy"]),
-            *(_number_interval(one[key]) for key in ("grasps_needed", "relative_to_random")),
-        )
-        for policy, one in policies.items()
-    ]
-    counts = range(1, 1 + len(rows[0][1:-2]))
-    grasps = (f"{count} grasp{'s' * (count > 1)}, %" for count in counts)
-    header = ("choice of the next grasp", *grasps, f"grasps to {100 * ACCURACY:g} %", "relative to random")
-    note = f"{MISSING_VALUE}: the accuracy is not reached. Intervals resample objects."
-    return Table(header, tuple(rows), (note,))
-
-
 def _percent_interval(value: float, low: float, high: float) -> str:
     return f"{percent(value)} [{percent(low)}, {percent(high)}]"
-
-
-def _number_interval(found: Mapping[str, float | None]) -> str:
-    value, low, high = (
-        f"{found[name]:.2f}" if found[name] is not None else MISSING_VALUE for name in ("value", "low", "high")
-    )
-    return f"{value} [{low}, {high}]"
 
 
 def _has_entry(results: Results, name: str, entry: str) -> bool:

@@ -24,7 +24,7 @@ from retrieval.serve.history import FeedbackBody
 from retrieval.serve.history_writer import HistoryWriter, Recorder
 from retrieval.serve.human_baseline import ChoiceBody, RunBody
 from retrieval.serve.metrics import Metrics
-from retrieval.serve.queries import AgreementBody, VerifyBody
+from retrieval.serve.queries import VerifyBody
 from retrieval.serve.queue import Queue
 from retrieval.serve.security import Guard
 from retrieval.serve.service import LiveRig, Service
@@ -47,7 +47,6 @@ _BODIES: tuple[type[BaseModel], ...] = (
     QueryBody,
     BatchBody,
     VerifyBody,
-    AgreementBody,
     FeedbackBody,
     RunBody,
     ChoiceBody,

@@ -88,11 +88,9 @@ class Client:
             ImageError: An image cannot be read.
             RetrievalError: No answer is available.
         """
-        return self._ask("query", touches, options)[0]
-
-    def query_cumulative(self, touches: AnyTouches, **options: Unpack[QueryOptions]) -> list[QueryResult]:
-        """Run `Searcher.query_cumulative` on the service; see `query`."""
-        return self._ask("query/cumulative", touches, options)
+        grasps = self._grasps(touches)
+        body = {"touches": _encoded(grasps), **_request_options(options)}
+        return _result(_document(self._send("POST", "query", json=body)), grasps)
 
     def query_many(self, objects: Sequence[AnyTouches], **options: Unpack[QueryOptions]) -> list[QueryResult]:
         """Run `Searcher.query_many` on the service; see `query`."""
@@ -110,11 +108,6 @@ class Client:
             BadInput: The service has no such photo.
         """
         return self._send("GET", f"photos/{quote(match.photo)}").content
-
-    def _ask(self, path: str, touches: AnyTouches, options: QueryOptions) -> list[QueryResult]:
-        grasps = self._grasps(touches)
-        answer = _document(self._send("POST", path, json={"touches": _encoded(grasps), **_request_options(options)}))
-        return [_result(one, grasps) for one in answer.get("answers", [answer])]
 
     def _grasps(self, touches: AnyTouches, of: str = "") -> list[list[InputImage]]:
         if self._fingers is None:

@@ -8,7 +8,6 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
-from retrieval.model.information import Information
 from retrieval.model.verification import DecisionBounds
 from retrieval.search.query.answer import NearestReference
 
@@ -35,13 +34,6 @@ EXAMPLE: dict[str, Any] = {
     "unlisted_probability": 0.02,
     "more_grasps": None,
     "advice": None,
-    "information": {
-        "gained_bits": 4.22,
-        "remaining_bits": 0.37,
-        "possible_bits": 5.32,
-        "next_grasp_bits": 0.04,
-        "next_effective_grasps": 1.11,
-    },
     "posterior": {"none_prior": 0.5, "grasps": 1, "objects": 20, "scored_objects": 20, "unscored_probability": 0.0},
     "results": [
         {
@@ -93,7 +85,6 @@ class QueryDocument(BaseModel):
     unlisted_probability: float | None = None
     more_grasps: int | None = None
     advice: str | None = None
-    information: Information | None = None
     posterior: dict[str, Any] | None
     results: list[MatchDocument]
 
@@ -102,16 +93,6 @@ class BatchDocument(BaseModel):
     """One answer for each object, in the order of the request."""
 
     answers: list[QueryDocument]
-
-
-class CumulativeQueryDocument(BaseModel):
-    """Answers to a cumulative query: after the first grasp, after the first two, and so on.
-
-    per_grasp: the answer to each single grasp; empty unless the request has `per_grasp=true`.
-    """
-
-    answers: list[QueryDocument]
-    per_grasp: list[QueryDocument]
 
 
 class PhotoDocument(BaseModel):
@@ -158,20 +139,6 @@ class VerificationDocument(BaseModel):
     grasps: list[str]
     log_ratios: list[float]
     bounds: DecisionBounds | None
-
-
-class AgreementDocument(BaseModel):
-    """Occlusion map of a photo: the decrease of the match logit if a square of the photo is hidden.
-
-    falls: rows from the top, columns from the left; negative if hiding the square raises the logit.
-    """
-
-    generation: str
-    photo: str
-    logit: float
-    rows: int
-    columns: int
-    falls: list[list[float]]
 
 
 class IndexDocument(BaseModel):

@@ -23,7 +23,7 @@ from retrieval.serve.errors import HttpProblem, validation_message
 from retrieval.serve.forms import form_parts
 from retrieval.serve.settings import MAX_BODY_BYTES, MAX_PICTURES, MAX_SMALL_BODY_BYTES
 
-PICTURE_PATHS = frozenset({"/v1/query", "/v1/query/batch", "/v1/query/cumulative", "/v1/verify", "/v1/agreement"})
+PICTURE_PATHS = frozenset({"/v1/query", "/v1/query/batch", "/v1/verify"})
 """Routes whose bodies contain pictures: up to `MAX_BODY_BYTES`. All others: up to `MAX_SMALL_BODY_BYTES`."""
 LARGE_BYTES = 1_000_000
 """Size in bytes above which a body is treated as large."""

@@ -15,8 +15,7 @@ from robot.settings import check_range
 class SpreadPlanner(GraspPlanner):
     """Draws several grasps from another planner; plans the one whose height differs most from those of earlier grasps.
 
-    With recorded grasps of simulated objects this recognises an object a little more often than random grasps do
-    (docs/measurements/next_grasp.md).
+    No gain over random grasps was shown for recognition (docs/answers.md).
 
     Args:
         planner: Draws the grasps.

@@ -1,5 +1,6 @@
 """The result of a query: a verdict and a ranking of objects with probabilities, with the index and the timing."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -10,8 +11,7 @@ from numpy.typing import NDArray
 
 from retrieval.errors import BadInput
 from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck
-from retrieval.model.information import Information, information, unlisted_probability
-from retrieval.model.posterior import Posterior, PosteriorProbabilities
+from retrieval.model.posterior import PosteriorProbabilities
 from retrieval.model.touches import TouchEncodings
 
 MATCH, NONE_OF_THESE, UNCALIBRATED = "match", "none of these", "uncalibrated"
@@ -150,25 +150,9 @@ class QueryResult:
     @property
     def unlisted_probability(self) -> float | None:
         """Probability of all objects that `results` does not list; None without probabilities."""
-        none = self.none_probability
-        return (
-            None if none is None else unlisted_probability(none, [match.probability or 0.0 for match in self.results])
-        )
-
-    @property
-    def information(self) -> Information | None:
-        """Information gained by the grasps, remaining, and expected from another grasp; None without probabilities."""
-        formula, none = self.posterior, self.none_probability
-        if formula is None or none is None:
+        if self.none_probability is None:
             return None
-        return information(
-            Posterior(formula["slope"], formula["offset"], formula["dependence"]),
-            formula["grasps"],
-            none,
-            [match.probability or 0.0 for match in self.results],
-            objects=formula["objects"],
-            none_prior=formula["none_prior"],
-        )
+        return max(0.0, 1 - math.fsum((self.none_probability, *(match.probability or 0.0 for match in self.results))))
 
     @classmethod
     def from_dict(cls, document: dict[str, Any]) -> "QueryResult":
@@ -185,7 +169,6 @@ class QueryResult:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the document of `retrieve query --json`."""
-        gained = self.information
         return {
             "query": {"touches": self.touches, "grasps": self.grasps},
             "index": self.index,
@@ -195,7 +178,6 @@ class QueryResult:
             "unlisted_probability": self.unlisted_probability,
             "more_grasps": self.more_grasps,
             "advice": self.advice,
-            "information": None if gained is None else asdict(gained),
             "posterior": self.posterior,
             "results": [match.to_dict() for match in self.results],
         }

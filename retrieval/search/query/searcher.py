@@ -192,27 +192,6 @@ class Searcher:
         grasps = parse_grasps(touches, opened.reader.fingers)
         return opened._results(grasps, [slice(len(grasps))], background, top, candidates, none_prior)[0]
 
-    def query_cumulative(
-        self,
-        touches: AnyTouches,
-        *,
-        background: Sequence[AnyImage] | None = None,
-        top: int = 10,
-        candidates: int | None = None,
-        none_prior: float = NONE_PRIOR,
-    ) -> list[QueryResult]:
-        """Return the results of `query` after the first grasp, the first two, and so on; each grasp is encoded once.
-
-        >>> with retrieval.open("index") as searcher:
-        ...     after_one, after_two = searcher.query_cumulative([["a.png", "b.png"], ["a2.png", "b2.png"]])
-        >>> len(after_one.touches), len(after_two.touches)
-        (1, 2)
-        """
-        opened = self._snapshot()
-        grasps = parse_grasps(touches, opened.reader.fingers)
-        spans = [slice(count) for count in range(1, len(grasps) + 1)]
-        return opened._results(grasps, spans, background, top, candidates, none_prior)
-
     def query_many(
         self,
         objects: Sequence[AnyTouches],

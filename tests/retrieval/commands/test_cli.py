@@ -131,7 +131,7 @@ def test_json_is_the_only_thing_on_stdout_and_has_the_documented_keys(workplace,
     document = json.loads(capsys.readouterr().out)
     assert set(document) == {
         *("query", "index", "timing_ms", "verdict", "none_probability", "posterior", "results"),
-        *("more_grasps", "advice", "unlisted_probability", "information"),
+        *("more_grasps", "advice", "unlisted_probability"),
     }
     touches = [["a.png", "b.png"], ["a.png", "b.png"]]
     assert document["query"] == {"touches": touches, "grasps": ["contact", "contact"]}

@@ -55,11 +55,9 @@ def test_arrays_bytes_and_pillow_images_give_the_same_ranking(client, searcher, 
         assert found.touches == expected.touches
 
 
-def test_client_batch_and_cumulative_queries_match_the_searcher(client, searcher, touch):
-    many, cumulative = [touch, [touch, touch]], [touch, touch]
+def test_client_batch_queries_match_the_searcher(client, searcher, touch):
+    many = [touch, [touch, touch]]
     for found, expected in zip(client.query_many(many), searcher.query_many(many), strict=True):
-        assert without_times(found) == without_times(expected)
-    for found, expected in zip(client.query_cumulative(cumulative), searcher.query_cumulative(cumulative), strict=True):
         assert without_times(found) == without_times(expected)
     assert client.query_many([]) == []
 

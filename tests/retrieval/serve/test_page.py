@@ -118,7 +118,7 @@ def test_objects_that_are_not_shown_share_one_bar(opened, files):
 def test_every_verdict_has_its_text(opened, files, searcher, verdict, claim, text):
     document = searcher.query(files[:2]).to_dict() | {"verdict": verdict}
     if verdict != "none of these":
-        document |= dict.fromkeys(("none_probability", "unlisted_probability", "posterior", "information"))
+        document |= dict.fromkeys(("none_probability", "unlisted_probability", "posterior"))
     if verdict in ("no contact", "not a gel image"):
         document |= {"results": [], "query": {"touches": [["a.png", "b.png"]], "grasps": [verdict]}}
     show_answer(document, opened, files)
@@ -155,27 +155,12 @@ def test_the_probability_of_unlisted_objects_is_that_of_the_service(opened, file
 def test_an_answer_without_advice_of_an_earlier_version_is_shown(opened, files, searcher):
     """The history may contain such answers."""
     document = searcher.query(files[:2], none_prior=0.999).to_dict()
-    del document["advice"], document["more_grasps"], document["information"], document["unlisted_probability"]
+    del document["advice"], document["more_grasps"], document["unlisted_probability"]
     for match in document["results"]:
         del match["probability_if_present"]
     show_answer(document, opened, files)
     opened.locator(".verdict").get_by_text("The nearest objects are shown.").wait_for()
-    assert opened.locator(".advice, .if-present, .next-grasp").count() == 0
-
-
-def test_a_photo_shows_its_agreement_with_the_touch(opened, files):
-    ask(opened, files[:2])
-    opened.locator(".photo.object button").first.click()
-    button = opened.get_by_role("button", name="Show agreement with the touch")
-    button.click()
-    shade = opened.locator("canvas.map")
-    shade.wait_for()
-    assert shade.get_attribute("data-squares") == "64"
-    read = "one => one.getContext('2d').getImageData(0, 0, one.width, one.height).data.filter((_, n) => n % 4 === 3)"
-    values = shade.evaluate(f"one => {{ const all = ({read})(one); return [Math.min(...all), Math.max(...all)]; }}")
-    assert values[0] < values[1]  # somewhere brighter than elsewhere
-    button.click()
-    assert shade.count() == 0
+    assert opened.locator(".advice, .if-present").count() == 0
 
 
 def test_similar_photos_open_their_objects(opened, files):

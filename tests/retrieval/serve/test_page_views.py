@@ -1,4 +1,4 @@
-"""The page in a real browser: cumulative queries, feedback, the history, the catalogue, the human baseline."""
+"""The page in a real browser: feedback, the history, the catalogue, the human baseline."""
 
 import io
 import json
@@ -33,61 +33,6 @@ def opened(browser, url):
 def open_view(opened, name):
     """Open a view by its link."""
     opened.get_by_role("navigation").get_by_role("link", name=name).click()
-
-
-def test_the_cumulative_query_is_plotted_and_tabulated(opened, files):
-    ask(opened, files)
-    section = opened.get_by_role("region", name="Grasp by grasp")
-    section.get_by_text("changed the answer most").wait_for()
-    assert section.locator("svg .none circle").count() == 2  # after one grasp, after two
-    section.get_by_text("As numbers").click()
-    assert section.get_by_role("columnheader").all_inner_texts() == ["Object", "Grasp 1", "Grasp 2"]
-    last = section.get_by_role("row", name="None of these").get_by_role("cell").last.inner_text()
-    assert last == opened.locator(".photo.none .p").inner_text()
-
-
-INFORMATION = {
-    "gained_bits": 1.25,
-    "remaining_bits": 2.5,
-    "possible_bits": 4.0,
-    "next_grasp_bits": 0.375,
-    "next_effective_grasps": 1.625,
-}
-
-
-def informed(answer, **changes):
-    """Return the document of an answer with this information, which contradicts its probabilities."""
-    return answer.to_dict() | {"information": INFORMATION | changes}
-
-
-def test_the_information_of_an_answer_is_shown_as_the_service_sends_it(opened, files, searcher):
-    """The page computes neither the information of each grasp nor that of the next one."""
-    grasps = [files[:2], files[2:]]
-    whole = informed(searcher.query(grasps))
-    per_grasp = [
-        informed(one, gained_bits=bits) for one, bits in zip(searcher.query_many(grasps), (0.5, 3.125), strict=True)
-    ]
-    cumulative = {"answers": [one.to_dict() for one in searcher.query_cumulative(grasps)], "per_grasp": per_grasp}
-    opened.route("**/v1/query", lambda route: route.fulfill(json=whole))
-    opened.route("**/v1/query/cumulative*", lambda route: route.fulfill(json=cumulative))
-    ask(opened, files)
-    text = opened.get_by_role("region", name="Another grasp").inner_text()
-    assert "would add about 0.38 of the 2.5 remaining bits of uncertainty" in text
-    assert "3 grasps of one object count as 1.63 independent ones" in text
-    assert "Grasp at another height than before." in text
-    section = opened.get_by_role("region", name="Grasp by grasp")
-    sentence = section.get_by_text("gives the most information").inner_text()
-    assert "grasp 2 gives the most information: 3.1 of the 4.0 bits" in sentence
-    section.get_by_text("As numbers").click()
-    row = section.get_by_role("row", name="Information of each single grasp").get_by_role("cell")
-    assert row.all_inner_texts() == ["0.50 bits", "3.13 bits"]
-
-
-def test_another_grasp_below_a_hundredth_bit_adds_almost_no_information(opened, files, searcher):
-    document = informed(searcher.query(files[:2]), next_grasp_bits=0.004)
-    opened.route("**/v1/query", lambda route: route.fulfill(json=document))
-    ask(opened, files[:2])
-    assert "would add almost no information" in opened.get_by_role("region", name="Another grasp").inner_text()
 
 
 def test_feedback_is_stored_and_shown_in_the_history(opened, files):
@@ -156,7 +101,6 @@ def test_the_catalogue_is_searched_and_its_photos_open_similar_photos(opened, ca
     opened.locator(".grid button").click()
     dialog = opened.get_by_role("dialog", name=name)
     assert dialog.get_by_alt_text(f"Photo {name}/2.jpg").is_visible()
-    assert dialog.get_by_role("button", name="Show agreement").count() == 0  # there is no touch
     dialog.locator(".similar-photos button").first.click()
     opened.get_by_role("dialog").locator(".similar-photos li").first.wait_for()
     opened.keyboard.press("Escape")

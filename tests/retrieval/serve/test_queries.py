@@ -63,25 +63,6 @@ def test_a_batch_returns_one_answer_per_object_in_order(client, searcher, grasps
         assert equal_but_times(answer, expected)
 
 
-def test_cumulative_query_returns_cumulative_and_per_grasp_answers(client, searcher, grasps):
-    query = {"touches": encoded(grasps)}
-    assert client.post("/v1/query/cumulative", json=query).json()["per_grasp"] == []
-    found = client.post("/v1/query/cumulative?per_grasp=true", json=query).json()
-    for answer, expected in zip(found["per_grasp"], searcher.query_many([[grasp] for grasp in grasps]), strict=True):
-        assert equal_but_times(answer, expected)
-    answers = found["answers"]
-    assert [len(answer["query"]["touches"]) for answer in answers] == [1, 2]
-    for answer, expected in zip(answers, searcher.query_cumulative(grasps), strict=True):
-        assert equal_but_times(answer, expected)
-
-
-def test_the_occlusion_map_of_a_photo_is_not_flat(client, searcher, grasps):
-    photo = searcher.generation.rows[0]["path"]
-    found = client.post("/v1/agreement", json={"photo": photo, "touches": encoded(grasps), "squares": 2}).json()
-    assert (found["rows"], found["columns"], [len(row) for row in found["falls"]]) == (2, 2, [2, 2])
-    assert len({fall for row in found["falls"] for fall in row}) > 1
-
-
 def test_verification_returns_the_document_of_the_searcher(grasps, model, catalogue, tmp_path):
     made = dataclasses.replace(load_checkpoint(model), verification=calibration(-1e3, -2e3), posterior=POSTERIOR)
     store_checkpoint(made, tmp_path / "m.safetensors")

@@ -4,8 +4,6 @@ import { thumbnailURL } from "./api.js";
 import { h, picture } from "./dom.js";
 import { openDetail } from "./detail.js";
 import { feedbackPanel } from "./feedback.js";
-import { cumulativePanel } from "./cumulative.js";
-import { nextGraspSection } from "./information.js";
 import { count, nearness, percent, verdict } from "./wording.js";
 
 const MIN_SHOWN = 0.0005;
@@ -27,8 +25,6 @@ export function answerPanel({ index, answer, id, query, stored = null }) {
         { class: "photos", "aria-label": "Objects, most likely first" },
         parts.map((part) => card(part, answer, open)),
       ),
-    parts.length > 0 && query.touches.length > 1 && answer.none_probability !== null && cumulativePanel(query),
-    parts.length > 0 && answer.information && nextGraspSection(answer),
     searchDetails(answer),
   );
 }

@@ -86,9 +86,6 @@ export async function query(touches, background, options) {
   return { answer: await response.json(), id: response.headers.get("x-query-id") };
 }
 
-export const cumulative = (touches, background, options) =>
-  json("/v1/query/cumulative?per_grasp=true", form(touches, background, options));
-
 /** Grasp an object with the simulated rig: the named one, else a random one. */
 export async function grasp(objectId = null) {
   const result = await json(withParameters("/v1/grasp", { object: objectId }), { method: "POST" });
@@ -106,8 +103,6 @@ async function postTouches(path, touches, background, values) {
   return json(path, jsonPost({ touches: all, background: frames, ...values }));
 }
 
-export const agreement = (photo, touches, background, squares = 8) =>
-  postTouches("/v1/agreement", touches, background, { photo, squares });
 export const verify = (expect, touches, background, far) =>
   postTouches("/v1/verify", touches, background, { expect, far });
 

@@ -2,7 +2,6 @@
 
 import * as api from "./api.js";
 import { announce, h, picture, problemCard } from "./dom.js";
-import { agreementTool } from "./agreement.js";
 import { blobURL, finger } from "./tray.js";
 import { count, nearness } from "./wording.js";
 
@@ -73,7 +72,6 @@ function photoStage(index, query, reference) {
   const photoFigure = h("figure", { class: "pane" }, photos);
   const element = h("div", { class: "stage" }, photoFigure);
   const touchOnly = reference !== null && reference.adds === null; // the shown picture is a gel image, not a photo
-  const tool = query && !touchOnly && agreementTool(query);
   const caption = h("figcaption", {});
   photoFigure.append(caption);
   if (reference) element.append(gelPane("the reference touch", referenceGels(index, reference), element));
@@ -82,7 +80,7 @@ function photoStage(index, query, reference) {
   function show(id) {
     const image = picture(api.photoURL(id), touchOnly ? `Gel image ${id}` : `Photo ${id}`);
     photos.replaceChildren(enlarger(image, "the photo", element, photoFigure));
-    caption.replaceChildren(h("span", { class: "muted" }, id), tool ? tool.of(id, image, photos) : "");
+    caption.replaceChildren(h("span", { class: "muted" }, id));
   }
   return { element, show };
 }
