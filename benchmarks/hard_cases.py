@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from retrieval.console.files import PAGE, RESULTS, text_bytes, write_output
+from retrieval.console.files import text_bytes, write_output
 from retrieval.report.document import Document, Section, Table, Text, to_html
 from retrieval.version import __version__
 from tests.hard_case import HardCase
@@ -95,7 +95,7 @@ def write_page(out: Path, document: Mapping[str, Any]) -> Path:
     sections = tuple(_section(name, [case for case in cases if case["package"] == name]) for name in packages)
     page = out / "stability.html"
     html = to_html(Document("Hard cases of every numerical kernel", lead, sections), out)
-    write_output(page, text_bytes(html), PAGE)
+    write_output(page, text_bytes(html))
     return page
 
 
@@ -125,7 +125,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     print("\n".join(lines(document)))
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-        write_output(out / "stability.json", (json.dumps(document, indent=1) + "\n").encode(), RESULTS)
+        write_output(out / "stability.json", (json.dumps(document, indent=1) + "\n").encode())
         print(f"page: {write_page(out, document)}")
     return int(document["failed"] > 0)
 

@@ -11,7 +11,6 @@ from _touch_retrieval.files import write_atomically
 from retrieval.adaptation.baseline import UnadaptedBaseline
 from retrieval.adaptation.data import AdaptationData
 from retrieval.adaptation.folds import Fold, draw_folds, fold_accuracy, measure
-from retrieval.console.files import GENERATOR_COMMENT
 from retrieval.console.progress import Bar
 from retrieval.methods.cca_towers import CcaSettings, TowerWidths, fit_projections
 from retrieval.metrics.intervals import summarise
@@ -170,7 +169,7 @@ def write_curve(folder: Path, points: Sequence[CurvePoint]) -> Path:
 
 
 def _text(points: Sequence[CurvePoint]) -> Iterator[str]:
-    yield from (GENERATOR_COMMENT, "# Accuracy by number of fitted objects and touches", "")
+    yield from ("# Accuracy by number of fitted objects and touches", "")
     yield "Top-1 accuracy and pair accuracy of one touch on objects that were left out of the fit. Intervals resample"
     yield f"objects; chance is {points[0].chance:.3f} and 0.500. In rows with touches only, another touch of an object"
     yield "replaces its photo, in the fit and in the test; both are of one recording, so drift may help.\n"

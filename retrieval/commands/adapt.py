@@ -6,7 +6,6 @@ from typing import Annotated
 import typer
 
 from retrieval.commands.options import SEED, SPLIT, CheckpointOut, Recording, read_split
-from retrieval.console.files import TEXT, require_ours
 from retrieval.console.output import say
 
 
@@ -39,8 +38,6 @@ def adapt(
     from retrieval.data.check.recording import check_gel_layout
     from retrieval.search import defaults
 
-    if report:
-        require_ours(report / "curve.md", TEXT)
     for finding in check_gel_layout(recording):
         say(f"{finding.severity}: {finding.message}")
     result = fit(recording, out, model, init=init, split=read_split(split), report=report, cache=cache, seed=seed)

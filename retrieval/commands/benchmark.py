@@ -19,7 +19,6 @@ from retrieval.commands.options import (
     announce_resume,
     training_config,
 )
-from retrieval.console.files import PAGE, RESULTS, TEXT, require_ours
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput
 from retrieval.evaluation.real import PROTOCOLS
@@ -30,7 +29,6 @@ PRESET = "real"
 METHODS = "cca_towers,cca_pca,cca,late_fusion,chance"
 PRESET_METHODS = {"adapt": "cca_towers,chance"}
 """Default methods of presets that fit only some of the methods."""
-OUTPUT_FILES = {"results.json": RESULTS, "report.md": TEXT, "report.html": PAGE}
 
 app = typer.Typer(name="benchmark", help=HELP, short_help=HELP, subcommand_metavar="DATA_KIND [ARGS]...")
 
@@ -90,8 +88,6 @@ def real(
     from retrieval.evaluation.real.benchmark import benchmark
     from retrieval.report.real import print_verdicts, write_report
 
-    for name, kind in OUTPUT_FILES.items():
-        require_ours(out / name, kind)
     requested = list(dict.fromkeys(protocols.split(","))) if protocols else PROTOCOLS.names()
     data_set_of = {name: PROTOCOLS.resolve(name).data_set for name in requested}
     config = training_config(preset, iterations, init=init)

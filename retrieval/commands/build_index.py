@@ -7,7 +7,6 @@ import typer
 
 from indexes import KINDS
 from retrieval.commands.options import COUNT, FRACTION, Json, Model, NumberParser, announce_resume
-from retrieval.console.files import PREVIEW, require_ours
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput, RetrievalError
 
@@ -155,7 +154,6 @@ def _preview_path(catalogue: Path, out: Path) -> Path:
     """
     folder = out.resolve()
     sheet = folder.with_name(f"{folder.name}-views.png")
-    require_ours(sheet, PREVIEW)
     if catalogue.resolve() in sheet.parents:
         raise BadInput(
             f"{sheet} would become a photo of the catalogue {catalogue}; choose an --out outside it for --preview"

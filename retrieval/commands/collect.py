@@ -6,7 +6,6 @@ from typing import Annotated, Any
 import typer
 
 from retrieval.commands.options import COUNT, SEED, Jobs, Objects, announce_resume, refuse_options
-from retrieval.console.files import PREVIEW, require_ours
 from retrieval.console.output import say, show
 from retrieval.console.progress import CountedBar
 from retrieval.errors import BadInput, RetrievalError
@@ -74,8 +73,6 @@ def collect(
     # "." and ".." have no name to extend, so they are resolved.
     folder = out if out.name not in ("", "..") else out.resolve()
     sheet = folder.with_name(f"{folder.name}-preview.png")
-    if preview:
-        require_ours(sheet, PREVIEW)
     decide, gate_name = _load_gate(gate)
     settings = CollectSettings(grasps=grasps, rounds=rounds)
     if rounds:

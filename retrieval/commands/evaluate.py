@@ -22,12 +22,9 @@ from retrieval.commands.options import (
     read_split,
     training_config,
 )
-from retrieval.console.files import PAGE, RESULTS, TEXT, TIMINGS, require_ours
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput
 from retrieval.methods import METHODS
-
-OUTPUT_FILES = {"results.json": RESULTS, "timings.json": TIMINGS, "report.md": TEXT, "report.html": PAGE}
 
 
 def evaluate(
@@ -70,8 +67,6 @@ def evaluate(
     inits = {"init": init, "init_photo": init_photo, "init_touch": init_touch}
     if model and (preset or any(inits.values())):
         raise BadInput("--model already defines towers and settings; give either --model or --preset and --init")
-    for name, kind in OUTPUT_FILES.items():
-        require_ours(out / name, kind)
     with announce_resume(f"results so far are stored in {out}"):
         results = run(
             recording,

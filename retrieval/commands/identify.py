@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from retrieval.commands.options import COUNT, FRACTION, SEED, Index, IndexModel, Json, NoVerify, announce_resume
-from retrieval.console.files import PAGE, require_folder, require_ours, text_bytes, write_output
+from retrieval.console.files import require_output, text_bytes, write_output
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput, RetrievalError
 
@@ -64,8 +64,7 @@ def identify(
     if html is not None:
         if expect is not None:
             raise BadInput("--html shows a ranking, and --expect ranks nothing; leave one of them out")
-        require_ours(html, PAGE)
-        require_folder(html)
+        require_output(html, ".html")
     from retrieval.search import defaults
 
     path, reason = defaults.find_index(index)
@@ -118,7 +117,7 @@ def identify(
         if html is not None:
             from retrieval.report.query import query_html
 
-            write_output(html, text_bytes(query_html(run.answer, searcher.catalogue)), PAGE)
+            write_output(html, text_bytes(query_html(run.answer, searcher.catalogue)))
             say(f"page: {html}")
     if json:
         print_json(run.answer.to_dict())

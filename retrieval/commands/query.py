@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from retrieval.commands.options import COUNT, FRACTION, Background, GelSight, Index, IndexModel, Json, NoVerify
-from retrieval.console.files import PAGE, require_folder, require_ours, text_bytes, write_output
+from retrieval.console.files import require_output, text_bytes, write_output
 from retrieval.console.memory import paused_collection
 from retrieval.console.output import print_json, say
 
@@ -41,8 +41,7 @@ def query(
     from retrieval.search.query.searcher import Searcher
 
     if html:
-        require_ours(html, PAGE)
-        require_folder(html)
+        require_output(html, ".html")
     searcher = Searcher.open(path, model=model, verify=not no_verify)
     result = searcher.query(
         [[Path(image) for image in grasp] for grasp in gelsight],
@@ -54,7 +53,7 @@ def query(
     if html:
         from retrieval.report.query import query_html
 
-        write_output(html, text_bytes(query_html(result, searcher.catalogue)), PAGE)
+        write_output(html, text_bytes(query_html(result, searcher.catalogue)))
         say(f"page: {html}")
     say(f"model: {result.index['model']} (trained on: {result.index['trained_on']})")
     if json:

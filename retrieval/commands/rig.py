@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from retrieval.commands.options import Command, Json
-from retrieval.console.files import HAND_EYE, require_folder, require_ours
+from retrieval.console.files import require_output
 from retrieval.console.output import print_json, say, show
 from retrieval.errors import RetrievalError
 
@@ -63,8 +63,7 @@ def calibrate(
     """Compute the camera's pose from points that are known in its frame and in the rig's frame."""
     from robot.sight.hand_eye import SUSPECT_MM, fit_hand_eye, read_pairs
 
-    require_ours(out, HAND_EYE)
-    require_folder(out)
+    require_output(out, ".json")
     found = fit_hand_eye(*read_pairs(points))
     mean_mm = float(found.residuals_mm.mean())
     say(f"residuals: mean {mean_mm:.1f} mm, maximum {found.residuals_mm.max():.1f} mm")

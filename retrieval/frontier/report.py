@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from retrieval.console.files import PAGE, text_bytes, write_output
+from retrieval.console.files import text_bytes, write_output
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, format_duration, format_number
 from retrieval.report.canvas import MUTED_COLOUR, Axes, Figure, canvas, draw
 from retrieval.report.document import Block, Details, Document, Picture, Section, Table, Text, to_html
@@ -50,7 +50,7 @@ def write_frontier(out: Path, document: Mapping[str, Any]) -> list[Path]:
     page = out / "frontier.html"
     sections = tuple(Section(row.title, tuple(_section(name, row))) for name, row in rows.items())
     html = to_html(Document("Error against run time", tuple(_lead(document, rows)), sections), out)
-    write_output(page, text_bytes(html), PAGE)
+    write_output(page, text_bytes(html))
     return [page, *figures]
 
 

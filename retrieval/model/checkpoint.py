@@ -19,12 +19,12 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from _touch_retrieval.files import write_atomically
-from retrieval.console.files import CARD, CHECKPOINT, HEADER, require_ours
 from retrieval.data.dataset import Split
 from retrieval.data.licences import stored_licences
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.checkpoint_info import (
     FORMAT,
+    HEADER,
     CheckpointInfo,
     checkpoint_info,
     read_header,
@@ -199,8 +199,6 @@ def require_writable(path: Path) -> None:
             pass
     except OSError as error:
         raise CheckpointError(f"{path} cannot be written ({error.strerror}); choose another place") from error
-    require_ours(path, CHECKPOINT)
-    require_ours(sibling_file(path, ".md"), CARD)
 
 
 def sibling_file(path: Path, ending: str) -> Path:

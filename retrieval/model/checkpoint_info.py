@@ -9,13 +9,14 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from _touch_retrieval.files import file_digest, open_regular, parse_json
-from retrieval.console.files import HEADER
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.config import Config
 from retrieval.model.fusion_scorer import FusionScorer, GelCheck
 from retrieval.model.verification import VerificationCalibration
 
 FORMAT = 2
+HEADER = "touch_retrieval"
+"""Key of our entry in the metadata of a `.safetensors` file."""
 _SCORER_TENSORS = ("head.second.weight", "head.second.bias", "head.out.weight", "head.out.bias")
 
 

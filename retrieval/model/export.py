@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from _touch_retrieval.files import write_atomically
-from retrieval.console.files import EXPORT, make_cache_folder, require_folder, require_ours, require_private
+from retrieval.console.files import make_cache_folder, require_output, require_private
 from retrieval.data.licences import LICENCES
 from retrieval.errors import BadInput, CheckpointError, RetrievalError
 from retrieval.model.checkpoint import Checkpoint
@@ -84,10 +84,7 @@ def export(checkpoint: Checkpoint, out: Path | None = None) -> ExportReport:
     if lacking:
         raise BadInput(f"export needs {lacking[0]}; install it with `pip install 'touch-retrieval[onnx]'`")
     path = out or checkpoint.path.with_suffix(EXPORT_SUFFIX)
-    if path.suffix != EXPORT_SUFFIX:
-        raise BadInput(f"an export must be named *{EXPORT_SUFFIX}; got {path}")
-    require_ours(path, EXPORT)
-    require_folder(path)
+    require_output(path, EXPORT_SUFFIX)
     unverified = path.with_name(f".{path.name}.unverified")
     try:
         write_atomically(unverified, with_checksum(touch_encoder_to_onnx(checkpoint)))

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 from PIL import Image
 
-from retrieval.console.files import GENERATOR_COMMENT, PAGE, TEXT, text_bytes, write_output
+from retrieval.console.files import text_bytes, write_output
 from retrieval.report.canvas import FIGURE_DPI, RelativeBox
 from retrieval.report.pages import data_uri, jpeg, render, script, thumbnail
 
@@ -130,8 +130,8 @@ def write_document(document: Document, out: Path) -> list[Path]:
         The paths of both files.
     """
     text, page = out / "report.md", out / "report.html"
-    write_output(text, text_bytes(f"{GENERATOR_COMMENT}\n\n{to_markdown(document)}"), TEXT)
-    write_output(page, text_bytes(to_html(document, out)), PAGE)
+    write_output(text, text_bytes(to_markdown(document)))
+    write_output(page, text_bytes(to_html(document, out)))
     return [text, page]
 
 

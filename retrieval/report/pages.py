@@ -13,9 +13,8 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 from PIL import Image
-from PIL.PngImagePlugin import PngInfo
 
-from retrieval.console.files import GENERATOR, PREVIEW, write_output
+from retrieval.console.files import write_output
 from retrieval.data.images import read_rgb
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import resize
@@ -72,7 +71,6 @@ def write_views(photos: Sequence[Path], settings: Preprocessing, out: Path) -> N
 
     Raises:
         ImageError: A photo cannot be read.
-        BadInput: `out` exists and is not a preview.
     """
     strips = [np.rint(255 * settings.load_photo(path)).astype(np.uint8) for path in photos]
     height, width = strips[0].shape[:2]
@@ -80,7 +78,6 @@ def write_views(photos: Sequence[Path], settings: Preprocessing, out: Path) -> N
     sheet = Image.new("RGB", (columns * width, -(-len(strips) // columns) * height), "white")
     for place, strip in enumerate(strips):
         sheet.paste(Image.fromarray(strip), (place % columns * width, place // columns * height))
-    info, content = PngInfo(), io.BytesIO()
-    info.add_text("Software", GENERATOR)
-    sheet.save(content, "PNG", pnginfo=info)
-    write_output(out, content.getvalue(), PREVIEW)
+    content = io.BytesIO()
+    sheet.save(content, "PNG")
+    write_output(out, content.getvalue())

@@ -1,7 +1,5 @@
 """A contact sheet of a recording: photo, depth, gels before and during, and the surface that each gel met."""
 
-import struct
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,8 +19,6 @@ Picture = npt.NDArray[np.uint8]
 TILE_PX = 160
 _HEADER_PX = 24
 _CAPTION_PX = 20
-_FIRST_CHUNK_END = 8 + 25
-"""Length in bytes of a PNG file up to its second chunk: the signature and the header."""
 _MAX_DEPTH_MM = 3.0
 """Surfaces are drawn from contact (bright) to this far behind (dark)."""
 
@@ -51,15 +47,8 @@ def write_preview(folder: str | Path, out: str | Path, rows: int = 12) -> Path:
     data, _ = file_content("preview", sheet)
     with storage_errors(Path(out)):
         Path(out).parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(Path(out), _add_software_chunk(data))
+        write_atomically(Path(out), data)
     return Path(out)
-
-
-def _add_software_chunk(png: bytes) -> bytes:
-    """Insert a chunk with the program's name after the first one; a later preview may replace such a file."""
-    chunk = b"tEXtSoftware\0touch-retrieval"
-    length, check = (struct.pack(">I", number) for number in (len(chunk) - 4, zlib.crc32(chunk)))
-    return png[:_FIRST_CHUNK_END] + length + chunk + check + png[_FIRST_CHUNK_END:]
 
 
 def _rig(folder: Path, info: Mapping[str, Any]) -> SimRig:

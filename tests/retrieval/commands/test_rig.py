@@ -73,13 +73,13 @@ def test_a_calibration_is_fitted_printed_and_written(here, capsys):
     assert [row[3] for row in rigid] == pytest.approx([0, 0, 800, 1], abs=1e-6)
 
 
-def test_a_calibration_overwrites_only_an_earlier_calibration(here, capsys):
+def test_a_calibration_overwrites_an_earlier_calibration_and_no_photo(here, capsys):
     (here / "points.csv").write_text(POINTS)
     for _ in range(2):
         assert main(["rig", "calibrate", "points.csv"]) == 0
     (here / "photo.png").write_bytes(b"\x89PNG")
     assert main(["rig", "calibrate", "points.csv", "--out", "photo.png"]) == 2
-    assert "photo.png is not a hand-eye calibration that this program wrote" in capsys.readouterr().err
+    assert "photo.png must be named *.json" in capsys.readouterr().err
     assert (here / "photo.png").read_bytes() == b"\x89PNG"
 
 

@@ -15,7 +15,7 @@ from indexes.errors import CorruptIndex
 from indexes.store.folder import IndexStore
 from retrieval.commands.main import main
 from retrieval.errors import BadInput, CheckpointError, ConfigError
-from retrieval.model.checkpoint import load_checkpoint, read_tensors, require_writable, write_tensors
+from retrieval.model.checkpoint import load_checkpoint, read_tensors, write_tensors
 from retrieval.model.checkpoint_info import read_checkpoint_info, read_scorer
 from retrieval.model.config import load_config
 from retrieval.search.query.objects import listed_photo
@@ -169,15 +169,6 @@ def test_settings_in_a_pipe_are_refused_without_waiting(tmp_path):
         load_config(str(tmp_path / "c.toml"))
     with pytest.raises(ConfigError):
         load_config("n" * 10_000)
-
-
-def test_a_training_refuses_to_overwrite_a_file_of_another_program(tmp_path):
-    (tmp_path / "a.safetensors").write_bytes(b"\x89PNG")
-    (tmp_path / "model.md").write_text("# My notes\n")
-    for name, kind in (("a.safetensors", "a checkpoint"), ("model.safetensors", "a model card")):
-        with pytest.raises(BadInput, match=f"is not {kind} that this program wrote"):
-            require_writable(tmp_path / name)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.safetensors", "model.md"]
 
 
 # Rows of an index -------------------------------------------------------------------------------------------
