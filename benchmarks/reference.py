@@ -68,13 +68,11 @@ retrieve check recording/                                   # before training
 
 An importer reads a public data set in its published layout, or your own pictures, and writes a
 [recording](formats.md#recording) for training, evaluation and search. It processes one grasp at a time, so memory
-grows only with names, not with pictures: 100,000 rows instead of 10,000 take 15 to 67 MB more, depending on the
-importer ([bags](#rosbag): by their messages). At the end, memory also holds
-the recording's lines, one per grasp. An interrupted import continues when you run it again. Unreadable items are
-skipped, counted by reason and reported. `recording.json` stores the counts under `skipped`, the licence with its
-terms, the citation, and under `objects` the data set's own information on them. Pictures that many grasps share, such
-as one no-contact frame, are stored once. A published split by objects is in `splits/<name>.json`, for `--split`. Some
-importers need packages of the extra: `pip install 'touch-retrieval[importers]'`.
+grows only with names and with the lines of the recording. An interrupted import continues when you run it again.
+Unreadable items are skipped, counted by reason and reported. `recording.json` stores the counts under `skipped`, the
+licence with its terms, the citation, and under `objects` the data set's own information on them. Pictures that many
+grasps share, such as one no-contact frame, are stored once. A published split by objects is in `splits/<name>.json`,
+for `--split`. Some importers need packages of the extra: `pip install 'touch-retrieval[importers]'`.
 
 The data sets are not ours, and their licences bind you. "Not stated" means that we know of no licence: look at the
 page of the data set, ask its authors, and write the answer into `recording.json`. `retrieve check` and `retrieve train`
@@ -83,6 +81,22 @@ a layout are not verified, the importer follows the authors' descriptions and ot
 parts when it ends.
 [Real data](real.md#what-counts-as-touch) defines the controls that the notes name.
 
+"""
+OTHER_DATA_SETS = """
+## Other data sets
+
+[`folder`](#folder) reads these layouts, with the options that the table lists. For other layouts [write a
+plug-in](extending.md).
+
+| data set | options of `retrieve import folder` |
+| --- | --- |
+| SSVTP | `touch=images_tac/image_{object}_tac photo=images_rgb/image_{object}_rgb`; each pair is an object |
+| Touch and Go | `pairs=pairs.csv`, a file of the pairs in `label.txt`; `{object}` is a video |
+| TVL, part HCT | `touch={data}/{object}/tactile/{frame} photo={data}/{object}/vision/{frame}` |
+| X-Capture | `touch={object}/{point}/*_tactile photo={object}/{point}/*_rgb` |
+| YCB-Slide | `touch=real/{object}/{log}/frames/{n}00 photo=real/{object}/{log}/webcam_frames/{n}00` |
+| HapticMatch | none, write a [plug-in](extending.md): the height maps are pickled |
+| VisGel | none, write a [plug-in](extending.md): it must choose a frame of each recording |
 """
 
 
@@ -199,7 +213,7 @@ def data_sets() -> str:
         licence = f"{facts.licence}: {facts.terms}" if facts.terms else facts.licence
         rows.append((f"[`{name}`](#{name})", facts.expects, facts.sensor, fingers, frame, licence, verified))
     table = "".join(f"| {' | '.join(row)} |\n" for row in rows)
-    return DATA_SETS_HEAD + table + "".join(map(_data_set, sorted(IMPORTERS)))
+    return DATA_SETS_HEAD + table + "".join(map(_data_set, sorted(IMPORTERS))) + OTHER_DATA_SETS
 
 
 def _data_set(name: str) -> str:

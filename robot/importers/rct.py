@@ -9,6 +9,7 @@ Missing pictures are counted. A material is an object; a press (material, positi
 a grasp. `sensor` selects the rows of one of the three sensors.
 """
 
+import csv
 import re
 from collections import Counter
 from collections.abc import Iterator
@@ -26,7 +27,6 @@ from robot.importers.importing import (
     import_items,
     safe_name,
 )
-from robot.importers.tvl import csv_rows
 from robot.recording.folder import Recording, SharedImage
 
 DATA_SET = DataSet(
@@ -113,13 +113,17 @@ def import_rct(
 
 def _rows(table: Path, sensor: str) -> Iterator[dict[str, str] | Skip]:
     """Yield the rows of a sensor (all if empty) that have all columns, and a `Skip` for each other row."""
-    for number, row in enumerate(csv_rows(table), start=2):
-        values = {key: (row.get(key) or "").strip() for key in (*_COLUMNS, "raw_fz")}
-        if all(_WORD.fullmatch(values[key]) and values[key].strip(". ") for key in _COLUMNS):
-            if not sensor or values["sensor"] == sensor:
-                yield values
-        else:
-            yield Skip(f"a row of {table.name} lacks {', '.join(_COLUMNS)}, or has an invalid name there", f"{number}")
+    try:
+        with open(table, encoding="utf-8", errors="replace", newline="") as file:
+            for number, row in enumerate(csv.DictReader(file, skipinitialspace=True), start=2):
+                values = {key: (row.get(key) or "").strip() for key in (*_COLUMNS, "raw_fz")}
+                if not all(_WORD.fullmatch(values[key]) and values[key].strip(". ") for key in _COLUMNS):
+                    reason = f"a row of {table.name} lacks {', '.join(_COLUMNS)}, or has an invalid name there"
+                    yield Skip(reason, f"{number}")
+                elif not sensor or values["sensor"] == sensor:
+                    yield values
+    except (OSError, csv.Error) as error:
+        raise ImporterError(f"{table} cannot be read: {error}") from error
 
 
 def _items(src: Path, table: Path, touch: str, photo: str, sensor: str) -> Iterator[Item | Skip]:

@@ -27,8 +27,6 @@ PROTOCOLS: "Registry[Protocol]" = Registry(
         "objectfolder": "retrieval.evaluation.real.objectfolder:PUBLISHED",
         "rct": "retrieval.evaluation.real.rct:MATERIALS",
         "physiclear": "retrieval.evaluation.real.physiclear:LEAVE_ONE_VIDEO_OUT",
-        "hapticmatch": "retrieval.evaluation.real.hapticmatch:MATERIALS",
-        "x-capture": "retrieval.evaluation.real.x_capture:OBJECTS",
         "feeling-of-success": "retrieval.evaluation.real.feeling_of_success:PAPER",
     },
     error=ConfigError,

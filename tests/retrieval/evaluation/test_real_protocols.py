@@ -60,8 +60,6 @@ RECORDINGS = {
         dict.fromkeys("abcdefgh"), splits={"published": Split(0, tuple("abcd"), tuple("ef"), tuple("gh"))}
     ),
     "rct": facts(dict.fromkeys(f"m{n}" for n in range(60))),
-    "hapticmatch": facts(dict.fromkeys(f"m{n}" for n in range(60))),
-    "x-capture": facts(dict.fromkeys(f"o{n}" for n in range(60))),
     "feeling-of-success": facts(dict.fromkeys(f"o{n}" for n in range(105))),
 }
 WITHOUT_SPLIT = {"physiclear"}
