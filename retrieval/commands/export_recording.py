@@ -1,4 +1,4 @@
-"""`retrieve export-recording`: write a recording as a data set of another format."""
+"""`retrieve export-recording`: write a recording as a LeRobot data set."""
 
 from pathlib import Path
 from typing import Annotated
@@ -13,21 +13,20 @@ from retrieval.console.progress import CountedBar
 def export_recording(
     recording: Recording,
     *,
-    to: Annotated[str, typer.Option(help="format; an unknown name lists the available ones")],
     out: Annotated[Path, typer.Option(help="new folder to write; an export that fails leaves no folder")],
     split: Annotated[
         Path | None, typer.Option(help=f"{SPLIT}, exported as separate parts (default: all as train)")
     ] = None,
 ) -> None:
-    """Write a recording in another format: lerobot, imagefolder or open-x-tactile."""
-    from robot.exporters import EXPORTERS
+    """Write a recording as a LeRobot data set, version 3."""
+    from robot.export_lerobot import export_lerobot
     from robot.recording.folder import read_recording
 
-    export, objects = EXPORTERS.resolve(to), read_split(split)
+    objects = read_split(split)
     source = read_recording(recording)
     parts = None if objects is None else {part: getattr(objects, part) for part in ("train", "validation", "test")}
     with CountedBar("export", "grasps") as bar:
-        result = export(source, out, parts=parts, progress=bar)
+        result = export_lerobot(source, out, parts=parts, progress=bar)
     for note in (*source.notes, *result.notes):
         say(note)
-    say(f"{out}: {result.grasps} grasps as {to}")
+    say(f"{out}: {result.grasps} grasps as a LeRobot data set")

@@ -28,7 +28,7 @@ MOMENT_SUFFIXES = {"before": "_before", "during": "", "after": "_after"}
 class Episode:
     """The pictures of one episode, read on first use of any of them."""
 
-    def __init__(self, steps: Callable[[], Iterable[Step]], fingers: int, moments: Sequence[str] | None) -> None:
+    def __init__(self, steps: Callable[[], Iterable[Step]], fingers: int, moments: Sequence[str] | None = None) -> None:
         """Store how to read the episode; nothing is read yet.
 
         Args:

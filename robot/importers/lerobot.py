@@ -19,14 +19,14 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from robot.errors import ImporterError
-from robot.importers.episodes import MOMENT_SUFFIXES, Episode, Picture, Step
+from robot.importers.episodes import Episode, Picture, Step
 from robot.importers.importing import (
     NOT_STATED,
     DataSet,
@@ -64,7 +64,8 @@ _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 _PATHS = {"data_path": f"data/{_FILE}.parquet", "video_path": "videos/{video_key}/" + f"{_FILE}.mp4"}
 _GEL = re.compile("touch|tactile|gel|digit", re.IGNORECASE)
 _FIELDS = ("force_n", "opening_mm", "touch_skew_s", "time_s", "outcome", "grasped", "pose")
-_MOMENTS = tuple(MOMENT_SUFFIXES)
+_MOMENTS = (["before", "during"], ["during", "after"], ["before", "during", "after"], ["during"])
+"""Moments of the steps in our own exports."""
 _WHAT = "a LeRobot data set"
 
 _Row = dict[str, Any]
@@ -136,13 +137,15 @@ class _LeRobotSource:
             raise ImporterError(f"{src}: info.json must contain fps") from error
         if not 0 < self._fps < math.inf:
             raise ImporterError(f"{src}: fps of info.json must be above 0 and finite, got {self._fps:g}")
-        self._has_moments = isinstance(features, dict) and "moment" in features
+        recording = self.info.get("recording")
+        self._recording: dict[str, Any] = recording if isinstance(recording, dict) else {}
+        moments = self._recording.get("moments")
+        self._moments = moments if moments in _MOMENTS else None
         self._videos: dict[str, tuple[Path, Any]] = {}
 
     def stored_facts(self) -> dict[str, Any]:
         """Return source, licence, terms, citation, rig and sensor from info.json, as far as it contains them."""
-        recording = self.info.get("recording")
-        facts = recording if isinstance(recording, dict) else {"rig": self.info.get("robot_type")}
+        facts = self._recording or {"rig": self.info.get("robot_type")}
         keys = ("source", "licence", "terms", "citation", "rig", "sensor")
         texts = {key: facts[key] for key in keys if isinstance(facts.get(key), str)}
         own_terms = {"terms": ""} if "licence" in texts else {}
@@ -201,35 +204,9 @@ class _LeRobotSource:
                 continue
             fields = {key: row[key] for key in _FIELDS if row.get(key) is not None}
             sequence = row.get("sequence_id") or f"episode-{number}"
-            pictures = Episode(partial(self._steps, row), len(self.touch), self._moments(row))
+            moments = self._moments if row["length"] == len(self._moments or ()) else None
+            pictures = Episode(partial(self._steps, row), len(self.touch), moments)
             yield Item(name, _object(row), pictures.images(), {"sequence_id": str(sequence), **fields})
-
-    def _moments(self, row: _Row) -> list[str] | None:
-        if not self._has_moments:
-            return None
-        try:
-            moments = [
-                moment for episode, moment in self._steps_of(_file_of(row, "data")) if episode == row["episode_index"]
-            ]
-        except ImporterError:
-            return None
-        if not all(isinstance(moment, int) for moment in moments):
-            return None
-        valid = len(set(moments)) == len(moments) == row["length"] and set(moments) <= set(range(len(_MOMENTS)))
-        return [_MOMENTS[moment] for moment in moments] if valid and 1 in moments else None
-
-    def _steps_of(self, file: str) -> list[tuple[int, int]]:
-        """Return (episode_index, moment) of the steps in one file. The last file stays in memory."""
-        if self._last_file[0] != file:
-            path = self.src / f"data/{file}.parquet"
-            with _readable(path):
-                table = import_extra("pyarrow.parquet", _WHAT).read_table(path, columns=["episode_index", "moment"])
-                self._last_file = (file, list(zip(*(column.to_pylist() for column in table.columns), strict=True)))
-        return self._last_file[1]
-
-    @cached_property
-    def _last_file(self) -> tuple[str, list[tuple[int, int]]]:
-        return "", []
 
     # Pictures ----------------------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""Open-X-Tactile: robot tasks with touch as zarr stores in the layout of FTP-1; and our own exports to that format.
+"""Open-X-Tactile: robot tasks with touch as zarr stores in the layout of FTP-1.
 
     <task>.zarr.zip, or <task>.zarr/ unpacked, zarr version 2
         meta/episode_ends                       (E,) end of each episode
@@ -8,10 +8,13 @@
 
 An episode becomes one grasp and one sequence: its first step provides the no-contact frame and the photo, and the step
 whose gel images differ most from the first is the touch. Published stores do not name objects, so a task is treated as
-one object. The exports of `retrieve export-recording` have `meta/object_id` and further fields, which are imported.
+one object. Stores are read one step at a time, without groups and without pickle.
 """
 
+import json
+import math
 import re
+import zipfile
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -19,21 +22,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robot.errors import ImporterError
-from robot.importers.episodes import MOMENT_SUFFIXES, Episode, Step
-from robot.importers.importing import (
-    NOT_STATED,
-    DataSet,
-    DataSetMetadata,
-    Item,
-    Progress,
-    Skip,
-    import_extra,
-    import_items,
-    safe_name,
-)
-from robot.importers.zarr_store import ZarrStore
+from robot.importers.episodes import Episode, Step
+from robot.importers.importing import NOT_STATED, DataSet, Item, Progress, import_extra, import_items, safe_name
 from robot.recording.folder import Recording
 
 DATA_SET = DataSet(
@@ -47,7 +40,7 @@ DATA_SET = DataSet(
     fingers=0,
     background="the first step of each episode",
     caveats=(
-        "A task counts as one object unless its store names objects: compare tasks, or set the objects yourself.",
+        "A task counts as one object: compare tasks, or set the objects yourself.",
         "The touch of an episode is its step that differs most from the first; a change of light can cause this too.",
     ),
     unverified=(
@@ -56,9 +49,11 @@ DATA_SET = DataSet(
         "the rest of the layout, which was taken from notes and not from a store",
     ),
 )
-_TACTILE = re.compile(r"data/(?P<side>\w+?)_tactile_data_(?P<group>\w+)")
-_NAMES = ("object_id", "grasp_id", "sequence_id")
-_FIELDS = ("force_n", "opening_mm", "touch_skew_s", "time_s", "outcome", "grasped", "pose")
+_TACTILE = re.compile(r"data/\w+?_tactile_data_\w+")
+_CODECS = ("blosc", "bz2", "gzip", "lz4", "lzma", "zlib", "zstd")
+"""Accepted codecs. A filter, or another codec, such as pickle, could run code."""
+_MAX_CHUNK_BYTES = 512 * 2**20
+"""Maximum bytes of a chunk, which is read into memory as a whole."""
 
 
 def import_open_x_tactile(
@@ -86,149 +81,162 @@ def import_open_x_tactile(
         lacking = f"unpack {packed[0].name} first" if packed else "there is no such file or folder"
         raise DATA_SET.mismatch_error(src, lacking)
     import_extra("zarr", "Open-X-Tactile")
-    tasks = [_TaskStore(ZarrStore(path), camera) for path in paths]
-    facts = _store_facts(tasks)
+    tasks = [_Task(path, camera) for path in paths]
     fingers = {task.fingers for task in tasks}
     if len(fingers) > 1:
         raise ImporterError(
             f"the stores of one recording must have the same number of fingers, got {sorted(fingers)}; import them "
             "one by one"
         )
-    splits = tasks[0].splits() if len(tasks) == 1 else {}
+    sensors = ", ".join(sorted({sensor for task in tasks for sensor in task.sensors})) or "unknown"
+    items = (item for task in tasks for item in task.items())
+    total = sum(len(task.ends) for task in tasks)
     return import_items(
-        replace(facts, fingers=fingers.pop()),
-        _items(tasks),
-        out,
-        total=sum(len(task.ends) for task in tasks),
-        progress=progress,
-        metadata=DataSetMetadata({}, splits),
+        replace(DATA_SET, sensor=sensors, fingers=fingers.pop()), items, out, total=total, progress=progress
     )
 
 
-def _store_facts(tasks: list["_TaskStore"]) -> DataSet:
-    """Return the facts of the data set, replaced by those in the stores."""
-    sensors = sorted({sensor for task in tasks for sensor in task.sensors()})
-    recording = tasks[0].store.attributes().get("recording") if len(tasks) == 1 else None
-    facts = recording if isinstance(recording, dict) else {}
-    keys = ("source", "licence", "terms", "citation", "rig")
-    texts = {key: facts[key] for key in keys if isinstance(facts.get(key), str)}
-    own_terms = {"terms": ""} if "licence" in texts else {}
-    return replace(DATA_SET, sensor=", ".join(sensors) or "unknown", **(own_terms | texts))
+class _Task:
+    """One store: its episodes, camera and fingers."""
 
-
-class _TaskStore:
-    """One store: its episodes, cameras and fingers."""
-
-    def __init__(self, store: ZarrStore, camera: str) -> None:
-        self.store = store
-        self._tactile = [name for name in store.names() if self._is_image(name)]
-        if f"data/{camera}" not in store.names():
-            cameras = sorted(name.removeprefix("data/") for name in store.names() if name.endswith("_rgb"))
+    def __init__(self, path: Path, camera: str) -> None:
+        store = _Store(path)
+        self.name = safe_name(path.name.removesuffix(".zip").removesuffix(".zarr"))
+        tactile = [
+            name
+            for name in store.names
+            if _TACTILE.fullmatch(name) and store.texts(name.replace("_data_", "_type_")) in ([], ["image"])
+        ]
+        if f"data/{camera}" not in store.names:
+            cameras = sorted(name.removeprefix("data/") for name in store.names if name.endswith("_rgb"))
             raise ImporterError(
-                f"{store.path} has no data/{camera}; set --option camera= to one of: {', '.join(cameras) or 'none'}"
+                f"{path} has no data/{camera}; set --option camera= to one of: {', '.join(cameras) or 'none'}"
             )
-        if not self._tactile or "meta/episode_ends" not in store.names():
-            raise ImporterError(f"{store.path} must contain meta/episode_ends and data/<side>_tactile_data_<group>")
-        self._camera = store.array(f"data/{camera}", ndim=4, kind="u1")
-        self._gels = [store.array(name, ndim=5, kind="u1") for name in self._tactile]
-        length = min(array.shape[0] for array in (self._camera, *self._gels))
-        self.ends = [int(end) for end in store.array("meta/episode_ends", ndim=1, kind="iu").all()]
+        if not tactile or "meta/episode_ends" not in store.names:
+            raise ImporterError(f"{path} must contain meta/episode_ends and data/<side>_tactile_data_<group>")
+        self._camera = _Steps(store, f"data/{camera}", 4)
+        self._gels = [_Steps(store, name, 5) for name in tactile]
+        self.sensors = [text for name in tactile for text in store.texts(name.replace("_data_", "_sensor_"))]
+        self.ends = [int(end) for end in store.small("meta/episode_ends", "iu").ravel()]
+        length = min(len(array) for array in (self._camera, *self._gels))
         is_increasing = all(start < end for start, end in zip([0, *self.ends], self.ends, strict=False))
         if not self.ends or not is_increasing or self.ends[-1] > length:
-            raise ImporterError(
-                f"{store.path}: meta/episode_ends must increase up to at most {length}, the number of steps"
-            )
+            raise ImporterError(f"{path}: meta/episode_ends must increase up to at most {length}, the number of steps")
         self.fingers = sum(array.shape[1] for array in self._gels)
         if not 1 <= self.fingers <= 26:
-            raise ImporterError(f"{store.path}: a touch must have 1 to 26 areas, got {self.fingers}")
-        self._moments = self._read_moments()
-        self._values = {key: self._read_values(key) for key in (*_NAMES, *_FIELDS)}
+            raise ImporterError(f"{path}: a touch must have 1 to 26 areas, got {self.fingers}")
 
-    def _is_image(self, name: str) -> bool:
-        found = _TACTILE.fullmatch(name)
-        kind = self.store.texts(name.replace("_tactile_data_", "_tactile_type_")) if found else []
-        return bool(found) and kind in ([], ["image"])
-
-    def _read_moments(self) -> list[str] | None:
-        moments = self.store.texts("meta/moment")
-        lengths = {end - start for start, end in zip([0, *self.ends], self.ends, strict=False)}
-        valid = lengths == {len(moments)} and len(set(moments)) == len(moments) and set(moments) <= set(MOMENT_SUFFIXES)
-        return moments if valid and "during" in moments else None
-
-    def _read_values(self, key: str) -> Any:
-        """Return an array of meta with one entry per episode, bytes as text; None if it is missing."""
-        if f"meta/{key}" not in self.store.names():
-            return None
-        kind = "US" if key == "outcome" else "USiuf" if key in _NAMES else "iufb"
-        values = self.store.array(f"meta/{key}", ndim=2 if key == "pose" else 1, kind=kind).all()
-        if len(values) != len(self.ends):
-            return None
-        return np.char.decode(values, "utf-8", "replace") if values.dtype.kind == "S" else values
-
-    def sensors(self) -> list[str]:
-        """Return the names of the sensors in its arrays."""
-        return [text for name in self._tactile for text in self.store.texts(name.replace("_data_", "_sensor_"))]
-
-    def object_id(self, episode: int) -> str:
-        """Return the object of an episode; the task if the store does not name objects."""
-        return self._text("object_id", episode) or self.store.name
-
-    def _text(self, key: str, episode: int) -> str:
-        return "" if self._values[key] is None else str(self._values[key][episode])
-
-    def splits(self) -> dict[str, dict[str, list[str]]]:
-        """Return the split that its attributes define by ranges of episodes."""
-        published = self.store.attributes().get("splits")
-        if not isinstance(published, dict) or len(published) < 2:
-            return {}
-        try:
-            ranges = {str(part): range(*map(int, bounds)) for part, bounds in published.items()}
-        except (TypeError, ValueError):
-            return {}
-        valid = set(range(len(self.ends)))
-        return {
-            "exported": {
-                part: sorted({self.object_id(episode) for episode in episodes if episode in valid})
-                for part, episodes in ranges.items()
-                if len(episodes) <= len(valid)
-            }
-        }
-
-    def items(self, is_only_store: bool) -> Iterator[Item | Skip]:
-        """Yield one grasp for each episode.
-
-        Args:
-            is_only_store: Whether there is no other store, so that stored grasp ids need no prefix.
-        """
+    def items(self) -> Iterator[Item]:
+        """Yield one grasp for each episode."""
         for episode, (start, end) in enumerate(zip([0, *self.ends], self.ends, strict=False)):
-            stored_id = self._text("grasp_id", episode)
-            if stored_id and is_only_store:
-                grasp_id = safe_name(stored_id)
-            else:
-                grasp_id = safe_name(self.store.name, stored_id or f"{episode:06d}")
-            sequence = self._text("sequence_id", episode) or f"{self.store.name}-{episode:06d}"
-            fields = {key: value for key in _FIELDS if (value := self._field(key, episode)) is not None}
-            pictures = Episode(partial(self._steps, start, end), self.fingers, self._moments)
-            yield Item(grasp_id, self.object_id(episode), pictures.images(), {"sequence_id": sequence, **fields})
-
-    def _field(self, key: str, episode: int) -> Any:
-        if self._values[key] is None:
-            return None
-        value = self._values[key][episode]
-        if key == "outcome":
-            return str(value) or None
-        if key == "grasped":
-            return bool(value) if value in (0, 1) else None
-        numbers = [float(number) for number in np.atleast_1d(value) if np.isfinite(number)]
-        if not numbers:
-            return None
-        return numbers if key == "pose" else numbers[0]
+            name = safe_name(self.name, f"{episode:06d}")
+            pictures = Episode(partial(self._steps, start, end), self.fingers)
+            yield Item(name, self.name, pictures.images(), {"sequence_id": f"{self.name}-{episode:06d}"})
 
     def _steps(self, start: int, end: int) -> Iterator[Step]:
         for step in range(start, end):
-            yield self._camera.step(step), [area for array in self._gels for area in array.step(step)]
+            yield self._camera[step], [area for array in self._gels for area in array[step]]
 
 
-def _items(tasks: list[_TaskStore]) -> Iterator[Item | Skip]:
-    for task in tasks:
-        yield from task.items(is_only_store=len(tasks) == 1)
+class _Store:
+    """A zarr store, version 2: a folder, or a .zip file of it.
+
+    Attributes:
+        path: The folder or file.
+        names: Paths of its arrays, sorted. Its groups can be implicit.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self._zip = None if path.is_dir() else zipfile.ZipFile(path)
+        except (OSError, zipfile.BadZipFile) as error:
+            raise ImporterError(f"{path} cannot be read as a zip file: {error}") from error
+        if self._zip and any(file.file_size > _MAX_CHUNK_BYTES for file in self._zip.infolist()):
+            raise ImporterError(f"{path} contains files of more than {_MAX_CHUNK_BYTES} bytes, the maximum of a chunk")
+        # A .zip file can contain the store itself, or the folder of the store.
+        tops = {name.split("/")[0] for name in self._zip.namelist()} if self._zip else set()
+        self._top = f"{tops.pop()}/" if len(tops) == 1 else ""
+        files = (
+            [name.removeprefix(self._top) for name in self._zip.namelist()]
+            if self._zip
+            else [file.relative_to(path).as_posix() for file in path.glob("*/*/.zarray")]
+        )
+        self.names = sorted(name.removesuffix("/.zarray") for name in files if name.endswith("/.zarray"))
+
+    def has(self, name: str) -> bool:
+        """Whether the store contains a file."""
+        return self._top + name in self._zip.NameToInfo if self._zip else (self.path / name).is_file()
+
+    def texts(self, name: str) -> list[str]:
+        """Return the distinct texts of a small array, in order; none if the array is missing."""
+        if name not in self.names:
+            return []
+        texts = self.small(name, "US").ravel().tolist()
+        return list(dict.fromkeys(text.decode(errors="replace") if isinstance(text, bytes) else text for text in texts))
+
+    def small(self, name: str, kinds: str) -> NDArray[Any]:
+        """Return all values of a small array, whose type must be one of NumPy's `kinds`."""
+        array, _ = self.open(name)
+        if array.dtype.kind not in kinds or array.size * array.dtype.itemsize > _MAX_CHUNK_BYTES:
+            raise ImporterError(f"{self.path.name}/{name} has type {array.dtype} and {array.size} values, not readable")
+        return _read(array, ..., f"{self.path.name}/{name}")
+
+    def open(self, name: str) -> tuple[Any, str]:
+        """Return an array and the separator in the names of its chunks. Its codecs are checked before zarr opens it.
+
+        Raises:
+            ImporterError: The array is damaged, its chunks are too large, or it has other codecs.
+        """
+        label = f"{self.path.name}/{name}"
+        zarr = import_extra("zarr", "Open-X-Tactile")
+        try:
+            file = f"{self._top}{name}/.zarray"
+            metadata = json.loads(self._zip.read(file) if self._zip else (self.path / file).read_bytes())
+            codec, version = metadata.get("compressor"), metadata.get("zarr_format")
+            is_known = codec is None or codec["id"] in _CODECS
+            if version == 2 and is_known and not metadata.get("filters"):
+                store = zarr.storage.ZipStore(self.path, mode="r") if self._zip else str(self.path)
+                array = zarr.open_array(store, path=self._top + name, mode="r", zarr_format=2)
+                if not 0 < math.prod(array.chunks) * array.dtype.itemsize <= _MAX_CHUNK_BYTES:
+                    raise ImporterError(f"{label} has chunks of {array.chunks}: too large, or empty")
+                return array, "/" if metadata.get("dimension_separator") == "/" else "."
+        except ImporterError:
+            raise
+        except Exception as error:  # zarr, numcodecs and zipfile raise many types for damaged stores
+            raise ImporterError(f"{label} cannot be opened: {error}") from error
+        raise ImporterError(
+            f"{label} must be zarr version 2 without filters, with one of these codecs: {', '.join(_CODECS)}"
+        )
+
+
+class _Steps:
+    """A uint8 array along time, read step by step."""
+
+    def __init__(self, store: _Store, name: str, ndim: int) -> None:
+        self._store, self._name = store, name
+        self._array, separator = store.open(name)
+        self.shape: tuple[int, ...] = self._array.shape
+        if self._array.dtype != np.uint8 or len(self.shape) != ndim:
+            raise ImporterError(
+                f"{store.path.name}/{name} must have type uint8 and {ndim} axes, got {self._array.dtype} and "
+                f"{len(self.shape)} axes"
+            )
+        self._chunk = f"{name}/{separator.join(['{}', *['0'] * (ndim - 1)])}"
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, step: int) -> NDArray[np.uint8]:
+        """Return the pictures of a step; raise ImporterError for a missing chunk, which zarr would read as zeros."""
+        if not self._store.has(self._chunk.format(step // self._array.chunks[0])):
+            raise ImporterError(f"a chunk of {self._store.path.name}/{self._name} is missing")
+        return _read(self._array, step, f"{self._store.path.name}/{self._name}")
+
+
+def _read(array: Any, index: Any, label: str) -> NDArray[Any]:
+    """Return values of a zarr array; raise ImporterError if they cannot be decoded."""
+    try:
+        return np.asarray(array[index])
+    except Exception as error:
+        raise ImporterError(f"{label} cannot be decoded: {type(error).__name__}") from error

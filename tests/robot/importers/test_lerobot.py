@@ -10,11 +10,8 @@ import numpy as np
 import pytest
 
 from robot.errors import ImporterError
-from robot.exporters import EXPORTERS
 from robot.importers.episodes import Episode
 from robot.importers.lerobot import import_lerobot
-from robot.recording.folder import read_recording
-from tests import synthetic
 from tests.miniatures import encoded, pixels
 
 pytest.importorskip("av")
@@ -89,28 +86,6 @@ def test_cameras_are_chosen_by_name_and_unknown_ones_list_the_known(source, tmp_
     for options in ({"touch": "left"}, {"photo": "front"}):
         with pytest.raises(ImporterError, match=r"from: observation\.images\.wrist, observation"):
             import_lerobot(source, tmp_path / "out", **options)
-
-
-def test_an_export_can_be_imported_again(tmp_path, monkeypatch):
-    monkeypatch.setattr("robot.exporters.lerobot.EPISODES_A_FILE", 4)
-    synthetic.write_recording(tmp_path / "r", synthetic.make_objects(3), 2)
-    first = read_recording(tmp_path / "r")
-    objects = sorted({grasp.object_id for grasp in first.grasps})
-    parts = {"train": objects[:2], "validation": [], "test": objects[2:]}
-    EXPORTERS.load("lerobot")(first, tmp_path / "exported", parts=parts)
-    again = import_lerobot(tmp_path / "exported", tmp_path / "back")
-    plain = ("grasp_id", "object_id", "sequence_id", "grasped", "force_n")
-    before = {grasp.grasp_id: grasp for grasp in first.grasps}
-    assert set(before) == {grasp.grasp_id for grasp in again.grasps}
-    for grasp in again.grasps:
-        old = before[grasp.grasp_id]
-        assert [getattr(grasp, key) for key in plain] == [getattr(old, key) for key in plain]
-        assert grasp.images().keys() == old.images().keys()
-        for column, path in grasp.images().items():
-            assert rms(picture(again, path), picture(first, old.images()[column])) < 3
-    split = json.loads((tmp_path / "back/splits/published.json").read_text())
-    assert {part: split[part] for part in parts} == parts
-    assert (again.info["sensor"], again.info["source"]) == (first.info["sensor"], first.info["source"])
 
 
 @pytest.mark.parametrize(

@@ -105,6 +105,16 @@ def test_the_columns_have_the_documented_names_without_missing_values(tmp_path):
     }
 
 
+def test_datasets_opens_a_recording(tmp_path):
+    datasets = pytest.importorskip("datasets")
+    two_grasps(tmp_path / "r")
+    rows = datasets.load_dataset("imagefolder", data_dir=str(tmp_path / "r"), cache_dir=str(tmp_path / "cache"))[
+        "train"
+    ]
+    assert rows["force_n"] == [5.0, None]
+    np.testing.assert_array_equal(np.asarray(rows[1]["touch_b"]), pixels(4))
+
+
 def test_pixels_are_read_back_in_rgb_and_depth_with_16_bits(tmp_path):
     depth = np.array([[0, 256, 65535]], np.uint16)
     with RecordingWriter(tmp_path, INFO) as writer:

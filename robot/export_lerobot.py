@@ -1,4 +1,4 @@
-"""LeRobot data set, version 3: `LeRobotDataset("name", root=OUT)`.
+"""Export of a recording as a LeRobot data set, version 3: `LeRobotDataset("name", root=OUT)`.
 
 Written with pyarrow and PyAV according to the source of lerobot 0.4.4; lerobot itself is not needed.
 
@@ -9,33 +9,35 @@ Written with pyarrow and PyAV according to the source of lerobot 0.4.4; lerobot 
     data/chunk-000/file-000.parquet                   a row for each step: before, during, after the touch
     videos/observation.images.<camera>/chunk-000/file-000.mp4      camera: photo, touch_a, touch_b, ...
 
-`moment` of a step is 0 before, 1 during, 2 after the touch; all steps of an episode have the same photo. Videos are
-H.264 with key frames only and colours at full resolution, but not lossless: on 144 touches of a GelSight Mini the root
-mean square error is 0.86 grey levels, at most 1.2.
+A grasp is an episode. Its steps are the moments before, during and after the touch that every grasp has. `moment` of a
+step is 0 before, 1 during, 2 after the touch; all steps of an episode have the same photo. Videos are H.264 with key
+frames only and colours at full resolution, but not lossless: on 144 touches of a GelSight Mini the root mean square
+error is 0.86 grey levels, at most 1.2. Only the current grasp is in memory.
 """
 
+import contextlib
 import itertools
 import json
-from collections.abc import Mapping, Sequence
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from robot.exporters.exporting import (
-    MOMENT_SUFFIXES,
-    EpisodeSteps,
-    Parts,
-    Picture,
-    RecordingExport,
-    atomic_folder,
-    grasps_by_part,
-    plain_fields,
-    recording_facts,
-)
-from robot.importers.importing import Progress, import_extra
+from robot.errors import ImporterError, RecordingError
+from robot.importers.episodes import MOMENT_SUFFIXES, Picture
+from robot.importers.importing import Progress, import_extra, picture_bytes
 from robot.recording.folder import RecordedGrasp, Recording
+from robot.storage import decode_picture, storage_errors
+
+Parts = Mapping[str, Sequence[str]]
+"""A split: train, validation, test -> object ids."""
 
 FPS = 1
 """Nominal, because steps have no fixed rate; readers require an integer."""
@@ -46,7 +48,22 @@ _DATA, _VIDEO = f"data/{_FILE}.parquet", "videos/{video_key}/" + f"{_FILE}.mp4"
 _EPISODES = f"meta/episodes/{_FILE}.parquet"
 _CODEC = {"crf": "10", "g": "1", "bf": "0", "preset": "fast"}
 _STEP_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index", "moment")
+_FACTS = ("source", "sensor", "rig", "licence", "terms", "citation", "background")
+"""Keys of recording.json that info.json repeats."""
 _WHAT = "LeRobot's format"
+
+
+@dataclass(frozen=True)
+class RecordingExport:
+    """Result of an export.
+
+    Attributes:
+        grasps: Number of written grasps.
+        notes: Remarks for the user.
+    """
+
+    grasps: int
+    notes: tuple[str, ...] = ()
 
 
 def export_lerobot(
@@ -56,21 +73,22 @@ def export_lerobot(
 
     Args:
         recording: The recording.
-        out: New or empty folder.
+        out: New or empty folder; after an error it does not exist.
         parts: Split of the objects; None for all in the training part.
         progress: Called with (done, total) after each grasp.
 
     Raises:
-        RecordingError: A picture is damaged, grasps differ in their fingers, or the split is invalid.
+        RecordingError: A picture is damaged, grasps differ in their fingers, `out` is not empty, or the split is
+            invalid.
         ImporterError: pyarrow or av is missing.
         StorageError: The folder cannot be written.
     """
     import_extra("pyarrow", _WHAT), import_extra("av", _WHAT)
-    by_part, notes = grasps_by_part(recording, parts)
+    by_part, notes = _grasps_by_part(recording, parts)
     grasps = [grasp for part in by_part.values() for grasp in part]
-    steps = EpisodeSteps(recording, grasps)
+    steps = _EpisodeSteps(recording, grasps)
     tasks = {name: number for number, name in enumerate(dict.fromkeys(grasp.object_id for grasp in grasps))}
-    with atomic_folder(out) as folder:
+    with _new_folder(out) as folder:
         stats = {name: _Stats() for name in (*_STEP_COLUMNS, *map(_key, steps.sizes))}
         for start in range(0, len(grasps), EPISODES_A_FILE):
             with _FileWriter(folder, start, steps, tasks, stats) as file:
@@ -81,7 +99,137 @@ def export_lerobot(
         _write_tasks(folder / "meta" / "tasks.parquet", tasks)
         _write_json(folder / "meta" / "stats.json", {name: values.to_dict() for name, values in stats.items()})
         _write_json(folder / "meta" / "info.json", _info(recording, steps, len(tasks), by_part))
-    return RecordingExport(out, len(grasps), (*notes, *steps.remarks()))
+    return RecordingExport(len(grasps), (*notes, *steps.remarks()))
+
+
+@contextlib.contextmanager
+def _new_folder(out: Path) -> Iterator[Path]:
+    """Create a temporary folder next to `out` that becomes `out` if the block succeeds, and is deleted otherwise."""
+    out = Path(os.path.abspath(out))
+    with storage_errors(out):
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise RecordingError(f"{out} must be a new or an empty folder; choose another one")
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent, ignore_cleanup_errors=True) as folder:
+            yield (part := Path(folder) / out.name)
+            os.replace(part, out)
+
+
+def _grasps_by_part(recording: Recording, parts: Parts | None) -> tuple[dict[str, list[RecordedGrasp]], list[str]]:
+    """Return the grasps by part of the split (None: all in `train`), and remarks."""
+    if parts is None:
+        return {"train": list(recording.grasps)}, []
+    part_of: dict[str, str] = {}
+    for part, objects in parts.items():
+        for object_id in objects:
+            if part_of.setdefault(object_id, part) != part:
+                raise RecordingError(f"the split has {object_id} in two parts; each object must be in one part")
+    found: dict[str, list[RecordedGrasp]] = {part: [] for part in parts}
+    for grasp in recording.grasps:
+        if grasp.object_id in part_of:
+            found[part_of[grasp.object_id]].append(grasp)
+    exported = {part: grasps for part, grasps in found.items() if grasps}
+    if not exported:
+        raise RecordingError("the split contains no object of the recording")
+    left_out = len(recording.grasps) - sum(map(len, exported.values()))
+    return exported, [f"left out {left_out} grasp(s) of objects that are not in the split"] if left_out else []
+
+
+# Steps -----------------------------------------------------------------------------------------------------
+
+
+class _EpisodeSteps:
+    """The pictures of grasps as steps in time. Each camera has one size, that of the first grasp.
+
+    Attributes:
+        moments: Moments that every grasp has.
+        sizes: (height, width) of `photo`, `touch_a`, ...
+    """
+
+    def __init__(self, recording: Recording, grasps: Sequence[RecordedGrasp]) -> None:
+        """Read the first grasp; raise RecordingError if there is none, or grasps differ in their fingers."""
+        if not grasps:
+            raise RecordingError(f"{recording.folder} must contain grasps, but contains none")
+        self._folder = recording.folder
+        self._fingers = sorted(grasps[0].touches)
+        for grasp in grasps:
+            if sorted(grasp.touches) != self._fingers:
+                raise RecordingError(
+                    f"every grasp must have the same fingers; {grasps[0].grasp_id} has {', '.join(self._fingers)}, "
+                    f"{grasp.grasp_id} has {', '.join(sorted(grasp.touches))}"
+                )
+        self.moments = [moment for moment in MOMENT_SUFFIXES if all(map(self._has(moment), grasps))]
+        self._left_out = [
+            moment for moment in MOMENT_SUFFIXES if moment not in self.moments and any(map(self._has(moment), grasps))
+        ]
+        self.sizes = {name: pictures[0].shape[:2] for name, pictures in self._read(grasps[0]).items()}
+        self._resized: dict[str, int] = {}
+
+    def _has(self, moment: str) -> Callable[[RecordedGrasp], bool]:
+        columns = {f"touch_{finger}{MOMENT_SUFFIXES[moment]}" for finger in self._fingers}
+        return lambda grasp: grasp.images().keys() >= columns
+
+    def pictures_of(self, grasp: RecordedGrasp) -> dict[str, list[Picture]]:
+        """Return the pictures of each camera (photo, touch_a, ...), one per step.
+
+        Raises:
+            RecordingError: A picture is damaged.
+        """
+        pictures = self._read(grasp)
+        for name, size in self.sizes.items():
+            if any(picture.shape[:2] != size for picture in pictures[name]):
+                self._resized[name] = self._resized.get(name, 0) + 1
+                pictures[name] = [letterbox(picture, size) for picture in pictures[name]]
+        return pictures
+
+    def _read(self, grasp: RecordedGrasp) -> dict[str, list[Picture]]:
+        files = grasp.images()
+        touches = {
+            f"touch_{finger}": [
+                _read_picture(self._folder / files[f"touch_{finger}{MOMENT_SUFFIXES[moment]}"])
+                for moment in self.moments
+            ]
+            for finger in self._fingers
+        }
+        return {"photo": [_read_picture(self._folder / files["photo"])] * len(self.moments), **touches}
+
+    def remarks(self) -> list[str]:
+        """Return remarks on moments that are left out and on pictures that were resized so far."""
+        left_out = [
+            f"the frames {moment} the touch are left out because some grasps do not have them"
+            for moment in self._left_out
+        ]
+        resized = [
+            f"{name}: {count} grasp(s) had another size and were resized to {self.sizes[name][1]} x "
+            f"{self.sizes[name][0]} with black borders"
+            for name, count in self._resized.items()
+        ]
+        return [*left_out, *resized]
+
+
+def _read_picture(path: Path) -> Picture:
+    """Return the pixels of a complete PNG or JPEG file: (H, W, 3) uint8, RGB."""
+    try:
+        image = decode_picture(picture_bytes("picture", path))
+    except ImporterError:
+        image = None
+    if image is None:
+        raise RecordingError(f"{path} is missing, damaged or cut off; run `retrieve check`, and remove its line")
+    return np.ascontiguousarray(image[..., ::-1], dtype=np.uint8)
+
+
+def letterbox(picture: Picture, size: tuple[int, int]) -> Picture:
+    """Scale a picture to fit into (height, width), centred on black."""
+    scale = min(size[0] / picture.shape[0], size[1] / picture.shape[1])
+    height, width = (max(round(scale * side), 1) for side in picture.shape[:2])
+    small = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+    canvas = np.zeros((*size, 3), np.uint8)
+    top, left = (size[0] - height) // 2, (size[1] - width) // 2
+    canvas[top : top + height, left : left + width] = small
+    return canvas
+
+
+# Files -----------------------------------------------------------------------------------------------------
 
 
 def _key(camera: str) -> str:
@@ -92,7 +240,7 @@ class _FileWriter:
     """The data, videos and episodes of one file number. `with` closes it, also after an error."""
 
     def __init__(
-        self, folder: Path, start: int, steps: EpisodeSteps, tasks: Mapping[str, int], stats: Mapping[str, "_Stats"]
+        self, folder: Path, start: int, steps: _EpisodeSteps, tasks: Mapping[str, int], stats: Mapping[str, "_Stats"]
     ) -> None:
         chunk, file = divmod(start // EPISODES_A_FILE, FILES_A_CHUNK)
         self._numbers = {"chunk_index": chunk, "file_index": file}
@@ -132,7 +280,7 @@ class _FileWriter:
             row[f"videos/{_key(camera)}/from_timestamp"] = float(start)
             row[f"videos/{_key(camera)}/to_timestamp"] = float(start + length / FPS)
         row |= {f"meta/episodes/{key}": value for key, value in self._numbers.items()}
-        fields = plain_fields(grasp)
+        fields = grasp.to_row()
         return row | {key: fields.get(key) for key in _PLAIN}
 
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
@@ -178,7 +326,7 @@ class _Stats:
         self._count, self._sum, self._squares = 0, np.zeros(1), np.zeros(1)
         self._low, self._high = np.full(1, np.inf), np.full(1, -np.inf)
 
-    def add(self, values: np.ndarray[Any, np.dtype[np.float64]]) -> None:
+    def add(self, values: NDArray[np.float64]) -> None:
         """Add values (n, c)."""
         self._count += len(values)
         self._sum = self._sum + values.sum(axis=0)
@@ -242,7 +390,7 @@ def _write_json(path: Path, value: Any) -> None:
 
 
 def _info(
-    recording: Recording, steps: EpisodeSteps, tasks: int, by_part: Mapping[str, Sequence[RecordedGrasp]]
+    recording: Recording, steps: _EpisodeSteps, tasks: int, by_part: Mapping[str, Sequence[RecordedGrasp]]
 ) -> dict[str, Any]:
     ends = list(itertools.accumulate(map(len, by_part.values())))
     episodes = ends[-1]
@@ -264,7 +412,7 @@ def _info(
             name: {"dtype": "float32" if name == "timestamp" else "int64", "shape": [1], "names": None}
             for name in _STEP_COLUMNS
         },
-        "recording": recording_facts(recording),
+        "recording": {key: recording.info.get(key) for key in _FACTS} | {"moments": steps.moments},
     }
 
 
