@@ -10,7 +10,6 @@ import pytest
 
 from robot.collection import CollectSettings, collect
 from robot.drivers.wsg50.driver import WSG50
-from robot.drivers.wsg50.motion import Motions
 from robot.errors import DeviceError
 from robot.recording.folder import read_recording
 from tests.emulated_rig import SPEED_UP, broken_images, collect_among_faults, emulated_rig
@@ -53,7 +52,7 @@ def test_jaws_that_a_failed_call_leaves_moving_are_counted(stops, monkeypatch):
     """The counter of these collections detects a driver that does not stop."""
     if not stops:
         monkeypatch.setattr(WSG50, "_stop", lambda self: None)
-        monkeypatch.setattr(Motions, "stop", lambda self: None)
+        monkeypatch.setattr(WSG50, "_stop_over_link", lambda self: None)
     with emulated_rig(1) as rig, rig:
         emulator = rig.shared.emulator
         emulator.speed_up = 1.0  # closing takes seconds

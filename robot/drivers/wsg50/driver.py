@@ -1,7 +1,4 @@
-"""Driver of the WSG-50 parallel gripper (Weiss Robotics, SCHUNK).
-
-Modules of the package: packets (codec), commands and replies (commands), the link, serial or TCP (link), supervised
-motions (motion), settings and forces (setup). Tested with an emulator, not yet with a gripper.
+"""Driver of the WSG-50 parallel gripper (Weiss Robotics, SCHUNK). Tested with an emulator, not yet with a gripper.
 
 Before use, set on the gripper's web page:
 
@@ -9,23 +6,43 @@ Before use, set on the gripper's web page:
 * "Part width tolerance" and "clamping travel": their maximum. The width of the object is unknown, so GRASP is sent with
   `grasp_width_mm`, by default 0. (The driver of the Robotics Library gives the same advice.)
 * "Error state on TCP disconnect": on. Then the jaws stop if this program is killed. Over a serial line they do not.
+
+A reply can be lost, late or duplicated, and a motion command that is sent twice may be executed twice. Therefore a
+motion has ended when the gripper reports that it is still, in a possible end state of the motion; replies only trigger
+a read. The command is sent again, once, only if the gripper is still and has not executed it. During a motion the state
+arrives as automatic updates every few milliseconds; without them the motion is stopped.
 """
 
 import logging
+import math
+import struct
 import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from robot.devices import Clock, Gripper
-from robot.drivers.wsg50 import commands
-from robot.drivers.wsg50.codec import Packet
-from robot.drivers.wsg50.commands import CommandId, GraspingState, Status, SystemState
-from robot.drivers.wsg50.link import LinkLost, NoReply
-from robot.drivers.wsg50.motion import ACTION, GripperReading, IsDone, check_ready, fault_names, read
-from robot.drivers.wsg50.setup import TYPICAL_LIMITS, GripperSetup, WSG50Settings
-from robot.errors import DeviceError
+from robot.drivers.wsg50 import codec
+from robot.drivers.wsg50.codec import (
+    CommandId,
+    GraspingState,
+    GripperLimits,
+    Packet,
+    Status,
+    SystemState,
+    WireError,
+    command_name,
+)
+from robot.drivers.wsg50.link import CommandFailed, Link, LinkLost, NoReply
+from robot.errors import DeviceError, RobotConfigError
 from robot.readings import GripperState, GripperStatus
+from robot.settings import TypedSettings, bounded
 
 _log = logging.getLogger(__name__)
+
+TYPICAL_LIMITS = GripperLimits(110.0, 5.0, 420.0, 100.0, 5000.0, 5.0, 80.0, 120.0)
+"""Limits of a WSG-50-110, used until the gripper has reported its own."""
+
 _STATUS_OF: dict[GraspingState, GripperStatus] = {
     GraspingState.IDLE: "idle",
     GraspingState.GRASPING: "moving",
@@ -38,14 +55,117 @@ _STATUS_OF: dict[GraspingState, GripperStatus] = {
 _CLOSED_STATES = {GraspingState.HOLDING, GraspingState.NO_PART, GraspingState.PART_LOST}
 """States that end only by RELEASE; in them, the gripper refuses GRASP."""
 
+_FAULTS = (
+    SystemState.TEMPERATURE_WARNING
+    | SystemState.TEMPERATURE_FAULT
+    | SystemState.POWER_FAULT
+    | SystemState.CURRENT_FAULT
+    | SystemState.FINGER_FAULT
+    | SystemState.COMMAND_FAILURE
+    | SystemState.SCRIPT_FAILURE
+)
+_RESENDABLE = (None, Status.SUCCESS, Status.CHECKSUM_ERROR)
+"""Answers after which a command that was not executed may be sent again: perhaps it was not received."""
+
+_UPDATED = (CommandId.SYSTEM_STATE, CommandId.GRASPING_STATE)
+_UPDATE_MS = 20
+"""Period of the state updates during a motion: 25 bytes, two frames with a status and a state."""
+
 _REACHED_MM, _SAME_MM = 1.0, 0.1
 """Tolerance of a reached target, and distance below which no motion is needed."""
-
 _REGRIP_MM = 5.0
 """Opening motion that releases a held object before another grasp."""
-
+_HOMING_S = 30.0
+"""Longest duration of homing."""
 _SLACK_S = 2.0
 """Extra time of a motion, for acceleration and the link."""
+_POLL_S = 0.01
+_LONGEST_WAIT_S = 5.0
+"""Longest wait between two tries to connect; doubling 20 times would take days."""
+_ROUNDING = 1e-6
+"""Accepted relative excess of the force limit, a rounding error of 32-bit numbers."""
+_ACTION = (
+    "remove the cause, acknowledge it on the gripper's web page or set acknowledge_faults = true, then start again "
+    "or call recover()"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WSG50Settings(TypedSettings):
+    """Settings of a WSG-50. Forces are those on each finger.
+
+    Attributes:
+        port: A path, or socket://192.168.1.20:1000.
+        baud: Baud rate of a serial line, as set in the gripper (the default is not verified).
+        stop_bits: Stop bits of a serial line, as set in the gripper (the default is not verified).
+        timeout_s: Longest wait for an answer.
+        acknowledge_faults: Whether to log and acknowledge a FAST STOP; if false, a person must acknowledge it.
+        grasp_width_mm: Nominal width of the object, sent with each GRASP; 0 if unknown.
+        min_part_mm: A smaller opening means that the fingers touch each other and hold no part.
+        opening_speed_mm_s: Speed of opening and pre-positioning.
+        finger_share: Fraction of the gripper's force on each finger; see `to_finger_force`.
+        reconnect_tries: Number of tries to open a lost port again.
+        reconnect_s: First wait between two tries, which doubles up to 5 s.
+        max_force_n: Upper limit of forces.
+        max_speed_mm_s: Upper limit of speeds.
+        max_state_age_s: The jaws are stopped if no state arrives for this long during a motion.
+    """
+
+    port: str
+    baud: int = bounded(28_000, 4_000_000, 115200)  # updates take at most half of the line: 2 x 25 x 11 x 50 bits/s
+    stop_bits: int = bounded(1, 2, 1)
+    timeout_s: float = bounded(1e-3, 600, 1.0)
+    acknowledge_faults: bool = False
+    grasp_width_mm: float = bounded(0, 1000, 0.0)
+    min_part_mm: float = bounded(0, 1000, 1.0)
+    opening_speed_mm_s: float = bounded(1e-3, 1e4, 80.0)
+    finger_share: float = bounded(0.1, 1.0, 0.5)
+    reconnect_tries: int = bounded(1, 20, 5)
+    reconnect_s: float = bounded(0, 5, 0.2)
+    max_force_n: float = bounded(1e-3, 1e4, 40.0)
+    max_speed_mm_s: float = bounded(1e-3, 1e4, 420.0)
+    max_state_age_s: float = bounded(0.04, 60, 0.5)
+
+    def to_finger_force(self, gripper_n: float) -> float:
+        """Convert the gripper's force (N) to the force on each finger (N).
+
+        The contract's force is the force on each finger (robot.devices). The gripper's force limit is the sum over
+        both. SCHUNK's manual of its fieldbus interface defines the register FORCELIMIT: "the grasping force is twice
+        the nominal force that is applied to the part to be grasped". SCHUNK also rates its grippers by the sum over the
+        jaws. So with a limit of 40 N each finger pushes with 20 N, the fraction 0.5. A user of the simulator Drake
+        found this factor in their own controller (its pull request 9950).
+
+        Two points are uncertain. We assume that the reported force (45h) is defined as the limit is. Without
+        force-measuring fingers, the gripper derives the force from its motor current only. With a force gauge, set
+        `finger_share` to the measured force on one finger divided by the limit.
+        """
+        return gripper_n * self.finger_share
+
+    def to_gripper_force(self, finger_n: float) -> float:
+        """Convert a force on each finger (N) to the gripper's force (N), rounded down to 32 bits."""
+        packed = struct.pack("<f", finger_n / self.finger_share)
+        if struct.unpack("<f", packed)[0] > finger_n / self.finger_share:
+            packed = struct.pack("<I", struct.unpack("<I", packed)[0] - 1)  # the next smaller positive float
+        return float(struct.unpack("<f", packed)[0])
+
+
+@dataclass(frozen=True)
+class GripperReading:
+    """State of the gripper; force_n as the gripper counts it."""
+
+    system: SystemState
+    grasping: GraspingState
+    opening_mm: float
+    force_n: float
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether the jaws move or will move."""
+        return _is_moving(self.system, self.grasping)
+
+
+IsDone = Callable[[GripperReading, Status | None], bool]
+"""Function from the gripper's state and its last answer (or None) to whether the motion was executed."""
 
 
 class WSG50(Gripper):
@@ -68,13 +188,10 @@ class WSG50(Gripper):
             max_speed_mm_s=options.max_speed_mm_s,
             clock=clock,
         )
-        self._setup = GripperSetup(self.name, options, self.refused)
-        self._link, self._motions = self._setup.link, self._setup.motions
-
-    @property
-    def line_counts(self) -> dict[str, int]:
-        """Number of errors on the serial or TCP link so far, by kind."""
-        return dict(self._link.counts)
+        self._link = Link(options.port, baud=options.baud, stop_bits=options.stop_bits, timeout_s=options.timeout_s)
+        self._limits = TYPICAL_LIMITS
+        self._may_be_moving = False
+        """Whether a motion was started and the jaws have not been still since."""
 
     # Methods of the contract.
 
@@ -88,133 +205,389 @@ class WSG50(Gripper):
 
         Over TCP, the gripper would otherwise enter FAST STOP.
         """
-        if not (self._link.has_echoed or self._motions.may_be_moving):  # no motion was started
+        if not (self._link.has_echoed or self._may_be_moving):  # no motion was started
             self._link.close()
             return
         try:
             if self._link.is_open:
-                self._setup.stop_if_moving(self._stop)
+                self._stop_if_moving(self._stop)
             else:  # the link was lost after the start of a motion; over a serial line the jaws still move
                 self._stop()
             try:
-                self._motions.stop_updates()
+                self._stop_updates()
             finally:
                 self._link.send(Packet(CommandId.DISCONNECT))
         finally:
             self._link.close()
 
     def _settings(self) -> dict[str, Any]:
-        return self._setup.read_back()
+        force = self._query(CommandId.GET_FORCE_LIMIT, codec.number)
+        return {
+            "info": asdict(self._query(CommandId.INFO, codec.info)),
+            "limits": asdict(self._query(CommandId.LIMITS, codec.limits)),
+            "acceleration_mm_s2": self._query(CommandId.GET_ACCELERATION, codec.number),
+            "force_limit_n": self._options.to_finger_force(force),
+            "finger_share": self._options.finger_share,
+            "soft_limits_mm": self._soft_limits(),
+        }
 
     def _recover(self) -> None:
         """Reconnect, then restore reference and settings as on connecting."""
         for number in range(1, self._options.reconnect_tries + 1):
-            self._setup.reconnect()
+            self._reconnect()
             try:
                 self._set_up()
                 return
-            except (LinkLost, NoReply):
-                self._stop_quietly()
-                if number == self._options.reconnect_tries:
+            except BaseException as error:
+                try:
+                    self._stop()
+                except DeviceError as second:
+                    _log.warning("%s: while it was stopped: %s", self.name, second)
+                if number == self._options.reconnect_tries or not isinstance(error, LinkLost | NoReply):
                     raise
-            except BaseException:
-                self._stop_quietly()
-                raise
 
     def _stop(self) -> None:
-        if not self._link.is_open:
-            self._setup.reopen()
+        """Stop the jaws; open a lost link again first."""
         for tries_left in reversed(range(self._options.reconnect_tries)):
             try:
-                self._motions.stop()
+                self._link.open()
+                self._stop_over_link()
                 return
             except LinkLost:
                 if not tries_left:
                     raise
             _log.warning("%s: lost the link during a possible motion: opening it again to stop the jaws", self.name)
-            self._setup.reopen()
+            time.sleep(self._options.reconnect_s)
 
     def _state(self) -> GripperState:
-        return self._as_state(read(self._link))
+        return self._as_state(self._read())
 
     def _open(self, opening_mm: float) -> GripperState:
         reading = self._read_ready()
         if reading.grasping in _CLOSED_STATES:
             reading = self._release(max(opening_mm, self._wider_opening(reading)))
         if abs(reading.opening_mm - opening_mm) > _SAME_MM:
-            reading = self._move(opening_mm, closing=opening_mm < reading.opening_mm)
+            if opening_mm < reading.opening_mm:  # it may close on something
+                self._set_force(self.min_force_n)
+            speed = self._opening_speed()
+            reading = self._run(codec.move(opening_mm, speed), speed, _is_at(opening_mm))
         return self._as_state(reading)
 
     def _grasp(self, force_n: float, speed_mm_s: float) -> GripperState:
         reading = self._read_ready()
         if reading.grasping in _CLOSED_STATES:
             self._release(self._wider_opening(reading))
-        self._setup.set_force(force_n)
-        width = max(self._options.grasp_width_mm, self._setup.opening_range[0])
-        packet = commands.packet(CommandId.GRASP, width, speed_mm_s)
+        self._set_force(force_n)
+        packet = codec.command(CommandId.GRASP, max(self._options.grasp_width_mm, self.min_opening_mm), speed_mm_s)
         return self._as_state(self._run(packet, speed_mm_s, lambda reading, _: reading.grasping in _CLOSED_STATES))
-
-    # Methods beyond the contract.
 
     def home(self) -> GripperState:
         """Home the jaws over the whole stroke, at the gripper's own speed; raise DeviceError if this fails."""
         with self._moving("cannot be homed"):
-            return self._as_state(self._setup.home())
+            return self._as_state(self._home())
 
-    # Implementation.
+    # Reading.
 
-    def _set_up(self) -> None:
-        """Apply the settings and read the gripper's limits; max_force_n and max_speed_mm_s may lower them."""
-        self._setup.run(may_home=self.may_move)
-        limits, options = self._setup.limits, self._options
-        self.min_opening_mm, self.stroke_mm = self._setup.opening_range
-        self.min_force_n = options.to_finger_force(limits.min_force_n)
-        self.max_force_n = min(options.max_force_n, options.to_finger_force(limits.max_force_n))
-        self.min_speed_mm_s = limits.min_speed_mm_s
-        self.max_speed_mm_s = min(options.max_speed_mm_s, limits.max_speed_mm_s)
+    def _query(self, command: CommandId, parse: Callable[[bytes], Any]) -> Any:
+        return self._link.query(codec.query(command), parse)
 
-    def _stop_quietly(self) -> None:
-        try:
-            self._stop()
-        except DeviceError as error:
-            _log.warning("%s: while it was stopped: %s", self.name, error)
-
-    def _read_ready(self) -> GripperReading:
-        reading = read(self._link)
-        check_ready(reading)
+    def _read(self) -> GripperReading:
+        """Read the gripper's state and update `_may_be_moving`."""
+        reading = GripperReading(
+            self._query(CommandId.SYSTEM_STATE, codec.system_state),
+            self._query(CommandId.GRASPING_STATE, codec.grasping_state),
+            self._query(CommandId.OPENING, codec.number),
+            self._query(CommandId.FORCE, codec.number),
+        )
+        self._may_be_moving = self._may_be_moving and reading.is_moving
         return reading
 
-    def _wider_opening(self, reading: GripperReading) -> float:
-        """Return an opening slightly wider than the current one, to release the object."""
-        return min(reading.opening_mm + _REGRIP_MM, self._setup.opening_range[1])
+    def _read_ready(self) -> GripperReading:
+        """Read the state; raise DeviceError unless the gripper can execute a motion."""
+        reading = self._read()
+        self._check_fault(reading)
+        if not reading.system & SystemState.REFERENCED:
+            raise DeviceError(f"{self.name} has lost its reference; call recover(), which homes it")
+        if reading.is_moving:
+            raise DeviceError(f"{self.name} is still moving; call stop() before the next motion")
+        return reading
 
-    def _release(self, width_mm: float) -> GripperReading:
-        speed = self._opening_speed()
-        return self._run(commands.packet(CommandId.RELEASE, width_mm, speed), speed, _is_at(width_mm))
-
-    def _move(self, width_mm: float, *, closing: bool) -> GripperReading:
-        """Pre-position the jaws; a closing motion uses the smallest force."""
-        if closing:
-            self._setup.set_force(self.min_force_n)
-        speed = self._opening_speed()
-        return self._run(commands.move(width_mm, speed), speed, _is_at(width_mm))
-
-    def _run(self, packet: Packet, speed_mm_s: float, done: IsDone) -> GripperReading:
-        seconds = self._setup.limits.stroke_mm / speed_mm_s + _SLACK_S + self._options.timeout_s
-        return self._motions.run(packet, seconds, done)
-
-    def _opening_speed(self) -> float:
-        return min(max(self._options.opening_speed_mm_s, self._setup.limits.min_speed_mm_s), self.max_speed_mm_s)
+    def _check_fault(self, reading: GripperReading) -> None:
+        if reading.system & SystemState.FAST_STOP or reading.grasping is GraspingState.ERROR:
+            raise DeviceError(
+                f"{self.name} is in FAST STOP or in an error state: {_fault_names(reading.system)}; {_ACTION}"
+            )
 
     def _as_state(self, reading: GripperReading) -> GripperState:
-        if reading.system & SystemState.FAST_STOP or reading.grasping not in _STATUS_OF:
-            raise DeviceError(
-                f"{self.name} is in FAST STOP or in an error state: {fault_names(reading.system)}; {ACTION}"
-            )
+        self._check_fault(reading)
         status = _STATUS_OF[reading.grasping]
         if status == "holding" and reading.opening_mm < self._options.min_part_mm:
             status = "no_part"
         return GripperState(reading.opening_mm, self._options.to_finger_force(reading.force_n), status)
+
+    # Motions.
+
+    def _home(self) -> GripperReading:
+        """Home the jaws. If the answer is lost, a reference that was missing and is now present proves success."""
+        before = self._query(CommandId.SYSTEM_STATE, codec.system_state)
+
+        def done(reading: GripperReading, status: Status | None) -> bool:
+            proven = status is Status.SUCCESS or not before & SystemState.REFERENCED
+            return proven and bool(reading.system & SystemState.REFERENCED)
+
+        return self._run_within(codec.home(), _HOMING_S, done)
+
+    def _release(self, width_mm: float) -> GripperReading:
+        speed = self._opening_speed()
+        return self._run(codec.command(CommandId.RELEASE, width_mm, speed), speed, _is_at(width_mm))
+
+    def _wider_opening(self, reading: GripperReading) -> float:
+        """Return an opening slightly wider than the current one, to release the object."""
+        return min(reading.opening_mm + _REGRIP_MM, self.stroke_mm)
+
+    def _opening_speed(self) -> float:
+        return min(max(self._options.opening_speed_mm_s, self._limits.min_speed_mm_s), self.max_speed_mm_s)
+
+    def _run(self, packet: Packet, speed_mm_s: float, done: IsDone) -> GripperReading:
+        seconds = self._limits.stroke_mm / speed_mm_s + _SLACK_S + self._options.timeout_s
+        return self._run_within(packet, seconds, done)
+
+    def _run_within(self, packet: Packet, seconds: float, done: IsDone) -> GripperReading:
+        """Run a motion and return the gripper's state at its end.
+
+        Args:
+            packet: The motion command.
+            seconds: Longest duration.
+            done: Returns whether the motion was executed.
+
+        Raises:
+            DeviceError: The motion failed; the jaws may still move.
+        """
+        deadline = time.monotonic() + seconds
+        for last_try in (False, True):
+            status = self._watch(packet, deadline)
+            reading = self._wait_until_still(deadline)
+            if done(reading, status):
+                return reading
+            if reading.system & SystemState.FAST_STOP or status not in _RESENDABLE or last_try:
+                break
+        answer = "nothing" if status is None else status.name
+        stop = f", FAST STOP: {_fault_names(reading.system)}" if reading.system & SystemState.FAST_STOP else ""
+        raise DeviceError(
+            f"the gripper answered {answer} to {command_name(packet.id)} and rests at "
+            f"{reading.opening_mm:.1f} mm, {reading.grasping.name.lower()}{stop}; check it, then call recover()"
+        )
+
+    def _watch(self, packet: Packet, deadline: float) -> Status | None:
+        """Send the motion and return its last answer, or None if the gripper is still and has not answered."""
+        link = self._link
+        for command in _UPDATED:
+            link.send(codec.update(command, _UPDATE_MS))
+        self._may_be_moving = True
+        link.begin(packet)
+        still_since = time.monotonic()
+        while True:
+            status = link.poll(packet.id, _POLL_S)
+            now = time.monotonic()
+            if status not in (None, Status.CMD_PENDING):
+                break
+            self._check_updates(now)
+            if status is Status.CMD_PENDING or self._updates_show_motion():
+                still_since = now
+            if now - still_since > link.timeout_s:
+                break
+            if now > deadline:
+                raise DeviceError(f"the gripper did not end {command_name(packet.id)} in time and still moves")
+        link.require_sync()
+        self._stop_updates()
+        return status
+
+    def _check_updates(self, now: float) -> None:
+        """Watchdog: send FAST STOP and raise DeviceError if updates are missing."""
+        limit_s = self._options.max_state_age_s
+        if now - self._link.updates[CommandId.SYSTEM_STATE][1] <= limit_s:
+            return
+        self._link.pump(0.0)  # this program may have been suspended: process the updates that have arrived
+        age = time.monotonic() - self._link.updates[CommandId.SYSTEM_STATE][1]
+        if age <= limit_s:
+            return
+        error = DeviceError(
+            f"the state of the moving gripper must be at most {limit_s:g} s old, got {age:.2g} s: sent FAST STOP; is "
+            "the link overloaded?"
+        )
+        try:
+            self._link.send_urgent(Packet(CommandId.FAST_STOP))
+        except DeviceError as second:
+            error.add_note(str(second))
+        raise error
+
+    def _updates_show_motion(self) -> bool:
+        """Return whether the last updates report a motion."""
+        system, grasping = (self._link.updates[command][0] for command in _UPDATED)
+        try:
+            return _is_moving(codec.system_state(system), codec.grasping_state(grasping))
+        except WireError:
+            return True  # unknown: read again
+
+    def _wait_until_still(self, deadline: float) -> GripperReading:
+        """Return the gripper's state when it is still; raise DeviceError at the deadline."""
+        reading = self._last_reading(deadline)
+        if reading.is_moving:
+            raise DeviceError(
+                f"the gripper should be still, but moves at {reading.opening_mm:.1f} mm: switch off its power"
+            )
+        return reading
+
+    def _last_reading(self, deadline: float) -> GripperReading:
+        """Return the gripper's state when it is still, or at the deadline."""
+        while (reading := self._read()).is_moving and time.monotonic() < deadline:
+            self._link.pump(_POLL_S)
+        return reading
+
+    # Stopping.
+
+    def _stop_over_link(self) -> None:
+        """Stop the jaws, by FAST STOP if STOP fails, and wait until they are still; raise DeviceError if they move."""
+        limit_s = self._options.max_state_age_s + self._link.timeout_s
+        self._send_until_answered((CommandId.STOP, CommandId.STOP, CommandId.FAST_STOP, CommandId.FAST_STOP))
+        if self._last_reading(time.monotonic() + limit_s).is_moving:
+            self._send_until_answered((CommandId.FAST_STOP, CommandId.FAST_STOP))
+            self._wait_until_still(time.monotonic() + limit_s)
+        self._stop_updates()
+
+    def _stop_updates(self) -> None:
+        for command in _UPDATED:
+            self._link.send(codec.query(command))
+
+    def _send_until_answered(self, commands: Sequence[CommandId]) -> None:
+        """Send commands one after the other until one is answered."""
+        for number, command in enumerate(commands, start=1):
+            if command is CommandId.FAST_STOP:
+                _log.warning("%s: STOP has failed: sending FAST STOP", self.name)
+            try:
+                self._link.send_urgent(Packet(command))
+                return
+            except CommandFailed:
+                return  # received; the state is read next
+            except NoReply:
+                if number == len(commands):
+                    raise
+                self._link.pad()
+
+    def _stop_if_moving(self, stop: Callable[[], None]) -> None:
+        """Call `stop` only if the jaws move or may move, because STOP would drop a held object."""
+        try:
+            is_moving = self._read().is_moving
+        except LinkLost:
+            if not self._may_be_moving:
+                raise
+            is_moving = True
+        except DeviceError:
+            is_moving = True  # unknown
+        if is_moving:
+            stop()
+
+    # Connecting.
+
+    def _reconnect(self) -> None:
+        """Open the port, if necessary, and synchronise; repeat after a failure, with increasing waits."""
+        tries = self._options.reconnect_tries
+        for number in range(tries):
+            try:
+                self._link.open()
+                self._link.sync()
+                return
+            except DeviceError as error:
+                self._link.close()
+                if number == tries - 1:
+                    raise DeviceError(f"{self.name} cannot be reached after {tries} tries: {error}") from error
+                wait_s = min(self._options.reconnect_s * 2**number, _LONGEST_WAIT_S)
+                _log.warning("%s: no connection (%s); trying again in %.2g s", self.name, error, wait_s)
+            time.sleep(wait_s)
+
+    def _set_up(self) -> None:
+        """Read the limits, end a FAST STOP if allowed, and home if the reference is lost."""
+        options = self._options
+        limits = self._limits = self._query(CommandId.LIMITS, codec.limits)
+        self.min_force_n = options.to_finger_force(limits.min_force_n)
+        if options.max_force_n < self.min_force_n or options.max_speed_mm_s < limits.min_speed_mm_s:
+            raise RobotConfigError(
+                f"{self.name}: the limits must allow at least {self.min_force_n:g} N on each finger and "
+                f"{limits.min_speed_mm_s:g} mm/s, the smallest values of the gripper; got {options.max_force_n:g} N "
+                f"and {options.max_speed_mm_s:g} mm/s"
+            )
+        self.max_force_n = min(options.max_force_n, options.to_finger_force(limits.max_force_n))
+        self.min_speed_mm_s = limits.min_speed_mm_s
+        self.max_speed_mm_s = min(options.max_speed_mm_s, limits.max_speed_mm_s)
+        self._stop_if_moving(self._stop_over_link)
+        self._end_fast_stop()
+        if not self._query(CommandId.SYSTEM_STATE, codec.system_state) & SystemState.REFERENCED:
+            if not self.may_move:
+                raise DeviceError(f"{self.name} has lost its reference and must be homed, but motion is not allowed")
+            _log.warning("%s has lost its reference: homing, the jaws move", self.name)
+            self._home()
+        if self._read().grasping is not GraspingState.HOLDING:  # with a smaller force, the held object would fall
+            self._set_force(self.min_force_n)
+        lowest, highest = self._soft_limits() or (0.0, limits.stroke_mm)
+        self.min_opening_mm, self.stroke_mm = max(0.0, lowest), min(highest, limits.stroke_mm)
+        self._check("grasp_width_mm", options.grasp_width_mm, 0.0, self.stroke_mm, "mm")
+
+    def _end_fast_stop(self) -> None:
+        """Log a FAST STOP, and acknowledge it if allowed."""
+        system = self._query(CommandId.SYSTEM_STATE, codec.system_state)
+        if not system & SystemState.FAST_STOP:
+            return
+        _log.warning("%s is in FAST STOP: %s", self.name, _fault_names(system))
+        if not self._options.acknowledge_faults:
+            raise DeviceError(
+                f"{self.name} is in FAST STOP: {_fault_names(system)}; remove the cause, then acknowledge it on the "
+                "gripper's web page, or set acknowledge_faults = true"
+            )
+        try:
+            self._link.send(codec.acknowledge())
+        except CommandFailed as error:  # a repeated command has nothing to acknowledge
+            _log.warning("%s: %s", self.name, error)
+        if self._query(CommandId.SYSTEM_STATE, codec.system_state) & SystemState.FAST_STOP:
+            raise DeviceError(
+                f"{self.name} is still in FAST STOP after acknowledgement: {_fault_names(system)}; remove the cause"
+            )
+        _log.warning("%s: FAST STOP acknowledged", self.name)
+
+    # Settings.
+
+    def _set_force(self, force_n: float) -> None:
+        """Set the force limit and read it back; raise DeviceError if the gripper would clamp harder."""
+        limit_n, ceiling_n = (
+            max(self._options.to_gripper_force(each), self._limits.min_force_n)
+            for each in (force_n, self._options.max_force_n)
+        )
+        self._link.send(codec.command(CommandId.SET_FORCE_LIMIT, limit_n))
+        has = self._query(CommandId.GET_FORCE_LIMIT, codec.number)
+        self.refused.pop("force_n", None)
+        if not math.isclose(has, limit_n, rel_tol=0.01):
+            self.refused["force_n"] = f"requested {force_n:g}, has {self._options.to_finger_force(has):g}"
+        if has > min(limit_n * (1 + _ROUNDING), ceiling_n):
+            raise DeviceError(
+                f"{self.name}: the force limit (both fingers) must be {limit_n:g} N, but the gripper has "
+                f"{has:g} N; the jaws do not close"
+            )
+
+    def _soft_limits(self) -> tuple[float, float] | None:
+        try:
+            minus, plus = self._query(CommandId.GET_SOFT_LIMITS, codec.soft_limits)
+        except CommandFailed:
+            return None
+        return (minus, plus) if minus < plus else None
+
+
+def _is_moving(system: SystemState, grasping: GraspingState) -> bool:
+    return bool(system & SystemState.MOVING) or _STATUS_OF.get(grasping) == "moving"
+
+
+def _fault_names(system: SystemState) -> str:
+    """Return the faults in a system state as text."""
+    named = [bit.name or "" for bit in SystemState if bit & system & _FAULTS]
+    return ", ".join(named).lower().replace("_", " ") or "no fault flag is set: a stop at the gripper, or a lost link"
 
 
 def _is_at(width_mm: float) -> IsDone:

@@ -10,12 +10,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 
-from robot.drivers.wsg50.codec import MAX_PAYLOAD, Packet
+from robot.drivers.wsg50.codec import Packet
 from tests.emulators.wsg50.mechanics import STROKE_MM, Mechanics
 
 # Numbers of the protocol: states, statuses, bits, limits, lengths of commands.
 IDLE, GRASPING, NO_PART, PART_LOST, HOLDING, RELEASING, POSITIONING, ERROR = range(8)
-OK, NOT_AVAILABLE, NOT_INITIALIZED, RUNNING, DAMAGED, NO_PARAM, FEW_PARAMS, UNKNOWN = 0, 1, 3, 4, 11, 12, 13, 14
+OK, NOT_AVAILABLE, NOT_INITIALIZED, RUNNING, NO_PARAM, FEW_PARAMS, UNKNOWN = 0, 1, 3, 4, 12, 13, 14
 FORMAT, DENIED, FAILED, ABORTED, INVALID, PENDING, RANGE, BLOCKED = 15, 16, 18, 19, 24, 26, 28, 29
 FAULT_BITS = {
     "temperature warning": 13,
@@ -30,9 +30,8 @@ UPDATES = frozenset({0x40, 0x41, 0x43, 0x45})
 REFERENCED_BIT, MOVING_BIT, MINUS_BIT, PLUS_BIT = 0, 1, 2, 3
 STOPPED_BIT, REACHED_BIT, FORCE_BIT, FAST_STOP_BIT = 6, 7, 9, 12
 SPEEDS, ACCELERATIONS, FORCES = (5.0, 420.0), (100.0, 5000.0), (5.0, 80.0)
-LENGTHS = {0x20: 1, 0x21: 9, 0x24: 3, 0x25: 8, 0x26: 8, 0x30: 4, 0x32: 4, 0x34: 8}
+LENGTHS = {0x20: 1, 0x21: 9, 0x24: 3, 0x25: 8, 0x26: 8, 0x32: 4}
 
-_MAX_RECEIVED = 100_000
 _HOMING_MM_S = 100.0
 _CLAMPING_MM = 3.0
 """Clamping travel: the distance beyond the nominal width in which the fingers detect a part."""
@@ -48,13 +47,10 @@ class EmulatedWSG50:
         object_mm: Width of the rigid object between the jaws, or None. It can change at any time; a held part is then
             lost.
         speed_up: Factor by which its time runs faster than `clock`.
-        has_force_fingers: Whether it can be tared.
         keeps_force_n: A fixed force limit that ignores commands, or None.
         jammed: The jaws move and no motion ends.
         silent: It receives commands and sends nothing.
         mute_updates: It sends no automatic updates.
-        answers_bad_checksum: It answers damaged commands with an error instead of nothing.
-        error_on_disconnect: A lost client raises a FAST STOP.
         next_status: Status by id that answers the next command of this id instead of its execution.
         received: Ids of the last commands.
         grasping: Grasping state of the protocol.
@@ -74,8 +70,7 @@ class EmulatedWSG50:
         self._lock = threading.RLock()
         self._jaws = Mechanics(opening_mm, object_mm)
         self.speed_up, self._clock = speed_up, clock
-        self.has_force_fingers = self.jammed = self.silent = self.mute_updates = False
-        self.answers_bad_checksum, self.error_on_disconnect = False, True
+        self.jammed = self.silent = self.mute_updates = False
         self.next_status: dict[int, int] = {}
         self.keeps_force_n: float | None = None
         self.received: list[int] = []
@@ -150,7 +145,7 @@ class EmulatedWSG50:
         """Handle the loss of the client: a FAST STOP, unless the client announced it."""
         with self._lock:
             self._updates.clear()
-            if self.error_on_disconnect and not self._announced:
+            if not self._announced:
                 self.fail()
             self._outgoing.clear()
 
@@ -159,21 +154,11 @@ class EmulatedWSG50:
         with self._lock:
             self._advance()
             self.received.append(packet.id)
-            del self.received[:-_MAX_RECEIVED]
             forced = self.next_status.pop(packet.id, None)
             answer = self._answer(packet.id, packet.payload) if forced is None else forced
-            if not isinstance(answer, int) and len(answer) > MAX_PAYLOAD - 2:
-                answer = RANGE  # too long for a packet with the status
             self._outgoing.append(
                 Packet(packet.id, _status(answer) if isinstance(answer, int) else _status(OK) + answer)
             )
-            return self._take_packets()
-
-    def receive_damaged(self, command: int) -> list[Packet]:
-        """Return the answers to a command with a wrong checksum."""
-        with self._lock:
-            if self.answers_bad_checksum:
-                self._outgoing.append(Packet(command, _status(DAMAGED)))
             return self._take_packets()
 
     def tick(self) -> list[Packet]:
@@ -347,35 +332,15 @@ class EmulatedWSG50:
         self._announced = True
         return OK
 
-    def _set_acceleration(self, payload: bytes) -> Answer:
-        (value,) = struct.unpack("<f", payload)
-        if not (refused := self._unsettable(ACCELERATIONS[0] <= value <= ACCELERATIONS[1])):
-            self._jaws.acceleration_mm_s2 = value
-        return refused
-
     def _set_force(self, payload: bytes) -> Answer:
         (value,) = struct.unpack("<f", payload)
-        if not (refused := self._unsettable(FORCES[0] <= value <= FORCES[1])):
-            self.force_limit_n = value if self.keeps_force_n is None else self.keeps_force_n
-        return refused
-
-    def _set_soft_limits(self, payload: bytes) -> Answer:
-        low, high = struct.unpack("<ff", payload)
-        if not (refused := self._unsettable(0 <= low < high <= STROKE_MM)):
-            self.soft_limits = low, high
-        return refused
-
-    def _unsettable(self, in_range: bool) -> int:
-        """Return the status of a change of parameters; a change during a motion raises a FAST STOP."""
-        if self._jaws.moves:
+        if self._jaws.moves:  # a change during a motion raises a FAST STOP
             self.fail()
             return DENIED
-        return OK if in_range else RANGE
-
-    def _tare(self, _: bytes) -> Answer:
-        if not self.has_force_fingers:
-            return NOT_AVAILABLE
-        return DENIED if self.grasping == HOLDING else OK
+        if not FORCES[0] <= value <= FORCES[1]:
+            return RANGE
+        self.force_limit_n = value if self.keeps_force_n is None else self.keeps_force_n
+        return OK
 
 
 def _status(number: int) -> bytes:
@@ -392,13 +357,10 @@ _ACTIONS: dict[int, Callable[[EmulatedWSG50, bytes], Answer]] = {
     0x24: EmulatedWSG50._acknowledge,
     0x25: EmulatedWSG50._grasp,
     0x26: EmulatedWSG50._release,
-    0x30: EmulatedWSG50._set_acceleration,
     0x31: lambda gripper, _: struct.pack("<f", gripper._jaws.acceleration_mm_s2),
     0x32: EmulatedWSG50._set_force,
     0x33: lambda gripper, _: struct.pack("<f", gripper.force_limit_n),
-    0x34: EmulatedWSG50._set_soft_limits,
     0x35: lambda gripper, _: struct.pack("<ff", *gripper.soft_limits) if gripper.soft_limits else NOT_AVAILABLE,
-    0x38: EmulatedWSG50._tare,
     0x50: lambda _, payload: struct.pack("<BBHI", 1, 6, 0x4000, 20260101),
     0x53: lambda _, payload: struct.pack("<8f", STROKE_MM, *SPEEDS, *ACCELERATIONS, *FORCES, 120.0),
 }

@@ -23,7 +23,7 @@ import tty
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from robot.drivers.wsg50.codec import PREAMBLE, Packet, decode, encode
+from robot.drivers.wsg50.codec import Packet, decode, encode
 from tests.emulators.interrupts import until_interrupted
 from tests.emulators.wsg50.faults import LineFaults
 from tests.emulators.wsg50.gripper import UPDATES, EmulatedWSG50
@@ -189,9 +189,8 @@ class _Session:
     def _handle(self, data: bytes) -> None:
         """Handle the bytes that remain of the sent ones after faults."""
         self._received += data
-        for noise, command in _packets(self._received):
-            answers = [answer for command_id in _damaged(noise) for answer in self.emulator.receive_damaged(command_id)]
-            for answer in answers + (self.emulator.receive(command) if command else []):
+        for _, command in _packets(self._received):
+            for answer in self.emulator.receive(command) if command else ():
                 self._send(answer)
 
     def _send(self, packet: Packet) -> None:
@@ -211,12 +210,6 @@ def _packets(buffer: bytearray) -> Iterator[tuple[bytes, Packet | None]]:
         yield noise, packet
         if packet is None:
             return
-
-
-def _damaged(noise: bytes) -> Iterator[int]:
-    """Yield the ids of packets that start in the noise."""
-    for start in noise.split(PREAMBLE)[1:]:
-        yield from start.lstrip(PREAMBLE)[:1]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

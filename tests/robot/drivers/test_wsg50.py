@@ -1,0 +1,541 @@
+"""The WSG-50's driver with an emulated gripper, over TCP and a terminal: motions, faults, lost packets, closing."""
+
+import contextlib
+import json
+import logging
+import math
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+from types import SimpleNamespace
+
+import pytest
+
+from robot.drivers.wsg50 import codec
+from robot.drivers.wsg50 import driver as wsg50
+from robot.drivers.wsg50.codec import Status
+from robot.drivers.wsg50.driver import WSG50
+from robot.drivers.wsg50.link import LinkLost
+from robot.errors import DeviceError, RobotConfigError
+from tests.emulators.wsg50 import gripper as wsg50_emulated
+from tests.emulators.wsg50.faults import LineFaults
+from tests.emulators.wsg50.gripper import EmulatedWSG50
+from tests.waiting import STARTED, STARTED_IDS, first_line, run_process, wait_until
+from tests.wsg50_bench import (
+    ACK,
+    FAST_STOP,
+    GRASP,
+    HOME,
+    MOVE,
+    PORTS,
+    QUICK,
+    RELEASE,
+    STOP,
+    ScriptedFaults,
+    gripper_with_emulator,
+)
+
+DISCONNECT = 0x07
+
+
+def slow(**settings):
+    return EmulatedWSG50(**{"referenced": True, "opening_mm": 100.0} | settings)
+
+
+# Motions -----------------------------------------------------------------------------------------------------
+
+
+@PORTS
+def test_it_grasps_holds_and_releases(port):
+    with gripper_with_emulator(port) as (gripper, emulator):
+        emulator.object_mm = 40.0
+        held = gripper.grasp(10.0, 200.0)
+        assert (held.opening_mm, held.force_n, held.status) == (pytest.approx(40.0), 10.0, "holding")
+        assert gripper.state() == held
+        assert gripper.grasp(20.0).force_n == 20.0  # released and grasped again
+        opened = gripper.open(110.0)
+        assert (opened.opening_mm, opened.force_n, opened.status) == (pytest.approx(110.0), 0.0, "idle")
+        assert gripper.state() == opened
+
+
+def test_no_part_and_a_lost_part_end_by_opening_or_grasping():
+    with gripper_with_emulator() as (gripper, emulator):
+        assert gripper.grasp(10.0).status == "no_part"
+        assert gripper.open(60.0).status == "idle"
+        assert gripper.grasp(10.0).status == "no_part"
+        emulator.object_mm = 3.0
+        assert gripper.grasp(10.0).status == "holding"  # released by 5 mm before: GRASP is refused in NO PART
+        assert emulator.received.count(RELEASE) == 2
+        emulator.object_mm = None
+        assert gripper.state().status == "part_lost"
+        assert gripper.open(110.0).status == "idle"
+        emulator.object_mm = 0.5
+        assert gripper.grasp(10.0).status == "no_part"  # thinner than any part
+
+
+def test_opening_to_less_than_the_held_object_releases_it_first():
+    with gripper_with_emulator() as (gripper, emulator):
+        emulator.object_mm = 40.0
+        gripper.grasp(10.0)
+        with pytest.raises(DeviceError, match=r"AXIS_BLOCKED to MOVE .* rests at 40.0 mm"):
+            gripper.open(20.0)
+        assert emulator.force_limit_n == 5.0  # the smallest force, because it is not a grasp
+
+
+def test_force_is_that_on_each_finger_and_twice_as_much_for_the_gripper():
+    with gripper_with_emulator(max_force_n=30.0) as (gripper, emulator):
+        assert (gripper.min_force_n, gripper.max_force_n) == (2.5, 30.0)
+        emulator.object_mm = 40.0
+        assert gripper.grasp(12.5).force_n == 12.5
+        assert emulator.force_limit_n == 25.0
+    with gripper_with_emulator(max_force_n=7.1, finger_share=0.3) as (gripper, emulator):
+        gripper.grasp(7.1)  # 23.666..., which 32 bits round up
+        assert 0.3 * emulator.force_limit_n == pytest.approx(7.1)
+        assert 0.3 * emulator.force_limit_n <= 7.1
+
+
+def test_a_gripper_that_would_clamp_harder_than_requested_does_not_grasp():
+    with gripper_with_emulator(max_force_n=20.0) as (gripper, emulator):
+        for has, requested in ((60.0, 10.0), (20.002, 10.0), (40.01, 20.0)):
+            emulator.keeps_force_n = has
+            with pytest.raises(DeviceError, match=r"force limit \(both fingers\) must be"):
+                gripper.grasp(requested)
+        assert GRASP not in emulator.received
+        emulator.keeps_force_n = 16.0
+        gripper.grasp(10.0)
+        assert gripper.refused["force_n"] == "requested 10, has 8"
+        emulator.keeps_force_n = 20.00001  # a rounding error
+        gripper.grasp(10.0)
+        assert gripper.refused == {}
+
+
+def test_values_out_of_range_never_reach_the_gripper():
+    emulator = EmulatedWSG50(referenced=True, speed_up=20.0)
+    emulator.soft_limits = (5.0, 100.0)
+    with gripper_with_emulator(emulator=emulator, max_force_n=30.0, max_speed_mm_s=300.0) as (gripper, _):
+        emulator.object_mm = 40.0
+        gripper.grasp(10.0)
+        emulator.received.clear()
+        for misuse in (
+            lambda: gripper.grasp(2.4),
+            lambda: gripper.grasp(30.1),
+            lambda: gripper.grasp(math.nan),
+            lambda: gripper.grasp(10.0, 4.9),
+            lambda: gripper.grasp(10.0, 301.0),
+            lambda: gripper.open(4.9),
+            lambda: gripper.open(100.1),
+        ):
+            with pytest.raises(DeviceError, match="must be from"):
+                misuse()
+        assert emulator.received == []
+        assert gripper.state().status == "holding"
+
+
+@pytest.mark.parametrize(
+    ("settings", "error"),
+    [
+        ({"max_force_n": 2.0}, "must allow"),
+        ({"max_speed_mm_s": 4.0}, "must allow"),
+        ({"grasp_width_mm": 111.0}, "grasp_width_mm"),
+    ],
+)
+def test_settings_beyond_the_grippers_limits_are_refused_on_connecting(settings, error):
+    with gripper_with_emulator(connect=False, **settings) as (gripper, emulator):
+        with pytest.raises((RobotConfigError, DeviceError), match=error):
+            gripper.connect()
+        assert not gripper.is_connected
+        assert not emulator.in_fast_stop
+
+
+@pytest.mark.parametrize("settings", [{"baud": 9600}, {"stop_bits": 3}, {"timeout_s": math.nan}, {"baud": "x"}])
+def test_a_setting_out_of_range_is_refused(settings):
+    with pytest.raises(RobotConfigError, match="must"):
+        WSG50(port="/dev/ttyUSB0", **settings)
+
+
+def test_settings_are_read_back_as_plain_json():
+    with gripper_with_emulator("pty", baud=57600, stop_bits=2) as (gripper, _):
+        assert (gripper._link._port.baudrate, gripper._link._port.stopbits) == (57600, 2)
+        settings = json.loads(json.dumps(gripper.settings()))
+    assert settings["info"] == {"kind": 1, "hardware": 6, "firmware": 0x4000, "serial": 20260101}
+    assert (settings["limits"]["max_speed_mm_s"], settings["force_limit_n"], settings["soft_limits_mm"]) == (
+        420,
+        2.5,
+        None,
+    )
+
+
+@PORTS
+def test_it_homes_on_connecting_if_the_reference_is_lost_and_motion_is_allowed(port, caplog):
+    with gripper_with_emulator(port, emulator=EmulatedWSG50(speed_up=20.0)) as (gripper, emulator):
+        assert emulator.received.count(HOME) == 1
+        assert "homing, the jaws move" in caplog.text
+        assert gripper.state().opening_mm == pytest.approx(110.0)
+        assert gripper.home().status == "idle"
+        emulator.lose_reference()
+        with pytest.raises(DeviceError, match="reference"):
+            gripper.grasp(10.0)
+        assert GRASP not in emulator.received
+    emulator = EmulatedWSG50(speed_up=20.0)
+    with gripper_with_emulator(port, emulator=emulator, connect=False) as (gripper, _):
+        gripper.may_move = False
+        with pytest.raises(DeviceError, match="must be homed, but motion is not allowed"):
+            gripper.connect()
+    assert HOME not in emulator.received
+
+
+# Faults of the gripper ---------------------------------------------------------------------------------------
+
+
+@PORTS
+def test_a_fast_stop_is_named_and_never_acknowledged_silently(port, caplog):
+    with gripper_with_emulator(port, connect=False) as (gripper, emulator):
+        emulator.fail("current")
+        with pytest.raises(DeviceError, match=r"FAST STOP: current fault; .* acknowledge_faults"):
+            gripper.connect()
+        assert ACK not in emulator.received
+    with gripper_with_emulator(port, connect=False, acknowledge_faults=True) as (gripper, emulator):
+        emulator.fail("current")
+        caplog.clear()
+        gripper.connect()
+        texts = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+        assert texts == ["WSG-50 is in FAST STOP: current fault", "WSG-50: FAST STOP acknowledged"]
+
+
+def test_after_a_fast_stop_every_call_raises_until_recovery():
+    with gripper_with_emulator(acknowledge_faults=True) as (gripper, emulator):
+        emulator.warn("temperature warning")
+        assert gripper.open(60.0).status == "idle"  # a warning alone does not prevent motions
+        emulator.fail("temperature")
+        for use in (gripper.state, lambda: gripper.open(50.0), lambda: gripper.grasp(10.0)):
+            with pytest.raises(DeviceError, match=r"temperature fault.*recover\(\)"):
+                use()
+        emulator.lose_reference()
+        gripper.recover()
+        assert emulator.received.count(HOME) == 1
+        assert gripper.open(50.0).status == "idle"
+
+
+def test_a_held_object_keeps_its_force_when_the_program_reconnects():
+    emulator = EmulatedWSG50(referenced=True, speed_up=20.0, object_mm=40.0)
+    with gripper_with_emulator(emulator=emulator) as (gripper, _):
+        gripper.grasp(10.0)
+        gripper.close()
+        time.sleep(0.05)
+        assert not emulator.in_fast_stop
+        assert emulator.received[-1] == DISCONNECT
+    with gripper_with_emulator(emulator=emulator) as (gripper, _):
+        assert (emulator.force_limit_n, gripper.state().status) == (20.0, "holding")
+        gripper.open(60.0)
+        gripper.recover()
+        assert emulator.force_limit_n == 5.0
+
+
+def test_missing_state_updates_stop_the_motion():
+    emulator = slow(object_mm=5.0)
+    with gripper_with_emulator(emulator=emulator, max_state_age_s=0.1) as (gripper, _):
+        emulator.mute_updates = True
+        with pytest.raises(DeviceError, match=r"at most 0.1 s old"):
+            gripper.grasp(10.0, 5.0)
+        assert emulator.in_fast_stop
+        assert not emulator.moves
+
+
+def test_a_suspended_program_does_not_count_as_a_silent_gripper(monkeypatch):
+    with gripper_with_emulator(emulator=slow(opening_mm=50.0, object_mm=40.0), max_state_age_s=1.0) as (gripper, _):
+        poll, waits = gripper._link.poll, [1.5]
+
+        def suspended(command, seconds):
+            status = poll(command, seconds)
+            time.sleep(waits.pop() if waits else 0)
+            return status
+
+        monkeypatch.setattr(gripper._link, "poll", suspended)
+        assert gripper.grasp(10.0, 100.0).status == "holding"
+
+
+def test_a_fault_during_a_motion_is_named():
+    emulator = slow()
+    with gripper_with_emulator(emulator=emulator) as (gripper, _):
+        thread = threading.Thread(target=lambda: (wait_until(lambda: emulator.moves), emulator.fail("current")))
+        thread.start()
+        with pytest.raises(DeviceError, match=r"answered CMD_ABORTED to GRASP .* current fault"):
+            gripper.grasp(10.0, 10.0)
+        thread.join()
+
+
+def test_a_motion_that_never_ends_is_stopped(monkeypatch):
+    monkeypatch.setattr(wsg50, "_SLACK_S", 0.0)
+    with gripper_with_emulator() as (gripper, emulator):
+        emulator.jammed = True
+        with pytest.raises(DeviceError, match=r"did not end GRASP \(25h\) in time"):
+            gripper.grasp(10.0, 400.0)
+        assert not emulator.moves
+        assert emulator.received.count(GRASP) == 1
+        emulator.jammed = False
+        assert gripper.grasp(10.0).status == "no_part"
+
+
+# Stopping and closing ----------------------------------------------------------------------------------------
+
+
+@PORTS
+@pytest.mark.parametrize("call", ["grasp", "open"])
+def test_ctrl_c_stops_the_jaws(port, call):
+    emulator = slow()
+    uses = {"grasp": lambda gripper: gripper.grasp(10.0, 10.0), "open": lambda gripper: gripper.open(10.0)}
+    with gripper_with_emulator(port, emulator=emulator, opening_speed_mm_s=10.0) as (gripper, _):
+
+        def interrupt():
+            wait_until(lambda: emulator.moves)
+            os.kill(os.getpid(), signal.SIGINT)
+
+        thread = threading.Thread(target=interrupt)
+        thread.start()
+        with pytest.raises(KeyboardInterrupt):
+            uses[call](gripper)
+        thread.join()
+        assert not emulator.moves
+        assert emulator.opening_mm > 50.0
+        assert not emulator.in_fast_stop
+
+
+def test_a_stop_without_an_answer_or_without_effect_becomes_a_fast_stop(monkeypatch):
+    script = ScriptedFaults()
+    with gripper_with_emulator(faults=script) as (gripper, emulator):
+        gripper.stop()
+        assert not emulator.in_fast_stop
+        script.tell({STOP: "dropped"})
+        gripper.stop()
+        assert (emulator.received.count(FAST_STOP), emulator.in_fast_stop) == (1, True)
+    monkeypatch.setitem(wsg50_emulated._ACTIONS, STOP, lambda own, _: 0)
+    emulator = slow()
+    with gripper_with_emulator(emulator=emulator, max_state_age_s=0.1) as (gripper, _):
+        gripper._link.begin(codec.move(10.0, 5.0))
+        wait_until(lambda: emulator.moves)
+        gripper.stop()
+        assert not emulator.moves
+        assert emulator.received.count(FAST_STOP) == 1
+
+
+def test_closing_stops_moving_jaws_and_is_not_announced_while_they_may_move():
+    """Without announcement the gripper stops by itself."""
+    for plan in ({}, {STOP: "dropped", FAST_STOP: "dropped"}):
+        emulator, script = slow(), ScriptedFaults()
+        with gripper_with_emulator(faults=script, emulator=emulator, timeout_s=0.1) as (gripper, _):
+            gripper._link.begin(codec.move(10.0, 5.0))
+            wait_until(lambda emulator=emulator: emulator.moves)
+            script.tell(plan)
+            with pytest.raises(DeviceError, match="did not answer FAST_STOP") if plan else contextlib.nullcontext():
+                gripper.close()
+            assert (DISCONNECT in emulator.received) == (not plan)
+            wait_until(lambda emulator=emulator: not emulator.moves)
+            assert emulator.in_fast_stop == bool(plan)
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda gripper: gripper.state(),
+        lambda gripper: gripper.settings(),
+        lambda gripper: gripper.grasp(10.0),
+        lambda gripper: gripper.stop(),
+        lambda gripper: gripper.recover(),
+        lambda gripper: gripper.close(),
+    ],
+)
+def test_no_call_waits_for_ever_for_a_silent_gripper(use):
+    with gripper_with_emulator(timeout_s=0.02, reconnect_tries=2) as (gripper, emulator):
+        emulator.silent = True
+        started = time.monotonic()
+        with pytest.raises(DeviceError):
+            use(gripper)
+        assert time.monotonic() - started < 5
+
+
+@pytest.mark.parametrize("use", ["state", "recover", "home", "stop", "settings"])
+def test_every_call_raises_before_connecting_and_after_closing(use):
+    with gripper_with_emulator(connect=False) as (gripper, _):
+        for _ in range(2):
+            with pytest.raises(DeviceError, match="must be connected"):
+                getattr(gripper, use)()
+            gripper.connect()
+            gripper.close()
+            gripper.close()
+
+
+def test_connecting_without_a_gripper_is_a_device_error_and_leaves_nothing_open():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        free = server.getsockname()[1]
+    with pytest.raises(DeviceError, match="cannot be opened"):
+        WSG50(port=f"socket://127.0.0.1:{free}", **QUICK).connect()
+    with gripper_with_emulator(connect=False, timeout_s=0.02) as (gripper, emulator):
+        emulator.silent = True
+        with pytest.raises(DeviceError, match="is it on and connected"):
+            gripper.connect()
+        assert not gripper._link.is_open
+        assert emulator.received == [0x06] * 3  # three tries of an echo and nothing else
+
+
+def test_recovery_raises_after_its_last_try_and_waits_seconds_at_most(monkeypatch):
+    """Without a limit, the last of twenty doubled waits would take more than a day."""
+    waits = []
+    monkeypatch.setattr(wsg50, "time", SimpleNamespace(sleep=waits.append, monotonic=time.monotonic))
+    gripper = WSG50(port="/nowhere/tty", reconnect_tries=20, reconnect_s=0.2)
+    gripper._connected = True  # as if the cable were unplugged
+    with pytest.raises(DeviceError, match="after 20 tries"):
+        gripper.recover()
+    assert (len(waits), waits[0], max(waits)) == (19, 0.2, 5.0)
+
+
+# Lost, doubled and damaged packets ---------------------------------------------------------------------------
+
+
+@PORTS
+def test_a_disconnect_during_a_motion_ends_with_still_jaws(port):
+    emulator, script = slow(), ScriptedFaults()
+    with gripper_with_emulator(port, faults=script, emulator=emulator, acknowledge_faults=True) as (gripper, _):
+        script.tell({(GRASP, 2): "disconnect"})
+        with pytest.raises(DeviceError, match="recover"):
+            gripper.grasp(10.0, 10.0)
+        wait_until(lambda: not emulator.moves)
+        assert emulator.opening_mm > 50.0
+        gripper.recover()
+        emulator.speed_up = 20.0
+        assert gripper.grasp(10.0, 100.0).status == "no_part"
+
+
+def test_jaws_that_could_not_be_stopped_are_stopped_on_closing_or_closing_raises(monkeypatch):
+    emulator, script = slow(speed_up=0.1), ScriptedFaults()
+
+    def no_cable():
+        raise LinkLost("no cable")
+
+    with gripper_with_emulator("pty", faults=script, emulator=emulator, reconnect_tries=2) as (gripper, _):
+        for is_plugged_in in (True, False):
+            script.tell({(GRASP, 2): "disconnect"})
+            with monkeypatch.context() as cable:
+                cable.setattr(gripper._link, "open", no_cable)
+                with pytest.raises(DeviceError, match="was lost"):
+                    gripper.grasp(10.0, 100.0)
+                assert emulator.moves
+                if not is_plugged_in:
+                    with pytest.raises(DeviceError):
+                        gripper.close()
+                    assert emulator.moves
+            if is_plugged_in:
+                gripper.close()
+                assert not emulator.moves
+            gripper.connect()
+            assert not emulator.moves
+
+
+@pytest.mark.parametrize("command", [STOP, 0x06])
+def test_a_command_with_a_damaged_length_does_not_swallow_the_next(command):
+    emulator, script = slow(), ScriptedFaults()
+    with gripper_with_emulator("pty", faults=script, emulator=emulator, timeout_s=0.1) as (gripper, _):
+        gripper._link.begin(codec.move(10.0, 5.0))
+        wait_until(lambda: emulator.moves)
+        script.tell({(command, 1): "long"})
+        gripper.stop()
+        assert not emulator.moves
+        assert FAST_STOP not in emulator.received
+
+
+def test_homing_with_a_lost_result_is_not_repeated():
+    script = ScriptedFaults()
+    with gripper_with_emulator(faults=script, emulator=EmulatedWSG50(speed_up=2.0), connect=False) as (gripper, found):
+        script.tell({(HOME, 3): "dropped"})
+        gripper.connect()
+        assert found.received.count(HOME) == 1
+
+
+@PORTS
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_a_grasp_is_executed_once_whichever_of_its_packets_is_lost(port, number):
+    """The packets are 1 the command, 2 the pending reply, 3 the result."""
+    script = ScriptedFaults()
+    with gripper_with_emulator(port, faults=script) as (gripper, emulator):
+        emulator.object_mm = 40.0
+        script.tell({(GRASP, number): "dropped"})
+        assert gripper.grasp(10.0, 200.0).status == "holding"
+        assert emulator.received.count(GRASP) == 1
+
+
+def test_a_grasp_that_was_answered_and_not_executed_is_sent_again_only_if_it_was_not_received():
+    emulator = EmulatedWSG50(referenced=True, speed_up=50.0, object_mm=40.0)
+    not_received = {Status.SUCCESS, Status.CMD_PENDING, Status.CHECKSUM_ERROR}
+    with gripper_with_emulator(timeout_s=0.1, emulator=emulator) as (gripper, _):
+        for status in (*not_received, Status.RANGE_ERROR, Status.ACCESS_DENIED, Status.CMD_ABORTED):
+            gripper.open(60.0)
+            emulator.received.clear()
+            emulator.next_status = {GRASP: status}
+            if status in not_received:
+                assert gripper.grasp(10.0, 400.0).status == "holding"
+            else:
+                with pytest.raises(DeviceError, match=f"answered {status.name} to GRASP"):
+                    gripper.grasp(10.0, 400.0)
+            assert emulator.received.count(GRASP) == 1 + (status in not_received)
+
+
+@pytest.mark.parametrize("kind", ["dropped", "duplicated", "corrupted", "delayed", "split", "wrong id"])
+@pytest.mark.parametrize("number", [1, 3])
+def test_opening_reaches_its_target_with_any_fault_of_a_packet(kind, number):
+    script = ScriptedFaults()
+    with gripper_with_emulator(faults=script) as (gripper, emulator):
+        for opening in (20.0, 80.0):
+            script.tell({(MOVE, number): kind})
+            assert gripper.open(opening).opening_mm == pytest.approx(opening, abs=0.1)
+        assert not emulator.moves
+
+
+@pytest.mark.parametrize("plan", [{(MOVE, 3): "duplicated"}, {(MOVE, 2): "after a result"}])
+def test_a_false_or_doubled_result_does_not_end_a_motion(plan):
+    emulator, script = slow(opening_mm=50.0), ScriptedFaults()
+    with gripper_with_emulator(faults=script, emulator=emulator, opening_speed_mm_s=50.0) as (gripper, _):
+        for opening in (60.0, 40.0):
+            script.tell(plan)
+            assert gripper.open(opening).opening_mm == pytest.approx(opening, abs=0.1)
+            assert not emulator.moves
+        assert emulator.received.count(MOVE) == 2
+
+
+@pytest.mark.slow
+@PORTS
+@pytest.mark.parametrize("kind", LineFaults.KINDS)
+def test_grasps_over_a_bad_link_succeed_or_raise_and_never_leave_the_jaws_closing(port, kind):
+    faults = LineFaults(0.0, [kind], seed=7, delay_s=0.02)
+    emulator = EmulatedWSG50(referenced=True, speed_up=40.0)
+    settings = {"timeout_s": 0.1, "acknowledge_faults": True}
+    with gripper_with_emulator(port, faults=faults, emulator=emulator, **settings) as (gripper, _):
+        faults.rate = 0.005 if kind == "disconnect" else 0.02
+        for number in range(6):
+            emulator.object_mm, expected = (40.0, "holding") if number % 2 else (None, "no_part")
+            for _ in range(10):
+                try:
+                    gripper.open(110.0)
+                    assert gripper.grasp(10.0, 300.0).status == expected
+                    break
+                except DeviceError:
+                    wait_until(lambda: not emulator.is_closing)
+                    with contextlib.suppress(DeviceError):
+                        gripper.recover()
+            else:
+                pytest.fail(f"ten tries, {faults.counts}")
+        faults.rate = 0.0
+
+
+@pytest.mark.parametrize("by", STARTED, ids=STARTED_IDS)
+@pytest.mark.parametrize(("port", "end"), [(["--tcp", "0"], signal.SIGINT), (["--pty"], signal.SIGTERM)])
+def test_the_emulator_runs_as_a_program_and_prints_its_port(port, end, by):
+    program = [sys.executable, "-m", "tests.emulators.wsg50.server", *port, "--object-mm", "40"]
+    with run_process([*by, *program]) as process:
+        line = first_line(process)
+        assert line.startswith("socket://127.0.0.1:") or os.path.exists(line.strip())
+        process.send_signal(end)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert "faults: {" in errors
