@@ -154,10 +154,8 @@ class TrainedFeatures(BatchImages):
         """Return features of the batch's touches and photos; each distinct image passes through its tower once."""
         touches, photos = len(loaded.batch.grasps), len(loaded.batch.photos)
         with autocast(self.device, self.config.training.precision):
-            with distributed.counting_rank_rows(touches):
-                touch = matcher.touch_features(loaded.touches)
-            with distributed.counting_rank_rows(photos):
-                photo = matcher.photo_features(loaded.photos)
+            touch = matcher.touch_features(loaded.touches)
+            photo = matcher.photo_features(loaded.photos)
         return distributed.gather_rows(touch, touches), distributed.gather_rows(photo, photos)
 
     def eval_features(self, matcher: Matcher, pairs: PairBatch) -> tuple[Tensor, Tensor]:

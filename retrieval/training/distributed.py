@@ -1,26 +1,25 @@
 """Data-parallel training: each rank encodes a part of a batch, and all ranks compute the same loss.
 
 Every rank has the whole batch (the sampler is stateless), encodes its rows of the distinct images, and gathers the
-features of the other ranks. The gather is differentiable, and batch normalisation in the towers uses the statistics of
-all ranks' images. So the loss, the running statistics and the mean of the ranks' gradients equal those of one process
-up to rounding. With negatives from one rank only, the gradient would differ by half; with batch statistics of one rank
-only, a ResNet-18's gradient differed by 115 %, and its loss differed too. One difference remains: dropout INSIDE a
-tower (the 1000-way output of MobileNetV2), where each rank draws the mask of its own images. `torchrun` starts the
-ranks; without it there is one rank.
+features of the other ranks. The gather is differentiable, so the loss and the mean of the ranks' gradients equal those
+of one process up to rounding. (With negatives from one rank only, the gradient would differ by half.) `torchrun` starts
+the ranks; without it there is one rank.
 
-PyTorch's SyncBatchNorm is not sufficient: it does not run on a CPU, and it counts repeated padding rows as new images.
+On GPUs batch normalisation in the towers uses the statistics of all ranks' images (torch.nn.SyncBatchNorm). PyTorch has
+no such layer for CPUs: there the statistics must stay frozen.
 """
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
+import warnings
+from collections.abc import Callable
 from typing import Any
 
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
-from torch.nn import functional
+from torch.nn.parallel import DistributedDataParallel
+
+from retrieval.errors import ConfigError
 
 
 def start() -> None:
@@ -96,128 +95,42 @@ def any_rank(flag: bool, device: torch.device) -> bool:
     return bool(count.item() > 0)
 
 
-def average_gradients(model: nn.Module) -> None:
-    """Replace every gradient by its mean over the ranks."""
-    if world_size() == 1:
-        return
-    for parameter in model.parameters():
-        if parameter.requires_grad:
-            if parameter.grad is None:
-                parameter.grad = torch.zeros_like(parameter)
-            dist.all_reduce(parameter.grad)
-            parameter.grad /= world_size()
+def synchronise_batch_norm(tower: nn.Module, device: torch.device) -> None:
+    """Make the batch normalisation of a tower use the statistics of all ranks' images.
 
+    Args:
+        tower: The tower, in the mode of its training.
+        device: Where it computes.
 
-# Batch normalisation -------------------------------------------------------------------------------------
-
-_counted_fraction: ContextVar[float] = ContextVar("_counted", default=1.0)
-"""Fraction of the current rows, from the first on, that belong to the batch; the others are padding."""
-
-
-@contextmanager
-def counting_rank_rows(count: int) -> Iterator[None]:
-    """Exclude padding rows from batch statistics while this rank encodes `rank_rows(count)`."""
-    size = len(rank_rows(count))
-    token = _counted_fraction.set(min(max(count - rank() * size, 0), size) / size)
-    try:
-        yield
-    finally:
-        _counted_fraction.reset(token)
-
-
-def synchronize_batch_norm(tower: nn.Module) -> None:
-    """Make the batch normalisation of a tower use the statistics of all ranks' images."""
-    if world_size() == 1:
-        return
-    for module in tower.modules():
-        if type(module) is nn.BatchNorm2d:
-            module.__class__ = SharedBatchNorm  # keeps the weights and their names
-
-
-class SharedBatchNorm(nn.BatchNorm2d):
-    """Batch normalisation (B, C, H, W) with training statistics of all ranks' images, without padding rows."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Normalise like BatchNorm2d. In training all ranks must call it, since they wait for each other."""
-        if not self.training:
-            return super().forward(x)
-        rows = round(_counted_fraction.get() * len(x))
-        # Sums in half precision would lose small values; BatchNorm2d also uses float32 for them.
-        wide = x.to(torch.promote_types(x.dtype, torch.float32))
-        mean, variance, count = _statistics(wide.detach()[:rows])
-        self._update_running_statistics(mean, variance * count / (count - 1))
-        normalised: Tensor = _Normalise.apply(  # type: ignore[no-untyped-call]
-            wide, self.weight, self.bias, mean, variance, count, rows, self.eps
-        )
-        return normalised.to(x.dtype)
-
-    @torch.no_grad()
-    def _update_running_statistics(self, mean: Tensor, variance: Tensor) -> None:
-        """Update the running statistics with a batch."""
-        assert self.running_mean is not None  # towers keep PyTorch's defaults
-        assert self.running_var is not None
-        assert self.num_batches_tracked is not None
-        assert self.momentum is not None
-        self.num_batches_tracked.add_(1)
-        self.running_mean.lerp_(mean, self.momentum)
-        self.running_var.lerp_(variance, self.momentum)
-
-
-def _statistics(counted: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return mean and variance (C,) and count () over the rows (B, C, H, W) of all ranks; a rank may have none."""
-    count = counted.new_full((counted.shape[1],), counted.numel() / counted.shape[1])
-    mean, variance = torch.zeros_like(count), torch.zeros_like(count)
-    if len(counted):  # the kernel of BatchNorm2d; `var_mean` takes thirty times as long with channels last
-        mean, variance = torch.batch_norm_update_stats(counted, None, None, 0.0)
-    own = torch.stack([count, mean, variance])
-    parts = [torch.empty_like(own) for _ in range(world_size())]
-    dist.all_gather(parts, own)
-    counts, means, variances = torch.stack(parts, 1)
-    weights = counts / counts.sum(0)
-    total_mean = (weights * means).sum(0)
-    # Squared differences: the mean square minus the squared mean loses all digits if the mean is far from 0.
-    return total_mean, (weights * (variances + (means - total_mean).square())).sum(0), counts.sum(0)[0]
-
-
-class _Normalise(torch.autograd.Function):
-    """Normalisation of x (B, C, H, W) by mean, variance, weight and bias, all (C,).
-
-    The statistics are those of `count` values in each channel: the first `rows` rows of every rank. PyTorch's kernels
-    need a third of the passes over x that plain operations take.
+    Raises:
+        ConfigError: Several ranks of a CPU would each use the statistics of their own images.
     """
+    layers = (module for module in tower.modules() if isinstance(module, nn.BatchNorm2d))
+    if world_size() == 1 or not any(layer.training for layer in layers):
+        return
+    if device.type == "cpu":
+        raise ConfigError(
+            f"{world_size()} ranks on CPUs cannot share the statistics of batch normalisation; set "
+            "freeze_batch_norm = true or freeze_towers = true, train in one process, or use GPUs"
+        )
+    nn.SyncBatchNorm.convert_sync_batchnorm(tower)  # type: ignore[no-untyped-call]
 
-    @staticmethod
-    def forward(
-        ctx: Any,
-        x: Tensor,
-        weight: Tensor,
-        bias: Tensor,
-        mean: Tensor,
-        variance: Tensor,
-        count: Tensor,
-        rows: int,
-        eps: float,
-    ) -> Tensor:
-        ctx.save_for_backward(x, weight, mean, variance, count)
-        ctx.rows, ctx.eps = rows, eps
-        return functional.batch_norm(x, mean, variance, weight, bias, eps=eps)
 
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        """Return the gradients; padding rows are in no loss, so their gradient is zero."""
-        x, weight, mean, variance, count = ctx.saved_tensors
-        own, counted = gradient[: ctx.rows], x[: ctx.rows]
-        scale, along, total = torch.rsqrt(variance + ctx.eps), torch.zeros_like(mean), torch.zeros_like(mean)
-        if len(own):
-            _, along, total = torch.ops.aten.native_batch_norm_backward(
-                own, counted, None, None, None, mean, scale, True, ctx.eps, [False, True, True]
-            )
-        sums = torch.stack([total, along])
-        dist.all_reduce(sums)
-        shift, slope = sums / count
-        factor = (weight * scale)[:, None, None]
-        normal = functional.batch_norm(counted, mean, variance, eps=ctx.eps)
-        x_gradient = torch.zeros_like(gradient)
-        correction = torch.addcmul(-factor * shift[:, None, None], normal, -factor * slope[:, None, None])
-        torch.addcmul(correction, own, factor, out=x_gradient[: ctx.rows])
-        return x_gradient, along, total, None, None, None, None, None
+class _Loss(nn.Module):
+    """A loss as a module that holds the trained parameters, as PyTorch's data parallelism requires."""
+
+    def __init__(self, modules: nn.Module, loss: Callable[[Any], Tensor]) -> None:
+        super().__init__()
+        self.modules_of_loss, self.loss = modules, loss
+
+    def forward(self, batch: Any) -> Tensor:
+        return self.loss(batch)
+
+
+def averaging_gradients(modules: nn.Module, loss: Callable[[Any], Tensor]) -> Callable[[Any], Tensor]:
+    """Return the loss such that its `backward` averages the gradients of `modules` over the ranks."""
+    if world_size() == 1:
+        return loss
+    # Gradients of 1 x 1 and depthwise convolutions have strides of axes of length 1 that differ from the weights'.
+    warnings.filterwarnings("ignore", "Grad strides do not match bucket view strides")
+    return DistributedDataParallel(_Loss(modules, loss), static_graph=True)  # some weights may be in no loss

@@ -11,7 +11,6 @@ from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
 from retrieval.model.towers.weights import initialise_tower
 from retrieval.search.defaults import shipped_model
-from retrieval.training import distributed
 
 TOWER_WEIGHTS = ("touch_tower.", "photo_tower.")
 """Prefixes of the names of the towers' weights in a matcher."""
@@ -33,7 +32,6 @@ def build_matcher(config: Config) -> Matcher:
         tower.requires_grad_(not settings.freeze_towers)
         if settings.freeze_stem:
             tower.stem_layers().requires_grad_(False)
-        distributed.synchronize_batch_norm(tower)
     return matcher
 
 

@@ -180,6 +180,8 @@ class Trainer:
             else TrainedFeatures(config, self.device)
         )
         set_training_mode(self.matcher, settings)
+        for tower in (self.matcher.touch_tower, self.matcher.photo_tower):
+            distributed.synchronise_batch_norm(tower, self.device)
         self.step, self.best = 0, -math.inf
         self._image_count, self._compute_s = 0, 0.0
 
@@ -212,11 +214,10 @@ class Trainer:
                 self.optimizer,
                 plan,
                 prefetch(map(self._prepare, range(self.step, plan.steps)), settings.prefetch),
-                self.loss,
+                distributed.averaging_gradients(self.modules, self.loss),
                 bar=bar,
                 done=self.step,
                 step_context=self.features.step_context,
-                before_step=lambda: distributed.average_gradients(self.modules),
                 after_step=self._after_step,
                 note=self._note,
                 validate=lambda _: self._validate_and_save(),

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from retrieval.model.losses.contrastive import contrastive_loss
 from retrieval.model.losses.listwise import listwise_loss
 from retrieval.model.losses.loss import Loss
 from retrieval.model.losses.match import match_loss
+from retrieval.training import distributed
 from retrieval.training.batches import FrozenFeatures, TrainedFeatures
 from retrieval.training.initial_weights import build_matcher
 from retrieval.training.state import state_path
@@ -427,30 +429,32 @@ torch.manual_seed(0)
 config = with_training(TINY, precision="float32")
 matcher = build_matcher(config)
 set_training_mode(matcher, config.training)
+losses = WeightedLosses(config.training.weights, matcher, 9)
+
+
+def contrastive(touch, photo, touch_objects, photo_objects):
+    objects = torch.from_numpy(touch_objects), torch.from_numpy(photo_objects)
+    touch, photo = matcher.touch_encoding(touch).embedding, matcher.photo_encoding(photo).embedding
+    return contrastive_loss(touch, photo, *objects, matcher.log_scale)
+
+
+def loss(loaded):
+    batch = loaded.batch
+    if sys.argv[3] == "local":  # the naive way: every rank's loss uses its own images only
+        touches, photos = (distributed.rank_rows(len(rows)) for rows in (batch.grasps, batch.photos))
+        touch, photo = matcher.touch_features(loaded.touches), matcher.photo_features(loaded.photos)
+        return contrastive(touch, photo, batch.touch_objects[touches], batch.photo_objects[photos])
+    touch, photo = source.train_features(matcher, loaded)
+    if sys.argv[3] == "contrast":
+        return contrastive(touch, photo, batch.touch_objects, batch.photo_objects)
+    return batch_loss(matcher, losses, batch, touch, photo)[0]
+
+
 with TrainedFeatures(config, torch.device("cpu")) as source:
     loaded = source.prepare(matcher, PairSampler(load_grasps(Path(sys.argv[1])), seed=0).batch(0, 5)).result()
     torch.manual_seed(1)
-    if sys.argv[3] == "local":  # the naive way: every rank's loss uses its own images only
-        rows = torch.tensor(distributed.rank_rows(len(loaded.batch.photos)))
-        touch = matcher.touch_encoding(matcher.touch_features(loaded.touches)).embedding
-        photo = matcher.photo_encoding(matcher.photo_features(loaded.photos)).embedding
-        touches = torch.tensor(distributed.rank_rows(len(loaded.batch.grasps)))
-        touch_objects, photo_objects = (
-            torch.from_numpy(labels) for labels in (loaded.batch.touch_objects, loaded.batch.photo_objects)
-        )
-        labels = touch_objects[touches], photo_objects[rows]
-        loss = contrastive_loss(touch, photo, *labels, matcher.log_scale)
-    elif sys.argv[3] == "contrast":
-        touch, photo = source.train_features(matcher, loaded)
-        labels = torch.from_numpy(loaded.batch.touch_objects), torch.from_numpy(loaded.batch.photo_objects)
-        loss = contrastive_loss(
-            matcher.touch_encoding(touch).embedding, matcher.photo_encoding(photo).embedding, *labels, matcher.log_scale
-        )
-    else:
-        losses = WeightedLosses(config.training.weights, matcher, 9)
-        loss, _ = batch_loss(matcher, losses, loaded.batch, *source.train_features(matcher, loaded))
-loss.backward()
-distributed.average_gradients(matcher)
+    averaged = distributed.averaging_gradients(torch.nn.ModuleList([matcher, losses]), loss)
+    averaged(loaded).backward()
 if distributed.rank() == 0:
     torch.save({name: value.grad for name, value in matcher.named_parameters() if value.grad is not None}, sys.argv[2])
 distributed.stop()
@@ -502,36 +506,6 @@ def test_without_validation_objects_the_checkpoint_is_the_last_step_without_a_po
     assert made.posterior is None
 
 
-BATCH_STATISTICS = """
-import sys, torch
-from torch import nn
-from retrieval.training import distributed
-from retrieval.model.towers import build_tower
-
-torch.set_num_threads(1)
-distributed.start()
-torch.manual_seed(0)
-if sys.argv[1] == "resnet18":
-    tower, images = build_tower("resnet18", "pooled").double(), torch.randn(5, 3, 64, 64).double()
-    encode = tower._encode  # without the check that images are in single precision
-else:
-    tower = nn.Sequential(nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4), nn.ReLU(), nn.Conv2d(4, 2, 3), nn.BatchNorm2d(2))
-    encode, images = tower.double(), 30 + torch.randn(4, 3, 8, 8).double()
-if sys.argv[2] == "all":
-    distributed.synchronize_batch_norm(tower)
-with distributed.counting_rank_rows(len(images)):
-    local = encode(images[distributed.rank_rows(len(images))])
-rows = distributed.gather_rows(local.flatten(1), len(images))
-loss = (rows * torch.randn(rows.shape).double()).sum() + rows.square().square().mean()
-loss.backward()
-distributed.average_gradients(tower)
-made = {name: value.grad for name, value in tower.named_parameters() if value.grad is not None}
-made |= {"loss": loss.detach()} | {name: value for name, value in tower.named_buffers() if "running" in name}
-torch.save(made, f"{sys.argv[3]}.{distributed.rank()}")
-distributed.stop()
-"""
-
-
 def run_ranks(script, ranks, *arguments):
     """Run a script on `ranks` ranks."""
     torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(ranks)] if ranks > 1 else []
@@ -541,33 +515,13 @@ def run_ranks(script, ranks, *arguments):
     assert done.returncode == 0, done.stderr
 
 
-def of_one_batch(tmp_path, tower, ranks, statistics="all"):
-    """Return each rank's loss, gradients and running statistics of a tower after one batch.
-
-    The computation is in double precision, so that rounding does not change the sign of a ReLU's input.
-    """
-    script, out = tmp_path / "statistics.py", tmp_path / f"{ranks}{statistics}"
-    script.write_text(BATCH_STATISTICS)
-    run_ranks(script, ranks, tower, statistics, out)
-    return [torch.load(f"{out}.{rank}", weights_only=True) for rank in range(ranks)]
-
-
-def test_batch_statistics_count_each_image_of_all_ranks_once(tmp_path):
-    """With four images on three ranks, the last rank has only repetitions of the fourth image."""
-    (one,) = of_one_batch(tmp_path, "tiny", 1)
-    three, *others = of_one_batch(tmp_path, "tiny", 3)
-    assert difference(three, one) < 1e-12
-    for other in others:  # all ranks have the same bits
-        assert all(torch.equal(other[name], three[name]) for name in three)
-
-
-@pytest.mark.slow
-def test_two_ranks_of_a_resnet_give_the_results_of_one_process(tmp_path):
-    (one,) = of_one_batch(tmp_path, "resnet18", 1)
-    assert difference(of_one_batch(tmp_path, "resnet18", 2)[0], one) < 1e-9
-    naive = of_one_batch(tmp_path, "resnet18", 2, statistics="own")[0]
-    assert difference(naive, one) > 0.3
-    assert abs(naive["loss"] - one["loss"]) > 0.01 * abs(one["loss"])
+@pytest.mark.parametrize("settings", [{}, {"freeze_batch_norm": True}, {"freeze_towers": True}])
+def test_ranks_of_cpus_must_freeze_batch_norm(settings, recording, tmp_path, monkeypatch):
+    config = dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, tower="resnet18"))
+    monkeypatch.setattr(distributed, "world_size", lambda: 2)
+    refusal = nullcontext() if settings else pytest.raises(ConfigError, match=r"2 ranks on CPUs.*freeze_batch_norm")
+    with refusal:
+        trainer_for(recording, tmp_path / "m.safetensors", with_training(config, **settings))
 
 
 TINY_TOML = """
