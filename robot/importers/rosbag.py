@@ -20,25 +20,26 @@ Messages are ordered by the times at which the bag recorded them.
 names a sensor_msgs/JointState: the sum of positions, in metre, is the opening, and the mean absolute effort, in newton,
 the force.
 
-The import prints a line on each topic: its rate (from the median interval), gaps of more than 3 intervals, and time
-stamps that repeat or go backwards. From a bag that is cut off, whole messages are imported. A bag is read twice, one
-message at a time; only times and numbers of its messages stay in memory, 0.9 kB for a grasp of 9 messages.
+Repair a bag whose recording was cut off before you import it: `rosbag reindex` (ROS 1), `mcap recover` (MCAP). A bag is
+read twice, one message at a time; only times and numbers of its messages stay in memory.
 """
 
-from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+import contextlib
+from array import array
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
 from string import ascii_lowercase
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robot.errors import ImporterError
-from robot.importers.bag_reader import Bag, BagMessage, bag_paths, picture_of
-from robot.importers.bag_scan import BagGrasp, BagScan, BagTopics, find_grasps, scan_bag, time_stamp_report
+from robot.grasping.gates import ContactAreaGate, GraspFrames
 from robot.importers.importing import (
     NOT_STATED,
     DataSet,
@@ -48,9 +49,11 @@ from robot.importers.importing import (
     Source,
     import_extra,
     import_items,
+    natural_sort_key,
     safe_name,
 )
 from robot.recording.folder import Recording
+from robot.storage import decode_picture
 
 DATA_SET = DataSet(
     source="ROS bags",
@@ -67,6 +70,10 @@ DATA_SET = DataSet(
         "Times are those at which the bag recorded the messages: a slow topic gets older images.",
     ),
 )
+_SUFFIXES = (".bag", ".mcap", ".db3")
+_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1}
+_REPAIR = "if its recording was cut off, repair it: rosbag reindex (ROS 1), mcap recover (MCAP)"
 
 
 def import_rosbag(
@@ -108,40 +115,326 @@ def import_rosbag(
     src = Path(src)
     if not 0 < contact <= 1:
         raise ImporterError(f"contact must be above 0 and at most 1, got {contact}")
-    paths = bag_paths(src)
+    paths = _bag_paths(src)
     if not paths:
         raise DATA_SET.mismatch_error(src, "there is no such bag")
     import_extra("rosbags", "a ROS bag")
-    topics = BagTopics(tuple(filter(None, (touch_a, touch_b))), photo, gripper, grasp, object)
-    scans: dict[Path, BagScan] = {}
+    topics = _Topics(tuple(filter(None, (touch_a, touch_b))), photo, gripper, grasp, object)
+    scans: dict[Path, _Scan] = {}
     skips: list[Skip] = []
     for path in paths:
         try:
             with Bag(path) as bag:
-                scans[path] = scan_bag(bag, topics)
+                scans[path] = _scan_bag(bag, topics)
         except ImporterError as error:
             skips.append(Skip(str(error), path.name))
     if not scans:
         raise ImporterError(f"{paths[0]}: {skips[0].reason}")
-    grasps = {path: find_grasps(scan, topics, contact, settle_s) for path, scan in scans.items()}
-    regular = [topic for topic in topics.types() if topic not in (grasp, object)]
-    report = time_stamp_report({path.name: scan for path, scan in scans.items()}, regular)
-    losses = [
-        f"{path.name} is cut off or damaged: imported its whole messages, the first "
-        f"{(scan.last_ns - scan.first_ns) / 1e9:.1f} s"
-        for path, scan in scans.items()
-        if scan.is_cut_off
-    ]
-    caveats = (*report, *losses, *DATA_SET.caveats)
-    facts = replace(DATA_SET, fingers=len(topics.touch), sensor=sensor, licence=licence, caveats=caveats)
+    grasps = {path: _find_grasps(scan, topics, contact, settle_s) for path, scan in scans.items()}
+    unreadable = sum((scan.unreadable for scan in scans.values()), Counter[str]())
+    lost = [f"{count} image(s) of {topic} cannot be decoded, or differ in size" for topic, count in unreadable.items()]
+    facts = replace(
+        DATA_SET,
+        fingers=len(topics.touch),
+        sensor=sensor,
+        licence=licence,
+        caveats=(*lost, *DATA_SET.caveats),
+    )
     start_ns = min(scan.first_ns for scan in scans.values())
     items = (item for path, scan in scans.items() for item in _items(path, scan, grasps[path], topics, start_ns))
     total = len(skips) + sum(map(len, grasps.values()))
     return import_items(facts, chain(skips, items), out, total=total, progress=progress)
 
 
+# Bags --------------------------------------------------------------------------------------------------------
+
+
+def _bag_paths(source: Path) -> list[Path]:
+    """Return the bags of a source, in natural order: the source itself, or those in the folder.
+
+    A folder with metadata.yaml, or within `source` one with .mcap or .db3 files, is one ROS 2 bag.
+    """
+    if source.is_file() or (source / "metadata.yaml").is_file():
+        return [source]
+    inside = sorted(source.iterdir(), key=lambda path: natural_sort_key(path.name)) if source.is_dir() else []
+    return [path for path in inside if (path.suffix in _SUFFIXES if path.is_file() else bool(_storage_files(path)))]
+
+
+def _storage_files(path: Path) -> list[Path]:
+    """Return the files of a bag with messages, in natural order."""
+    if path.is_file():
+        return [path]
+    return sorted(
+        (file for file in path.iterdir() if file.is_file() and file.suffix in _SUFFIXES[1:]),
+        key=lambda file: natural_sort_key(file.name),
+    )
+
+
+class BagMessage(NamedTuple):
+    """A message that is not yet decoded.
+
+    Attributes:
+        topic: Its topic.
+        time_ns: When the bag recorded it.
+        decode: Returns the message.
+    """
+
+    topic: str
+    time_ns: int
+    decode: Callable[[], Any]
+
+
+class Bag(contextlib.AbstractContextManager["Bag"]):
+    """An open bag.
+
+    Attributes:
+        name: File name without its suffix.
+        topics: Topic -> message type, such as "std_msgs/msg/Bool".
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open the bag.
+
+        Args:
+            path: .bag, .mcap or .db3 file, or folder of a ROS 2 bag.
+
+        Raises:
+            ImporterError: The package rosbags is missing, or the bag is damaged.
+        """
+        self.name = path.stem if path.is_file() else path.name
+        reader = import_extra("rosbags.highlevel", "a ROS bag").AnyReader
+        types = import_extra("rosbags.typesys", "a ROS bag")
+        files = [path] if (path / "metadata.yaml").is_file() else _storage_files(path)
+        try:
+            # The types are for older bags, which do not contain their definitions.
+            self._reader = reader(files, default_typestore=types.get_typestore(types.Stores.LATEST))
+            self._reader.open()
+        except Exception as error:  # rosbags raises many types for damaged files
+            raise ImporterError(f"its bag cannot be read: {error}; {_REPAIR}") from error
+        self.topics = {connection.topic: connection.msgtype for connection in self._reader.connections}
+
+    def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
+        """Yield the messages of some topics in the order in which they were recorded.
+
+        Raises:
+            ImporterError: The bag is damaged.
+        """
+        connections = [connection for connection in self._reader.connections if connection.topic in topics]
+        messages = self._reader.messages(connections)
+        while True:
+            try:
+                connection, time_ns, data = next(messages)
+            except StopIteration:
+                return
+            except Exception as error:
+                raise ImporterError(f"its bag is damaged: {error}; {_REPAIR}") from error
+            yield BagMessage(connection.topic, time_ns, partial(self._decode, data, connection))
+
+    def _decode(self, data: bytes, connection: Any) -> Any:
+        try:
+            return self._reader.deserialize(data, connection.msgtype)
+        except Exception as error:
+            raise ImporterError(f"a message of {connection.topic} cannot be decoded: {error}") from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._reader.close()
+
+
+def picture_of(message: Any) -> NDArray[np.uint8] | bytes:
+    """Return the picture of an image message.
+
+    Args:
+        message: A sensor_msgs/Image or sensor_msgs/CompressedImage, as rosbags or rclpy returns it.
+
+    Returns:
+        (H, W, 3) red first, or the content of the PNG or JPEG file.
+
+    Raises:
+        ImporterError: The encoding is not supported, or bytes are missing.
+    """
+    if not hasattr(message, "encoding"):
+        return bytes(message.data)
+    if message.encoding not in _CHANNELS:
+        raise ImporterError(f"the encoding of its images must be {', '.join(_CHANNELS)}, got {message.encoding!r}")
+    channels = _CHANNELS[message.encoding]
+    data = np.frombuffer(message.data, np.uint8)  # rclpy: array.array
+    if data.size != message.height * message.step or message.step < message.width * channels:
+        raise ImporterError(
+            f"an image of {message.height} x {message.width} pixels has {data.size} bytes, {message.step} in a row"
+        )
+    rows = data.reshape(message.height, message.step)
+    pixels = rows[:, : message.width * channels].reshape(message.height, message.width, channels)
+    if channels == 1:
+        return np.repeat(pixels, 3, axis=2)
+    return pixels if message.encoding == "rgb8" else pixels[..., ::-1]
+
+
+# The first pass: times and numbers ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Topics:
+    """Topics of the options; `touch` has one per finger, the others are empty if not used."""
+
+    touch: tuple[str, ...]
+    photo: str
+    gripper: str
+    grasp: str
+    object: str
+
+    def types(self) -> dict[str, tuple[str, ...]]:
+        """Return the accepted message types of each topic in use."""
+        images = dict.fromkeys((*self.touch, self.photo), _IMAGES)
+        others = {
+            self.gripper: ("sensor_msgs/msg/JointState",),
+            self.grasp: ("std_msgs/msg/Bool",),
+            self.object: ("std_msgs/msg/String",),
+        }
+        return images | {topic: types for topic, types in others.items() if topic}
+
+    def check(self, bag: Bag) -> None:
+        """Raise ImporterError if a topic is missing in the bag, or of another type."""
+        for topic, types in self.types().items():
+            if bag.topics.get(topic) not in types:
+                known = ", ".join(f"{name} ({kind})" for name, kind in sorted(bag.topics.items()))
+                raise ImporterError(
+                    f"its bag must have the topic {topic} of type {' or '.join(types)}; choose topics with --option "
+                    f"touch_a=... touch_b=... photo=... from: {known or 'none'}"
+                )
+
+
+@dataclass
+class _Scan:
+    """Times and numbers from one bag.
+
+    Attributes:
+        times: Topic -> when the bag recorded its messages, in ns; images that cannot be decoded are left out.
+        values: Topic of grasp or object -> its messages' values.
+        openings_mm: Opening in each message of the gripper; NaN if it has no positions.
+        forces_n: Force in each message of the gripper; NaN if it has no efforts.
+        changes: Topic of a finger -> mean change of each gel image from the first one, in grey levels.
+        changed: The same as the fraction of the gel's area that changed; empty if a topic marks the grasps.
+        unreadable: Topic -> number of images that cannot be decoded or have another size.
+        first_ns: When the first message was recorded.
+    """
+
+    times: dict[str, "array[int]"] = field(default_factory=lambda: defaultdict(lambda: array("q")))
+    values: dict[str, list[bool | str]] = field(default_factory=lambda: defaultdict(list))
+    openings_mm: "array[float]" = field(default_factory=lambda: array("d"))
+    forces_n: "array[float]" = field(default_factory=lambda: array("d"))
+    changes: dict[str, "array[float]"] = field(default_factory=lambda: defaultdict(lambda: array("d")))
+    changed: dict[str, "array[float]"] = field(default_factory=lambda: defaultdict(lambda: array("d")))
+    unreadable: Counter[str] = field(default_factory=Counter)
+    first_ns: int = 0
+
+    def latest(self, topic: str, time_ns: int) -> int | None:
+        """Return the number of the last message of a topic at or before a time; None if there is none."""
+        after = int(np.searchsorted(self.times[topic], time_ns, "right"))
+        return after - 1 if after else None
+
+    def latest_value(self, topic: str, time_ns: int) -> bool | str | None:
+        """Return the value of this message of grasp or object."""
+        number = self.latest(topic, time_ns)
+        return None if number is None else self.values[topic][number]
+
+
+def _scan_bag(bag: Bag, topics: _Topics) -> _Scan:
+    """Read all messages of the topics once; each gel image is compared with the first one of its topic."""
+    topics.check(bag)
+    scan = _Scan()
+    gate = None if topics.grasp else ContactAreaGate()
+    first: dict[str, NDArray[np.uint8]] = {}
+    for topic, time_ns, decode in bag.messages(topics.types()):
+        message = decode()
+        scan.first_ns = scan.first_ns or time_ns
+        if topic in topics.touch:
+            picture = picture_of(message)
+            gel = decode_picture(picture) if isinstance(picture, bytes) else picture
+            if gel is None or gel.shape != first.setdefault(topic, gel.copy()).shape:
+                scan.unreadable[topic] += 1
+                continue
+            scan.changes[topic].append(float(np.mean(np.abs(np.subtract(gel, first[topic], dtype=np.int16)))))
+            if gate is not None:
+                scan.changed[topic].append(gate.changed_fractions({"": GraspFrames(first[topic], gel)})[""])
+        elif topic == topics.photo:
+            picture_of(message)  # its encoding is checked
+        elif topic == topics.gripper:
+            scan.openings_mm.append(1000 * float(np.sum(message.position)) if len(message.position) else np.nan)
+            scan.forces_n.append(float(np.mean(np.abs(message.effort))) if len(message.effort) else np.nan)
+        else:
+            scan.values[topic].append(message.data)
+        scan.times[topic].append(time_ns)
+    return scan
+
+
+class _Grasp(NamedTuple):
+    """When the images of one grasp were recorded, in ns; the gel images of each finger."""
+
+    photo: int
+    no_contact: tuple[int, ...]
+    touch: tuple[int, ...]
+
+
+def _find_grasps(scan: _Scan, topics: _Topics, contact: float, settle_s: float) -> list[_Grasp | str]:
+    """Return the grasps of a bag in order of time; a text is the reason why one is not usable."""
+    first, *others = (np.array(scan.times[topic], np.int64) for topic in topics.touch)
+    if not len(first) or not all(map(len, others)):
+        return []
+    # Everything is on the clock of the first finger: the other fingers' images nearest in time belong to its images.
+    numbers = [np.arange(len(first)), *(_nearest(times, first) for times in others)]
+    fingers = list(zip(topics.touch, numbers, strict=True))
+    if topics.grasp:
+        is_held = np.array([bool(scan.latest_value(topics.grasp, time_ns)) for time_ns in first.tolist()])
+    else:
+        is_held = np.any([np.array(scan.changed[topic])[number] >= contact for topic, number in fingers], axis=0)
+    strength = np.sum([np.array(scan.changes[topic])[number] for topic, number in fingers], axis=0)
+    photos = np.array(scan.times[topics.photo], np.int64)
+    clocks = [clock[number] for clock, number in zip((first, *others), numbers, strict=True)]
+    found: list[_Grasp | str] = []
+    released = 0
+    for start, stop in _intervals(first, is_held, int(settle_s * 1e9)):
+        before = photos[(photos < first[start]) & ((photos >= first[released]) | (released == 0))]
+        if start == released:
+            found.append("there is no gel image before its contact")
+        elif not len(before):
+            found.append("there is no camera image between the previous grasp and its contact")
+        else:
+            middle = (first[released] + first[start]) // 2
+            rest = max(int(np.searchsorted(first, middle, "right")) - 1, released)
+            peak = start + int(np.argmax(strength[start:stop]))
+            no_contact, touch = (tuple(int(clock[at]) for clock in clocks) for at in (rest, peak))
+            found.append(_Grasp(int(before[-1]), no_contact, touch))
+        released = stop
+    return found
+
+
+def _nearest(times: NDArray[np.int64], to: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Return the number of the time that is nearest to each of the others."""
+    after = np.clip(np.searchsorted(times, to), 1, max(len(times) - 1, 1))
+    is_before = to - times[after - 1] <= times[np.minimum(after, len(times) - 1)] - to
+    return np.where(is_before | (len(times) == 1), after - 1, after)
+
+
+def _intervals(times: NDArray[np.int64], is_held: NDArray[np.bool_], settle_ns: int) -> list[tuple[int, int]]:
+    """Return first and end number of each run of true values, after joining near runs and leaving out short ones."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], is_held, [False]]).astype(np.int8)))
+    joined: list[tuple[int, int]] = []
+    for start, stop in edges.reshape(-1, 2).tolist():
+        if joined and times[start] - times[joined[-1][1]] < settle_ns:
+            joined[-1] = (joined[-1][0], stop)
+        else:
+            joined.append((start, stop))
+    return [(start, stop) for start, stop in joined if times[min(stop, len(times) - 1)] - times[start] >= settle_ns]
+
+
+# The second pass: images -------------------------------------------------------------------------------------
+
+
 def _items(
-    path: Path, scan: BagScan, grasps: Sequence[BagGrasp | str], topics: BagTopics, start_ns: int
+    path: Path, scan: _Scan, grasps: Sequence[_Grasp | str], topics: _Topics, start_ns: int
 ) -> Iterator[Item | Skip]:
     """Yield the grasps of a bag, in one more pass over its images; only those of one grasp are in memory."""
     places: dict[tuple[str, int], list[tuple[str, str]]] = defaultdict(list)
@@ -160,8 +453,10 @@ def _items(
             sequence = f"{bag.name}-{object_id}" if topics.object else bag.name
             facts = {"object_id": object_id, "sequence_id": sequence, "time_s": time_s}
             fields[name] = {**facts, **_fields(grasp, scan, topics)}
-            for column, place in _places(grasp, topics).items():
-                places[place].append((name, column))
+            places[topics.photo, grasp.photo].append((name, "photo"))
+            for finger, topic, rest, touch in zip(ascii_lowercase, topics.touch, *grasp[1:], strict=False):
+                places[topic, touch].append((name, f"touch_{finger}"))
+                places[topic, rest].append((name, f"touch_{finger}_before"))
         images: dict[str, dict[str, Source]] = defaultdict(dict)
         for message in bag.messages((*topics.touch, topics.photo)):
             for name, column in places.pop((message.topic, message.time_ns), ()):
@@ -171,15 +466,7 @@ def _items(
                     yield Item(name, str(facts.pop("object_id")), images.pop(name), facts)
 
 
-def _places(grasp: BagGrasp, topics: BagTopics) -> dict[str, tuple[str, int]]:
-    """Return topic and time of the image of each column."""
-    found = {"photo": (topics.photo, grasp.photo)}
-    for finger, topic, rest, touch in zip(ascii_lowercase, topics.touch, grasp.no_contact, grasp.touch, strict=False):
-        found |= {f"touch_{finger}": (topic, touch), f"touch_{finger}_before": (topic, rest)}
-    return found
-
-
-def _fields(grasp: BagGrasp, scan: BagScan, topics: BagTopics) -> dict[str, float]:
+def _fields(grasp: _Grasp, scan: _Scan, topics: _Topics) -> dict[str, float]:
     """Return the time between the fingers' images, and opening and force at the touch, as far as they were recorded."""
     found = {"touch_skew_s": (max(grasp.touch) - min(grasp.touch)) / 1e9} if len(grasp.touch) > 1 else {}
     number = scan.latest(topics.gripper, grasp.touch[0])

@@ -14,7 +14,7 @@ import retrieval
 from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
 from retrieval.model.touches import TouchReader
 from retrieval.search.build.build_index import build_index
-from robot.importers.bag_reader import Bag
+from robot.importers.rosbag import Bag
 from tests import synthetic
 from tests.integrations import fake_rclpy
 from tests.miniatures import rosbag

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from retrieval import BadInput, QueryResult, Searcher, Verification
 from robot.errors import ImporterError
-from robot.importers.bag_reader import picture_of, stamp_ns
+from robot.importers.rosbag import picture_of
 
 GelPicture = NDArray[np.uint8] | bytes
 """(H, W, 3) red first, or the content of a PNG or JPEG file."""
@@ -64,8 +64,9 @@ class GelTopic:
             self.picture, self._fault = picture_of(message), ""
         except ImporterError as error:
             self.picture, self._fault = None, str(error)
-        # A camera whose clock is ahead must not make old images look new.
-        self.time_ns = min(stamp_ns(message, received_ns), received_ns)
+        stamp = message.header.stamp
+        # A camera whose clock is ahead must not make old images look new; one without a clock states 0.
+        self.time_ns = min(stamp.sec * 10**9 + stamp.nanosec or received_ns, received_ns)
         self._arrivals_ns.append(received_ns)
 
     def state(self, now_ns: int, max_age_s: float) -> GelTopicState:
