@@ -1,4 +1,4 @@
-"""Pictures of your own, found by patterns or listed in a CSV or JSONL file.
+"""Pictures of your own, found by patterns or listed in a CSV file.
 
     <object>/touch_*.png     by the pattern `touch`
     <object>/photo_*.jpg     by the pattern `photo`
@@ -13,24 +13,23 @@ photos match, the first touch gets the first photo, the second touch the second 
 `background` is a pattern for the no-contact frames: `rest_{finger}.png` for one per finger, `{object}/rest.png` for one
 per object. Links to other folders are followed.
 
-Instead of patterns, `pairs` names a file below the folder: CSV with a header, or JSONL. Each line is a grasp with
-`object`, `photo` and `touch` (or `touch_a`, `touch_b`), and optionally `background` (or `touch_a_before`, ...),
-`sequence`, `force_n`, `opening_mm` and `time_s`. Paths are relative to the folder. The file is read line by line.
+Instead of patterns, `pairs` names a CSV file below the folder, with a header. Each line is a grasp with `object`,
+`photo` and `touch` (or `touch_a`, `touch_b`), and optionally `background` (or `touch_a_before`, ...), `sequence`,
+`force_n`, `opening_mm` and `time_s`. Paths are relative to the folder.
 """
 
 import csv
 import os
 import re
-import sys
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path, PurePosixPath
 from string import ascii_lowercase
-from typing import Any, NoReturn
+from typing import NoReturn
 
-from robot.errors import ImporterError, RecordingError
+from robot.errors import ImporterError
 from robot.importers.importing import (
     NOT_STATED,
     DataSet,
@@ -43,7 +42,6 @@ from robot.importers.importing import (
     safe_name,
 )
 from robot.recording.folder import Recording, SharedImage
-from robot.storage import parse_object
 
 DATA_SET = DataSet(
     source="your own pictures",
@@ -59,8 +57,6 @@ _WORD = re.compile(r"(\{\w+\}|\*)")
 _COLUMNS = {"object": "object_id", "touch": "touch_a", "background": "touch_a_before", "sequence": "sequence_id"}
 _NUMBERS = ("force_n", "opening_mm", "time_s")
 _TOUCH = re.compile("touch_[a-z]")
-_LINE = 1 << 20
-"""Maximum characters of a line in a file of pairs; a longer line is split, and each part is read as a line."""
 
 Words = Mapping[str, str]
 
@@ -147,94 +143,69 @@ class _PatternMatches:
 
     def __init__(self, src: Path, touch: str, photo: str, background: str) -> None:
         self.src = src
-        self._touch, self._photo = _Pattern("touch", touch), _Pattern("photo", photo)
-        self._background = _Pattern("background", background) if background else None
-        for option, pattern in (("touch", self._touch), ("photo", self._photo)):
+        self._touch, photo_pattern = _Pattern("touch", touch), _Pattern("photo", photo)
+        for option, pattern in (("touch", self._touch), ("photo", photo_pattern)):
             if "object" not in pattern.words:
                 raise ImporterError(f"the pattern {option} must contain {{object}}, such as {{object}}/touch_*")
-        self._photos = _MatchingFiles(self._photo, self._touch)
-        self._frames = _MatchingFiles(self._background, self._touch)
-        example, has_touch, names = "", False, set[str]()
-        for path in _pictures(src):
-            example = example or path
-            words, photo_words = self._touch.match(path), self._photo.match(path)
-            if words and photo_words:
-                raise ImporterError(f"{path} matches both patterns; change touch or photo so that only one matches")
-            if words:
-                has_touch = True
-                names.add(words.get("finger", ""))
-            self._photos.add(path)
-            self._frames.add(path)
-        for option, text, is_found in (("touch", touch, has_touch), ("photo", photo, bool(self._photos))):
-            if not is_found:
-                content = f"only others, such as {example}" if example else "no picture at all"
+        files = list(_pictures(src))
+        touches = [(path, words) for path in files if (words := self._touch.match(path))]
+        if both := next((path for path, _ in touches if photo_pattern.match(path)), None):
+            raise ImporterError(f"{both} matches both patterns; change touch or photo so that only one matches")
+        self._photos = _MatchingFiles(photo_pattern, self._touch, files)
+        self._frames = _MatchingFiles(_Pattern("background", background), self._touch, files if background else ())
+        self.has_background = bool(self._frames)
+        for option, text, matches in (("touch", touch, touches), ("photo", photo, self._photos)):
+            if not matches:
+                content = f"only others, such as {files[0]}" if files else "no picture at all"
                 raise ImporterError(
                     f"{src} must contain a {option} that matches {text!r}, but contains {content}; "
                     "change the pattern with --option"
                 )
+        names = sorted({words.get("finger", "") for _, words in touches}, key=natural_sort_key)
         if len(names) > len(ascii_lowercase):
-            first = sorted(names, key=natural_sort_key)[:3]
-            raise ImporterError(f"{{finger}} must match at most 26 fingers, got {len(names)}, such as {first}")
-        self.fingers = dict(zip(sorted(names, key=natural_sort_key), ascii_lowercase, strict=False))
-        self.has_background = bool(self._frames)
+            raise ImporterError(f"{{finger}} must match at most 26 fingers, got {len(names)}, such as {names[:3]}")
+        self.fingers = dict(zip(names, ascii_lowercase, strict=False))
         self._repeated: list[str] = []
-        self._grasps = self._group_by_words()
-
-    def _group_by_words(self) -> dict[tuple[str, ...], list[str]]:
-        """Return a dictionary: words without the finger -> path of each finger's picture ("" if it is missing)."""
-        grasps: dict[tuple[str, ...], list[str]] = {}
-        position = {finger: number for number, finger in enumerate(self.fingers)}
-        for path in _pictures(self.src):
-            if (words := self._touch.match(path)) and words.get("finger", "") in position:
-                others = (value for key, value in words.items() if key not in ("object", "finger"))
-                paths = grasps.setdefault((sys.intern(words["object"]), *others), [""] * len(position))
-                if paths[position[words.get("finger", "")]]:
-                    self._repeated.append(path)
-                else:
-                    paths[position[words.get("finger", "")]] = path
-        return grasps
-
-    @property
-    def total(self) -> int:
-        """Number of items."""
-        return len(self._grasps) + len(self._repeated)
+        self._grasps: dict[tuple[str, ...], dict[str, str]] = defaultdict(
+            dict
+        )  # words without finger -> finger -> path
+        for path, words in touches:
+            others = (value for key, value in words.items() if key not in ("object", "finger"))
+            grasp = self._grasps[words["object"], *others]
+            if grasp.setdefault(words.get("finger", ""), path) != path:
+                self._repeated.append(path)
+        self.total = len(self._grasps) + len(self._repeated)
 
     def items(self) -> Iterator[Item | Skip]:
         """Yield the grasps, and a `Skip` for each unusable touch."""
         assigned: Counter[tuple[str, ...]] = Counter()
         yield from (Skip("another picture of the same grasp and finger was found", path) for path in self._repeated)
         for key, paths in self._grasps.items():
-            name, words = safe_name(*key), self._touch.match(next(filter(None, paths))) or {}
+            name, words = safe_name(*key), self._touch.match(next(iter(paths.values()))) or {}
             photos, group = self._photos.of(words)
-            if not all(paths):
+            if len(paths) < len(self.fingers):
                 yield Skip("a finger has no picture", name)
             elif not photos:
                 yield Skip("no photo matches it", name)
             else:
-                photo = photos[assigned[group] % len(photos)]
+                images: Images = {"photo": _shared(self.src, photos[assigned[group] % len(photos)])}
                 assigned[group] += 1
-                images: Images = {"photo": _shared(self.src, photo)}
-                for letter, path in zip(self.fingers.values(), paths, strict=True):
-                    column = f"touch_{letter}"
-                    before = self._frames.of(self._touch.match(path) or {})[0]
-                    images = {**images, column: self.src / path}
-                    if before:
-                        images[f"{column}_before"] = _shared(self.src, before[0])
+                for finger, letter in self.fingers.items():
+                    images = {**images, f"touch_{letter}": self.src / paths[finger]}
+                    if before := self._frames.of(self._touch.match(paths[finger]) or {})[0]:
+                        images[f"touch_{letter}_before"] = _shared(self.src, before[0])
                 yield Item(name, key[0], images, {"sequence_id": words.get("sequence")})
 
 
 class _MatchingFiles:
     """The files that match a pattern, grouped by the words that it has in common with the pattern of the touches."""
 
-    def __init__(self, pattern: _Pattern | None, others: _Pattern) -> None:
-        self._pattern = pattern
-        self._words = sorted(pattern.words & others.words) if pattern else []
+    def __init__(self, pattern: _Pattern, others: _Pattern, files: Iterable[str]) -> None:
+        self._words = sorted(pattern.words & others.words)
         self._files: dict[tuple[str, ...], list[str]] = defaultdict(list)
-
-    def add(self, path: str) -> None:
-        """Add a file if it matches the pattern."""
-        if self._pattern and (words := self._pattern.match(path)):
-            self._files[self._key(words)].append(path)
+        for path in files:
+            if words := pattern.match(path):
+                self._files[self._key(words)].append(path)
 
     def __bool__(self) -> bool:
         return bool(self._files)
@@ -290,28 +261,26 @@ class _PairsFile:
     def __init__(self, src: Path, pairs: str) -> None:
         self.src, self._file = src, src / pairs
         if not os.path.isfile(self._file):
-            raise ImporterError(f"{self._file} must be a CSV or JSONL file of pairs, but does not exist")
-        first = next((row for row in self._rows() if isinstance(row, dict)), None)
-        if first is None or not (self._fingers(first) and {"object_id", "photo"} <= first.keys()):
+            raise ImporterError(f"{self._file} must be a CSV file of pairs, but does not exist")
+        first = next(self._rows(), {})
+        self.fingers = sorted(filter(_TOUCH.fullmatch, first))
+        if not self.fingers or not {"object_id", "photo"} <= first.keys():
             raise ImporterError(
                 f"{self._file} must contain object, photo and touch (or touch_a, touch_b, ...) in each line"
             )
-        self.fingers = self._fingers(first)
         self.has_background = any(column.endswith("_before") for column in first)
         self.total = sum(1 for _ in self._rows())
 
     def items(self) -> Iterator[Item | Skip]:
         """Yield a grasp for each line, and a `Skip` for each unusable one."""
+        required = ("photo", *self.fingers)
         for number, row in enumerate(self._rows(), start=1):
-            if isinstance(row, str):
-                yield Skip(row, f"number {number}")
-                continue
-            name = safe_name(row.get("object_id") or "", str(number))
-            columns = ("photo", *self.fingers, *(f"{finger}_before" for finger in self.fingers))
+            name = safe_name(row["object_id"], str(number))
+            columns = (*required, *(f"{finger}_before" for finger in self.fingers))
             paths = {column: row[column] for column in columns if row.get(column)}
-            if self._fingers(row) != self.fingers or not paths.get("photo") or not row.get("object_id"):
+            if not row["object_id"] or not all(row[column] for column in required):
                 yield Skip("its line lacks the object, the photo or a touch", name)
-            elif any(not _is_inside(path) for path in paths.values()):
+            elif any(path.startswith("/") or ".." in PurePosixPath(path).parts for path in paths.values()):
                 yield Skip("a path must be relative to the folder and lead to a file below it", name)
             elif (numbers := _numbers(row)) is None:
                 yield Skip(f"{', '.join(_NUMBERS)} must be numbers", name)
@@ -322,47 +291,19 @@ class _PairsFile:
                 }
                 yield Item(name, row["object_id"], images, {"sequence_id": row.get("sequence_id") or None, **numbers})
 
-    def _fingers(self, row: Mapping[str, Any]) -> list[str]:
-        return sorted(column for column in row if _TOUCH.fullmatch(column) and row[column])
-
-    def _rows(self) -> Iterator[dict[str, Any] | str]:
-        """Yield rows by column name, or the reason why a row is unusable."""
+    def _rows(self) -> Iterator[dict[str, str]]:
+        """Yield rows with columns named as in a recording; a missing value is empty."""
         try:
             with open(self._file, encoding="utf-8-sig", newline="") as file:
-                lines = iter(lambda: file.readline(_LINE), "")
-                rows = csv.DictReader(lines) if self._file.suffix.lower() == ".csv" else _documents(lines)
-                for row in rows:
-                    yield row if isinstance(row, str) else _rename_columns(row)
+                for row in csv.DictReader(file):
+                    plain = {key.removesuffix("_file_name"): value or "" for key, value in row.items() if key}
+                    yield {_COLUMNS.get(key, key): value for key, value in plain.items()}
         except (csv.Error, UnicodeDecodeError) as error:
-            raise ImporterError(f"{self._file} must be CSV with a header, or JSONL, in UTF-8: {error}") from error
+            raise ImporterError(f"{self._file} must be CSV with a header, in UTF-8: {error}") from error
 
 
-def _documents(lines: Iterator[str]) -> Iterator[dict[str, Any] | str]:
-    for line in lines:
-        if line.strip():
-            try:
-                yield parse_object(line.encode(), RecordingError)
-            except RecordingError:
-                yield "its line is not a JSON object"
-
-
-def _rename_columns(row: Mapping[Any, Any]) -> dict[str, Any]:
-    """Rename columns as in a recording. Values other than text and numbers are treated as missing."""
-    plain = {str(key).removesuffix("_file_name"): value for key, value in row.items() if key is not None}
-    return {
-        _COLUMNS.get(key, key): value
-        for key, value in plain.items()
-        if isinstance(value, str | int | float) and (key in _NUMBERS or isinstance(value, str))
-    }
-
-
-def _is_inside(path: str) -> bool:
-    parts = PurePosixPath(path).parts
-    return bool(parts) and ".." not in parts and not path.startswith("/") and "\\" not in path and path.isprintable()
-
-
-def _numbers(row: Mapping[str, Any]) -> dict[str, float] | None:
+def _numbers(row: Mapping[str, str]) -> dict[str, float] | None:
     try:
-        return {name: float(row[name]) for name in _NUMBERS if row.get(name) not in (None, "")}
-    except (ValueError, OverflowError):
+        return {name: float(row[name]) for name in _NUMBERS if row.get(name)}
+    except ValueError:
         return None
