@@ -14,8 +14,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
-from robot.errors import ImporterError
-from robot.importers.importing import DataSet, Item, Progress, Skip, import_items, subfolders
+from robot.importers.importing import DataSet, Item, Progress, Skip, import_items, numbered_files, subfolders
 from robot.recording.folder import Recording
 
 DATA_SET = DataSet(
@@ -33,7 +32,7 @@ DATA_SET = DataSet(
         "state exact (Clopper-Pearson) intervals.",
     ),
 )
-_FILE = re.compile(r"(?P<place>.+)_(?P<kind>touch|photo)\.(png|jpg|jpeg)", re.IGNORECASE)
+_FILE = re.compile(r"(?P<place>[^.].*)_(?P<kind>touch|photo)\.(png|jpg|jpeg)", re.IGNORECASE)
 _Files = dict[str, Path]  # "photo" and "touch" -> file, of one place
 
 
@@ -43,34 +42,21 @@ def import_billets(src: Path, out: Path, progress: Progress | None = None) -> Re
     Raises:
         ImporterError: `src` contains no pair of photo and touch.
     """
-    src = Path(src)
-    total, has_pairs = 0, False
-    for item in _places(src):
-        total, has_pairs = total + 1, has_pairs or isinstance(item, Item)
-    if not has_pairs:
+    items = list(_places(Path(src)))
+    if not any(isinstance(item, Item) for item in items):
         raise DATA_SET.mismatch_error(src, "it contains no pair")
-    return import_items(DATA_SET, _places(src), out, total=total, progress=progress)
+    return import_items(DATA_SET, items, out, total=len(items), progress=progress)
 
 
 def _places(src: Path) -> Iterator[Item | Skip]:
     for billet in subfolders(src):
-        for place, files in sorted(_find_files(billet).items()):
+        places: dict[str, dict[str, Path]] = defaultdict(dict)  # place -> "photo" and "touch" -> file
+        for match, path in numbered_files(billet, _FILE):
+            places[match["place"]][match["kind"].lower()] = path
+        for place, files in sorted(places.items()):
             name = f"{billet.name}-{place}"
             if len(files) < 2:
                 yield Skip("its photo or touch is missing", f"{billet.name}/{next(iter(files.values())).name}")
             else:
                 images = {"photo": files["photo"], "touch_a": files["touch"]}
                 yield Item(name, name, images, {"sequence_id": billet.name})
-
-
-def _find_files(billet: Path) -> dict[str, _Files]:
-    """Return the files of one billet by place."""
-    found: dict[str, _Files] = defaultdict(dict)
-    try:
-        for path in sorted(billet.iterdir()):
-            match = _FILE.fullmatch(path.name)
-            if match and not path.name.startswith("."):
-                found[match["place"]][match["kind"].lower()] = path
-    except OSError as error:
-        raise ImporterError(f"{billet} cannot be read: {error.strerror}") from error
-    return found

@@ -13,7 +13,8 @@ other files are not followed.
 
 import contextlib
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -66,6 +67,7 @@ _COLUMNS = {
     **{f"touch_{finger}_before": f"gelsight{sensor}_before" for finger, sensor in (("a", "A"), ("b", "B"))},
     **{f"touch_{finger}_after": f"gelsight{sensor}_after" for finger, sensor in (("a", "A"), ("b", "B"))},
 }
+_GRIPPING = {0: False, 1: True}
 _MAX_PIXELS = 50_000_000
 _BROKEN = (OSError, KeyError, ValueError, RuntimeError, TypeError)
 """Errors that h5py raises for damaged files."""
@@ -98,41 +100,33 @@ def _count(h5py: Any, path: Path) -> int:
 def _items(h5py: Any, files: list[Path]) -> Iterator[Item | Skip]:
     last_object, run = "", 0
     for path in files:
-        try:
-            file = h5py.File(path)
-        except OSError:
-            yield Skip("its file is not HDF5 or is cut off", path.name)
-            continue
-        with file:
-            for group in _groups(h5py, file):
-                if isinstance(group, Skip):
-                    yield Skip(group.reason, path.name)
-                    continue
-                name = safe_name(path.stem, group.name.rpartition("/")[2])
-                object_id, grasped = _attributes(group)
-                if object_id is None or grasped is None:
+        with contextlib.ExitStack() as stack:
+            try:
+                data = _local(h5py, stack.enter_context(h5py.File(path)), "data")
+                names = sorted(filter(_GRASP.fullmatch, data or ()), key=natural_sort_key)
+            except _BROKEN:
+                yield Skip("its file is not HDF5 or is cut off", path.name)
+                continue
+            if data is None:
+                yield Skip("its file has no /data; it may be of another version", path.name)
+            for key in names:
+                name = safe_name(path.stem, key)
+                group = _local(h5py, data, key)
+                try:
+                    object_id, grasped = _text(group.attrs["object_name"]), _GRIPPING[group.attrs["is_gripping"]]
+                except (*_BROKEN, AttributeError):
+                    object_id, grasped = "", False
+                if not object_id:
                     yield Skip("its object_name or is_gripping is missing", name)
                     continue
                 if object_id != last_object:
                     last_object, run = object_id, run + 1
-                images: Images = {column: _reader(h5py, group, dataset) for column, dataset in _COLUMNS.items()}
+                images: Images = {column: partial(_read, h5py, group, dataset) for column, dataset in _COLUMNS.items()}
                 yield Item(name, object_id, images, {"grasped": grasped, "sequence_id": f"{object_id}-{run}"})
 
 
-def _groups(h5py: Any, file: Any) -> Iterator[Any]:
-    """Yield the groups of the grasps in a file, in the order of their numbers, or a `Skip` with the reason."""
-    data = _local(h5py, file, "data")
-    if not isinstance(data, h5py.Group):
-        yield Skip("its file has no /data; it may be of another version", "")
-        return
-    try:
-        names = [name for name in data if isinstance(name, str) and _GRASP.fullmatch(name)]
-    except _BROKEN:
-        yield Skip("its file is not HDF5 or is cut off", "")
-        return
-    for name in sorted(names, key=natural_sort_key):
-        group = _local(h5py, data, name)
-        yield group if isinstance(group, h5py.Group) else Skip("a grasp is not a group", "")
+def _text(name: Any) -> str:
+    return (name.decode(errors="replace") if isinstance(name, bytes) else str(name)).strip()
 
 
 def _local(h5py: Any, group: Any, name: str) -> Any:
@@ -143,31 +137,15 @@ def _local(h5py: Any, group: Any, name: str) -> Any:
         return None
 
 
-def _attributes(group: Any) -> tuple[str | None, bool | None]:
+def _read(h5py: Any, group: Any, name: str) -> npt.NDArray[Any]:
+    """Return a picture; raise ImporterError without the name of the file."""
+    dataset = _local(h5py, group, name)
     try:
-        name, grasped = group.attrs.get("object_name"), group.attrs.get("is_gripping")
-    except _BROKEN:
-        return None, None
-    text = name.decode(errors="replace") if isinstance(name, bytes) else str(name) if name is not None else ""
-    try:
-        return text.strip() or None, bool(grasped) if grasped in (0, 1) else None
-    except ValueError:
-        return None, None
-
-
-def _reader(h5py: Any, group: Any, name: str) -> Callable[[], npt.NDArray[Any]]:
-    """Return a function that reads a picture. It raises ImporterError without the name of the file."""
-
-    def read() -> npt.NDArray[Any]:
-        dataset = _local(h5py, group, name)
-        try:
-            if not isinstance(dataset, h5py.Dataset) or dataset.external or dataset.is_virtual:
-                raise ImporterError(f"its {name} is missing")
-            height, width, *colours = (*(dataset.shape or ()), 0, 0)[:3]
-            if dataset.dtype != "uint8" or dataset.ndim != 3 or colours != [3] or height * width > _MAX_PIXELS:
-                raise ImporterError(f"its {name} is not a picture with 8-bit colours")
-            return dataset[()]  # type: ignore[no-any-return]
-        except _BROKEN as error:
-            raise ImporterError(f"its {name} cannot be read; blosc needs pip install hdf5plugin") from error
-
-    return read
+        if not isinstance(dataset, h5py.Dataset) or dataset.external or dataset.is_virtual:
+            raise ImporterError(f"its {name} is missing")
+        height, width, *colours = (*(dataset.shape or ()), 0, 0)[:3]
+        if dataset.dtype != "uint8" or dataset.ndim != 3 or colours != [3] or height * width > _MAX_PIXELS:
+            raise ImporterError(f"its {name} is not a picture with 8-bit colours")
+        return dataset[()]  # type: ignore[no-any-return]
+    except _BROKEN as error:
+        raise ImporterError(f"its {name} cannot be read; blosc needs pip install hdf5plugin") from error

@@ -12,7 +12,7 @@ read again, so a stopped import resumes where it stopped.
 import json
 import os
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
@@ -43,7 +43,6 @@ _END_MARKERS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9"}
 _DIGITS = re.compile(r"[0-9]{1,4000}")
 _TAIL = 65536
 """Bytes that a camera may write after the end of a JPEG."""
-_MAX_VIDEO_PIXELS = 50_000_000
 
 
 @dataclass(frozen=True)
@@ -185,9 +184,8 @@ def import_items(
             raise ImporterError(
                 f"no grasp could be imported: {'; '.join(skipped.notes()) or 'the source contains none'}"
             )
-        splits, rejected = _split_disjoint(metadata.splits)
+        rejected = _write_splits(out, metadata.splits)
         writer.update_info(objects=dict(metadata.objects), skipped=dict(skipped.counts), notes=[*notes, *rejected])
-        _write_splits(out, splits)
     recording = read_recording(out)
     return replace(recording, notes=(*recording.notes, *skipped.notes(), *rejected, *notes))
 
@@ -244,53 +242,40 @@ def picture_bytes(column: str, source: Source) -> bytes:
 
 
 class _SkipCounts:
-    """Counts of skipped grasps by reason, with the first names; at most `_MAX_REASONS` reasons."""
+    """Counts of skipped grasps by reason, with the first names."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
-        self._names: dict[str, list[str]] = {}
+        self._names: dict[str, list[str]] = defaultdict(list)
 
     def add(self, skip: Skip | None) -> None:
-        if skip is None:
-            return
-        reason = skip.reason if skip.reason in self.counts or len(self.counts) < _MAX_REASONS else "another reason"
-        self.counts[reason] += 1
-        if len(names := self._names.setdefault(reason, [])) < _EXAMPLES:
-            names.append(skip.name)
+        if skip is not None:
+            known = skip.reason in self.counts or len(self.counts) < _MAX_REASONS
+            reason = skip.reason if known else "another reason"
+            self.counts[reason] += 1
+            self._names[reason].append(skip.name)
+            del self._names[reason][_EXAMPLES:]
 
     def notes(self) -> list[str]:
         return [f"skipped {n}: {reason}, such as {', '.join(self._names[reason])}" for reason, n in self.counts.items()]
 
 
-# Splits ----------------------------------------------------------------------------------------------------
-
-_Splits = Mapping[str, Mapping[str, Sequence[str]]]
-
-
-def _split_disjoint(splits: _Splits) -> tuple[_Splits, list[str]]:
-    """Return the splits with disjoint objects, and a sentence on each other split: it does not test unseen objects."""
-    disjoint, rejected = {}, []
+def _write_splits(out: Path, splits: Mapping[str, Mapping[str, Sequence[str]]]) -> list[str]:
+    """Write the splits whose parts have different objects; return a sentence on each other split."""
+    rejected = []
     for name, parts in splits.items():
-        counts = Counter(object_id for part in parts.values() for object_id in set(part))
+        counts = Counter(object_id for objects in parts.values() for object_id in set(objects))
         if shared := sum(count > 1 for count in counts.values()):
             rejected.append(
                 f"the published split {name!r} has grasps of {shared} object(s) in two parts, so it does not test "
                 "unseen objects; it is not stored, draw a split by objects"
             )
-        else:
-            disjoint[name] = parts
-    return disjoint, rejected
-
-
-def _write_splits(out: Path, splits: _Splits) -> None:
-    if not splits:
-        return
-    folder = out / SPLITS_FOLDER
-    with storage_errors(folder):
-        folder.mkdir(exist_ok=True)
-        for name, parts in splits.items():
-            split = {"seed": 0, **{part: sorted(parts.get(part, ())) for part in ("train", "validation", "test")}}
-            write_atomically(folder / f"{name}.json", json.dumps(split, indent=1).encode() + b"\n")
+            continue
+        split = {"seed": 0, **{part: sorted(parts.get(part, ())) for part in ("train", "validation", "test")}}
+        with storage_errors(out / SPLITS_FOLDER):
+            (out / SPLITS_FOLDER).mkdir(exist_ok=True)
+            write_atomically(out / SPLITS_FOLDER / f"{name}.json", json.dumps(split, indent=1).encode() + b"\n")
+    return rejected
 
 
 # Files and names of a source --------------------------------------------------------------------------------
@@ -312,34 +297,14 @@ def safe_name(*parts: str) -> str:
     return f"{plain}-{sha256('/'.join(parts).encode(errors='surrogatepass')).hexdigest()[:8]}"
 
 
-@dataclass(frozen=True)
-class NumberedFiles:
-    """Files of a folder whose names match a pattern, in the order of their numbers. Only names are in memory.
+def numbered_files(folder: Path, pattern: re.Pattern[str]) -> list[tuple[re.Match[str], Path]]:
+    """Return the files of a folder whose names match, in natural order; none if the folder does not exist.
 
-    Attributes:
-        folder: The folder.
-        pattern: Pattern of the file names.
-        names: File names in order.
+    Raises:
+        ImporterError: `folder` cannot be read.
     """
-
-    folder: Path
-    pattern: re.Pattern[str]
-    names: Sequence[str]
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def __iter__(self) -> Iterator[tuple[re.Match[str], Path]]:
-        for name in self.names:
-            match = self.pattern.fullmatch(name)
-            assert match is not None
-            yield match, self.folder / name
-
-
-def numbered_files(folder: Path, pattern: re.Pattern[str]) -> NumberedFiles:
-    """Return the files of a folder whose names match, in natural order; none if the folder does not exist."""
-    names = os.listdir(folder) if folder.is_dir() else []
-    return NumberedFiles(folder, pattern, sorted(filter(pattern.fullmatch, names), key=natural_sort_key))
+    names = sorted(_list(folder), key=natural_sort_key) if folder.is_dir() else []
+    return [(match, folder / name) for name in names if (match := pattern.fullmatch(name))]
 
 
 def subfolders(parent: Path) -> list[Path]:
@@ -348,13 +313,15 @@ def subfolders(parent: Path) -> list[Path]:
     Raises:
         ImporterError: `parent` cannot be read.
     """
+    names = sorted((name for name in _list(parent) if not name.startswith(".")), key=natural_sort_key)
+    return [parent / name for name in names if (parent / name).is_dir()]
+
+
+def _list(folder: Path) -> list[str]:
     try:
-        return sorted(
-            (path for path in parent.iterdir() if path.is_dir() and not path.name.startswith(".")),
-            key=lambda path: natural_sort_key(path.name),
-        )
+        return os.listdir(folder)
     except OSError as error:
-        raise ImporterError(f"{parent} cannot be read: {error.strerror}") from error
+        raise ImporterError(f"{folder} cannot be read: {error.strerror}") from error
 
 
 def natural_sort_key(name: str) -> str:
@@ -379,15 +346,3 @@ def import_extra(name: str, purpose: str) -> Any:
         raise ImporterError(
             f"{purpose} needs {name}, which is missing; run pip install 'touch-retrieval[importers]'"
         ) from error
-
-
-def video_stream(container: Any) -> Any:
-    """Return the video stream of a container that PyAV opened.
-
-    Raises:
-        ImporterError: A frame has too many pixels.
-    """
-    stream = container.streams.video[0]
-    if stream.codec_context.width * stream.codec_context.height > _MAX_VIDEO_PIXELS:
-        raise ImporterError(f"its video has more than {_MAX_VIDEO_PIXELS} pixels")
-    return stream

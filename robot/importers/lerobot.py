@@ -37,7 +37,6 @@ from robot.importers.importing import (
     import_extra,
     import_items,
     safe_name,
-    video_stream,
 )
 from robot.recording.folder import Recording
 from robot.storage import decode_picture, read_json_object
@@ -230,7 +229,7 @@ class _LeRobotSource:
         end = start + (row["length"] - 0.5) / self._fps
         try:
             video = self._open_video(key, path)
-            stream = video_stream(video)
+            stream = video.streams.video[0]
             video.seek(int(start / stream.time_base), stream=stream)
             for frame in video.decode(stream):
                 if frame.time is not None and frame.time >= start - 0.5 / self._fps:

@@ -11,8 +11,8 @@ the file names, part by part.
 
 import heapq
 import re
-from collections.abc import Iterator
-from functools import cached_property, partial
+from collections.abc import Callable, Iterator
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,6 @@ from robot.importers.importing import (
     import_items,
     numbered_files,
     safe_name,
-    video_stream,
 )
 from robot.recording.folder import Recording, SharedImage
 
@@ -74,7 +73,7 @@ def import_physiclear(src: Path, out: Path, progress: Progress | None = None, *,
     if frames < 1:
         raise ImporterError(f"frames must be at least 1, got {frames}")
     videos = numbered_files(src / "dataset" if (src / "dataset").is_dir() else src, _VIDEO)
-    if not len(videos):
+    if not videos:
         raise DATA_SET.mismatch_error(src, "it contains no such video")
     import_extra("av", _WHAT)
     items = (item for match, path in videos for item in _items(match["part"], path, frames))
@@ -83,68 +82,53 @@ def import_physiclear(src: Path, out: Path, progress: Progress | None = None, *,
 
 def _items(part: str, path: Path, frames: int) -> Iterator[Item | Skip]:
     sequence = safe_name(path.stem)
-    video = StrongestFrames(path, frames)
-    before = SharedImage(safe_name(sequence, "no_contact"), video.no_contact)  # type: ignore[arg-type]  # import_items calls it
-    for number in range(frames):
-        name = safe_name(sequence, str(number + 1))
-        touch = SharedImage(name, partial(video.frame, number))  # type: ignore[arg-type]
+    read = cache(partial(strongest_frames, path, frames))  # decoded once, on first use
+    before = SharedImage(safe_name(sequence, "no_contact"), lambda: read()[0])  # type: ignore[arg-type]  # import_items calls it
+    for number in range(1, frames + 1):
+        name = safe_name(sequence, str(number))
+        touch = SharedImage(name, partial(_frame, read, number))  # type: ignore[arg-type]
         images = {"photo": touch, "touch_a": touch, "touch_a_before": before}
         yield Item(name, part, images, {"sequence_id": sequence})
 
 
-class StrongestFrames:
-    """The frames of strongest contact in one video, which is decoded once, on first use.
+def _frame(read: Callable[[], list[Frame]], number: int) -> Frame:
+    return read()[number]
 
-    Reading raises ImporterError.
+
+def strongest_frames(path: Path, count: int) -> list[Frame]:
+    """Return the first frame of a video, and those that differ most from it, in order of time.
+
+    Args:
+        path: The video.
+        count: Number of frames besides the first.
+
+    Returns:
+        1 + count frames: (H, W, 3) uint8, RGB.
+
+    Raises:
+        ImporterError: The video cannot be decoded, or too few of its frames differ from the first.
     """
+    decoded = _decoded(path)
+    first = next(decoded, None)
+    if first is None:
+        raise ImporterError("its video contains no frame")
+    strongest: list[tuple[float, int, Frame]] = []
+    for number, frame in enumerate(decoded):
+        change = float(np.abs(frame.astype(np.int16) - first).mean())
+        # Among equal changes the earlier frame stays. Numbers differ, so frames are never compared.
+        heapq.heappush(strongest, (change, -number, frame))
+        if len(strongest) > count:
+            heapq.heappop(strongest)
+    if len(strongest) < count or not strongest[0][0]:
+        raise ImporterError(f"its video must have at least {count} frames that differ from the first one")
+    return [first, *(frame for _, _, frame in sorted(strongest, key=lambda entry: -entry[1]))]
 
-    def __init__(self, path: Path, count: int) -> None:
-        """Store the path; nothing is decoded yet.
 
-        Args:
-            path: The video.
-            count: Number of frames.
-        """
-        self._path, self._count = path, count
-
-    def no_contact(self) -> Frame:
-        """Return the first frame: (H, W, 3) uint8, RGB."""
-        return self._read[0]
-
-    def frame(self, number: int) -> Frame:
-        """Return one of the frames of strongest contact: (H, W, 3) uint8, RGB.
-
-        Args:
-            number: Its number in order of time, from 0.
-        """
-        return self._read[1 + number]
-
-    @cached_property
-    def _read(self) -> list[Frame]:
-        decoded = self._decoded()
-        first = next(decoded, None)
-        if first is None:
-            raise ImporterError("its video contains no frame")
-        strongest: list[tuple[float, int, Frame]] = []
-        for number, frame in enumerate(decoded):
-            if frame.shape != first.shape:
-                raise ImporterError("the frames of its video differ in size")
-            change = float(np.abs(frame.astype(np.int16) - first).mean())
-            # Among equal changes the earlier frame stays. Numbers differ, so frames are never compared.
-            heapq.heappush(strongest, (change, -number, frame))
-            if len(strongest) > self._count:
-                heapq.heappop(strongest)
-        if len(strongest) < self._count:
-            raise ImporterError(f"its video must have at least {1 + self._count} frames, got {1 + len(strongest)}")
-        if not strongest[0][0]:
-            raise ImporterError("its video has too few frames that differ from the first one")
-        return [first, *(frame for _, _, frame in sorted(strongest, key=lambda entry: -entry[1]))]
-
-    def _decoded(self) -> Iterator[Frame]:
-        av = import_extra("av", _WHAT)
-        try:
-            with av.open(str(self._path)) as video:
-                for frame in video.decode(video_stream(video)):
-                    yield frame.to_ndarray(format="rgb24")
-        except (av.error.FFmpegError, OSError, ValueError, IndexError) as error:
-            raise ImporterError("its video cannot be decoded") from error
+def _decoded(path: Path) -> Iterator[Frame]:
+    av = import_extra("av", _WHAT)
+    try:
+        with av.open(str(path)) as video:
+            for frame in video.decode(video=0):
+                yield frame.to_ndarray(format="rgb24")
+    except (av.error.FFmpegError, OSError, ValueError, IndexError) as error:
+        raise ImporterError("its video cannot be decoded") from error

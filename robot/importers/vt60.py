@@ -64,12 +64,11 @@ _SAME_OBJECTS = {"bottleempty": "bottle", "bottlefull": "bottle"}
 
 @dataclass(frozen=True)
 class _Instance:
-    """The folders of one instance, and its number of touches."""
+    """One object: its touches and its folder of photos."""
 
     object_id: str
-    touch: Path
+    touches: list[tuple[re.Match[str], Path]]
     vision: Path
-    count: int
     metadata: dict[str, Any]
 
 
@@ -83,7 +82,10 @@ def import_vt60(src: Path, out: Path, progress: Progress | None = None) -> Recor
     for part in ("touch", "vision"):
         if not (src / part).is_dir():
             raise DATA_SET.mismatch_error(src, f"it has no {part}/ (the folder is code/data/vt60 of the repository)")
-    objects = [instance for instance in map(_read_instance, _instances(src)) if instance.count]
+    classes = (folder for folder in subfolders(src / "touch") if _CLASS.fullmatch(folder.name))
+    folders = (folder for kind in classes for folder in subfolders(kind))
+    found = ((folder, numbered_files(folder, _TOUCH)) for folder in folders)
+    objects = [_read_instance(src, folder, touches) for folder, touches in found if touches]
     if not objects:
         raise DATA_SET.mismatch_error(
             src, "it contains no touch_<id>_img_<k>_name_<class>_<nickname>_at_<x>_<y>_<z>.jpg"
@@ -94,26 +96,16 @@ def import_vt60(src: Path, out: Path, progress: Progress | None = None) -> Recor
         DATA_SET if has_frame else replace(DATA_SET, background="none"),
         _items(src, objects, no_contact if has_frame else None),
         out,
-        total=sum(instance.count for instance in objects),
+        total=sum(len(instance.touches) for instance in objects),
         progress=progress,
         metadata=DataSetMetadata({instance.object_id: instance.metadata for instance in objects}),
     )
 
 
-def _instances(src: Path) -> Iterator[Path]:
-    """Yield the folders touch/<NN_class>/<II>."""
-    for kind in subfolders(src / "touch"):
-        if _CLASS.fullmatch(kind.name):
-            yield from subfolders(kind)
-
-
-def _read_instance(folder: Path) -> _Instance:
+def _read_instance(src: Path, folder: Path, touches: list[tuple[re.Match[str], Path]]) -> _Instance:
     kind, instance = folder.parent.name, folder.name
-    found = numbered_files(folder, _TOUCH)
-    name = kind.partition("_")[2]
-    metadata = {"class": name, "instance": instance, "nickname": next((match["nickname"] for match, _ in found), None)}
-    vision = folder.parents[2] / "vision" / kind / instance
-    return _Instance(safe_name(kind, instance), folder, vision, len(found), metadata)
+    metadata = {"class": kind.partition("_")[2], "instance": instance, "nickname": touches[0][0]["nickname"]}
+    return _Instance(safe_name(kind, instance), touches, src / "vision" / kind / instance, metadata)
 
 
 def _items(src: Path, objects: list[_Instance], no_contact: Path | None) -> Iterator[Item | Skip]:
@@ -126,15 +118,14 @@ def _items(src: Path, objects: list[_Instance], no_contact: Path | None) -> Iter
         photos = [path for _, path in numbered_files(instance.vision, _PHOTO)]
         common = _SAME_OBJECTS.get(instance.metadata["class"])
         sequence = f"{common}-{instance.metadata['nickname']}" if common else instance.object_id
-        for number, (match, touch) in enumerate(numbered_files(instance.touch, _TOUCH)):
+        for number, (match, touch) in enumerate(instance.touches):
             name = safe_name(instance.object_id, match[2])
             if not photos:
                 yield Skip("its object has no photo", name)
-                continue
-            if no_contact and touch.is_file() and filecmp.cmp(touch, no_contact, shallow=False):
+            elif no_contact and touch.is_file() and filecmp.cmp(touch, no_contact, shallow=False):
                 yield Skip("its touch is the no-contact frame itself", name)
-                continue
-            photo = photos[number % len(photos)]
-            shared = SharedImage(safe_name(instance.object_id, photo.stem), photo)
-            images: Images = {"photo": shared, "touch_a": touch, **background}
-            yield Item(name, instance.object_id, images, {"sequence_id": sequence})
+            else:
+                photo = photos[number % len(photos)]
+                shared = SharedImage(safe_name(instance.object_id, photo.stem), photo)
+                images: Images = {"photo": shared, "touch_a": touch, **background}
+                yield Item(name, instance.object_id, images, {"sequence_id": sequence})
