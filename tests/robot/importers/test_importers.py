@@ -1,9 +1,9 @@
 """Common behaviour of all importers, on a miniature of each data set; test_<name>.py tests each importer."""
 
 import re
+import sys
 from hashlib import sha256
 from importlib import import_module
-from pathlib import Path
 
 import cv2
 import pytest
@@ -187,13 +187,27 @@ def test_the_command_imports_it_and_lists_it(name, source, tmp_path, capsys):
 # The table, and options ------------------------------------------------------------------------------------------
 
 
-def test_every_importer_has_a_miniature():
-    files = {path.stem for path in (Path(__file__).parents[2] / "miniatures").glob("[!_]*.py")}
-    assert files == {name.replace("-", "_") for name in IMPORTERS}
-
-
 def test_the_page_of_data_sets_is_generated_from_the_importers():
     assert text_of(DATA_SETS) == data_sets(), "run `python -m benchmarks.reference`"
+
+
+@pytest.mark.parametrize(
+    ("name", "package"),
+    [
+        ("feeling-of-success", "h5py"),
+        ("lerobot", "pyarrow"),
+        ("open-x-tactile", "zarr"),
+        ("physiclear", "av"),
+        ("rosbag", "rosbags"),
+    ],
+)
+def test_an_error_names_the_extra_of_a_missing_package(name, package, tmp_path, monkeypatch):
+    miniature(name).write(tmp_path / "src")
+    importer = load_importer(name)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ImporterError, match=rf"needs {package}, .*pip install 'touch-retrieval\[importers\]'"):
+        importer(tmp_path / "src", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_an_unknown_name_lists_the_known_ones(capsys):

@@ -1,7 +1,6 @@
 """Importer of LeRobot data sets; test_importers.py tests the common behaviour."""
 
 import json
-import sys
 import tracemalloc
 from zlib import crc32
 
@@ -144,31 +143,6 @@ def test_unusable_stored_pictures_cost_their_episode(source, tmp_path, picture, 
     assert message in reason
 
 
-@pytest.mark.parametrize("start", [float("inf"), -1e30])
-def test_an_episode_with_an_invalid_start_time_is_skipped(source, tmp_path, start):
-    key = f"videos/{lerobot.LEFT}/from_timestamp"
-    rewrite(
-        source / "meta/episodes/chunk-000/file-000.parquet",
-        lambda number, row: row | ({key: start} if number == 1 else {}),
-    )
-    assert import_lerobot(source, tmp_path / "out").info["skipped"] == {"its video cannot be decoded": 1}
-
-
-def test_moments_that_are_not_numbers_are_ignored(source, tmp_path):
-    features = json.loads((source / "meta/info.json").read_text())["features"]
-    change(source, features=features | {"moment": {"dtype": "int64"}})
-    rewrite(source / "data/chunk-000/file-000.parquet", lambda number, row: row | {"moment": [1]})
-    assert len(import_lerobot(source, tmp_path / "out").grasps) == lerobot.GRASPS
-
-
-@pytest.mark.parametrize("package", ["pyarrow", "av"])
-def test_an_error_names_the_extra_if_a_package_is_missing(source, tmp_path, monkeypatch, package):
-    monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(ImporterError, match=rf"needs {package}, .*pip install 'touch-retrieval\[importers\]'"):
-        import_lerobot(source, tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
 # Grasps from episodes ------------------------------------------------------------------------------------------
 
 
@@ -189,20 +163,6 @@ def test_steps_of_a_long_episode_are_read_one_by_one():
     assert images["touch_a"][0, 0, 0] == 200
     assert (images["touch_a_before"][0, 0, 0], images["photo"][0, 0, 0]) == (100, 0)
     assert peak < 20 * 360_000  # a picture has 360,000 bytes, the episode 1,000 pictures
-
-
-def test_an_episode_is_read_once_on_first_use():
-    calls = []
-
-    def read():
-        calls.append(1)
-        return steps(3, 1)
-
-    images = Episode(read, 1, None).images()
-    assert calls == []
-    for source in images.values():
-        source()
-    assert calls == [1]
 
 
 def test_labelled_moments_define_the_columns():

@@ -27,11 +27,6 @@ def test_a_material_is_an_object_a_press_a_sequence_and_a_row_a_grasp_with_its_f
     assert (recording.folder / grasp.touches["a"]).read_bytes() == picture.read_bytes()
 
 
-def test_the_photo_of_a_material_is_stored_once(source, tmp_path):
-    recording = import_rct(source, tmp_path / "out")
-    assert len({grasp.photo for grasp in recording.grasps}) == len(rct.MATERIALS)
-
-
 def test_rows_without_a_picture_or_a_sensor_are_counted(source, tmp_path):
     assert import_rct(source, tmp_path / "out").info["skipped"] == {
         "no picture matches the option touch": 1,
