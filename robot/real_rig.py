@@ -87,17 +87,17 @@ DRIVERS: Mapping[str, Registry[type[Device]]] = {
     "sensors": _drivers(
         "sensors",
         "TactileSensor",
-        gelsight="robot.drivers.gels.opencv:GelSight",
-        gelsight_mini="robot.drivers.gels.opencv:GelSightMini",
-        digit="robot.drivers.gels.opencv:Digit",
-        uvc="robot.drivers.gels.opencv:OpencvTactile",
+        gelsight="robot.drivers.usb_camera.driver:GelSight",
+        gelsight_mini="robot.drivers.usb_camera.driver:GelSightMini",
+        digit="robot.drivers.usb_camera.driver:Digit",
+        uvc="robot.drivers.usb_camera.driver:OpencvTactile",
     ),
     "camera": _drivers(
         "camera",
         "Camera",
         kinect2="robot.drivers.cameras.kinect2:Kinect2",
         realsense="robot.drivers.cameras.realsense:RealSense",
-        uvc="robot.drivers.cameras.uvc:UvcCamera",
+        uvc="robot.drivers.usb_camera.driver:UvcCamera",
     ),
 }
 """Drivers by role and name, imported on first use.

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from robot.devices import Camera, Device, TactileSensor, read_together
 from robot.drivers.discover import usb_port
-from robot.drivers.video.frames import Arrival
+from robot.drivers.usb_camera.stream import Arrival
 from robot.errors import DeviceError, RobotError
 from robot.rig import Rig
 

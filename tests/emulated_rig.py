@@ -23,9 +23,9 @@ import numpy as np
 
 from robot.collection import CollectSettings, collect
 from robot.devices import Arm, Camera
-from robot.drivers.gels.opencv import OpencvTactile
 from robot.drivers.sawyer.driver import Sawyer
-from robot.drivers.video import opencv_stream
+from robot.drivers.usb_camera import stream as opencv_stream
+from robot.drivers.usb_camera.driver import OpencvTactile
 from robot.drivers.wsg50.driver import WSG50
 from robot.errors import DeviceError
 from robot.grasping.settings import AttemptSettings, GraspSettings

@@ -9,7 +9,7 @@ import math
 import franky
 
 from robot import Pose
-from robot.drivers.sawyer.messages import Mount
+from robot.drivers.sawyer.codec import Mount
 
 DYNAMICS = 0.2
 """Fraction of the robot's largest acceleration and jerk; the speed is limited in mm/s."""

@@ -12,7 +12,7 @@ import rtde_receive
 from scipy.spatial.transform import Rotation
 
 from robot import Pose
-from robot.drivers.sawyer.messages import Mount
+from robot.drivers.sawyer.codec import Mount
 
 ACCELERATION_M_S2, STOP_M_S2, POLL_S, TIMEOUT_S = 0.5, 2.0, 0.02, 60.0
 

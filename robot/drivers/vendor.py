@@ -2,25 +2,15 @@
 
 import contextlib
 import math
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
 from robot.devices import Camera
-from robot.drivers.video.frames import MAX_CAMERA_WAIT_S
+from robot.drivers.usb_camera.stream import MAX_CAMERA_WAIT_S
 from robot.errors import DeviceError
 from robot.settings import TypedSettings, bounded
-
-_LIBRARY = re.compile(r"(lib[^\s:/]+\.(?:so|dylib)[.\d]*)")
-"""The library's name in the loader's error message on Linux and macOS."""
-
-_INSTALL_COMMANDS = {
-    "libfreenect2": "ldconfig after building libfreenect2 with shared libraries (github.com/OpenKinect/libfreenect2)",
-    "libusb": "apt-get install libusb-1.0-0 (Debian, Ubuntu) or brew install libusb (macOS)",
-    "libudev": "apt-get install libudev1 (Debian, Ubuntu)",
-}
 
 
 def import_package(package: str, device: str, install: str) -> Any:
@@ -33,20 +23,12 @@ def import_package(package: str, device: str, install: str) -> Any:
     """
     try:
         return import_module(package)
+    except ModuleNotFoundError as error:
+        raise DeviceError(f"{device} requires {package}, which is missing; {install}") from error
     except ImportError as error:
-        need = missing_library(package, error) or f"{package}, which is missing; {install}"
-        raise DeviceError(f"{device} requires {need}") from error
-
-
-def missing_library(package: str, error: ImportError) -> str | None:
-    """Return a description of the system library that an installed package lacks, or None."""
-    found = None if isinstance(error, ModuleNotFoundError) else _LIBRARY.search(str(error))
-    if found is None:
-        return None
-    library = found[1]
-    run = next((run for name, run in _INSTALL_COMMANDS.items() if library.startswith(name)), None)
-    remedy = f"run {run}" if run else "install the package of your system that contains it"
-    return f"{library}, a library of the system that {package} cannot find; {remedy}"
+        raise DeviceError(
+            f"{device} requires {package}, which cannot be imported: {error}; install what it lacks"
+        ) from error
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robot.drivers.cameras.uvc import UvcCamera
-from robot.drivers.gels.opencv import OpencvTactile
 from robot.drivers.manual_arm import ManualArm
+from robot.drivers.usb_camera.driver import OpencvTactile, UvcCamera
 from robot.drivers.wsg50.driver import WSG50
 from robot.errors import RobotConfigError, UnknownName
 from robot.grasping.planner import CylinderPlanner, GraspPlan, GraspPlanner

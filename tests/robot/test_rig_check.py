@@ -4,7 +4,7 @@ import pytest
 
 from robot import rig_check
 from robot.drivers.discover import UsbPort
-from robot.drivers.video.frames import Arrival
+from robot.drivers.usb_camera.stream import Arrival
 from robot.errors import RobotConfigError
 from robot.readings import Frame, GripperState, Pose
 from robot.rig_check import check_rig

@@ -14,7 +14,7 @@ from lerobot.cameras import Camera, CameraConfig
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 from robot.drivers import discover
-from robot.drivers.gels.opencv import OpencvTactile
+from robot.drivers.usb_camera.driver import OpencvTactile
 from robot.errors import DeviceError
 from robot.real_rig import DRIVERS
 from robot.settings import build

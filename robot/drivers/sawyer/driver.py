@@ -24,16 +24,15 @@ from typing import Any
 import numpy as np
 
 from robot.devices import Arm, Clock
-from robot.drivers.sawyer import messages
-from robot.drivers.sawyer.messages import Joints, Mount, is_still, newest_joints
-from robot.drivers.sawyer.rosbridge import ReceivedMessage, RosbridgeLink
-from robot.drivers.sawyer.straight_line import JointTrajectory, waypoints
+from robot.drivers.sawyer import codec
+from robot.drivers.sawyer.codec import Joints, JointTrajectory, Mount, is_still, newest_joints, waypoints
+from robot.drivers.sawyer.link import ReceivedMessage, RosbridgeLink
 from robot.errors import DeviceError
 from robot.readings import Pose, Region
 from robot.settings import TypedSettings, bounded, check_range
 
 _LOG = logging.getLogger(__name__)
-_STATE_TOPICS = (messages.JOINT_STATES, messages.ROBOT_STATE, messages.TIP_STATES, messages.COLLISION)
+_STATE_TOPICS = (codec.JOINT_STATES, codec.ROBOT_STATE, codec.TIP_STATES, codec.COLLISION)
 _SLOW_STATE_AGE_S = 2.0
 """Oldest accepted /robot/state and collision state, which are slower than the joint states."""
 _COLLISIONS = "collision state"
@@ -122,24 +121,24 @@ class Sawyer(Arm):
         """Note in `refused` if the robot reports no collision state."""
         self.refused.pop(_COLLISIONS, None)
         try:
-            self._link.wait_for(messages.COLLISION[0])
+            self._link.wait_for(codec.COLLISION[0])
             self._sees_collisions = True
         except DeviceError:
             self._link.check()
             self.refused[_COLLISIONS] = "no messages: collisions are not detected"
-            _LOG.warning("%s: no messages on %s: collisions are not detected", self.name, messages.COLLISION[0])
+            _LOG.warning("%s: no messages on %s: collisions are not detected", self.name, codec.COLLISION[0])
 
     def _open_link(self) -> None:
         """Open a new link and wait for each state once, also the collision state if it was available on connecting."""
         self._link = self._new_link()
         self._link.open()
-        for topic, kind in (*_STATE_TOPICS, messages.SPEED_RATIO, messages.COMMAND_TIMEOUT):
+        for topic, kind in (*_STATE_TOPICS, codec.SPEED_RATIO, codec.COMMAND_TIMEOUT):
             self._link.subscribe(topic, kind)
-        self._link.advertise(*messages.JOINT_COMMAND)
+        self._link.advertise(*codec.JOINT_COMMAND)
         for topic, _ in _STATE_TOPICS if self._sees_collisions else _STATE_TOPICS[:-1]:
             self._link.wait_for(topic)
-        self._set("speed_ratio", messages.SPEED_RATIO, self._options.speed_ratio)
-        self._set("command_timeout_s", messages.COMMAND_TIMEOUT, self._options.command_timeout_s)
+        self._set("speed_ratio", codec.SPEED_RATIO, self._options.speed_ratio)
+        self._set("command_timeout_s", codec.COMMAND_TIMEOUT, self._options.command_timeout_s)
 
     def _set(self, name: str, topic: tuple[str, str], value: float) -> None:
         """Publish a setting and read it back from its topic; note a difference in `refused`."""
@@ -148,7 +147,7 @@ class Sawyer(Arm):
         self._link.publish(topic[0], {"data": value})
         self.refused.pop(name, None)
         try:
-            found = messages.number_of(self._link.wait_for(topic[0], since_s=since).message)
+            found = codec.number_of(self._link.wait_for(topic[0], since_s=since).message)
         except DeviceError:
             self._link.check()
             self.refused[name] = f"requested {value:g}, cannot be read back"
@@ -161,8 +160,8 @@ class Sawyer(Arm):
         state = self._robot_state()
         if self._options.enable and self.may_move and not (state.enabled or state.stopped or state.error):
             _LOG.warning("%s: enabling the motors", self.name)
-            self._link.advertise(*messages.ENABLE)
-            self._link.publish(messages.ENABLE[0], {"data": True})
+            self._link.advertise(*codec.ENABLE)
+            self._link.publish(codec.ENABLE[0], {"data": True})
             deadline = self.clock() + self._options.timeout_s
             while not self._robot_state().enabled and self.clock() < deadline:
                 time.sleep(self._tick_s)
@@ -181,13 +180,13 @@ class Sawyer(Arm):
         return {
             "url": self._url,
             "tip": self._options.tip,
-            "speed_ratio": self._read_back(messages.SPEED_RATIO),
-            "command_timeout_s": self._read_back(messages.COMMAND_TIMEOUT),
+            "speed_ratio": self._read_back(codec.SPEED_RATIO),
+            "command_timeout_s": self._read_back(codec.COMMAND_TIMEOUT),
         }
 
     def _read_back(self, topic: tuple[str, str]) -> float | None:
         arrivals = self._link.history(topic[0])
-        return messages.number_of(arrivals[-1].message) if arrivals else None
+        return codec.number_of(arrivals[-1].message) if arrivals else None
 
     def _recover(self) -> None:
         """Connect again with back-off if the link or a state is lost; raise DeviceError if a person must act."""
@@ -200,7 +199,7 @@ class Sawyer(Arm):
             _LOG.warning("%s: %s; connecting again", self.name, error)
             self._reconnect()
         if self._has_collided_since(-math.inf, newest=True):
-            raise DeviceError(f"{self.name}: recovery is refused: {messages.COLLIDED}")
+            raise DeviceError(f"{self.name}: recovery is refused: {codec.COLLIDED}")
         self._make_ready()
 
     def _reconnect(self) -> None:
@@ -219,14 +218,14 @@ class Sawyer(Arm):
         return self._pose_since(self.clock() - self._options.max_state_age_s)
 
     def _pose_since(self, since_s: float) -> Pose:
-        arrival = self._link.wait_for(messages.TIP_STATES[0], since_s=since_s)
-        return self._mount.pose_of(messages.tip_of(arrival.message, self._options.tip))
+        arrival = self._link.wait_for(codec.TIP_STATES[0], since_s=since_s)
+        return self._mount.pose_of(codec.tip_of(arrival.message, self._options.tip))
 
     def _move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
         began = self.clock()
         self._check_free()
         if self._has_collided_since(began, newest=True):
-            raise DeviceError(f"{self.name}: {messages.COLLIDED}")
+            raise DeviceError(f"{self.name}: {codec.COLLIDED}")
         start = self._fresh_joints()
         poses = waypoints(self._check_inside(self._pose()), pose)
         joints = self._solve(poses, start)
@@ -262,9 +261,9 @@ class Sawyer(Arm):
         """Solve one way-point; after a failure, try other seeds up to `ik_retries` times."""
         tip, seeds = self._mount.tip_of(pose), (before, start, None)
         for number in range(self._options.ik_retries + 1):
-            request = messages.ik_request(tip, self._options.tip, seeds[number % len(seeds)])
+            request = codec.ik_request(tip, self._options.tip, seeds[number % len(seeds)])
             try:
-                joints = messages.ik_answer(self._link.call(messages.IK_SERVICE, request))
+                joints = codec.ik_answer(self._link.call(codec.IK_SERVICE, request))
             except DeviceError as error:
                 self._link.check()
                 problem = str(error)
@@ -312,7 +311,7 @@ class Sawyer(Arm):
             time.sleep(self._tick_s)
 
     def _is_still(self, since_s: float) -> bool:
-        return is_still(self._link.history(messages.JOINT_STATES[0]), since_s, self.clock())
+        return is_still(self._link.history(codec.JOINT_STATES[0]), since_s, self.clock())
 
     def _watch(self, commanded: Joints, began: float) -> Joints:
         """Return the current joints; raise DeviceError if the motion must not continue."""
@@ -320,7 +319,7 @@ class Sawyer(Arm):
         joints = self._fresh_joints()
         self._check_free()
         if self._has_collided_since(began):
-            raise DeviceError(f"{self.name}: {messages.COLLIDED}")
+            raise DeviceError(f"{self.name}: {codec.COLLIDED}")
         if (lag := float(np.abs(joints - commanded).max())) > _MAX_LAG_RAD:
             raise DeviceError(
                 f"{self.name}: the arm must follow within {_MAX_LAG_RAD} rad, but a joint is {lag:.2f} behind; check "
@@ -340,11 +339,11 @@ class Sawyer(Arm):
             time.sleep(self._tick_s)
 
     def _command(self, joints: Joints) -> None:
-        self._link.publish(messages.JOINT_COMMAND[0], messages.joint_command(joints))
+        self._link.publish(codec.JOINT_COMMAND[0], codec.joint_command(joints))
 
     def _fresh_joints(self) -> Joints:
         """Return the newest joints; raise DeviceError if they are too old, by their first copy."""
-        found, age_s = newest_joints(self._link.history(messages.JOINT_STATES[0])), math.inf
+        found, age_s = newest_joints(self._link.history(codec.JOINT_STATES[0])), math.inf
         if found is not None:
             joints, since_s = found
             if (age_s := self.clock() - since_s) <= self._options.max_state_age_s:
@@ -356,16 +355,16 @@ class Sawyer(Arm):
             f"new commands the robot ends its motion after {self._options.command_timeout_s:g} s"
         )
 
-    def _robot_state(self) -> messages.RobotState:
-        arrivals = self._link.history(messages.ROBOT_STATE[0])
-        self._check_arrives(messages.ROBOT_STATE[0], arrivals, "an emergency stop")
-        return messages.robot_state(arrivals[-1].message)
+    def _robot_state(self) -> codec.RobotState:
+        arrivals = self._link.history(codec.ROBOT_STATE[0])
+        self._check_arrives(codec.ROBOT_STATE[0], arrivals, "an emergency stop")
+        return codec.robot_state(arrivals[-1].message)
 
     def _collisions(self) -> Sequence[ReceivedMessage]:
         """Return the collision states; empty only if there was none on connecting either."""
-        arrivals = self._link.history(messages.COLLISION[0])
+        arrivals = self._link.history(codec.COLLISION[0])
         if arrivals or self._sees_collisions:
-            self._check_arrives(messages.COLLISION[0], arrivals, "a collision")
+            self._check_arrives(codec.COLLISION[0], arrivals, "a collision")
         return arrivals
 
     def _check_arrives(self, topic: str, arrivals: Sequence[ReceivedMessage], event: str) -> None:
@@ -385,4 +384,4 @@ class Sawyer(Arm):
         """Return whether any message after `began`, or with `newest` the last one, reports a collision."""
         arrivals = self._collisions()
         checked = arrivals[-1:] if newest else [arrival for arrival in arrivals if arrival.time_s >= began]
-        return any(messages.has_collided(arrival.message) for arrival in checked)
+        return any(codec.has_collided(arrival.message) for arrival in checked)

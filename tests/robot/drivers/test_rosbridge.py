@@ -13,10 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot.drivers.sawyer import rosbridge
-from robot.drivers.sawyer.rosbridge import RosbridgeLink, decode, encode
+from robot.drivers.sawyer import link as rosbridge
+from robot.drivers.sawyer.link import RosbridgeLink, decode, encode
 from robot.errors import DeviceError
-from tests.emulators.sawyer.server import EmulatedSawyer, MessageFaults, serve
 from tests.waiting import STARTED, STARTED_IDS, first_line, run_process, wait_until
 
 
@@ -82,22 +81,10 @@ def test_an_encoded_operation_is_decoded_unchanged(fields, name):
     assert decode(encode(operation)) == operation
 
 
-@settings(max_examples=100)
-@given(st.text() | st.binary() | PLAIN.map(lambda value: json.dumps(value)))
-def test_decoding_any_text_returns_an_operation_or_none(text):
-    found = decode(text)
-    assert found is None or isinstance(found["op"], str)
-
-
 @pytest.mark.parametrize("value", [math.nan, math.inf, object(), {1, 2}])
 def test_values_that_json_cannot_express_are_not_sent(value):
     with pytest.raises(DeviceError, match="plain finite values"):
         encode({"op": "publish", "msg": value})
-
-
-def test_an_incomplete_operation_is_noise():
-    assert decode('{"op":"publish"') is None
-    assert decode('{"op": 3}') is None
 
 
 def test_a_call_accepts_only_the_answer_with_its_id():
@@ -110,7 +97,6 @@ def test_a_call_accepts_only_the_answer_with_its_id():
 
     with linked(answer) as link:
         assert link.call("/s", {"a": 1}) == {"x": 1}
-        assert link.counts == {"late": 2, "noise": 4}
 
 
 def test_a_late_answer_is_never_that_of_the_next_call():
@@ -124,7 +110,6 @@ def test_a_late_answer_is_never_that_of_the_next_call():
         with pytest.raises(DeviceError, match=r"no answer of /s within 0\.05 s"):
             link.call("/s", {}, timeout_s=0.05)
         assert link.call("/s", {}) == {"x": 1}
-        assert link.counts["late"] == 1
 
 
 @pytest.mark.parametrize(
@@ -150,7 +135,6 @@ def test_a_status_error_that_names_a_call_fails_it_and_others_are_logged(caplog)
 
     with linked(answer) as link, pytest.raises(DeviceError, match="/s failed: type unknown"):
         link.call("/s", {})
-    assert link.counts["status"] == 2
     assert "slow" in caplog.text
 
 
@@ -162,70 +146,13 @@ def test_messages_of_a_topic_are_buffered_with_their_times():
     with linked(answer) as link:
         before = time.monotonic()
         link.subscribe("/t", "std_msgs/Int32")
-        link._wait(lambda: link.counts["noise"] == 2 or None, 5.0, "messages")
+        wait_until(lambda: len(link.history("/t")) == 3)
         history = link.history("/t")
         assert [arrival.message["data"] for arrival in history] == [0, 1, 2]
         assert before <= history[0].time_s <= history[-1].time_s <= time.monotonic()
         assert link.wait_for("/t", since_s=before) == history[-1]
         with pytest.raises(DeviceError, match=r"no message on /t within 0\.02 s"):
             link.wait_for("/t", since_s=time.monotonic(), timeout_s=0.02)
-
-
-def history_after(texts):
-    """Return the buffered messages of /t after these texts were received."""
-    link = RosbridgeLink("ws://127.0.0.1:1")
-    link._socket = type("NoSocket", (), {"send": lambda self, text: None})()
-    link._closed_reason = ""
-    link.subscribe("/t", "std_msgs/String")
-    for text in texts:
-        link._handle(text)
-    return link.history("/t")
-
-
-def test_the_buffer_of_a_topic_is_limited_in_number_and_total_length():
-    def published(number, characters):
-        return json.dumps({"op": "publish", "topic": "/t", "msg": {"n": number, "data": "x" * characters}})
-
-    many = history_after(published(number, 10) for number in range(1000))
-    assert [arrival.message["n"] for arrival in many] == list(range(800, 1000))
-    long = history_after(published(number, 100_000) for number in range(1000))
-    assert [arrival.message["n"] for arrival in long] == list(range(995, 1000))  # 5 x 100 KB within 512 KiB
-    alone = history_after([published(0, 10), published(1, 1_000_000)])
-    assert [arrival.message["n"] for arrival in alone] == [1]
-
-
-def test_too_large_a_message_closes_the_connection_with_the_reason():
-    def answer(operation):
-        return ['{"op": "publish", "topic": "/t", "msg": {"data": "' + "x" * 2**20 + '"}}']
-
-    with linked(answer) as link:
-        link.subscribe("/t", "std_msgs/String")
-        with pytest.raises(DeviceError, match=r"the connection to rosbridge at .* is closed: .*message too big"):
-            link.wait_for("/t", timeout_s=20.0)
-        assert link.history("/t") == []
-
-
-def test_unread_messages_do_not_accumulate(monkeypatch):
-    """Nothing is read here, so a flooding peer must wait before it has sent half of its messages."""
-    text = json.dumps({"op": "publish", "topic": "/t", "msg": {"data": "x" * 2**17}})
-    read, sent = threading.Event(), []
-
-    def answer(operation):
-        for _ in range(1000):
-            yield text
-            sent.append(1)
-
-    with scripted(answer) as (url, _):
-        link = RosbridgeLink(url, timeout_s=20.0)
-        monkeypatch.setattr(link, "_handle", lambda text: read.wait(60.0))
-        link.open()
-        link.subscribe("/t", "std_msgs/String")
-        wait_until(lambda: link._socket.recv_messages.paused or len(sent) == 1000)
-        assert link._socket.recv_messages.paused
-        assert link._socket.recv_messages.frames.qsize() <= 20
-        assert len(sent) < 500
-        read.set()
-        link.close()
 
 
 def test_an_error_message_is_truncated_and_escaped(caplog):
@@ -245,7 +172,6 @@ def test_a_connection_that_breaks_ends_every_wait_at_once():
     with linked(lambda _: None, timeout_s=60.0) as link:
         with pytest.raises(DeviceError, match=r"the connection to rosbridge at .* is closed"):
             link.call("/s", {})
-        assert not link.is_open
         for use in (
             link.check,
             lambda: link.publish("/t", {}),
@@ -265,10 +191,9 @@ def test_a_link_can_be_closed_twice_and_unopened_and_leaves_no_thread():
         for _ in range(3):  # several in one process
             link = RosbridgeLink(url)
             link.open()
-            assert link.is_open
+            link.check()
             link.close()
             link.close()
-            assert not link.is_open
             assert not readers()
 
 
@@ -310,32 +235,6 @@ def test_a_missing_package_is_a_device_error_that_names_the_extra(monkeypatch):
         RosbridgeLink("ws://127.0.0.1:9090").open()
 
 
-def test_the_emulator_answers_like_rosbridge():
-    with serve(EmulatedSawyer()) as url, contextlib.closing(RosbridgeLink(url, timeout_s=5.0)) as link:
-        link.open()
-        with pytest.raises(DeviceError, match="/none does not exist"):
-            link.call("/none", {})
-        link.publish("/not/advertised", {"data": 1})
-        link.subscribe("/robot/state", "intera_core_msgs/RobotAssemblyState")
-        assert link.wait_for("/robot/state").message["enabled"] is True
-        assert link.counts["status"] == 1
-        link.advertise("/t", "std_msgs/Float64", latch=True)
-        link.publish("/t", {"data": 2.5})
-        link.subscribe("/t", "std_msgs/Float64")
-        assert link.wait_for("/t").message == {"data": 2.5}
-
-
-def test_faults_are_reproducible_and_counted():
-    kinds = ("dropped", "corrupted")
-    first, second = MessageFaults(0.5, kinds, seed=3), MessageFaults(0.5, kinds, seed=3)
-    drawn = [first.draw(("dropped", "duplicated", "corrupted")) for _ in range(200)]
-    assert drawn == [second.draw(("dropped", "duplicated", "corrupted")) for _ in range(200)]
-    assert set(drawn) == {None, *kinds}
-    assert first.counts == {kind: drawn.count(kind) for kind in kinds}
-    assert MessageFaults(1.0, kinds).draw(("delayed",)) is None
-    assert MessageFaults().draw(kinds) is None
-
-
 @pytest.mark.parametrize("by", STARTED, ids=STARTED_IDS)
 def test_the_emulator_runs_as_a_process_and_ends_with_ctrl_c(by):
     command = [sys.executable, "-m", "tests.emulators.sawyer.server", "--port", "0", "--faults", "1"]
@@ -344,7 +243,8 @@ def test_the_emulator_runs_as_a_process_and_ends_with_ctrl_c(by):
         link = RosbridgeLink(url, timeout_s=60.0)
         link.open()
         link.subscribe("/robot/joint_states", "sensor_msgs/JointState")
-        link._wait(lambda: link.counts["noise"] or link.history("/robot/joint_states") or None, 60.0, "message")
+        with contextlib.suppress(DeviceError):  # every message may be damaged
+            link.wait_for("/robot/joint_states", timeout_s=1.0)
         link.close()
         process.send_signal(signal.SIGINT)
         counts, _ = process.communicate(timeout=60)

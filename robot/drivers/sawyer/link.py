@@ -17,7 +17,7 @@ import logging
 import socket
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -31,12 +31,6 @@ T = TypeVar("T")
 _LOG = logging.getLogger(__name__)
 _MAX_MESSAGES = 200
 """Number of buffered messages of each topic: two seconds at 100 Hz."""
-_MAX_CHARACTERS = 2**19
-"""Limit of a topic's buffered JSON characters; parsed, they take up to 30 times as many bytes."""
-_MAX_MESSAGE_BYTES = 2**20
-"""A larger message closes the connection; a robot's state is about a thousandth of this."""
-_MAX_QUEUE = 16
-"""Number of unread messages at which reading from the network pauses."""
 _MAX_ERROR_CHARACTERS = 300
 """Number of characters of an error message that are passed on."""
 _PING_S = 5.0
@@ -48,29 +42,6 @@ class ReceivedMessage:
 
     message: Message
     time_s: float
-
-
-class _MessageBuffer:
-    """The newest messages of a topic, limited in number and total length; the last one is always stored."""
-
-    def __init__(self) -> None:
-        self._arrivals: deque[tuple[ReceivedMessage, int]] = deque()
-        self._characters = 0
-
-    def add(self, arrival: ReceivedMessage, characters: int) -> None:
-        """Store a message of this length in JSON, and drop the oldest ones if necessary."""
-        self._arrivals.append((arrival, characters))
-        self._characters += characters
-        while len(self._arrivals) > 1 and (len(self._arrivals) > _MAX_MESSAGES or self._characters > _MAX_CHARACTERS):
-            self._characters -= self._arrivals.popleft()[1]
-
-    def all(self) -> list[ReceivedMessage]:
-        """Return the messages, oldest first."""
-        return [arrival for arrival, _ in self._arrivals]
-
-    def newest(self) -> ReceivedMessage | None:
-        """Return the last message, or None."""
-        return self._arrivals[-1][0] if self._arrivals else None
 
 
 def encode(operation: Message) -> str:
@@ -91,29 +62,19 @@ def decode(text: str | bytes) -> Message | None:
 
 
 class RosbridgeLink:
-    """A connection to `ws://host:port`; every wait ends after `timeout_s` at the latest.
-
-    Attributes:
-        counts: Numbers of "noise" (invalid operations), "late" (unexpected replies) and "status" (errors of rosbridge).
-    """
+    """A connection to `ws://host:port`; every wait ends after `timeout_s` at the latest."""
 
     def __init__(self, url: str, *, timeout_s: float = 2.0, clock: Clock = time.monotonic) -> None:
         self.url, self.timeout_s, self.clock = url, timeout_s, clock
-        self.counts: Counter[str] = Counter()
         self._changed = threading.Condition()
         self._numbers = itertools.count(1)
-        self._topics: dict[str, _MessageBuffer] = {}
+        self._topics: dict[str, deque[ReceivedMessage]] = {}
         self._awaited: dict[str, str] = {}
         self._replies: dict[str, Message] = {}
         self._contexts = contextlib.ExitStack()
         self._socket: Any = None
         self._reader: threading.Thread | None = None
         self._closed_reason = "it was never opened"
-
-    @property
-    def is_open(self) -> bool:
-        """Whether the connection is open, as far as this side has noticed."""
-        return not self._closed_reason
 
     def open(self) -> None:
         """Connect, once only, or raise DeviceError; a closed link cannot be opened again."""
@@ -132,8 +93,6 @@ class RosbridgeLink:
                 ping_interval=_PING_S,
                 ping_timeout=_PING_S,
                 compression=None,  # latency matters more than size
-                max_size=_MAX_MESSAGE_BYTES,
-                max_queue=_MAX_QUEUE,
                 proxy=None,
             )
             self._socket = self._contexts.enter_context(connection)  # websockets 17 requires a context
@@ -161,7 +120,7 @@ class RosbridgeLink:
 
     def subscribe(self, topic: str, kind: str) -> None:
         """Subscribe to a topic of ROS type `kind`; if the link is slow, older messages are dropped."""
-        self._topics[topic] = _MessageBuffer()
+        self._topics[topic] = deque(maxlen=_MAX_MESSAGES)
         self._send({"op": "subscribe", "topic": topic, "type": kind, "throttle_rate": 0, "queue_length": 1})
 
     def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
@@ -192,8 +151,7 @@ class RosbridgeLink:
     def history(self, topic: str) -> list[ReceivedMessage]:
         """Return the buffered messages of a subscribed topic, oldest first."""
         with self._changed:
-            buffer = self._topics.get(topic)
-            return buffer.all() if buffer else []
+            return list(self._topics.get(topic, ()))
 
     def wait_for(
         self, topic: str, *, since_s: float = float("-inf"), timeout_s: float | None = None
@@ -201,9 +159,8 @@ class RosbridgeLink:
         """Wait for a message of a topic after `since_s` and return the newest; raise DeviceError if none arrives."""
 
         def fresh() -> ReceivedMessage | None:
-            buffer = self._topics.get(topic)
-            newest = buffer.newest() if buffer else None
-            return newest if newest and newest.time_s > since_s else None
+            arrivals = self._topics.get(topic)
+            return arrivals[-1] if arrivals and arrivals[-1].time_s > since_s else None
 
         return self._wait(fresh, timeout_s, f"message on {topic}")
 
@@ -241,44 +198,20 @@ class RosbridgeLink:
             self._changed.notify_all()
 
     def _handle(self, text: str | bytes) -> None:
-        operation = decode(text) or {"op": "noise"}
-        handlers = {
-            "publish": self._handle_publish,
-            "service_response": self._handle_response,
-            "status": self._handle_status,
-        }
+        """Store a message of a topic or the answer of a call; log errors of rosbridge; ignore all else."""
+        operation = decode(text) or {}
+        kind, identity, message = operation.get("op"), operation.get("id"), operation.get("msg")
         with self._changed:
-            handler = handlers.get(operation["op"])
-            if handler is None or not handler(operation, len(text)):
-                self.counts["noise"] += 1
+            service = self._awaited.get(identity) if isinstance(identity, str) else None
+            if kind == "publish" and isinstance(message, dict) and operation.get("topic") in self._topics:
+                self._topics[operation["topic"]].append(ReceivedMessage(message, self.clock()))
+            elif kind == "service_response" and service and operation.get("service", service) == service:
+                self._replies[str(identity)] = operation
+            elif kind == "status" and service and operation.get("level") == "error":
+                self._replies[str(identity)] = {"result": False, "values": message}
+            elif kind == "status":
+                _LOG.warning("rosbridge at %s reports: %s", self.url, _shorten(message))
             self._changed.notify_all()
-
-    def _handle_publish(self, operation: Message, characters: int) -> bool:
-        topic, message = operation.get("topic"), operation.get("msg")
-        buffer = self._topics.get(topic) if isinstance(topic, str) else None
-        if buffer is None or not isinstance(message, dict):
-            return False
-        buffer.add(ReceivedMessage(message, self.clock()), characters)
-        return True
-
-    def _handle_response(self, operation: Message, _: int) -> bool:
-        identity = operation.get("id")
-        service = self._awaited.get(identity) if isinstance(identity, str) else None
-        if service is None or operation.get("service", service) != service:
-            self.counts["late"] += 1
-        else:
-            self._replies[str(identity)] = operation
-        return True
-
-    def _handle_status(self, operation: Message, _: int) -> bool:
-        """Pass an error to the waiting call with its id; log all other messages."""
-        identity, text = operation.get("id"), operation.get("msg")
-        self.counts["status"] += 1
-        if isinstance(identity, str) and identity in self._awaited and operation.get("level") == "error":
-            self._replies[identity] = {"result": False, "values": text}
-        else:
-            _LOG.warning("rosbridge at %s reports: %s", self.url, _shorten(text))
-        return True
 
 
 def _shorten(text: object) -> str:

@@ -1,1 +1,0 @@
-"""Gel sensors."""

@@ -1,0 +1,1 @@
+"""Gels and cameras on USB."""

@@ -1,0 +1,230 @@
+"""Sensors and cameras on USB: GelSight, GelSight Mini, DIGIT, any other gel, and a plain camera over the table.
+
+To support another gel, add a class of a few lines here, and its name to DRIVERS of robot.real_rig. A rig's file may
+override each value of PRESET. Automatic exposure and white balance of a gel are off by default, because they change the
+images of equal presses.
+"""
+
+import time
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from robot.devices import Camera, Clock, Device, TactileSensor
+from robot.drivers.usb_camera.stream import Arrival, CaptureReader, CaptureSettings, UsbCameraSettings
+from robot.errors import DeviceError, RobotConfigError
+from robot.readings import RGBD, Frame
+from robot.settings import bounded
+
+Picture = npt.NDArray[np.uint8]
+_MAX_PX = 20_000
+
+
+class UsbDevice(Device):
+    """The common part of the devices behind a USB camera: the reader of its stream."""
+
+    _reader: CaptureReader
+    _options: UsbCameraSettings
+
+    @property
+    def arrivals(self) -> list[Arrival]:
+        """The newest frames of the stream, as they arrived."""
+        return self._reader.arrivals
+
+    def _connect(self) -> None:
+        self._reader = CaptureReader(self, self._options)
+        self._reader.start()
+
+    def _close(self) -> None:
+        self._reader.close()
+
+    def _settings(self) -> dict[str, Any]:
+        """Return the camera's settings of the last opening of its stream."""
+        return dict(self._reader.camera)
+
+    def _recover(self) -> None:
+        self._reader.recover()
+
+
+# Gels --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class GelCameraSettings(UsbCameraSettings):
+    """Settings of the camera behind a gel and of the crop.
+
+    `keep` frames are buffered, so that a frame close in time to that of the other finger is found.
+
+    Attributes:
+        crop: Fractions of the picture to remove at left, top, right and bottom, each from 0 to below 1.
+        output_px: Width and height of the result; left out: the size of the remaining picture.
+    """
+
+    crop: tuple[float, ...] = ()
+    output_px: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Raise RobotConfigError for a setting out of range."""
+        super().__post_init__()
+        crop, size = self.crop, self.output_px
+        left, top, right, bottom = crop if len(crop) == 4 else (0.0,) * 4
+        is_valid = len(crop) in (0, 4) and all(0 <= each < 1 for each in crop)
+        if not is_valid or left + right >= 1 or top + bottom >= 1:
+            raise RobotConfigError(
+                f"crop must be fractions at left, top, right and bottom that leave a part of the picture, got {crop}"
+            )
+        if size and (len(size) != 2 or not all(1 <= each <= _MAX_PX for each in size)):
+            raise RobotConfigError(f"output_px must be width and height, 1 to {_MAX_PX} pixels, got {size}")
+
+
+class OpencvTactile(UsbDevice, TactileSensor):
+    """The gel behind a USB camera; the fields of GelCameraSettings are keyword arguments of the constructor.
+
+    Attributes:
+        PRESET: Default width, height, fps, fourcc and led of a kind of sensor; its other fields have no effect.
+        CROP: Default crop: fractions of width and height to remove at left, top, right and bottom.
+        QUARTER_TURNS: Rotation of the picture, in quarter turns counterclockwise.
+    """
+
+    Settings = GelCameraSettings
+    PRESET: ClassVar[CaptureSettings] = CaptureSettings()
+    CROP: ClassVar[tuple[float, ...]] = ()
+    QUARTER_TURNS: ClassVar[int] = 0
+    _options: GelCameraSettings
+
+    def __init__(self, *, finger: str, clock: Clock = time.monotonic, **settings: Any) -> None:
+        """Check the settings without using the device; raise RobotConfigError if invalid."""
+        super().__init__(f"gel {finger}", finger, clock=clock)
+        options, preset = GelCameraSettings(**settings), self.PRESET
+        size = options if options.width or options.height else preset
+        self._options = replace(
+            options,
+            width=size.width,
+            height=size.height,
+            fps=options.fps or preset.fps,
+            fourcc=options.fourcc or preset.fourcc,
+            led=options.led or preset.led,
+            crop=options.crop or self.CROP,
+        )
+        self._reader = CaptureReader(self, self._options)
+        self._picture_px: list[int] = []
+
+    def read_after(self, time_s: float, timeout_s: float) -> Frame:
+        """Wait at most `timeout_s` for a frame newer than `time_s` and return the newest frame; else raise DeviceError.
+
+        Unlike `read`, it waits for a lost stream no longer than this. With `timeout_s` 0 it does not wait at all.
+        """
+        with self._use("cannot be read"):
+            return self._picture(self._reader.after(time_s, timeout_s))
+
+    def _connect(self) -> None:
+        super()._connect()
+        height, width = self._read().pixels.shape[:2]
+        self._picture_px = [width, height]
+
+    def _settings(self) -> dict[str, Any]:
+        return {**super()._settings(), "picture_px": self._picture_px}
+
+    def _read(self) -> Frame:
+        return self._picture(self._reader.newest())
+
+    def _read_near(self, time_s: float) -> Frame:
+        return self._picture(self._reader.near(time_s))
+
+    def _picture(self, frame: Frame) -> Frame:
+        """Rotate, crop, then convert to RGB. The conversion is last, because it is faster with fewer pixels."""
+        picture = np.rot90(frame.pixels, self.QUARTER_TURNS)
+        return Frame(to_rgb(crop_and_resize(picture, self._options.crop, self._options.output_px)), frame.time_s)
+
+
+class GelSight(OpencvTactile):
+    """The paper's GelSight, with the picture size, rate and format of the authors' usb_cam settings."""
+
+    PRESET = CaptureSettings(width=1280, height=960, fps=30.0, fourcc="MJPG")
+
+
+class GelSightMini(OpencvTactile):
+    """GelSight Mini with the size and the crop of the vendor's software.
+
+    The camera's full 3280 x 2464 pixels at 25 frames/s would occupy one CPU core.
+    """
+
+    PRESET = CaptureSettings(width=320, height=240, fps=25.0)
+    CROP = (0.15, 0.15, 0.15, 0.15)
+
+
+class Digit(OpencvTactile):
+    """DIGIT, with LEDs at full brightness by default.
+
+    The vendor's software transposes and flips its picture, which is a quarter turn counterclockwise.
+    """
+
+    PRESET = CaptureSettings(width=320, height=240, fps=60.0, led=(15, 15, 15))
+    QUARTER_TURNS = 1
+
+
+def crop_and_resize(picture: Picture, crop: tuple[float, ...], output_px: tuple[int, ...]) -> Picture:
+    """Crop a picture (H, W, 3) and resize it, by area means to shrink (without aliasing of the gel's markers)."""
+    height, width = picture.shape[:2]
+    left, top, right, bottom = crop or (0.0,) * 4
+    x, y = min(round(left * width), width - 1), min(round(top * height), height - 1)
+    part = picture[y : max(y + 1, height - round(bottom * height)), x : max(x + 1, width - round(right * width))]
+    part = np.ascontiguousarray(part)
+    if not output_px:
+        return part
+    shrinks = output_px[0] <= part.shape[1] and output_px[1] <= part.shape[0]
+    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(part, output_px, interpolation=method), dtype=np.uint8)
+
+
+def to_rgb(picture: Picture) -> Picture:
+    """Convert BGR to contiguous RGB; raise DeviceError unless the picture is (H, W, 3) uint8.
+
+    It takes 0.1 ms for 896 x 672 pixels; reversing the axis and copying takes 6 ms.
+    """
+    if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
+        raise DeviceError(
+            f"a camera must return pictures H x W x 3 uint8, got {picture.shape} {picture.dtype}; set a fourcc with "
+            'colours, such as "MJPG"'
+        )
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+# The camera of the table -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class UvcSettings(UsbCameraSettings):
+    """Settings of a USB camera, with automatic exposure and white balance; upside_down: rotate by 180 degrees."""
+
+    auto_exposure: bool = True
+    auto_white_balance: bool = True
+    keep: int = bounded(1, 1000, 1, unit="pictures")
+    upside_down: bool = False
+
+
+class UvcCamera(UsbDevice, Camera):
+    """A plain USB camera: colour only, so grasps cannot be planned from its picture.
+
+    The fields of UvcSettings are keyword arguments of the constructor.
+    """
+
+    Settings = UvcSettings
+    has_depth = False
+    _options: UvcSettings
+
+    def __init__(self, *, extrinsics: npt.ArrayLike, clock: Clock = time.monotonic, **settings: Any) -> None:
+        """Check the settings without using the device; raise RobotConfigError for one out of range."""
+        super().__init__("usb camera", extrinsics, clock=clock)
+        self._options = UvcSettings(**settings)
+        self._reader = CaptureReader(self, self._options)
+
+    def _read(self, depth: bool) -> RGBD:
+        frame = self._reader.newest()
+        colour = to_rgb(frame.pixels)
+        if self._options.upside_down:
+            colour = np.ascontiguousarray(colour[::-1, ::-1])
+        return RGBD(colour, None, None, frame.time_s)

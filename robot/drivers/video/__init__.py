@@ -1,1 +1,0 @@
-"""Streams of free-running cameras, and the rectification of their pictures."""
