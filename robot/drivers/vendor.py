@@ -23,12 +23,8 @@ def import_package(package: str, device: str, install: str) -> Any:
     """
     try:
         return import_module(package)
-    except ModuleNotFoundError as error:
-        raise DeviceError(f"{device} requires {package}, which is missing; {install}") from error
     except ImportError as error:
-        raise DeviceError(
-            f"{device} requires {package}, which cannot be imported: {error}; install what it lacks"
-        ) from error
+        raise DeviceError(f"{device} requires {package}, which is missing or incomplete ({error}); {install}") from error
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -41,7 +41,7 @@ class GelSightCameraConfig(CameraConfig):
         fps: Frame rate of the camera; by default that of the sensor.
         width: Width of the pictures that LeRobot records; the driver's picture is resized to it.
         height: Height of these pictures. Both have a default for every sensor except uvc.
-        settings: Further settings of the driver, such as crop, calibration, exposure_ms or timeout_s.
+        settings: Further settings of the driver, such as crop, exposure_ms or timeout_s.
     """
 
     device: str
