@@ -16,7 +16,7 @@ from benchmarks.common import ResultLine
 from benchmarks.query import STAGES, gel_images, write_index
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.export import touch_encoder_to_onnx
-from retrieval.model.onnx_encoder import EXPORT_SUFFIX, with_checksum
+from retrieval.model.onnx_encoder import EXPORT_SUFFIX
 from retrieval.search.defaults import shipped_model
 
 PHOTOS = 1000
@@ -84,7 +84,7 @@ def _models(folder: Path, source: Path) -> dict[str, Path]:
         models[backend] = Path(shutil.copy(source, folder / backend / "model.safetensors"))
         if backend != "torch":
             path = models[backend]
-            path.with_suffix(EXPORT_SUFFIX).write_bytes(with_checksum(touch_encoder_to_onnx(load_checkpoint(path))))
+            path.with_suffix(EXPORT_SUFFIX).write_bytes(touch_encoder_to_onnx(load_checkpoint(path)))
     return models
 
 

@@ -19,10 +19,10 @@ from retrieval.model.config import Config
 from retrieval.model.encode import TorchEncoder, touch_batch
 from retrieval.model.export import touch_encoder_to_onnx
 from retrieval.model.fusion import Matcher
-from retrieval.model.onnx_encoder import OnnxEncoder, with_checksum
+from retrieval.model.onnx_encoder import OnnxEncoder
 from retrieval.model.posterior import Posterior
 from retrieval.model.stored_partials import to_stored
-from retrieval.model.touches import TouchEncoder
+from retrieval.model.touch_reader import TouchEncoder
 from retrieval.search.defaults import shipped_model
 from retrieval.search.query.searcher import Searcher
 from retrieval.search.query.shard import FolderShard
@@ -109,7 +109,7 @@ def encoders(folder: Path, checkpoint: Checkpoint) -> Iterator[TouchEncoder]:
     yield TorchEncoder(checkpoint.matcher)
     if find_spec("onnx") and find_spec("onnxruntime"):
         path = folder / "exported.onnx"
-        path.write_bytes(with_checksum(touch_encoder_to_onnx(checkpoint)))
+        path.write_bytes(touch_encoder_to_onnx(checkpoint))
         yield OnnxEncoder(path, checkpoint.digest)
 
 

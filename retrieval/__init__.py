@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from retrieval.model.encode import encode_photos as encode_photos
     from retrieval.model.encode import encode_touches as encode_touches
     from retrieval.model.losses.loss import Loss as Loss
-    from retrieval.model.touches import EncodedTouches as EncodedTouches
+    from retrieval.model.touch_reader import EncodedTouches as EncodedTouches
     from retrieval.model.towers.tower import Tower as Tower
     from retrieval.report.evaluation import write_report as write_report
     from retrieval.search.build.build_index import build_index as build_index
@@ -62,7 +62,7 @@ _MODULES = {
     "Checkpoint": "model.checkpoint:Checkpoint",
     "Client": "serve.client:Client",
     "Config": "model.config:Config",
-    "EncodedTouches": "model.touches:EncodedTouches",
+    "EncodedTouches": "model.touch_reader:EncodedTouches",
     "Loss": "model.losses.loss:Loss",
     "Match": "search.query.answer:Match",
     "Method": "methods.method:Method",

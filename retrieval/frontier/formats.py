@@ -22,7 +22,7 @@ from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import batches, for_inference, has_fast_bfloat16, touch_batch
 from retrieval.model.export import touch_encoder_to_onnx
 from retrieval.model.fusion import Matcher
-from retrieval.model.onnx_encoder import OnnxEncoder, with_checksum
+from retrieval.model.onnx_encoder import OnnxEncoder
 
 LOGIT_TOLERANCE = 0.05
 """Largest negligible error of a match logit: the probability changes by about one percentage point at most."""
@@ -108,7 +108,7 @@ def _onnx(checkpoint: Checkpoint) -> Encode:
     """Return the encoder that `retrieve export` writes, on one thread."""
     with TemporaryDirectory() as folder:
         path = Path(folder, "model.onnx")
-        path.write_bytes(with_checksum(touch_encoder_to_onnx(checkpoint)))
+        path.write_bytes(touch_encoder_to_onnx(checkpoint))
         encoder = OnnxEncoder(path, checkpoint.digest, threads=1)
     return lambda images: encoder.encode(images)[0]
 

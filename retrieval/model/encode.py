@@ -8,7 +8,6 @@ index that was built elsewhere.
 
 import copy
 import itertools
-import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
@@ -23,14 +22,11 @@ from torch.nn.utils.fusion import fuse_conv_bn_weights
 
 from retrieval.errors import ConfigError
 from retrieval.model.fusion import ImageEncoding, Matcher
-from retrieval.model.touches import TouchEncodings
+from retrieval.model.touch_reader import TouchEncodings
 from retrieval.model.towers.tower import Tower
 
 T = TypeVar("T")
 Image = NDArray[np.float32]
-
-# A forked process has no OpenMP threads and would wait for them for ever.
-os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 
 def to_batch(images: Sequence[Image], device: torch.device | str = "cpu") -> Tensor:

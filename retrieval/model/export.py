@@ -1,14 +1,9 @@
-"""`retrieve export`: the touch encoder as ONNX, if ONNX Runtime is faster on this machine."""
+"""`retrieve export`: the touch encoder as ONNX, for queries without PyTorch."""
 
 import copy
 import json
 import logging
-import stat
-import statistics
-import time
 import warnings
-from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,9 +14,9 @@ import torch
 from torch import Tensor, nn
 
 from _touch_retrieval.files import write_atomically
-from retrieval.console.files import make_cache_folder, require_output, require_private
+from retrieval.console.files import require_output
 from retrieval.data.licences import LICENCES
-from retrieval.errors import BadInput, CheckpointError, RetrievalError
+from retrieval.errors import BadInput, RetrievalError
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import TorchEncoder, for_inference
 from retrieval.model.fusion import Matcher, Standardise
@@ -32,39 +27,32 @@ from retrieval.model.onnx_encoder import (
     LICENCES_KEY,
     OnnxEncoder,
     cached_export_path,
-    read_checked_export,
-    with_checksum,
+    is_private,
 )
 
 log = logging.getLogger(__name__)
-ROUNDS = 9
 TOLERANCE = 1e-3
 """Largest accepted difference from PyTorch: of partial activations relative to the largest, of embeddings absolute."""
 
 
 @dataclass(frozen=True)
 class ExportReport:
-    """Result of an export. Times are medians for one touch.
+    """Result of an export.
 
     Attributes:
         path: The ONNX file.
-        torch_ms: Milliseconds that PyTorch takes.
-        onnx_ms: Milliseconds that ONNX Runtime takes.
         partial_difference: Largest difference of a partial activation, relative to the largest partial activation.
         embedding_difference: Largest difference of an embedding's component.
     """
 
     path: str
-    torch_ms: float
-    onnx_ms: float
     partial_difference: float
     embedding_difference: float
 
     def __str__(self) -> str:
         return (
-            f"{self.path}: ONNX Runtime encodes a touch in {self.onnx_ms:.1f} ms, PyTorch in {self.torch_ms:.1f} ms "
-            f"({self.torch_ms / self.onnx_ms:.2f} times); partial activations differ by {self.partial_difference:.1g} "
-            f"of the largest, embeddings by {self.embedding_difference:.1g}"
+            f"{self.path}: partial activations differ from PyTorch's by {self.partial_difference:.1g} of the largest, "
+            f"embeddings by {self.embedding_difference:.1g}"
         )
 
 
@@ -76,28 +64,24 @@ def export(checkpoint: Checkpoint, out: Path | None = None) -> ExportReport:
         out: The file to write; by default the name next to the checkpoint that `retrieve query` looks up.
 
     Raises:
-        BadInput: `onnx` or `onnxruntime` is missing.
-        RetrievalError: ONNX Runtime is not faster on this machine, or its results differ from PyTorch's. Nothing is
-            written.
+        BadInput: `onnx` or `onnxruntime` is missing, or the file has another suffix.
+        RetrievalError: The results of ONNX Runtime differ from PyTorch's. Nothing is written.
     """
     lacking = [name for name in ("onnx", "onnxruntime") if find_spec(name) is None]
     if lacking:
         raise BadInput(f"export needs {lacking[0]}; install it with `pip install 'touch-retrieval[onnx]'`")
     path = out or checkpoint.path.with_suffix(EXPORT_SUFFIX)
     require_output(path, EXPORT_SUFFIX)
-    unverified = path.with_name(f".{path.name}.unverified")
-    try:
-        write_atomically(unverified, with_checksum(touch_encoder_to_onnx(checkpoint)))
-        unverified.chmod(unverified.stat().st_mode & ~(stat.S_IWGRP | stat.S_IWOTH))  # a query requires this
-        result = compare(checkpoint, unverified, path)
-        if not max(result.partial_difference, result.embedding_difference) <= TOLERANCE:
-            raise RetrievalError(f"nothing is exported, because ONNX Runtime gives other numbers. {result}")
-        if result.onnx_ms >= result.torch_ms:
-            raise RetrievalError(f"nothing is exported, because PyTorch is as fast on this machine. {result}")
-        unverified.replace(path)
-    finally:
-        unverified.unlink(missing_ok=True)
-    return result
+    model = touch_encoder_to_onnx(checkpoint)
+    with TemporaryDirectory() as folder:
+        unverified = Path(folder, path.name)
+        unverified.write_bytes(model)
+        differences = _differences(checkpoint, OnnxEncoder(unverified, checkpoint.digest))
+    report = ExportReport(str(path), *differences)
+    if not max(differences) <= TOLERANCE:
+        raise RetrievalError(f"nothing is exported, because ONNX Runtime gives other numbers. {report}")
+    write_atomically(path, model)
+    return report
 
 
 def export_to_cache(checkpoint: Checkpoint) -> ExportReport | None:
@@ -106,27 +90,17 @@ def export_to_cache(checkpoint: Checkpoint) -> ExportReport | None:
     For checkpoints in the folder of an installed package, which we must not write to. Queries also look in the cache.
 
     Returns:
-        The report; None if an export exists already or cannot be written. Queries work without it. A cache folder that
-        other users can write to is not used; a warning is logged.
+        The report; None if an export exists already or cannot be written. Queries work without it.
     """
     path = cached_export_path(checkpoint.digest)
     if path is None or checkpoint.path.with_suffix(EXPORT_SUFFIX).is_file():
         return None
     try:
-        make_cache_folder(path.parent)
-        require_private(path.parent, path.parent.stat())
-    except BadInput as error:
-        log.warning("%s; the cache gets no export for queries", error)
-        return None
-    except OSError as error:
-        log.info("no export for queries: %s", error)
-        return None
-    with suppress(CheckpointError):  # absent, damaged, or writable by others
-        read_checked_export(path)
-        return None
-    try:
-        path.unlink(missing_ok=True)  # every file of the cache is ours
-        return export(checkpoint, path)
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not is_private(path.parent):
+            log.warning("%s must have mode 0700 to take exports for queries; run `chmod 700` on it", path.parent)
+            return None
+        return None if path.is_file() else export(checkpoint, path)
     except (OSError, RetrievalError) as error:
         log.info("no export for queries: %s", error)
         return None
@@ -228,30 +202,11 @@ class _FrozenNorm(nn.Module):
         return (x - self.mean) * self.scale
 
 
-def compare(checkpoint: Checkpoint, written: Path, path: Path) -> ExportReport:
-    """Encode the same touch with PyTorch and ONNX Runtime, alternately.
-
-    Args:
-        checkpoint: The model.
-        written: The ONNX file.
-        path: Its final name, for the report.
-    """
-    torch_encoder, onnx_encoder = TorchEncoder(checkpoint.matcher), OnnxEncoder(written, checkpoint.digest)
+def _differences(checkpoint: Checkpoint, exported: OnnxEncoder) -> tuple[float, float]:
+    """Return the differences of a random touch's encoding from PyTorch's, as in `ExportReport`."""
     side, fingers = checkpoint.config.preprocessing.touch_px, checkpoint.config.matcher.fingers
     touch = list(np.random.default_rng(0).random((fingers, side, side, 3), dtype=np.float32))
-    partial, embedding, *_ = torch_encoder.encode([touch])
-    other_partial, other_embedding, *_ = onnx_encoder.encode([touch])
-    times = [
-        (_ms(lambda: torch_encoder.encode([touch])), _ms(lambda: onnx_encoder.encode([touch]))) for _ in range(ROUNDS)
-    ]
-    torch_ms, onnx_ms = (statistics.median(arm) for arm in zip(*times, strict=True))
-    partial_difference = float(np.abs(partial - other_partial).max() / np.abs(partial).max())
-    return ExportReport(
-        str(path), torch_ms, onnx_ms, partial_difference, float(np.abs(embedding - other_embedding).max())
-    )
-
-
-def _ms(function: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    function()
-    return 1e3 * (time.perf_counter() - start)
+    partial, embedding, *_ = TorchEncoder(checkpoint.matcher).encode([touch])
+    other_partial, other_embedding, *_ = exported.encode([touch])
+    partial_difference = np.abs(partial - other_partial).max() / np.abs(partial).max()
+    return float(partial_difference), float(np.abs(embedding - other_embedding).max())

@@ -1,8 +1,6 @@
-"""The photo encoder of a long build: ONNX Runtime if it is installed, agrees with PyTorch and is faster."""
+"""The photo encoder of a long build: ONNX Runtime if it is installed and agrees with PyTorch."""
 
 import logging
-import statistics
-import time
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from typing import NamedTuple
@@ -17,7 +15,7 @@ from retrieval.model.onnx_encoder import open_session
 
 log = logging.getLogger(__name__)
 Floats = NDArray[np.float32]
-ROUNDS, SAMPLE = 3, 8
+SAMPLE = 4
 TOLERANCE = 2e-4
 """Largest accepted difference of a partial activation from PyTorch's, relative to the largest. Storage as float16
 rounds by more."""
@@ -65,26 +63,20 @@ def onnx_photo_encoder(checkpoint: Checkpoint) -> PhotoEncoder | None:
 
 
 def fastest_photo_encoder(checkpoint: Checkpoint) -> PhotoEncoder:
-    """Return the faster of the two encoders, or PyTorch's if the partial activations differ.
+    """Return the encoder by ONNX Runtime, or PyTorch's on a GPU or if the partial activations differ.
 
     Do not call this while other threads encode: the export would also record their operations.
     """
+    torch = torch_photo_encoder(checkpoint)
+    on_cpu = next(checkpoint.matcher.parameters()).device.type == "cpu"
+    onnx = onnx_photo_encoder(checkpoint) if on_cpu else None
+    if onnx is None:
+        return torch
     settings = checkpoint.config.preprocessing
     shape = SAMPLE, settings.photo_px, len(settings.views) * settings.photo_px, 3
     images = list(np.random.default_rng(0).random(shape, dtype=np.float32))
-    torch, onnx = torch_photo_encoder(checkpoint), onnx_photo_encoder(checkpoint)
-    if onnx is None:
-        return torch
     partial, other = torch(images).partial, onnx(images).partial
     if not np.abs(partial - other).max() <= TOLERANCE * np.abs(partial).max():
         log.warning("ONNX Runtime gives other partial activations than PyTorch; PyTorch encodes the photos")
         return torch
-    times = [[_seconds(each, images) for each in (torch, onnx)] for _ in range(ROUNDS)]
-    torch_s, onnx_s = (statistics.median(column) for column in zip(*times, strict=True))
-    return onnx if onnx_s < torch_s else torch
-
-
-def _seconds(encode: PhotoEncoder, images: Sequence[Image]) -> float:
-    start = time.thread_time()
-    encode(images)
-    return time.thread_time() - start
+    return onnx

@@ -9,7 +9,8 @@ from retrieval.data.resize import RgbImage
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import encode_photos
-from retrieval.model.touches import AnyImage, EncodedTouches, read_image
+from retrieval.model.touch_reader import EncodedTouches
+from retrieval.model.touches import AnyImage, read_image
 from retrieval.search.defaults import find_model
 
 

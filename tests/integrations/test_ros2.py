@@ -12,7 +12,7 @@ pytest.importorskip("rosbags")
 
 import retrieval
 from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
-from retrieval.model.touches import TouchReader
+from retrieval.model.touch_reader import TouchReader
 from retrieval.search.build.build_index import build_index
 from robot.importers.rosbag import Bag
 from tests import synthetic

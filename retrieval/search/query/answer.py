@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from retrieval.errors import BadInput
 from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck
 from retrieval.model.posterior import PosteriorProbabilities
-from retrieval.model.touches import TouchEncodings
+from retrieval.model.touch_reader import TouchEncodings
 
 MATCH, NONE_OF_THESE, UNCALIBRATED = "match", "none of these", "uncalibrated"
 CLEAR_PROBABILITY = 0.5

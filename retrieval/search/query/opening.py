@@ -12,7 +12,7 @@ from indexes.store.sharded import ShardedManifest, is_sharded, open_shard, read_
 from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_checkpoint_info, read_scorer
 from retrieval.model.fusion_scorer import FusionScorer
 from retrieval.model.stored_partials import CELLS, stored_layout
-from retrieval.model.touches import TouchEncoder
+from retrieval.model.touch_reader import TouchEncoder
 from retrieval.search import defaults
 from retrieval.search.query.objects import check_usable
 from retrieval.search.query.shard import FolderShard, IndexInfo, Shard, Shards

@@ -18,16 +18,8 @@ from retrieval.model.fusion_scorer import CONTACT, NOT_A_GEL, FusionScorer
 from retrieval.model.onnx_encoder import find_export
 from retrieval.model.posterior import NONE_PRIOR, Posterior, PosteriorProbabilities, require_prior
 from retrieval.model.reference_calibration import REFERENCE_ROWS
-from retrieval.model.touches import (
-    AnyImage,
-    AnyTouches,
-    EncodedTouches,
-    InputImage,
-    Stopwatch,
-    TouchEncoder,
-    TouchReader,
-    parse_grasps,
-)
+from retrieval.model.touch_reader import EncodedTouches, Stopwatch, TouchEncoder, TouchReader
+from retrieval.model.touches import AnyImage, AnyTouches, InputImage, parse_grasps
 from retrieval.search.query.answer import (
     NONE_OF_THESE,
     Match,

@@ -24,7 +24,7 @@ from retrieval.model.fusion_scorer import FusionScorer
 from retrieval.model.posterior import EvidenceMass, Posterior
 from retrieval.model.reference_calibration import REFERENCE_ROWS
 from retrieval.model.stored_partials import StoredPartials
-from retrieval.model.touches import Stopwatch
+from retrieval.model.touch_reader import Stopwatch
 from retrieval.search.query.answer import NearestReference
 from retrieval.search.query.objects import ListedPhoto, Objects, ScoredObjects, listed_photo
 from retrieval.search.query.reference_touches import References, Similarities

@@ -10,7 +10,8 @@ import numpy as np
 
 from retrieval.errors import BadInput
 from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL
-from retrieval.model.touches import AnyImage, AnyTouches, Stopwatch, parse_grasps
+from retrieval.model.touch_reader import Stopwatch
+from retrieval.model.touches import AnyImage, AnyTouches, parse_grasps
 from retrieval.model.verification import (
     ACCEPT,
     ANOTHER_GRASP,

@@ -1,0 +1,206 @@
+"""Read touches and encode them by the matcher: partial activations, embeddings and readings."""
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from retrieval.data.resize import RgbImage
+from retrieval.errors import BadInput, IncompleteSearch, NumericalError
+from retrieval.model.config import Config
+from retrieval.model.fork_guard import fork_guard
+from retrieval.model.fusion_scorer import contact_level
+from retrieval.model.gel_images import GelImage
+from retrieval.model.touches import AnyImage, InputImage, parse_grasps
+
+BATCH = 32
+"""Largest number of grasps whose images are in memory, and in the encoder, at once."""
+DECODERS = 2  # a touch has two images
+Floats = NDArray[np.float32]
+
+
+class TouchEncodings(NamedTuple):
+    """Encoding of G grasps, float32.
+
+    Attributes:
+        partials: (G, partial) partial activations.
+        embeddings: (G, embedding_dim) unit embeddings.
+        readings: (G, fingers, 2) log-odds of the gel head, if the model has one (`retrieval.model.fusion_scorer`).
+        levels: (G, fingers) differences in grey levels from the no-contact frames, if given.
+    """
+
+    partials: Floats
+    embeddings: Floats
+    readings: Floats | None = None
+    levels: Floats | None = None
+
+
+class TouchEncoder(Protocol):
+    """Encoder of touches: PyTorch or ONNX Runtime."""
+
+    @property
+    def name(self) -> str:
+        """Its name in the answer."""
+
+    def encode(self, touches: Sequence[Sequence[RgbImage]]) -> TouchEncodings:
+        """Encode grasps, each a sequence of its fingers' images."""
+
+
+class EncodedTouches(NamedTuple):
+    """Encoding of images, one row each, float32.
+
+    Attributes:
+        embeddings: (N, embedding_dim) unit vectors for candidate search.
+        partials: (N, partial) partial activations, from which pairs are scored.
+
+    >>> with retrieval.open("index") as searcher:
+    ...     embeddings, partials = searcher.encode([["a.png", "b.png"], ["a2.png", "b2.png"]])
+    >>> len(embeddings), len(partials), embeddings.dtype.name
+    (2, 2, 'float32')
+    """
+
+    embeddings: Floats
+    partials: Floats
+
+
+class Stopwatch:
+    """Milliseconds of named stages and the total."""
+
+    def __init__(self) -> None:
+        self._start = time.perf_counter()
+        self._stages: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Time the block as part of `stage`."""
+        start = time.perf_counter()
+        yield
+        self.add({stage: 1e3 * (time.perf_counter() - start)})
+
+    def add(self, timing_ms: Mapping[str, float]) -> None:
+        """Add stages that another stopwatch timed."""
+        for stage, ms in timing_ms.items():
+            self._stages[stage] = self._stages.get(stage, 0.0) + ms
+
+    def finish(self, parts: int) -> dict[str, float]:
+        """Return the stages in their order and the "total" since construction, each divided by `parts`."""
+        everything = {**self._stages, "total": 1e3 * (time.perf_counter() - self._start)}
+        return {stage: ms / parts for stage, ms in everything.items()}
+
+
+class TouchReader:
+    """Reads and encodes touches for a model."""
+
+    def __init__(self, config: Config, encoder: TouchEncoder, compares_contact: bool = False) -> None:
+        """Prepare a reader.
+
+        Args:
+            config: Settings of the model.
+            encoder: Its touch encoder.
+            compares_contact: Compare each touch with its no-contact frame to decide whether there is a contact.
+        """
+        self.encoder, self.fingers, self._preprocessing = encoder, config.matcher.fingers, config.preprocessing
+        self.takes_background = compares_contact or self._preprocessing.background != "none"
+
+    def no_contact_frames(self, background: Sequence[AnyImage] | None) -> Sequence[GelImage | None]:
+        """Return the no-contact frame of each finger, None for a model that uses none.
+
+        Raises BadInput if the frames are missing, or given to a model that would ignore them.
+        """
+        policy = self._preprocessing.background
+        if background is None and policy != "none":
+            raise BadInput(
+                f'this model subtracts the no-contact gel (background = "{policy}"): give a no-contact frame for each '
+                "finger with --background"
+            )
+        if background is None:
+            return [None] * self.fingers
+        if not self.takes_background:
+            raise BadInput("this model uses gel images unchanged and would ignore --background; leave it out")
+        frames = parse_grasps(background, self.fingers, noun="background")
+        if len(frames) != 1:
+            raise BadInput(f"give one background, with a no-contact frame for each finger; got {len(frames)}")
+        return [self._gel_image(frame, True) for frame in frames[0]]
+
+    def encode(
+        self, grasps: Sequence[Sequence[InputImage]], no_contact_frames: Sequence[GelImage | None], clock: Stopwatch
+    ) -> TouchEncodings:
+        """Encode grasps in batches.
+
+        Args:
+            grasps: The images of each grasp.
+            no_contact_frames: The no-contact frame of each finger, or None.
+            clock: Times the stages "decode" and "encode".
+        """
+        parts, levels = [], []
+        for start in range(0, len(grasps), BATCH):
+            with clock("decode"):
+                views = self._preprocessed(grasps[start : start + BATCH], no_contact_frames)
+                levels += [[level for _, level in grasp] for grasp in views]
+            with clock("encode"), fork_guard.computing():
+                parts.append(self.encoder.encode([[view for view, _ in grasp] for grasp in views]))
+        partials, embeddings = (np.concatenate([part[place] for part in parts]) for place in (0, 1))
+        readings = [part.readings for part in parts if part.readings is not None]
+        return TouchEncodings(
+            _finite(partials, "partial activation"),
+            _finite(embeddings, "embedding"),
+            np.concatenate(readings) if readings else None,
+            None if no_contact_frames[0] is None else np.array(levels, dtype=np.float32),
+        )
+
+    def _preprocessed(
+        self, grasps: Sequence[Sequence[InputImage]], no_contact_frames: Sequence[GelImage | None]
+    ) -> list[list[tuple[RgbImage, float]]]:
+        """Return the preprocessed images of grasps, each with its difference from its no-contact frame (0 without one).
+
+        The images are decoded in parallel. Of several bad ones, the first is reported. The threads end with the call,
+        because a forked process would not have them.
+        """
+        subtracts = self._preprocessing.background != "none"
+        for source in (source for grasp in grasps for source in grasp):
+            # A Pillow image reads its file on the first access to its pixels, which two threads must not do at once.
+            if isinstance(source.image, Image.Image):
+                with suppress(Exception):  # `read` reports it
+                    source.image.load()
+
+        def view(source: InputImage, reference: GelImage | None) -> tuple[RgbImage, float]:
+            with fork_guard.computing():
+                image = self._gel_image(source, reference is not None)
+                if reference is None:
+                    return self._preprocessing.touch(image.touch), 0.0
+                level = contact_level(_blocks(image), _blocks(reference))
+                return self._preprocessing.touch(image.touch, reference.touch if subtracts else None), level
+
+        with ThreadPoolExecutor(DECODERS, "decode") as threads:
+            jobs = [
+                [threads.submit(view, source, frame) for source, frame in zip(grasp, no_contact_frames, strict=True)]
+                for grasp in grasps
+            ]
+            return [[job.result() for job in grasp] for grasp in jobs]
+
+    def _gel_image(self, source: InputImage, compares_contact: bool) -> GelImage:
+        """Return an image at this model's sizes. Raises ImageError; IncompleteSearch if read for another model."""
+        px = self._preprocessing.touch_px
+        if not isinstance(source.image, GelImage):
+            return GelImage.of(source.read(), px, compares_contact)
+        if source.image.touch.shape != (px, px, 3):
+            raise IncompleteSearch("an index of another model was opened in the meantime; repeat the query")
+        return source.image
+
+
+def _blocks(image: GelImage) -> RgbImage:
+    if image.blocks is None:
+        raise BadInput("a gel image was read without the blocks for the comparison with a no-contact frame")
+    return image.blocks
+
+
+def _finite(values: Floats, name: str) -> Floats:
+    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    if len(bad):
+        raise NumericalError(f"the {name} of touch {bad[0] + 1} contains a NaN or infinite number; use another model")
+    return values
