@@ -7,11 +7,9 @@ import typer
 
 from retrieval.commands.options import COUNT, FRACTION, Background, GelSight, Index, IndexModel, Json, NoVerify
 from retrieval.console.files import require_output, text_bytes, write_output
-from retrieval.console.memory import paused_collection
 from retrieval.console.output import print_json, say
 
 
-@paused_collection()
 def query(
     *,
     gelsight: GelSight,

@@ -1,21 +1,6 @@
-"""Memory in commands: when reference cycles are collected, and when freed memory returns to the system."""
+"""Memory in commands: freed memory stays in the process."""
 
-import gc
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-
-
-@contextmanager
-def paused_collection() -> Iterator[None]:
-    """Pause the collection of reference cycles during the block, or leave it disabled if it is."""
-    was_enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_enabled:
-            gc.enable()
 
 
 def keep_freed_memory() -> None:

@@ -24,7 +24,9 @@ def import_package(package: str, device: str, install: str) -> Any:
     try:
         return import_module(package)
     except ImportError as error:
-        raise DeviceError(f"{device} requires {package}, which is missing or incomplete ({error}); {install}") from error
+        raise DeviceError(
+            f"{device} requires {package}, which is missing or incomplete ({error}); {install}"
+        ) from error
 
 
 @dataclass(frozen=True, kw_only=True)
