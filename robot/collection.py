@@ -15,7 +15,6 @@ import functools
 import itertools
 import json
 import re
-import time
 import zlib
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -82,7 +81,6 @@ class Progress:
         grasps_done: Accepted grasps, plus the missing grasps of objects that need no further attempt.
         accepted: Accepted grasps.
         attempts: Attempts so far.
-        seconds_left: Estimated time left; None if unknown.
     """
 
     objects: int
@@ -91,16 +89,11 @@ class Progress:
     grasps_done: int
     accepted: int
     attempts: int
-    seconds_left: float | None
-
-    @property
-    def accept_rate(self) -> float:
-        """Fraction of the attempts that gave an accepted grasp."""
-        return self.accepted / self.attempts if self.attempts else 0.0
 
     def __str__(self) -> str:
+        rate = self.accepted / self.attempts if self.attempts else 0.0
         done = f"{self.objects_done} of {self.objects} objects"
-        return f"{done}, {self.accept_rate:.0%} of {self.attempts} attempts accepted"
+        return f"{done}, {rate:.0%} of {self.attempts} attempts accepted"
 
 
 def collect(
@@ -221,8 +214,6 @@ def _check_can_continue(folder: Path, expected: Mapping[str, Any], strict: bool)
     else:
         expected = {name: value for name, value in expected.items() if name != "devices"}
     stored, expected = ({**info, "collection": {"rounds": False, **info["collection"]}} for info in (stored, expected))
-    if "gels" not in stored:  # recordings of older versions
-        expected = {name: value for name, value in expected.items() if name != "gels"}
     for name, value in _flatten(expected).items():
         old = _flatten(stored).get(name)
         if old != value:
@@ -267,7 +258,6 @@ class _Collection:
         for grasp in read_recording(writer.folder).grasps if is_enough and writer.grasp_ids else ():
             if grasp.grasped:  # accepted before the collection was stopped
                 self._add_accepted(grasp)
-        self._start, self._done_at_start = time.monotonic(), self._count_done()
 
     def run(self, workers: WorkerPool[GraspAttempt]) -> None:
         """Make and record all attempts in order; workers may work on later attempts that will be needed."""
@@ -350,26 +340,19 @@ class _Collection:
         grasp_id = grasp_id_of(attempt.object_id, attempt.number)
         return logged(accepted=accepted, grasp_id=grasp_id, score=score, fit=attempt.fit)
 
-    def _count_done(self) -> int:
-        target = self.settings.grasps
-        return sum(self.tallies[name].accepted if self._needs_attempt(name, target) else target for name in self.names)
-
     def _report(self) -> None:
         if self._progress is None:
             return
-        tallies = [self.tallies[name] for name in self.names]
-        grasps_target, grasps_done = len(tallies) * self.settings.grasps, self._count_done()
-        fresh = grasps_done - self._done_at_start
-        left = (grasps_target - grasps_done) * (time.monotonic() - self._start) / fresh if fresh else None
+        tallies, target = [self.tallies[name] for name in self.names], self.settings.grasps
+        open_tallies = [counts for counts in tallies if self._needs_attempt(counts.object_id, target)]
         self._progress(
             Progress(
                 objects=len(tallies),
-                objects_done=sum(not self._needs_attempt(name, self.settings.grasps) for name in self.names),
-                grasps_target=grasps_target,
-                grasps_done=grasps_done,
-                accepted=sum(each.accepted for each in tallies),
-                attempts=sum(each.attempts for each in tallies),
-                seconds_left=left,
+                objects_done=len(tallies) - len(open_tallies),
+                grasps_target=len(tallies) * target,
+                grasps_done=len(tallies) * target - sum(target - counts.accepted for counts in open_tallies),
+                accepted=sum(counts.accepted for counts in tallies),
+                attempts=sum(counts.attempts for counts in tallies),
             )
         )
 

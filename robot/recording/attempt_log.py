@@ -132,7 +132,6 @@ class Tally:
         attempts: Attempts so far.
         accepted: Accepted grasps.
         outcomes: Number of attempts by outcome.
-        reasons: Number of attempts by the reason why there was no grasp.
         skipped: Reason why the object is ungraspable; None if it is graspable.
     """
 
@@ -140,7 +139,6 @@ class Tally:
     attempts: int = 0
     accepted: int = 0
     outcomes: Counter[str] = field(default_factory=Counter)
-    reasons: Counter[str] = field(default_factory=Counter)
     skipped: str | None = None
 
     def add(self, attempt: LoggedAttempt) -> None:
@@ -151,8 +149,6 @@ class Tally:
         self.attempts += 1
         self.accepted += attempt.accepted
         self.outcomes[attempt.outcome] += 1
-        if attempt.reason:
-            self.reasons[attempt.reason] += 1
 
 
 def tally(attempts: Iterable[LoggedAttempt]) -> dict[str, Tally]:

@@ -46,7 +46,6 @@ from robot.storage import (
 )
 
 SCHEMA_VERSION = 1
-KNOWN_VERSIONS = (1,)
 INFO_FILE = "recording.json"
 METADATA_FILE = "metadata.jsonl"
 IMAGES_FOLDER = "images"
@@ -169,10 +168,8 @@ def read_info(root: Path) -> dict[str, Any]:
 
 
 def _check_info(info: Mapping[str, Any], path: str | Path = INFO_FILE) -> None:
-    version = info.get("schema_version")
-    if type(version) is not int or version not in KNOWN_VERSIONS:
-        known = ", ".join(map(str, KNOWN_VERSIONS))
-        raise RecordingError(f"{path}: schema_version must be a supported one ({known}), got {version!r}")
+    if (version := info.get("schema_version")) != SCHEMA_VERSION:
+        raise RecordingError(f"{path}: schema_version must be {SCHEMA_VERSION}, got {version!r}")
     for key in ("source", "sensor"):
         check_name(f"{path}: {key}", info.get(key))
 

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import json
-import zlib
 
 import cv2
 import numpy as np
@@ -15,7 +14,7 @@ from robot.grasping.attempt import AttemptRunner, depth_in_mm
 from robot.grasping.gates import ContactAreaGate, RecordedTouches
 from robot.grasping.planner import CylinderPlanner, GraspPlan
 from robot.grasping.settings import AttemptSettings, GraspSettings
-from robot.readings import RGBD, Pose
+from robot.readings import Pose
 from robot.recording.attempt_log import read_attempts
 from robot.recording.folder import RecordingWriter, read_recording
 from robot.rig import Rig
@@ -138,12 +137,6 @@ def test_the_recording_contains_the_settings_of_its_collection(tmp_path):
     assert info["collection"]["attempt"]["grasp"]["force_n"] == [5.0, 25.0]
 
 
-def test_every_attempt_is_logged_with_its_reason_and_acceptance_reads_it(tmp_path):
-    tallies = run(tmp_path / "r", ["round-0", "wide-1"], grasps=1)
-    assert tallies["wide-1"].outcomes == {"no_plan": 14}
-    assert all("wider than the stroke" in reason for reason in tallies["wide-1"].reasons)
-
-
 # End conditions ---------------------------------------------------------------------------------------------
 
 
@@ -151,11 +144,8 @@ def test_an_object_that_cannot_be_grasped_ends_at_the_limit_of_attempts(tmp_path
     tallies = run(tmp_path / "r", ["wide-0", "none-1", "round-2"], grasps=1)
     assert [each.accepted for each in tallies.values()] == [0, 0, 1]
     assert tallies["wide-0"].attempts == tallies["none-1"].attempts == 4 * 1 + 10
-    assert any("no object" in reason or "lowest height" in reason for reason in tallies["none-1"].reasons)
-
-
-def test_the_number_of_attempts_is_a_setting(tmp_path):
-    assert run(tmp_path / "r", ["wide-0"], limit=3)["wide-0"].attempts == 3
+    logged = read_attempts(tmp_path / "r", {row["grasp_id"] for row in rows(tmp_path / "r")})
+    assert all("wider than the stroke" in each.reason for each in logged if each.object_id == "wide-0")
 
 
 def test_an_object_at_its_limit_is_not_tried_again_when_the_collection_continues(tmp_path):
@@ -209,11 +199,9 @@ def test_progress_is_reported_after_every_attempt(tmp_path):
     run(tmp_path / "r", ["round-0", "wide-1"], grasps=2, limit=4, progress=reports.append)
     assert [each.attempts for each in reports] == list(range(len(reports)))
     first, last = reports[0], reports[-1]
-    assert (first.grasps_done, first.objects_done, first.seconds_left, first.accept_rate) == (0, 0, None, 0.0)
+    assert (first.grasps_done, first.objects_done) == (0, 0)
     assert (last.objects, last.objects_done, last.grasps_target, last.grasps_done, last.accepted) == (2, 2, 4, 4, 2)
-    assert last.accept_rate == 2 / last.attempts
     assert str(last) == f"2 of 2 objects, {2 / last.attempts:.0%} of {last.attempts} attempts accepted"
-    assert last.seconds_left == 0.0
 
 
 class OneRig(FakeRig):
@@ -238,24 +226,6 @@ def test_a_collection_continues_with_devices_that_read_back_other_values(tmp_pat
     collect(lambda: OneRig(3), tmp_path / "r", **arguments)
     assert sum(grasp.grasped for grasp in read_recording(tmp_path / "r").grasps) == 2
     assert OneRig.times == 2
-
-
-@pytest.mark.parametrize("make", [OneRig, FakeRig])
-def test_a_recording_without_gels_of_an_older_version_can_be_continued(tmp_path, make):
-    arguments = {"objects": ["round-0"], "seed": 3, "settings": CollectSettings(1)}
-    collect(lambda: make(3), tmp_path / "r", **arguments)
-    path = tmp_path / "r" / "recording.json"
-    info = json.loads(path.read_text())
-    assert info.pop("gels") == "unknown"
-    path.write_text(json.dumps(info))
-
-    def make_with_gels():
-        rig = make(3)
-        rig.info["gels"] = [{"a": {"thickness_mm": 2.0}}]
-        return rig
-
-    collect(make_with_gels, tmp_path / "r", **(arguments | {"objects": ["round-0", "round-2"]}))
-    assert {grasp.object_id for grasp in read_recording(tmp_path / "r").grasps} == {"round-0", "round-2"}
 
 
 # Rounds -----------------------------------------------------------------------------------------------------
@@ -289,13 +259,6 @@ def test_an_object_that_cannot_be_grasped_is_left_out_of_later_rounds(tmp_path):
     tallies = run(tmp_path / "r", ["round-0", "wide-1", "round-2"], rounds=True, limit=4)
     assert tallies["wide-1"].attempts == 4
     assert objects_of_accepted(tmp_path / "r") == ["round-0", "round-2"] * 2
-
-
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_an_ungraspable_object_is_skipped_in_rounds_too(tmp_path, jobs):
-    settings = CollectSettings(2, None, AttemptSettings(), rounds=True)
-    tallies = collect(picky_rig, tmp_path / "r", objects=NAMES, seed=3, settings=settings, jobs=jobs)
-    assert [(each.accepted, each.skipped) for each in tallies] == [(2, None), (0, "too thin"), (2, None)]
 
 
 @pytest.mark.parametrize("stop", range(1, 9))
@@ -432,9 +395,9 @@ def picky_rig():
     return rig
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_an_ungraspable_object_is_skipped_at_once_and_the_others_are_collected(tmp_path, jobs):
-    settings = CollectSettings(2, None, AttemptSettings())
+@pytest.mark.parametrize(("jobs", "rounds"), [(1, False), (2, False), (2, True)])
+def test_an_ungraspable_object_is_skipped_at_once_and_the_others_are_collected(tmp_path, jobs, rounds):
+    settings = CollectSettings(2, None, AttemptSettings(), rounds)
     tallies = collect(picky_rig, tmp_path / "r", objects=NAMES, seed=3, settings=settings, jobs=jobs)
     assert [(each.accepted, each.skipped) for each in tallies] == [(2, None), (0, "too thin"), (2, None)]
     logged = read_attempts(tmp_path / "r", {row["grasp_id"] for row in rows(tmp_path / "r")})
@@ -521,15 +484,6 @@ def test_any_gate_decides_which_grasps_are_accepted(tmp_path):
     assert [attempt.score for attempt in logged] == [0.25, 0.25, 0.75] * 2
 
 
-def test_the_jaws_are_open_and_the_object_is_put_down_inside_the_table():
-    rig = FakeRig(3)
-    with rig:
-        attempter = AttemptRunner(rig, 3, AttemptSettings())
-        results = [attempter.run("round-0", number) for number in range(12)]
-        assert rig.gripper.state().status == "idle"
-    assert {"held", "slipped"} == {result.outcome for result in results}
-
-
 def test_an_attempt_is_a_function_of_seed_object_and_number_alone():
     with FakeRig(3) as one, FakeRig(3) as two:
         first, second = (AttemptRunner(rig, 3, AttemptSettings()) for rig in (one, two))
@@ -537,22 +491,6 @@ def test_an_attempt_is_a_function_of_seed_object_and_number_alone():
             first.run("round-0", number)
         second.run("thin-1", 5)
         assert first.run("round-2", 4) == second.run("round-2", 4)
-
-
-def test_other_seeds_give_other_grasps(tmp_path):
-    run(tmp_path / "r", seed=3)
-    run(tmp_path / "s", seed=4)
-    assert {tuple(row["pose"]) for row in rows(tmp_path / "r")}.isdisjoint(
-        tuple(row["pose"]) for row in rows(tmp_path / "s")
-    )
-
-
-def test_random_numbers_are_those_of_the_triple():
-    """The force is the fifth number of the generator seeded with seed, crc32 of the name, and number."""
-    result, _ = calls_of(AttemptSettings(grasp=GraspSettings(force_n=(10.0, 20.0))))
-    rng = np.random.default_rng([3, zlib.crc32(b"round-0"), 0])
-    rng.uniform(-1, 1, 2), rng.uniform(), rng.uniform(0, np.pi)
-    assert result.fields["force_n"] == round(float(rng.uniform(10, 20)), 3)
 
 
 # Devices that fail ------------------------------------------------------------------------------------------
@@ -653,6 +591,7 @@ OTHER_SETTINGS = {
         {"attempt": AttemptSettings(grasp=GraspSettings(force_n=(5, 30)))},
         r"with attempt\.grasp\.force n \[5\.0, 25\.0\], not \[5\.0, 30\.0\]",
     ),
+    "another version": ({"version": "0.0.1"}, r"was collected with software version '0\.0\.1', not"),
     "another gate": ({"gate": ContactAreaGate(20.0)}, "was collected with gate 'ContactAreaGate"),
     "other objects": ({"names": ["round-9"]}, "was collected with other objects"),
     "fewer objects": ({"names": ["round-0"]}, "was collected with other objects"),
@@ -662,23 +601,15 @@ OTHER_SETTINGS = {
 @pytest.mark.parametrize("case", OTHER_SETTINGS)
 def test_a_recording_with_other_settings_is_refused_and_not_changed(tmp_path, case):
     run(tmp_path / "r")
-    before = files(tmp_path / "r")
     options, message = OTHER_SETTINGS[case]
+    options = dict(options)
+    if version := options.pop("version", None):
+        info = json.loads((tmp_path / "r/recording.json").read_text())
+        (tmp_path / "r/recording.json").write_text(json.dumps({**info, "software_version": version}))
+    before = files(tmp_path / "r")
     with pytest.raises(RecordingError, match=message):
         run(tmp_path / "r", **options)
     assert files(tmp_path / "r") == before
-
-
-def test_a_recording_of_another_version_is_refused(tmp_path):
-    run(tmp_path / "r")
-    path = tmp_path / "r" / "recording.json"
-    info = json.loads(path.read_text())
-    path.write_text(json.dumps({**info, "software_version": "0.0.1"}))
-    with pytest.raises(RecordingError, match=r"was collected with software version '0\.0\.1', not"):
-        run(tmp_path / "r")
-    path.write_text(json.dumps({**info, "schema_version": 2}))
-    with pytest.raises(RecordingError, match=r"schema_version must be a supported one \(1\), got 2"):
-        run(tmp_path / "r")
 
 
 def test_a_recording_that_no_rig_collected_is_refused(tmp_path):
@@ -716,15 +647,6 @@ def test_an_object_with_an_invalid_name_is_refused_before_any_motion(tmp_path, n
     with pytest.raises(RecordingError, match="an object's name must be a non-empty printable string"):
         run(tmp_path / "r", names=["round-0", name])
     assert not (tmp_path / "r").exists()
-
-
-@pytest.mark.parametrize(
-    "setting",
-    [{"outputs": ("photo",)}, {"settle_s": -1.0}, {"travel_mm_s": 0.0}, {"jpeg_quality": 101}, {"table_share": 1.1}],
-)
-def test_an_attempt_setting_out_of_range_is_refused(setting):
-    with pytest.raises(RobotConfigError, match=next(iter(setting))):
-        AttemptSettings(**setting)
 
 
 def test_a_real_rig_cannot_run_in_several_jobs(tmp_path, monkeypatch):
@@ -765,20 +687,3 @@ def test_a_grasp_has_an_id_that_a_recording_accepts(tmp_path, object_id):
         for number in (0, 12345):
             writer.append(grasp_id_of(object_id, number), object_id, {"photo": image, "touch_a": image})
     assert grasp_id_of("mug", 7) == "mug-0007"
-
-
-def test_similar_names_have_different_grasp_ids():
-    names = ["a b", "a_b", "a/b", "a:b", "y" * 150, "y" * 151]
-    assert len({grasp_id_of(name, 0) for name in names}) == len(names)
-
-
-def test_the_fit_does_not_change_the_picture_of_the_camera():
-    with FakeRig(3) as rig:
-        rig.prepare("round-0", 0)
-        image = rig.camera.read()
-    copy = RGBD(image.colour.copy(), image.depth_m.copy(), image.intrinsics, 0.0)
-    from robot.sight.cylinder import fit_cylinder
-
-    fit_cylinder(image, rig.camera.extrinsics)
-    assert (image.colour == copy.colour).all()
-    np.testing.assert_array_equal(image.depth_m, copy.depth_m)

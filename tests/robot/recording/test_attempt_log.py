@@ -98,12 +98,7 @@ def test_an_earlier_line_without_its_grasp_is_damage(tmp_path):
         b"\xff",
         b'{"object_id": "mug"}',
         b'{"object_id": "mug", "number": 0, "outcome": "lost", "accepted": true, "ended_s": 1.0}',
-        b'{"object_id": "mug", "number": 0, "outcome": "held", "accepted": 1, "ended_s": 1.0}',
-        b'{"object_id": "mug", "number": "0", "outcome": "held", "accepted": true, "ended_s": 1.0}',
-        b'{"object_id": "mug", "number": 0, "outcome": "held", "accepted": true, "ended_s": null}',
-        b'{"object_id": "mug", "number": 0, "outcome": "held", "accepted": true, "ended_s": "1.0"}',
         b'{"object_id": "mug", "number": 0, "outcome": "held", "accepted": true, "ended_s": NaN}',
-        b'{"object_id": "mug", "number": 0, "outcome": ["held"], "accepted": true, "ended_s": 1.0}',
         b'{"object_id": "mug", "number": 0, "outcome": "held", "accepted": true, "ended_s": 1.0, "grasp_id": []}',
         b'{"object_id": "mug", "number": 0, "outcome": "held", "accepted": true, "ended_s": 1.0, "colour": 3}',
         b'{"object_id": "mug", "number": 1, "outcome": "held", "accepted": true, "ended_s": 1.0}',
@@ -147,7 +142,6 @@ def test_attempts_are_counted_by_object():
     mug, cup = tally(ALL).values()
     assert (mug.object_id, mug.attempts, mug.accepted) == ("mug", 3, 1)
     assert mug.outcomes == {"held": 1, "no_plan": 1, "missed": 1}
-    assert mug.reasons == {"the object is wider than the stroke": 1}
     assert (cup.attempts, cup.accepted) == (1, 1)
 
 

@@ -3,6 +3,7 @@
 import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -178,38 +179,26 @@ def test_a_line_of_another_program_may_leave_keys_null_and_end_without_a_newline
 BAD_LINES = {
     "{": "must be JSON",
     "[]": "one JSON object",
-    '"x"': "one JSON object",
-    "\udcff": "must be JSON in UTF-8",
     json.dumps({**ROW, "grasp_id": "0"}): "grasp_id must be unique, got '0' twice",
     json.dumps({**ROW, "object_id": None}): "object_id is missing",
     json.dumps({key: ROW[key] for key in ROW if key != "grasp_id"}): "grasp_id is missing",
     json.dumps({key: ROW[key] for key in ROW if key != "photo_file_name"}): "photo_file_name is missing",
     json.dumps({key: ROW[key] for key in ROW if key != "touch_a_file_name"}): "at least one touch",
     json.dumps({**ROW, "grasp_id": 5}): "grasp_id must be a non-empty printable string, got 5",
-    json.dumps({**ROW, "object_id": " "}): "object_id must be a non-empty",
     json.dumps({**ROW, "object_id": "\ud800"}): "escaped utf-16 surrogate pair",
-    json.dumps({**ROW, "sequence_id": ["a"]}): "sequence_id must be",
     json.dumps({**ROW, "force_n": "5"}): "force_n must be a finite number, got '5'",
-    json.dumps({**ROW, "force_n": True}): "force_n must be a finite number, got True",
     json.dumps({**ROW, "force_n": float("nan")}): "must be JSON in UTF-8, without NaN",
-    json.dumps({**ROW, "force_n": float("inf")}): "must be JSON in UTF-8, without NaN",
     json.dumps(ROW)[:-1] + ', "time_s": 1e999}': "of finite numbers: Number out of range",
-    json.dumps({**ROW, "time_s": 10**400}): "time_s must be a finite number",
     json.dumps({**ROW, "grasped": 1}): "grasped must be true or false, got 1",
     json.dumps({**ROW, "outcome": "lost"}): "outcome must be one of held, missed, slipped, no_plan, got 'lost'",
-    json.dumps({**ROW, "outcome": ["held"]}): "outcome must be one of",
     json.dumps({**ROW, "pose": 5}): "pose must be a list of numbers",
-    json.dumps({**ROW, "pose": "123"}): "pose must be a list of numbers",
     json.dumps({**ROW, "pose": [1, "2"]}): "pose must be a finite number, got '2'",
     json.dumps({**ROW, "photo_file_name": 5}): "photo_file_name must be a path inside",
-    json.dumps({**ROW, "photo_file_name": ""}): "must be a path inside the recording, got ''",
-    json.dumps({**ROW, "photo_file_name": "."}): "must be a path inside",
     json.dumps({**ROW, "photo_file_name": "/etc/passwd"}): "must be a path inside",
     json.dumps({**ROW, "photo_file_name": "a/../../b.png"}): "must be a path inside",
     json.dumps({**ROW, "photo_file_name": "C:/x.png"}): "must be a path inside",
     json.dumps({**ROW, "photo_file_name": "..\\x.png"}): "must be a path inside",
     json.dumps({**ROW, "photo_file_name": "a\0.png"}): "must be a path inside",
-    json.dumps({**ROW, "touch_a_file_name": {"a": 1}}): "touch_a_file_name must be a path inside",
 }
 
 
@@ -242,10 +231,10 @@ def test_an_incomplete_line_before_the_last_is_an_error(tmp_path):
         read_recording(tmp_path)
 
 
-@pytest.mark.parametrize("version", [0, 2, "1", True, None, 1.0])
-def test_another_schema_version_names_the_known_ones(tmp_path, version):
+@pytest.mark.parametrize("version", [0, 2, "1", None])
+def test_another_schema_version_is_refused(tmp_path, version):
     write(tmp_path, ROW, info={**INFO, "schema_version": version})
-    with pytest.raises(RecordingError, match=r"recording\.json: schema_version must be a supported one \(1\), got"):
+    with pytest.raises(RecordingError, match=r"recording\.json: schema_version must be 1, got"):
         read_recording(tmp_path)
 
 
@@ -274,15 +263,6 @@ def test_reading_opens_no_image_and_imports_no_opencv(tmp_path):
 
 
 # Writing ---------------------------------------------------------------------------------------------------
-
-
-def test_a_writer_continues_an_existing_recording(tmp_path):
-    two_grasps(tmp_path)
-    with RecordingWriter(tmp_path, {**INFO, "seed": 9}) as writer:
-        assert set(writer.grasp_ids) == {"1", "2"}
-        assert writer.info["seed"] == 3
-        writer.append("3", "cup", pictures())
-    assert ids(tmp_path) == ["1", "2", "3"]
 
 
 def test_an_incomplete_last_line_is_removed_when_the_recording_is_opened_again(tmp_path):
@@ -325,18 +305,16 @@ def test_a_second_writer_of_a_recording_is_refused(tmp_path):
 
 
 def test_a_folder_of_other_files_is_not_written_to(tmp_path):
+    (two_grasps(tmp_path / "r") / "recording.json").unlink()
+    with pytest.raises(RecordingError, match=r"has a metadata\.jsonl but no recording\.json"):
+        RecordingWriter(tmp_path / "r", INFO)
+    shutil.rmtree(tmp_path / "r")
     (tmp_path / "thesis.tex").write_text("x")
     with pytest.raises(RecordingError, match=r"contains other files, such as thesis\.tex"):
         RecordingWriter(tmp_path, INFO)
     with pytest.raises(RecordingError, match="is a file"):
         RecordingWriter(tmp_path / "thesis.tex", INFO)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
-
-
-def test_grasps_without_their_recording_json_are_not_overwritten(tmp_path):
-    (two_grasps(tmp_path) / "recording.json").unlink()
-    with pytest.raises(RecordingError, match=r"has a metadata\.jsonl but no recording\.json"):
-        RecordingWriter(tmp_path, INFO)
 
 
 @pytest.mark.parametrize(
@@ -360,7 +338,6 @@ BAD_IMAGES = {
     "missing touch": ({"photo": pixels()}, "at least one touch"),
     "float": ({"photo": pixels() / 255, "touch_a": pixels()}, "photo must be H x W x 3 uint8 RGB"),
     "grey": ({"photo": pixels()[..., 0], "touch_a": pixels()}, "photo must be H x W x 3 uint8 RGB"),
-    "alpha": ({"photo": np.zeros((2, 2, 4), np.uint8), "touch_a": pixels()}, "photo must be H x W x 3"),
     "no pixels": ({"photo": pixels(), "touch_a": np.zeros((0, 2, 3), np.uint8)}, "touch_a must be H x W"),
     "too wide": (
         {"photo": np.zeros((1, 2_000_000, 3), np.uint8), "touch_a": pixels()},
@@ -372,13 +349,10 @@ BAD_IMAGES = {
         "photo must be a PNG or JPEG file; its first bytes are b'GIF8'",
     ),
     "no file": ({"photo": "/nowhere/x.png", "touch_a": pixels()}, "photo: /nowhere/x.png cannot be read"),
-    "no such name": ({"photo": "a\0b.png", "touch_a": pixels()}, "cannot be read: embedded null byte"),
     "a Pillow image": (
         {"photo": Image.new("RGB", (2, 2)), "touch_a": pixels()},
         "the path of a PNG or JPEG file; got Image",
     ),
-    "numbers": ({"photo": pixels().tolist(), "touch_a": pixels()}, "photo must be pixels as a NumPy array, or"),
-    "a descriptor": ({"photo": 3, "touch_a": pixels()}, "the path of a PNG or JPEG file; got int"),
     "unknown column": ({**pictures(), "foto": pixels()}, "unknown key 'foto_file_name'"),
 }
 
@@ -461,22 +435,6 @@ def test_a_path_that_is_not_a_file_is_refused_without_being_read_or_written(tmp_
         with pytest.raises((RecordingError, StorageError)):
             RecordingWriter(tmp_path, INFO)
         path.rmdir() if path.is_dir() else path.unlink()
-
-
-def test_a_pipe_in_place_of_metadata_jsonl_is_refused(tmp_path):
-    os.mkfifo(tmp_path / "metadata.jsonl")
-    with pytest.raises(StorageError, match="is a pipe, not a regular file"):
-        RecordingWriter(tmp_path, INFO)
-    assert [path.name for path in tmp_path.iterdir() if path.suffix == ".json"] == []
-
-
-def test_a_picture_that_is_not_a_file_is_refused_without_being_read(tmp_path):
-    os.mkfifo(tmp_path / "pipe.png")
-    with (
-        RecordingWriter(tmp_path / "r", INFO) as writer,
-        pytest.raises(RecordingError, match=r"photo: .*is a pipe, not a regular file"),
-    ):
-        writer.append("1", "mug", {**pictures(), "photo": tmp_path / "pipe.png"})
 
 
 def test_a_full_disk_error_names_the_file(tmp_path):
