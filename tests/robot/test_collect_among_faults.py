@@ -3,18 +3,13 @@
 `python -m tests.emulated_rig --grasps 500 --out faulty/` runs a long collection.
 """
 
-import signal
-import threading
-
 import pytest
 
 from robot.collection import CollectSettings, collect
-from robot.drivers.wsg50.driver import WSG50
 from robot.errors import DeviceError
 from robot.recording.folder import read_recording
-from tests.emulated_rig import SPEED_UP, broken_images, collect_among_faults, emulated_rig
+from tests.emulated_rig import broken_images, collect_among_faults, emulated_rig
 from tests.fake_video import own_threads
-from tests.waiting import wait_until
 
 
 @pytest.mark.slow
@@ -45,27 +40,3 @@ def test_if_a_device_stays_disconnected_the_collection_stops_with_the_reason_and
         assert not rig.shared.emulator.moves
         assert rig.shared.emulator.opening_mm == pytest.approx(110.0, abs=0.5)
         assert read_recording(tmp_path / "r").grasps == ()
-
-
-@pytest.mark.parametrize("stops", [True, False])
-def test_jaws_that_a_failed_call_leaves_moving_are_counted(stops, monkeypatch):
-    """The counter of these collections detects a driver that does not stop."""
-    if not stops:
-        monkeypatch.setattr(WSG50, "_stop", lambda self: None)
-        monkeypatch.setattr(WSG50, "_stop_over_link", lambda self: None)
-    with emulated_rig(1) as rig, rig:
-        emulator = rig.shared.emulator
-        emulator.speed_up = 1.0  # closing takes seconds
-        begun = threading.Thread(target=interrupt_when, args=(lambda: emulator.is_closing,))
-        begun.start()
-        with pytest.raises(KeyboardInterrupt):
-            rig.gripper.grasp(10.0, 10.0)
-        begun.join()
-        assert rig.shared.left_moving == (0 if stops else 1)
-        emulator.speed_up = SPEED_UP
-
-
-def interrupt_when(true):
-    """Send Ctrl-C as soon as a condition is true."""
-    wait_until(true)
-    signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)

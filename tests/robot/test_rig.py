@@ -31,12 +31,6 @@ def test_if_one_device_fails_none_stays_connected(number):
     assert all(device.is_connected for device in rig.devices)
 
 
-def test_a_failed_connection_reports_its_first_error():
-    rig = FakeRig(faults={"camera.connect": {1}, "arm.close": {1}})
-    with pytest.raises(DeviceError, match=r"camera\.connect"):
-        rig.connect()
-
-
 def test_closing_continues_when_one_device_fails():
     rig = FakeRig(faults={"gel b.close": {1}, "arm.close": {1}})
     rig.connect()
@@ -88,10 +82,6 @@ def test_a_rig_without_a_person_to_change_objects_raises():
         rig.prepare("mug", 0)
 
 
-def test_fingers_are_in_order_however_they_were_given():
-    assert list(FakeRig(fingers=("b", "a")).sensors) == ["a", "b"]
-
-
 # By name ----------------------------------------------------------------------------------------------------
 
 
@@ -123,44 +113,23 @@ def test_an_unknown_rig_lists_the_known_ones():
         load_rig("sawyer", seed=0)
 
 
-def test_an_unknown_setting_lists_the_known_ones():
-    with pytest.raises(RobotConfigError, match="FakeRig has no setting 'finger'; known settings: faults, fingers"):
-        load_rig(FAKE, seed=0, finger="a")
-
-
 BAD_FILES = {
+    None: "rig.toml cannot be read",
     "rig = ": "is not TOML",
     "[fake]": "must name its rig",
-    'fingers = ["a"]': "must name its rig",
     "rig = 3": "must name its rig",
     'rig = "none"': "must be one of real, sim; got 'none'",
-    'rig = "tests.fake_rig:FakeRig"\ncolour = 3': "has no setting 'colour'",
+    'rig = "tests.fake_rig:FakeRig"\ncolour = 3': "has no setting 'colour'; known settings: faults, fingers",
     'rig = "tests.fake_rig:FakeRig"\n[fake]\nfingers = ["a"]': "has no setting 'fake'",
 }
 
 
-@pytest.mark.parametrize("text", sorted(BAD_FILES))
+@pytest.mark.parametrize("text", BAD_FILES)
 def test_a_wrong_file_raises_with_the_reason(tmp_path, text):
     path = tmp_path / "rig.toml"
-    path.write_text(text)
+    if text is not None:
+        path.write_text(text)
     with pytest.raises((RobotConfigError, UnknownName), match=BAD_FILES[text]):
-        load_rig(str(path), seed=0)
-
-
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ("gels = 5.0", "gels must be a whole number, got 5.0"),
-        ('fingers = "ab"', "fingers must be a list, got 'ab'"),
-        ('families = ["ring", 3]', r"families\[1\] must be a text in quotes, got 3"),
-        ("localisation_mm = 3", "localisation_mm must be a list, got 3"),
-        ("contact_grid = [120.0, 160.0]", r"contact_grid\[0\] must be a whole number, got 120.0"),
-    ],
-)
-def test_a_setting_of_another_type_raises_with_the_file_and_the_required_type(tmp_path, setting, message):
-    path = tmp_path / "rig.toml"
-    path.write_text(f'rig = "sim"\n{setting}\n')
-    with pytest.raises(RobotConfigError, match=f"rig.toml: {message}"):
         load_rig(str(path), seed=0)
 
 
@@ -168,8 +137,3 @@ def test_a_setting_of_another_type_raises_with_the_file_and_the_required_type(tm
 def test_a_seed_must_be_a_whole_number_from_0(seed):
     with pytest.raises(RobotConfigError, match=r"^seed must be a whole number from 0, got"):
         load_rig("sim", seed=seed)
-
-
-def test_a_missing_file_is_named():
-    with pytest.raises(RobotConfigError, match=r"nowhere\.toml cannot be read"):
-        load_rig("nowhere.toml", seed=0)

@@ -57,13 +57,6 @@ def test_without_motion_arm_and_jaws_do_not_move(rig):
     assert {"arm", "open", "grasp"}.isdisjoint(rig.shared.calls)
 
 
-def test_without_motion_devices_connect_with_may_move_false(rig):
-    assert rig.gripper.may_move
-    list(check_rig(rig, motion=False))
-    assert not rig.gripper.may_move
-    assert not rig.arm.may_move
-
-
 def test_a_configuration_error_on_connecting_is_a_row_too(rig, monkeypatch):
     def wrong(self):
         raise RobotConfigError("the calibration is for another size")
@@ -88,12 +81,6 @@ def test_a_held_object_is_not_released(rig, monkeypatch):
     monkeypatch.setattr(FakeGripper, "_open", lambda *_: pytest.fail("it opened"))
     (row,) = [row for row in check_rig(rig) if row.role == "gripper"]
     assert row.measured["motion"] == "none, because it is holding"
-
-
-def test_refused_settings_are_reported(rig, monkeypatch):
-    rig.sensors["a"].refused = {"exposure": "requested 5, has 8"}
-    row = next(row for row in check_rig(rig) if row.device == "fake gel a")
-    assert row.line().endswith("; refused exposure: requested 5, has 8")
 
 
 def test_a_manual_arm_is_not_moved(rig, monkeypatch):
@@ -149,12 +136,3 @@ def test_cameras_that_starve_each_other_on_one_usb_bus_are_a_failure_that_names_
         "with all cameras, frames are lost: fake gel b 20.0 frames/s, alone 100.0; fake gel a and fake gel b share USB "
         "bus 3 (480 Mbit/s). Connect the cameras to different USB controllers, or lower width, height or fps"
     )
-
-
-def test_a_shared_usb_bus_without_loss_is_reported(real_rig, monkeypatch):
-    monkeypatch.setattr(FakeSensor, "_settings", lambda self: {"device": self.finger})
-    monkeypatch.setattr(rig_check, "usb_port", lambda device: UsbPort(3, device, 5000) if device else None)
-    (row,) = [row for row in check_rig(real_rig, motion=False) if row.role == "together"]
-    assert row.failure is None
-    assert set(row.measured) == {"fake gel a", "fake gel b", "fake camera", "shared"}
-    assert row.measured["shared"] == "fake gel a and fake gel b share USB bus 3 (5000 Mbit/s)"

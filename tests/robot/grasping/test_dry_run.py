@@ -48,10 +48,3 @@ def test_a_tilt_is_reported_and_is_refused_for_an_arm_that_cannot_tilt():
         pytest.raises(DeviceError, match="tilt must be 0, because the fingers always point down"),
     ):
         dry.arm.move_to(pose, 100.0)
-
-
-def test_a_dry_run_has_the_limits_of_the_rig():
-    rig = FakeRig(5)
-    limits = rig.arm.workspace, rig.gripper.max_force_n
-    dry = make_dry_run(rig, print)
-    assert (dry.arm.workspace, dry.gripper.max_force_n) == limits

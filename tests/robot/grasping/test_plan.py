@@ -11,7 +11,6 @@ from robot.errors import PlanError, RobotConfigError
 from robot.grasping.planner import plan_grasp
 from robot.grasping.settings import GraspSettings
 from robot.readings import Region
-from robot.settings import build
 from robot.sight.cylinder import CylinderFit
 from tests.fake_rig import WORKSPACE, FakeArm, FakeGripper, FakeRigState
 
@@ -48,23 +47,12 @@ def test_yaw_force_and_height_are_uniform():
     assert farthest_from_uniform([p.pose.y_mm for p in drawn], -8, -6) < bound
 
 
-def test_a_rounded_draw_is_not_uniform_by_the_same_test():
-    """A yaw drawn as an integer number of radians takes 3 values of a half turn."""
-    rounded = [int(np.random.default_rng(seed).integers(0, 3)) for seed in range(2000)]
-    assert farthest_from_uniform(rounded, 0, math.pi) > 0.3
-
-
 def test_yaw_stays_within_the_half_turn_and_draws_are_independent():
     drawn = np.array([[*p.pose.as_tuple(), p.force_n] for p in plans()])
     assert drawn[:, 3].min() >= 0
     assert drawn[:, 3].max() < math.pi
     correlation = np.corrcoef(drawn.T) - np.eye(5)
     assert np.abs(correlation).max() < 4 / math.sqrt(len(drawn))  # 4 standard errors
-
-
-def test_the_same_generator_gives_the_same_plan():
-    assert plan(3) == plan(3)
-    assert plan(3) != plan(4)
 
 
 def test_a_plan_comes_from_straight_above_with_open_jaws():
@@ -151,19 +139,6 @@ WRONG = {
 def test_a_setting_out_of_range_is_refused(name, value):
     with pytest.raises(RobotConfigError, match=name):
         GraspSettings(**{name: value})
-
-
-def test_settings_come_from_plain_values():
-    assert build(GraspSettings, {"force_n": [6, 7], "jitter_mm": 2}) == GraspSettings((6, 7), jitter_mm=2)
-    with pytest.raises(RobotConfigError, match="no setting 'jitter'; known settings: clearance_mm, finger_mm"):
-        build(GraspSettings, {"jitter": 3})
-    for wrong, message in (
-        ({"force_n": [1, 2, 3]}, "force_n must be a list of length 2"),
-        ({"force_n": ["a", "b"]}, r"force_n\[0\] must be a number, got 'a'"),
-        ({"lift_mm": "high"}, "lift_mm must be a number"),
-    ):
-        with pytest.raises(RobotConfigError, match=message):
-            build(GraspSettings, wrong)
 
 
 def test_forces_outside_the_grippers_range_are_refused_before_any_motion():

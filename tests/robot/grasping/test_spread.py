@@ -50,7 +50,3 @@ def test_if_all_draws_are_impossible_the_last_reason_is_raised():
 def test_an_object_that_cannot_be_grasped_ends_the_draws():
     with pytest.raises(UngraspableError):
         planned([40.0], UngraspableError("larger than the jaws"), 42.0)
-
-
-def test_it_needs_depth_if_the_other_planner_does():
-    assert not SpreadPlanner(Listed(), []).needs_depth
