@@ -9,9 +9,6 @@ unpressed picture plus the model's change, and compared over a crop of 200 x 200
     aligned      these three numbers are fitted to its picture, with fixed colours
                  (benchmarks.optics.least_squares)
     as shipped   aligned, and chosen to generalise to other places and objects than the presses
-
-Taxim's published figures (L1 5.565, SSIM .882, PSNR 30.97; Si & Yuan, RA-L 2022) are for other objects than balls,
-crops of 400 x 400 and a manual alignment: they show the quality of the field's pictures, not a ranking.
 """
 
 import argparse
@@ -26,17 +23,14 @@ import numpy as np
 
 from benchmarks.optics.image_error import PictureError
 from benchmarks.optics.least_squares import Matrix
-from benchmarks.optics.model_choice import SAME_PLACE, Fit, fit, held_out_error, picture_error, select, to_optics
-from benchmarks.optics.real_presses import BALLS_MM, Presses, find_presses, read_presses, taxim_change
+from benchmarks.optics.model_choice import Fit, fit, held_out_error, picture_error, select, to_optics
+from benchmarks.optics.real_presses import BALLS_MM, Presses, find_presses, read_presses
 from robot.errors import BadRobotInput, RobotError
 from robot.sim.gel.fitted_optics import FORMAT, optics_to_json
 
 FIT_COUNT = {"gelsight": 36, "gelsight_mini": 18}
 SPLITS = 5
 DEGREES = (1, 2, 3, 4)
-THEIRS = "Taxim's shipped table (fitted on these presses)"
-PUBLISHED = "Taxim's table I (other objects, 400 x 400 crops, by hand aligned): L1 5.565, SSIM .882, PSNR 30.974"
-PROTOTYPE = "degree 4 of this project's prototype (200 x 200 crops, gelsight, labels): L1 5.18, SSIM .966, PSNR 31.40"
 SOURCE = (
     "fitted to the ball presses in the Python package taxim 1.4.1 (MIT licence, T. Schneider; Si & Yuan, RA-L 2022)"
 )
@@ -78,20 +72,15 @@ def splits(count: int, fit_count: int, number: int = SPLITS) -> Iterator[tuple[l
         yield sorted(order[:fit_count]), sorted(order[fit_count:])
 
 
-def evaluate(presses: Presses, *, number: int = SPLITS, taxim_table: Any = None) -> dict[str, Scores]:
+def evaluate(presses: Presses, *, number: int = SPLITS) -> dict[str, Scores]:
     """Return held-out errors of every way of predicting, over `number` splits."""
     out: dict[str, Scores] = {}
     for chosen, held_out in splits(len(presses), FIT_COUNT[presses.name], number):
         models = _models(presses, chosen)
         for index in held_out:
             out.setdefault("background only", Scores()).add(index, picture_error(presses, index, 0.0))
-            if taxim_table is not None:
-                change = taxim_change(presses, index, taxim_table)
-                out.setdefault(THEIRS, Scores()).add(index, picture_error(presses, index, change))
             for name, model in models.items():
                 out.setdefault(name, Scores()).add(index, held_out_error(presses, index, model))
-    if groups := SAME_PLACE.get(presses.name):
-        out["as shipped, another place"] = _across_places(presses, groups)
     return out
 
 
@@ -102,7 +91,6 @@ def _models(presses: Presses, chosen: Sequence[int]) -> dict[str, Fit]:
     setting = select(presses, chosen, align=True, ship=True)
     shipped = {degree: replace(setting, degree=degree) for degree in DEGREES}
     return {
-        "labels, unpressed picture as it is": replace(by_label, blur_px=0.0),
         "labels": by_label,
         "aligned": by_picture,
         "as shipped (aligned)": fit(presses, chosen, setting, align=True),
@@ -113,17 +101,6 @@ def _models(presses: Presses, chosen: Sequence[int]) -> dict[str, Fit]:
 def by_degree(degree: int) -> str:
     """Return the row name of the shipped kind of model of this degree."""
     return f"as shipped, degree {degree}"
-
-
-def _across_places(presses: Presses, groups: Sequence[range]) -> Scores:
-    """Return held-out errors for presses at places without fitted presses."""
-    scores = Scores()
-    for group in groups:
-        chosen = [one for one in range(len(presses)) if one not in group]
-        model = fit(presses, chosen, select(presses, chosen, align=True, ship=True), align=True)
-        for index in group:
-            scores.add(index, held_out_error(presses, index, model))
-    return scores
 
 
 # Command ---------------------------------------------------------------------------------------------------
@@ -160,7 +137,7 @@ def table(presses: Presses, scores: dict[str, Scores]) -> str:
             for value, digits in zip(one.summary().values(), (2, 1, 3, 2), strict=True)
         ]
         lines.append(f"{name:54}" + "".join(f"{cell:>21}" for cell in cells))
-    return "\n".join([*lines, "", PROTOTYPE, PUBLISHED, ""])
+    return "\n".join([*lines, ""])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -183,9 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(folder: Path, name: str, out: Path) -> None:
     presses = read_presses(folder, name)
-    shipped = folder / name / "polycalib.npz"
-    theirs = dict(np.load(shipped, allow_pickle=False)) if shipped.is_file() else None
-    scores = evaluate(presses, number=SPLITS, taxim_table=theirs)
+    scores = evaluate(presses, number=SPLITS)
     print(table(presses, scores), flush=True)
     content = json.dumps(document(presses, scores), indent=1)
     try:

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -34,7 +33,6 @@ CROP = 200
 PIXEL_MM = 0.0295
 # The radius of the ball of the Mini's presses is not documented: it is chosen with the rest of the model.
 BALLS_MM = {"gelsight": (2.0,), "gelsight_mini": (0.7, 0.85, 1.0, 2.0)}
-TAXIM_BALL_MM = 2.0  # Taxim's tables have the least error with this radius, on either sensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,17 +110,13 @@ def read_presses(folder: str | Path, name: str) -> Presses:
     ):
         shapes = [array.shape for array in found]
         raise BadRobotInput(f"{path} must hold uint8 pictures of one size, {CROP} pixels or more, got {shapes}")
-    _check_labels(path, np.c_[centres, radii].astype(np.float64))
-    return Presses(name, no_contact, pictures, centres.astype(np.float64), radii.astype(np.float64))
-
-
-def _check_labels(path: Path, labels: Matrix) -> None:
-    """Check the labels (count, 3): x, y, radius. A NaN would make every fitted weight NaN."""
+    labels = np.c_[centres, radii].astype(np.float64)
     bad = np.flatnonzero(~(np.isfinite(labels).all(axis=1) & (labels[:, 2] > 0)))
-    if len(bad):
+    if len(bad):  # a NaN would make every fitted weight NaN
         raise BadRobotInput(
             f"{path} must hold labels that are finite, with radii above 0; press {bad[0]} has {labels[bad[0]]}"
         )
+    return Presses(name, no_contact, pictures, labels[:, :2], labels[:, 2])
 
 
 @lru_cache(maxsize=256)
@@ -205,42 +199,3 @@ def _radial(displacement: Matrix, reaches_mm: tuple[float, ...], pixel: float) -
     """Return the middle row to the right, unsmoothed and smoothed over each reach: (1 + reaches, points)."""
     maps = [displacement, *(gaussian_filter(displacement, reach / pixel) for reach in reaches_mm)]
     return np.stack([one[_GRID // 2, _GRID // 2 :] for one in maps])
-
-
-# Taxim's own prediction ------------------------------------------------------------------------------------
-
-
-def taxim_change(presses: Presses, index: int, table: Any) -> Matrix:
-    """Return the change (200, 200, 3) that Taxim's binned table predicts for a labelled press; a reproduction.
-
-    Si & Yuan, RA-L 2022: the ball inside the contact, outside it a pyramid of Gaussian blurs; slopes by np.gradient
-    (theirs are central differences too); 125 x 125 bins of tilt and direction, each with a polynomial in x and y.
-    `table`: grad_r, grad_g, grad_b (125, 125, 6). Their shadows and the curvature of their gel pad are left out.
-    """
-    rows, cols = presses.crop(index)
-    height, width = presses.no_contact.shape[:2]
-    x, y = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-    heights = _pyramid(presses, index, x, y)
-    down, right = np.gradient(heights / PIXEL_MM)
-    bins = table["grad_r"].shape[0] - 1
-    tilt = np.floor(np.arctan(np.hypot(down, right)) / (0.5 * np.pi / bins)).astype(int)[rows, cols]
-    turn = np.floor((np.arctan2(down, right) + np.pi) / (2 * np.pi / bins)).astype(int)[rows, cols]
-    x, y = x[rows, cols], y[rows, cols]
-    terms = np.stack([x * x, y * y, x * y, x, y, np.ones_like(x)], axis=-1)
-    return np.stack([(table[f"grad_{name}"][tilt, turn] * terms).sum(axis=-1) for name in "rgb"], axis=-1)
-
-
-_PYRAMID_PX = (30.5, 15.5, 8.0, 3.5, 2.0, 1.1)
-
-
-def _pyramid(presses: Presses, index: int, x: Matrix, y: Matrix) -> Matrix:
-    """Return heights in mm: the ball's cap above the gel, its rim smoothed, its core (deeper than 0.4) unchanged."""
-    ball_mm = TAXIM_BALL_MM
-    contact = min(presses.radii[index] * PIXEL_MM, 0.99 * ball_mm)
-    square = ((x - presses.centres[index][0]) ** 2 + (y - presses.centres[index][1]) ** 2) * PIXEL_MM**2
-    base = math.sqrt(ball_mm**2 - contact**2)
-    cap = np.maximum(np.sqrt(np.maximum(ball_mm**2 - square, 0)) - base, 0)
-    core, heights = cap > 0.4 * (ball_mm - base), cap
-    for sigma in _PYRAMID_PX:
-        heights = np.where(core, cap, cv2.GaussianBlur(heights, (0, 0), sigma))
-    return np.asarray(cv2.GaussianBlur(heights, (0, 0), 2.0))

@@ -8,17 +8,15 @@ from importlib.util import find_spec
 import cv2
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
 
 from benchmarks.optics import least_squares as pose_fit
 from benchmarks.optics import model_choice as press_model
 from benchmarks.optics import photometric
-from benchmarks.optics import real_presses as presses
 from benchmarks.optics.image_error import compare, ssim
 from benchmarks.optics.least_squares import OpticsSetting, aligned, columns_of, features, gram, labelled_poses, solve
 from benchmarks.optics.model_choice import fit, held_out_error, picture_error, select, to_optics
 from benchmarks.optics.real_presses import PIXEL_MM, Presses, ball_table, find_presses, read_presses
-from robot.errors import BadRobotInput, UnknownName
+from robot.errors import BadRobotInput
 from robot.sim.gel.fitted_optics import fitted_document, fitted_names, load_fitted, optics_from_json
 from robot.sim.gel.surface import Field, Surface
 
@@ -102,14 +100,6 @@ def write(folder, **changes):
     return folder
 
 
-def test_presses_are_read_as_they_are(tmp_path):
-    drawn, _ = draw_presses(2)
-    read = read_presses(write(tmp_path), "gelsight")
-    np.testing.assert_array_equal(read.pictures, drawn.pictures)
-    np.testing.assert_array_equal(read.centres, drawn.centres)
-    assert len(read) == 2
-
-
 @pytest.mark.parametrize(
     "changes",
     [
@@ -117,51 +107,13 @@ def test_presses_are_read_as_they_are(tmp_path):
         {"imgs": np.zeros((2, 10, 10, 3), np.uint8)},
         {"imgs": np.zeros((2, 260, 320, 3))},
         {"touch_center": np.zeros((5, 2))},
-        {"touch_radius": np.zeros(7)},
+        {"touch_radius": np.array([55.0, np.nan])},
         {"touch_radius": np.array([{"a": 1}, None], dtype=object)},
     ],
 )
 def test_an_invalid_file_of_presses_is_refused_and_nothing_is_unpickled(tmp_path, changes):
     with pytest.raises(BadRobotInput, match=r"dataPack\.npz must hold"):
         read_presses(write(tmp_path, **changes), "gelsight")
-
-
-@pytest.mark.parametrize("key", ["touch_center", "touch_radius"])
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_label_that_is_not_finite_is_refused_with_its_press(tmp_path, key, value):
-    drawn, _ = draw_presses(2)
-    labels = {"touch_center": drawn.centres, "touch_radius": drawn.radii}[key].copy()
-    labels[1, ...] = value
-    with pytest.raises(BadRobotInput, match=r"dataPack\.npz must hold labels that are finite, .*; press 1 has"):
-        read_presses(write(tmp_path, **{key: labels}), "gelsight")
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_picture_that_is_not_finite_is_not_compared(value):
-    picture = np.full((11, 11, 3), 250.0)
-    picture[4, 5, 1] = value
-    with pytest.raises(BadRobotInput, match=r"must be finite to be compared, got (nan|inf) at \(4, 5, 1\)"):
-        compare(picture, np.full((11, 11, 3), 250, np.uint8))
-
-
-def test_missing_and_broken_files_and_unknown_sensors_are_refused(tmp_path, monkeypatch):
-    with pytest.raises(BadRobotInput, match="must hold"):
-        read_presses(tmp_path, "gelsight")
-    (tmp_path / "gelsight").mkdir()
-    (tmp_path / "gelsight" / "dataPack.npz").write_bytes(b"PK\x03\x04 half a file")
-    with pytest.raises(BadRobotInput, match="must hold"):
-        read_presses(tmp_path, "gelsight")
-    with pytest.raises(UnknownName, match="known are gelsight, gelsight_mini"):
-        read_presses(tmp_path, "digit")
-    monkeypatch.setattr(presses, "find_spec", lambda name: None)
-    with pytest.raises(BadRobotInput, match=r"touch-retrieval\[calibration\]"):
-        find_presses()
-
-
-def test_a_crop_at_the_border_is_moved_inside():
-    drawn, _ = draw_presses(1)
-    moved = Presses("gelsight", drawn.no_contact, drawn.pictures, np.array([[3.0, 258.0]]), drawn.radii)
-    assert moved.crop(0) == (slice(60, 260), slice(0, 200))
 
 
 # Surfaces --------------------------------------------------------------------------------------------------
@@ -182,22 +134,6 @@ def test_the_gel_follows_the_ball_in_the_contact_and_falls_off_outside():
     np.testing.assert_allclose(slope[outside], np.gradient(height, x)[outside], atol=0.02)
 
 
-def test_profiles_smoothed_along_the_radius_are_those_of_the_smoothed_map():
-    table, axis = ball_table(2.0, 4.0, 0.48, (0.6,)), (np.arange(161) - 80) * 0.1
-    x, y = np.meshgrid(axis, axis)
-    (height, *_), (smooth, along, down) = table.at(1.2, x, y)
-    np.testing.assert_allclose(smooth, gaussian_filter(height, 6.0), atol=0.01)
-    expected = np.gradient(smooth, 0.1)
-    np.testing.assert_allclose(along[20:-20, 20:-20], expected[1][20:-20, 20:-20], atol=0.02)
-    np.testing.assert_allclose(down[20:-20, 20:-20], expected[0][20:-20, 20:-20], atol=0.02)
-
-
-def test_a_ball_pressed_beyond_its_equator_has_finite_slopes():
-    for contact in (0.0, 1e-9, 1.999, 5.0):
-        maps = ball_table(2.0, 4.0, 0.48, ()).at(contact, np.linspace(-9, 9, 50), np.zeros(50))
-        assert all(np.isfinite(part).all() for one in maps for part in one)
-
-
 # Least squares ---------------------------------------------------------------------------------------------
 
 
@@ -211,21 +147,6 @@ def test_weights_without_ridge_are_those_of_least_squares_and_empty_columns_get_
     np.testing.assert_allclose(rows @ found, rows @ weights, atol=0.2)  # pictures are rounded
     empty = pose_fit.Gram(np.diag([1.0, 0.0]), np.array([[2.0] * 3, [0.0] * 3]), 1.0, 3)
     np.testing.assert_allclose(solve([empty], 1e-9), [[2.0] * 3, [0.0] * 3], rtol=1e-6)
-
-
-def test_the_naive_normal_equations_are_singular_and_the_ridge_is_not():
-    twice = pose_fit.Gram(np.ones((2, 2)), np.ones((2, 3)), 3.0, 3)
-    with pytest.raises(np.linalg.LinAlgError):
-        np.linalg.solve(twice.square, twice.cross)
-    np.testing.assert_allclose(solve([twice], 1e-6), 0.5, rtol=1e-5)
-
-
-def test_the_loss_of_a_gram_is_the_mean_squared_error():
-    drawn, _ = draw_presses(2)
-    weights = np.random.default_rng(0).normal(size=(15, 3))
-    pose = labelled_poses(drawn, PLAIN)[1]
-    error = features(drawn, 1, pose, PLAIN) @ weights - pose_fit.change(drawn, 1)
-    assert gram(drawn, 1, pose, PLAIN).loss(weights) == pytest.approx(np.mean(error**2))
 
 
 @pytest.mark.parametrize("narrow", [OpticsSetting(2, 3, reaches_mm=()), OpticsSetting(3, 1), OpticsSetting(1, 6)])
@@ -243,14 +164,6 @@ def test_a_press_is_found_again_from_its_picture():
         start = truth[index] + [9, -7, -0.2]
         found = aligned(drawn, index, start, weights, PLAIN, 10)
         np.testing.assert_allclose(found, truth[index], atol=0.5)  # it started 9 px away
-
-
-def test_a_press_without_information_is_not_moved():
-    drawn, weights = draw_presses(1)
-    drawn.pictures[0] = drawn.no_contact
-    found = aligned(drawn, 0, pose_fit.first_pose(drawn, 0, PLAIN), 0 * weights, PLAIN, 5)
-    np.testing.assert_array_equal(found, pose_fit.first_pose(drawn, 0, PLAIN))
-    np.testing.assert_array_equal(found[:2], drawn.centres[0])
 
 
 # Fitting and testing ---------------------------------------------------------------------------------------
@@ -305,23 +218,6 @@ def test_the_optics_of_a_fit_render_its_predictions():
     np.testing.assert_allclose(change[rows, cols][away_from_rim], expected[away_from_rim], atol=1.5)
 
 
-def test_splits_share_no_press():
-    splits = list(photometric.splits(24, 18, 5))
-    assert len({tuple(held_out) for _, held_out in splits}) == 5
-    for chosen, held_out in splits:
-        assert len(chosen) == 18
-        assert sorted(chosen + held_out) == list(range(24))
-
-
-def test_an_interval_resamples_presses_not_repeats_of_one():
-    scores = photometric.Scores()
-    for index, value in ((0, 1.0), (0, 3.0), (1, 6.0)):
-        scores.add(index, photometric.PictureError(value, value, value, value))
-    summary = scores.summary()["psnr"]
-    assert summary["mean"] == 4.0
-    assert (summary["low"], summary["high"]) == (2.0, 6.0)
-
-
 @pytest.mark.slow
 def test_the_command_fits_scores_and_writes_a_file_that_loads(tmp_path, monkeypatch, capsys):
     drawn, _ = draw_presses(5)
@@ -341,15 +237,9 @@ def test_the_command_fits_scores_and_writes_a_file_that_loads(tmp_path, monkeypa
     assert photometric.main([*command, str(tmp_path / "out")]) == 0
     output = capsys.readouterr().out
     assert "background only" in output
-    assert "5.565" in output
     content = json.loads((tmp_path / "out" / "gelsight.json").read_text())
     assert optics_from_json(content).weights
     assert content["held_out"]["labels"]["mse"]["mean"] < 3
-
-
-def test_the_command_prints_an_error_in_one_line(tmp_path, capsys):
-    assert photometric.main(["--data", str(tmp_path), "--out", str(tmp_path)]) == 2
-    assert capsys.readouterr().err.startswith("error: ")
 
 
 # Real presses ----------------------------------------------------------------------------------------------
@@ -390,9 +280,6 @@ def test_held_out_presses_are_predicted_better_than_before(name, packs):
     errors = np.mean([held_out_error(pack, index, model) for index in held_out], axis=0)
     assert errors[3] > HELD_OUT[name][0] > 30.5
     assert errors[2] > HELD_OUT[name][1] > 0.966
-    table = dict(np.load(find_presses() / name / "polycalib.npz", allow_pickle=False))
-    theirs = [picture_error(pack, index, presses.taxim_change(pack, index, table)).mse for index in held_out]
-    assert errors[1] < 0.5 * np.mean(theirs)
 
 
 @real
