@@ -68,10 +68,6 @@ def serve(
         ),
     ] = 8,
     workers: Annotated[int, typer.Option(parser=WORKERS, help="requests that run in parallel")] = 1,
-    batch_ms: Annotated[
-        float,
-        typer.Option(parser=NumberParser(float, 0, 1000), help="time that a query waits for others to share a batch"),
-    ] = 0.0,
     deadline: Annotated[
         float, typer.Option(metavar="SECONDS", parser=SECONDS, help="maximum time for one request")
     ] = 30.0,
@@ -140,7 +136,6 @@ def serve(
         token=_read_token(token_file),
         queue=queue,
         workers=workers,
-        batch_ms=batch_ms,
         deadline_s=deadline,
         history=None if no_history else history or local.with_name(f"{local.name}-history"),
     )

@@ -1,40 +1,33 @@
 """The application, created from its parts."""
 
 import asyncio
-import logging
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, suppress
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import anyio.to_thread
 from fastapi import FastAPI
 from pydantic import BaseModel
+from starlette.staticfiles import StaticFiles
 from threadpoolctl import threadpool_limits
 
 from retrieval.search.query.opening import OpenShards
-from retrieval.serve import catalogue, errors, health, history, human_baseline, live, page_files, queries
+from retrieval.serve import catalogue, errors, health, history, human_baseline, live, queries
 from retrieval.serve.decoders import Decoders
 from retrieval.serve.generations import Generations
-from retrieval.serve.health import SessionBody
-from retrieval.serve.history import FeedbackBody
 from retrieval.serve.history_writer import HistoryWriter, Recorder
-from retrieval.serve.human_baseline import ChoiceBody, RunBody
 from retrieval.serve.metrics import Metrics
 from retrieval.serve.queries import VerifyBody
 from retrieval.serve.queue import Queue
 from retrieval.serve.security import Guard
 from retrieval.serve.service import LiveRig, Service
 from retrieval.serve.settings import ServiceSettings
-from retrieval.serve.thumbnails import Thumbnails
 from retrieval.serve.trials import Trials
 from retrieval.serve.uploads import BatchBody, BodyLimit, QueryBody
 from retrieval.version import __version__
 
-log = logging.getLogger(__name__)
 THREADS = 4
 """Number of threads that read files and make thumbnails; the model and the rig have other threads."""
 MAX_RIG_GRASPS = 4
@@ -42,17 +35,9 @@ MAX_RIG_GRASPS = 4
 MAX_FRAMES = 8
 """Maximum number of pending requests for single sensor pictures, in addition to streams."""
 _CLOSING_S = 1.0
-"""Time for each part of the service to close; parts that hang are abandoned."""
-_BODIES: tuple[type[BaseModel], ...] = (
-    QueryBody,
-    BatchBody,
-    VerifyBody,
-    FeedbackBody,
-    RunBody,
-    ChoiceBody,
-    SessionBody,
-    errors.ProblemDocument,
-)
+"""Time for each queue to close; work that hangs is abandoned."""
+_BODIES: tuple[type[BaseModel], ...] = (QueryBody, BatchBody, VerifyBody, errors.ProblemDocument)
+"""Models that the OpenAPI document lacks, because the routes parse their bodies themselves."""
 
 
 def create_app(
@@ -77,7 +62,7 @@ def create_app(
     metrics, rig = Metrics(), rig or LiveRig()
     generations = Generations(settings, metrics, shards)
     decoders = Decoders()
-    single = replace(settings, workers=1, max_batch=1, batch_ms=0.0)
+    single = replace(settings, workers=1, max_batch=1)
     parts = Service(
         settings,
         metrics,
@@ -90,7 +75,6 @@ def create_app(
             for name in rig.sensors
         },
         rig,
-        Thumbnails(),
         HistoryWriter(settings.history, recorder, settings, metrics) if settings.history and recorder else None,
         Trials(trials) if trials else None,
         asyncio.Semaphore(settings.streams),
@@ -108,7 +92,7 @@ def create_app(
     errors.install_handlers(app)
     for module in (queries, catalogue, live, history, human_baseline, health):
         app.include_router(module.router)
-    app.include_router(page_files.router_of())
+    app.mount("/", StaticFiles(directory=Path(__file__).parent / "page", html=True))
     app.openapi = lambda: _document(app)  # type: ignore[method-assign]
     app.add_middleware(BodyLimit, seconds=settings.body_s)
     app.add_middleware(Guard, settings=settings, metrics=metrics)
@@ -127,37 +111,18 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     for queue in queues:
         queue.start()
     if parts.history_writer:
-        parts.history_writer.start()
+        await asyncio.to_thread(parts.history_writer.record_pending)
     watching = asyncio.ensure_future(parts.generations.watch())
     try:
         with threadpool_limits(parts.settings.threads, "blas"):  # BLAS threads spin between two queries
             yield
     finally:
         parts.stopping.set()
-        if parts.history_writer:
-            await parts.history_writer.drain()
         watching.cancel()
-        await asyncio.wait([watching, asyncio.ensure_future(parts.decoders.close())], timeout=_CLOSING_S)
-        closing: list[Callable[[], None]] = [partial(queue.close, _CLOSING_S) for queue in queues]
+        await parts.decoders.close()
+        await asyncio.gather(*(asyncio.to_thread(queue.close, _CLOSING_S) for queue in queues))
         if parts.history_writer:
-            closing.append(parts.history_writer.close)
-        await asyncio.wait([_in_daemon(close) for close in closing], timeout=_CLOSING_S)
-
-
-def _in_daemon(work: Callable[[], None]) -> asyncio.Future[None]:
-    """Run `work` in a daemon thread, so that a hanging part does not keep the process alive."""
-    loop, done = asyncio.get_running_loop(), asyncio.get_running_loop().create_future()
-
-    def run() -> None:
-        try:
-            work()
-        except Exception:
-            log.exception("A part of the service failed to close.")
-        with suppress(RuntimeError):  # the loop has ended
-            loop.call_soon_threadsafe(done.set_result, None)
-
-    Thread(target=run, daemon=True).start()
-    return done
+            await asyncio.to_thread(parts.history_writer.close)
 
 
 def _document(app: FastAPI) -> dict[str, Any]:

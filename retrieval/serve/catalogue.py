@@ -5,6 +5,7 @@ The index maps an id to its file. No text of a request becomes part of a file pa
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -117,10 +118,19 @@ def get_thumbnail(
 ) -> Response:
     """Return a photo, or a gel image of a reference touch, as a small JPEG."""
 
-    def read(path: Path, row: dict[str, object]) -> bytes | None:
-        return parts.thumbnails.of(path, str(row.get("digest")), px)
+    def read(path: Path, row: dict[str, object]) -> bytes:
+        return _thumbnail(path, str(row.get("digest")), px)
 
     return _catalogue_image_response(request, parts, photo, str(px), read)
+
+
+@lru_cache(512)
+def _thumbnail(path: Path, digest: str, px: int) -> bytes:
+    """Return a photo as a small JPEG file; the digest of its content identifies it in the cache."""
+    image = thumbnail(path, px)
+    if image is None:
+        raise ImageError(str(path), "unreadable")
+    return jpeg(image)
 
 
 def _catalogue_image_response(

@@ -60,7 +60,7 @@ class MatchDocument(BaseModel):
     object_id: str
     logit: float
     probability: float | None
-    probability_if_present: float | None = None
+    probability_if_present: float | None
     photo: str
     metadata: dict[str, Any]
     reference: NearestReference | None = None
@@ -71,8 +71,7 @@ class QueryDocument(BaseModel):
 
     unlisted_probability: total probability of the objects that `results` does not list. more_grasps: number of further
     grasps after which the verdict is expected to be "match"; null for other verdicts than "none of these", and if more
-    grasps do not help. advice: a sentence on how to get a clearer answer. Answers that an earlier version stored in the
-    history lack the optional keys.
+    grasps do not help. advice: a sentence on how to get a clearer answer.
     """
 
     model_config = {"json_schema_extra": {"examples": [EXAMPLE]}}
@@ -82,9 +81,9 @@ class QueryDocument(BaseModel):
     timing_ms: dict[str, float]
     verdict: str
     none_probability: float | None
-    unlisted_probability: float | None = None
-    more_grasps: int | None = None
-    advice: str | None = None
+    unlisted_probability: float | None
+    more_grasps: int | None
+    advice: str | None
     posterior: dict[str, Any] | None
     results: list[MatchDocument]
 

@@ -64,7 +64,7 @@ class ProblemDocument(BaseModel):
     )
 
 
-class HttpProblem(Exception):
+class HttpProblem(HTTPException):
     """An error that becomes a problem document.
 
     Args:
@@ -74,13 +74,8 @@ class HttpProblem(Exception):
     """
 
     def __init__(self, kind: str, detail: str, headers: Mapping[str, str] | None = None) -> None:
-        super().__init__(detail)
-        self.kind, self.detail, self.headers = kind, detail, dict(headers or {})
-
-    @property
-    def status(self) -> int:
-        """The HTTP status."""
-        return KINDS[self.kind][0]
+        super().__init__(KINDS[kind][0], detail, headers)
+        self.kind = kind
 
     def response(self) -> JSONResponse:
         """Return the problem document as a response."""
@@ -88,10 +83,8 @@ class HttpProblem(Exception):
         detail = (
             self.detail if len(self.detail) <= MAX_DETAIL_CHARACTERS else self.detail[:MAX_DETAIL_CHARACTERS] + " ..."
         )
-        document = ProblemDocument(type=PREFIX + self.kind, title=title, status=status, detail=detail)
-        return DocumentResponse(
-            document.model_dump(), status, {"cache-control": "no-store", **self.headers}, MEDIA_TYPE
-        )
+        document = {"type": PREFIX + self.kind, "title": title, "status": status, "detail": detail}
+        return DocumentResponse(document, status, {"cache-control": "no-store", **(self.headers or {})}, MEDIA_TYPE)
 
 
 def problem_of(error: Exception) -> HttpProblem:

@@ -8,7 +8,6 @@ import asyncio
 import gc
 import logging
 from functools import cached_property
-from threading import Lock
 
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.search.defaults import manifest_of
@@ -29,28 +28,21 @@ class ServedGeneration:
     Attributes:
         searcher: Searcher of the generation.
         shard: Its index.
-        model: Digest of the checkpoint.
         fingers: Gel images of one grasp.
     """
 
     def __init__(self, searcher: Searcher) -> None:
         self.searcher, self.shard = searcher, searcher.shard
-        self.model = searcher.checkpoint.digest
         self.fingers: int = searcher.checkpoint.config.matcher.fingers
-        self._lock = Lock()
 
     @property
     def name(self) -> str:
         """The name of the generation."""
         return self.searcher.info.name
 
-    def checkpoint(self) -> Checkpoint:
-        """Return the whole model, including the photo tower, which queries do not need."""
-        with self._lock:
-            return self._checkpoint
-
     @cached_property
-    def _checkpoint(self) -> Checkpoint:
+    def checkpoint(self) -> Checkpoint:
+        """The whole model, including the photo tower, which queries do not need."""
         return load_checkpoint(self.searcher.checkpoint.path, info=self.searcher.checkpoint)
 
 

@@ -1,12 +1,12 @@
 """Routes for liveness, readiness and metrics, and for the session cookie of the page."""
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Response
 from pydantic import BaseModel, Field
 
 from retrieval.serve.errors import HttpProblem, problem_responses
 from retrieval.serve.security import COOKIE, same_token
 from retrieval.serve.service import Parts
-from retrieval.serve.uploads import RequestBody, json_body, read_json
+from retrieval.serve.uploads import RequestBody
 
 router = APIRouter(tags=["health"])
 
@@ -43,18 +43,12 @@ class SessionBody(RequestBody):
     token: str = Field(max_length=1000)
 
 
-@router.post(
-    "/v1/session",
-    status_code=204,
-    responses=problem_responses("bad-input", "too-large", "too-slow", "unsupported-type"),
-    openapi_extra=json_body("SessionBody"),
-)
-async def session(request: Request, parts: Parts) -> Response:
+@router.post("/v1/session", status_code=204, responses=problem_responses("bad-input", "too-large", "too-slow"))
+async def session(body: SessionBody, parts: Parts) -> Response:
     """Store the token in a cookie that scripts cannot read.
 
     The page needs it, because requests for images cannot send a header.
     """
-    body = await read_json(request, SessionBody)
     token = parts.settings.token
     if token is not None and not same_token(body.token, token):
         raise HttpProblem("no-token", "This is not the service's token.", {"www-authenticate": "Bearer"})

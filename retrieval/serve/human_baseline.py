@@ -16,7 +16,7 @@ from retrieval.serve.errors import HttpProblem, problem_responses
 from retrieval.serve.service import HistoryWriter, Parts, Service
 from retrieval.serve.store import HistoryStore, TrialChoice, TrialRun, new_id
 from retrieval.serve.trials import CHOICES, Trial, TrialAccuracy, Trials, trial_accuracies
-from retrieval.serve.uploads import RequestBody, json_body, read_json
+from retrieval.serve.uploads import RequestBody
 
 router = APIRouter(tags=["human baseline"])
 Number = Annotated[int, InPath(ge=1, le=10_000)]
@@ -128,25 +128,15 @@ def trials(parts: Parts) -> TrialsDocument:
     )
 
 
-@router.post(
-    "/v1/trials",
-    status_code=201,
-    responses=problem_responses("unknown", "bad-input"),
-    openapi_extra=json_body("RunBody"),
-)
-async def begin_run(request: Request, parts: Parts) -> RunDocument:
+@router.post("/v1/trials", status_code=201, responses=problem_responses("unknown", "bad-input"))
+def begin_run(body: RunBody, parts: Parts) -> RunDocument:
     """Begin a series of trials."""
-    body = await read_json(request, RunBody)
-
-    def create() -> RunDocument:
-        known, store = _require_trials(parts)
-        seed = secrets.randbelow(2**31) if body.seed is None else body.seed
-        known.trial(parts.generations.current, seed, 1)  # raises if a trial is impossible
-        run = TrialRun(new_id(), time.time(), body.participant, seed, body.count, known.folder.name)
-        store.add_run(run)
-        return _document(run, store)
-
-    return await run_in_threadpool(create)
+    known, store = _require_trials(parts)
+    seed = secrets.randbelow(2**31) if body.seed is None else body.seed
+    known.trial(parts.generations.current, seed, 1)  # raises if a trial is impossible
+    run = TrialRun(new_id(), time.time(), body.participant, seed, body.count, known.folder.name)
+    store.add_run(run)
+    return _document(run, store)
 
 
 @router.get("/v1/trials/{name}", responses=problem_responses("unknown"))
@@ -170,14 +160,9 @@ def trial(name: str, number: Number, parts: Parts) -> TrialDocument:
     )
 
 
-@router.post(
-    "/v1/trials/{name}/{number}",
-    responses=problem_responses("unknown", "bad-input", "conflict", "busy"),
-    openapi_extra=json_body("ChoiceBody"),
-)
-async def choose(request: Request, name: str, number: Number, parts: Parts) -> TrialDocument:
+@router.post("/v1/trials/{name}/{number}", responses=problem_responses("unknown", "bad-input", "conflict", "busy"))
+async def choose(body: ChoiceBody, request: Request, name: str, number: Number, parts: Parts) -> TrialDocument:
     """Store the choice of a trial, once; the response contains the right photo and the model's choice."""
-    body = await read_json(request, ChoiceBody)
     known, store = _require_trials(parts)
     sampled_trial = await run_in_threadpool(lambda: _trial(parts, _run(parts, name), number))
     model = await parts.queue.submit(lambda generation: known.model_choice(generation, sampled_trial), request)

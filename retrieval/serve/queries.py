@@ -36,9 +36,11 @@ async def query(request: Request, parts: Parts) -> DocumentResponse:
     """Return the document of `retrieve query --json` for one or several grasps of one object."""
     parts.queue.require_capacity()
     parsed_query = await read_query(request, parts.generations.current.fingers)
-    answer = await parts.queue.answer(parsed_query, request)
-    query_id = parts.history_writer.submit(parsed_query, answer) if parts.history_writer else None
-    return DocumentResponse(answer.result.to_dict(), headers={"x-query-id": query_id} if query_id else None)
+    result = await parts.queue.answer(parsed_query, request)
+    query_id = None
+    if parts.history_writer is not None:
+        query_id = await parts.history_writer.add_query(parsed_query.pictures, result)
+    return DocumentResponse(result.to_dict(), headers={"x-query-id": query_id} if query_id else None)
 
 
 @router.post("/v1/query/batch", response_model=BatchDocument, responses=_PROBLEMS, openapi_extra=json_body("BatchBody"))

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from threading import Condition, Thread
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from starlette.requests import Request
 
@@ -25,13 +25,6 @@ from retrieval.serve.settings import ServiceSettings
 from retrieval.serve.uploads import ParsedQuery, RequestPictures
 
 Result = TypeVar("Result")
-
-
-class QueryAnswer(NamedTuple):
-    """An answer, and the digest of the model that produced it."""
-
-    result: QueryResult
-    model: str
 
 
 @dataclass(eq=False)
@@ -98,7 +91,7 @@ class Queue:
                 {"retry-after": "1", "connection": "close"},
             )
 
-    async def answer(self, parsed_query: ParsedQuery, request: Request) -> QueryAnswer:
+    async def answer(self, parsed_query: ParsedQuery, request: Request) -> QueryResult:
         """Answer a query.
 
         Args:
@@ -112,17 +105,15 @@ class Queue:
             HttpProblem: The queue is full, the client disconnects or the deadline passes.
             RetrievalError: The errors of `Searcher.query`.
         """
-        answer: QueryAnswer = await self.submit(
-            lambda generation: QueryAnswer(
-                generation.searcher.query(parsed_query.pictures.images[0], **parsed_query.keywords), generation.model
-            ),
+        result = await self.submit(
+            lambda generation: generation.searcher.query(parsed_query.pictures.images[0], **parsed_query.keywords),
             request,
             parsed_query.options.deadline_ms,
             parsed_query.pictures,
             parsed_query,
         )
-        self._metrics.count_answer(answer.result)
-        return answer
+        self._metrics.count_answer(result)
+        return result
 
     async def submit(
         self,
@@ -214,18 +205,16 @@ class Queue:
                 loop.call_soon_threadsafe(_set_results, jobs, answers)
 
     def _next_batch(self) -> list[_Job]:
-        """Return the next job and the jobs of the time window that can be batched with it; empty at the end."""
+        """Return the next job and the waiting jobs that can be batched with it; empty at the end."""
         with self._changed:
             self._changed.wait_for(lambda: self._jobs or self._closed)
             if not self._jobs:
                 return []
-            jobs, until = [first := self._jobs.popleft()], time.monotonic() + self._settings.batch_ms / 1e3
-            while first.parsed_query and len(jobs) < self._settings.max_batch:
-                if not self._changed.wait_for(lambda: self._jobs, until - time.monotonic()):
-                    break
-                if not (parsed_query := self._jobs[0].parsed_query) or not parsed_query.can_batch_with(
-                    first.parsed_query
-                ):
+            jobs = [self._jobs.popleft()]
+            first = jobs[0].parsed_query
+            while first and self._jobs and len(jobs) < self._settings.max_batch:
+                following = self._jobs[0].parsed_query
+                if not following or not following.can_batch_with(first):
                     break
                 jobs.append(self._jobs.popleft())
             return jobs
@@ -252,10 +241,8 @@ def _answers(generation: ServedGeneration, jobs: list[_Job]) -> list[Any]:
     parsed_queries = [job.parsed_query for job in jobs if job.parsed_query is not None]
     if len(jobs) > 1:
         with suppress(BaseException):  # if the batch fails, each query is answered separately
-            found = generation.searcher.query_many(
-                [one.pictures.images[0] for one in parsed_queries], **parsed_queries[0].keywords
-            )
-            return [QueryAnswer(result, generation.model) for result in found]
+            images = [one.pictures.images[0] for one in parsed_queries]
+            return list(generation.searcher.query_many(images, **parsed_queries[0].keywords))
     return [_answer(generation, job) for job in jobs]
 
 

@@ -77,8 +77,8 @@ class Guard:
                 headers = MutableHeaders(scope=message)
                 for name, value in HEADERS.items():
                     headers.setdefault(name, value)
-                if scope["path"].startswith("/v1/"):
-                    headers.setdefault("cache-control", "no-store")
+                is_page = not scope["path"].startswith("/v1/")  # browsers check its files for changes
+                headers.setdefault("cache-control", "no-cache" if is_page else "no-store")
             await send(message)
 
         if problem := self._refusal(scope["path"], Headers(scope=scope)):

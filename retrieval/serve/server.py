@@ -1,22 +1,18 @@
 """The HTTP server; on SIGTERM or Ctrl-C it finishes the requests in flight and ends."""
 
 import asyncio
-import contextlib
-import os
+import faulthandler
 import signal
 import socket
-import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Callable
 from types import FrameType
 
 import uvicorn
 from fastapi import FastAPI
 
 from retrieval.errors import BadInput
-from retrieval.serve.connections import IDLE_S, MAX_CONNECTIONS, Connection, ConnectionTable
+from retrieval.serve.connections import HEADERS_S, MAX_CONNECTIONS, MAX_HEADER_BYTES, Connection
 from retrieval.serve.service import Service
 
 DRAIN_S = 0.5
@@ -25,12 +21,10 @@ SHUTDOWN_GRACE_S = 4
 """Time limit for requests in flight, after `DRAIN_S`."""
 MAX_SHUTDOWN_S = 7.5
 """Maximum time from the signal to the end of the process, even if a thread hangs."""
-_SWEEP_TICKS = 5
-"""Ticks of 0.1 s between two checks of the connections' deadlines."""
 
 
 class Server(uvicorn.Server):
-    """A uvicorn server that ends on a signal without raising it again, so that the process exits with status 0.
+    """A uvicorn server that ends the streams of the service on a signal.
 
     Args:
         config: Configuration of uvicorn.
@@ -48,32 +42,10 @@ class Server(uvicorn.Server):
         if self.started:
             self._on_started(self.servers[0].sockets[0].getsockname()[1])
 
-    async def on_tick(self, counter: int) -> bool:
-        """Close late connections twice a second; return whether to end (uvicorn callback)."""
-        if counter % _SWEEP_TICKS == 0:
-            now = asyncio.get_running_loop().time()
-            for connection in list(self.server_state.connections):
-                if isinstance(connection, Connection):
-                    connection.close_if_late(now)
-        return await super().on_tick(counter)
-
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Answer the requests sent so far, and end."""
         await asyncio.sleep(DRAIN_S)
         await super().shutdown(sockets)
-
-    @contextlib.contextmanager
-    def capture_signals(self) -> Iterator[None]:
-        """Handle both signals while the server runs; restore their handlers afterwards."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-        before = {number: signal.signal(number, self.handle_exit) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """End the streams, which otherwise never end, and the server."""
@@ -93,7 +65,6 @@ def serve(app: FastAPI, on_started: Callable[[int], object]) -> None:
         RetrievalError: The errors of `Searcher.open`.
     """
     parts: Service = app.state.service
-    threading.Thread(target=_enforce_shutdown, args=(parts.stopping,), daemon=True).start()
     parts.generations.open()
     host, port = parts.settings.host, parts.settings.port
     try:
@@ -101,29 +72,20 @@ def serve(app: FastAPI, on_started: Callable[[int], object]) -> None:
         listening = socket.create_server(address[:2], family=family)
     except OSError as error:
         raise BadInput(f"Cannot listen on {host}, port {port}: {error.strerror or error}") from error
+    for number in (signal.SIGINT, signal.SIGTERM):  # uvicorn raises the signal again at its end
+        signal.signal(number, lambda *_: None)
+    threading.Thread(target=_enforce_shutdown, args=(parts.stopping,), daemon=True).start()
     with listening:
         Server(uvicorn_config(app), parts, on_started).run([listening])
 
 
 def _enforce_shutdown(stopping: threading.Event) -> None:
-    """End the process `MAX_SHUTDOWN_S` after `stopping` is set.
+    """End the process `MAX_SHUTDOWN_S` after `stopping` is set, with the calls in which its threads hang on stderr.
 
     The interpreter itself would wait for threads that hang in a driver, in the disk or in a decoder.
     """
     stopping.wait()
-    # SIGALRM ends the process if the interpreter itself hangs.
-    signal.setitimer(signal.ITIMER_REAL, MAX_SHUTDOWN_S + 1)
-    time.sleep(MAX_SHUTDOWN_S)
-    hanging = ", ".join(
-        thread.name for thread in threading.enumerate() if not thread.daemon and thread is not threading.main_thread()
-    )
-    with contextlib.suppress(OSError, ValueError):
-        sys.stderr.write(
-            f"The service did not end within {MAX_SHUTDOWN_S:g} s of the signal and is killed. "
-            f"Hanging threads: {hanging}\n"
-        )
-        sys.stderr.flush()
-    os._exit(1)
+    faulthandler.dump_traceback_later(MAX_SHUTDOWN_S, exit=True)
 
 
 def uvicorn_config(app: FastAPI) -> uvicorn.Config:
@@ -137,9 +99,10 @@ def uvicorn_config(app: FastAPI) -> uvicorn.Config:
         access_log=False,
         server_header=False,
         proxy_headers=False,
-        http=partial(Connection, table=ConnectionTable()),  # type: ignore[arg-type]  # uvicorn only calls it
+        http=Connection,
+        h11_max_incomplete_event_size=MAX_HEADER_BYTES,
         ws="none",
         backlog=MAX_CONNECTIONS,
-        timeout_keep_alive=IDLE_S,
+        timeout_keep_alive=HEADERS_S,
         timeout_graceful_shutdown=SHUTDOWN_GRACE_S,
     )

@@ -14,7 +14,6 @@ from retrieval.serve.history_writer import HistoryWriter as HistoryWriter
 from retrieval.serve.metrics import Metrics
 from retrieval.serve.queue import Queue
 from retrieval.serve.settings import ServiceSettings
-from retrieval.serve.thumbnails import Thumbnails
 from retrieval.serve.trials import Trials
 
 
@@ -61,7 +60,6 @@ class Service:
         grasps: Queue of the rig's gripper.
         frames: Queue of each sensor, by name.
         rig: Functions of the live rig.
-        thumbnails: Cache of small pictures.
         history_writer: Writer of the history; None if no history is stored.
         trials: Trials of the human baseline; None if there is no recording for them.
         streams: Limits the number of live streams.
@@ -76,7 +74,6 @@ class Service:
     grasps: Queue
     frames: Mapping[str, Queue]
     rig: LiveRig
-    thumbnails: Thumbnails
     history_writer: HistoryWriter | None
     trials: Trials | None
     streams: Semaphore

@@ -32,7 +32,6 @@ class ServiceSettings:
         token: Access token of at least 16 ASCII characters; None for a service without one.
         queue: Maximum number of requests in flight.
         workers: Threads that answer queries.
-        batch_ms: Time for which a query waits for further queries of its batch.
         max_batch: Maximum number of queries with equal options in one batch.
         deadline_s: Time limit for an answer.
         body_s: Time limit for the body of a request to arrive.
@@ -54,7 +53,6 @@ class ServiceSettings:
     token: str | None = None
     queue: int = 8
     workers: int = 1
-    batch_ms: float = 0.0
     max_batch: int = 4
     deadline_s: float = 30.0
     body_s: float = 10.0
@@ -74,9 +72,8 @@ class ServiceSettings:
                 raise ConfigError(
                     f"{name} must be above 0 and at most {MAX_WAIT_S} seconds, got {getattr(self, name)}."
                 )
-        for name, maximum in (("batch_ms", 1000), ("port", 2**16 - 1)):
-            if not 0 <= getattr(self, name) <= maximum:
-                raise ConfigError(f"{name} must be from 0 to {maximum}, got {getattr(self, name)}.")
+        if not 0 <= self.port <= 2**16 - 1:
+            raise ConfigError(f"port must be from 0 to {2**16 - 1}, got {self.port}.")
         if self.token is None and not self.is_local:
             raise ConfigError(
                 f"Other machines can reach {self.host}, so a token is required. Write at least {MIN_TOKEN_CHARACTERS} "

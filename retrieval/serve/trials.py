@@ -9,7 +9,6 @@ from collections import defaultdict
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from threading import Lock
 
 import numpy as np
 
@@ -79,7 +78,6 @@ class Trials:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._grasps = load_grasps(folder)
-        self._lock = Lock()
 
     @cached_property
     def _by_object(self) -> dict[str, list[Grasp]]:
@@ -90,7 +88,7 @@ class Trials:
 
     def unseen(self, generation: ServedGeneration) -> list[str]:
         """Return the objects that the model was neither trained nor calibrated on, sorted."""
-        split = generation.checkpoint().split
+        split = generation.checkpoint.split
         training_objects = {*split.train, *split.validation} if split else set()
         return sorted(set(self._by_object) - training_objects)
 
@@ -133,5 +131,5 @@ class Trials:
         background = generation.searcher.checkpoint.config.preprocessing.background
         reference = trial.grasp.backgrounds if background != "none" else None
         partials = generation.searcher.encode([trial.grasp.touches], background=reference).partials
-        photos = embed_photos(trial.photos, model=generation.checkpoint()).partials
+        photos = embed_photos(trial.photos, model=generation.checkpoint).partials
         return int(generation.searcher.scorer.logits(partials, photos).argmax()) + 1

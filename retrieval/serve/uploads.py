@@ -20,7 +20,6 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from retrieval.model.gel_images import GelImage
 from retrieval.model.posterior import NONE_PRIOR
 from retrieval.serve.errors import HttpProblem, validation_message
-from retrieval.serve.forms import form_parts
 from retrieval.serve.settings import MAX_BODY_BYTES, MAX_PICTURES, MAX_SMALL_BODY_BYTES
 
 PICTURE_PATHS = frozenset({"/v1/query", "/v1/query/batch", "/v1/verify"})
@@ -31,13 +30,11 @@ MAX_LARGE_BODIES = 2
 """Maximum number of concurrent large bodies."""
 MAX_SMALL_BODIES_BYTES = 20_000_000
 """Maximum total size of all concurrent small bodies."""
-MAX_INLINE_PARSE_BYTES = 1 << 18
-"""Maximum size of a body that is parsed in the event loop, which is faster than starting a thread."""
 MAX_JSON_VALUES = 2_000
 """Maximum number of JSON values of a body. A body with `MAX_PICTURES` pictures, each in its own lists, and with all
 options has fewer than 800 values."""
-MAX_FIELD_BYTES = 1000
-"""Maximum size of an option in a form."""
+MAX_FIELDS, MAX_FIELD_BYTES = 8, 1024
+"""Maximum number of the options in a form, and maximum size of each."""
 Body = TypeVar("Body", bound=BaseModel)
 MAX_GRASPS, MAX_OBJECTS = 32, 32
 _CLOSE = {"connection": "close"}  # the rest of the body is not read
@@ -272,34 +269,19 @@ def pictures_of(
 
 
 async def read_query(request: Request, fingers: int) -> ParsedQuery:
-    """Return the query in a request's body.
-
-    Args:
-        request: The request.
-        fingers: Number of gel images of one grasp.
-
-    Returns:
-        The query.
+    """Return the query in a request's body; `fingers` is the number of gel images of one grasp.
 
     Raises:
         HttpProblem: The body is not a valid query.
     """
     if _content_type(request) == "multipart/form-data":
-        data = await _body_of(request)
-        return await run_in_threadpool(_from_form, data, request.headers["content-type"], fingers)
+        return await _read_form(request, fingers)
     body = await read_json(request, QueryBody)
     return ParsedQuery(pictures_of([body.touches], body.background), body)
 
 
 async def read_json(request: Request, model: type[Body]) -> Body:
-    """Return the JSON body of a request; a large body is parsed in a thread.
-
-    Args:
-        request: The request.
-        model: Model of the body.
-
-    Returns:
-        The body.
+    """Return the JSON body of a request with pictures, parsed in a thread.
 
     Raises:
         HttpProblem: The body is not valid JSON for the model, or exceeds a limit.
@@ -309,57 +291,54 @@ async def read_json(request: Request, model: type[Body]) -> Body:
         raise HttpProblem(
             "unsupported-type", f"The body must be application/json, got {kind[:100] or 'no content-type'}."
         )
-    data = await _body_of(request)
-    try:
-        if len(data) <= MAX_INLINE_PARSE_BYTES:
-            return _parsed(data, model)
-        return await run_in_threadpool(_parsed, data, model)
-    except ValidationError as error:
-        errors = error.errors(include_input=False, include_url=False, include_context=False)
-        is_malformed = any(one["type"] == "json_invalid" for one in errors)
-        raise HttpProblem("malformed" if is_malformed else "bad-input", validation_message(errors)) from None
+    data = b"".join([chunk async for chunk in request.stream()])
+    return await run_in_threadpool(_parsed, data, model)
 
 
 def _content_type(request: Request) -> str:
     return request.headers.get("content-type", "").partition(";")[0].strip().lower()
 
 
-async def _body_of(request: Request) -> bytes:
-    """Return the whole body without caching it in the request."""
-    return b"".join([chunk async for chunk in request.stream()])
-
-
 def _parsed(data: bytes, model: type[Body]) -> Body:
     """Parse a body after a check that it cannot have more than `MAX_JSON_VALUES` values.
 
-    Every JSON value except the first comes after one of `,:[{`. These characters do not occur in base64. Raises
-    HttpProblem and ValidationError.
+    Every JSON value except the first comes after one of `,:[{`. These characters do not occur in base64.
     """
     values = 1 + sum(map(data.count, (b",", b":", b"[", b"{")))
     if values > MAX_JSON_VALUES:
         raise HttpProblem(
             "bad-input", f"A body may have at most {MAX_JSON_VALUES:,} JSON values, got up to {values:,}."
         )
-    return model.model_validate_json(data)
+    try:
+        return model.model_validate_json(data)
+    except ValidationError as error:
+        raise _invalid(error) from None
 
 
-def _from_form(data: bytes, content_type: str, fingers: int) -> ParsedQuery:
+def _invalid(error: ValidationError) -> HttpProblem:
+    errors = error.errors(include_input=False, include_url=False, include_context=False)
+    is_malformed = any(one["type"] == "json_invalid" for one in errors)
+    return HttpProblem("malformed" if is_malformed else "bad-input", validation_message(errors))
+
+
+async def _read_form(request: Request, fingers: int) -> ParsedQuery:
     files: dict[str, list[bytes]] = {"gelsight": [], "background": []}
     fields: dict[str, str] = {}
-    for name, is_file, content in form_parts(data, content_type):
-        if is_file != (name in files) or (not is_file and len(content) > MAX_FIELD_BYTES):
-            kind = "a file" if name in files else f"a text of at most {MAX_FIELD_BYTES} bytes"
-            raise HttpProblem("bad-input", f"{name[:100]!r} must be {kind}; only gelsight and background are files.")
-        if is_file:
-            files[name].append(content)
-        else:
-            fields[name] = content.decode("utf-8", "replace")
+    limits = {"max_files": MAX_PICTURES, "max_fields": MAX_FIELDS, "max_part_size": MAX_FIELD_BYTES}
+    async with request.form(**limits) as form:
+        for name, value in form.multi_items():
+            if isinstance(value, str) == (name in files):
+                raise HttpProblem(
+                    "bad-input", f"{name[:100]!r}: gelsight and background must be files, and all others text."
+                )
+            if isinstance(value, str):
+                fields[name] = value
+            else:
+                files[name].append(await value.read())
     try:
         options = Options.model_validate(fields)
     except ValidationError as error:
-        raise HttpProblem(
-            "bad-input", validation_message(error.errors(include_input=False, include_url=False))
-        ) from None
+        raise _invalid(error) from None
     images = files["gelsight"]
     if not images or len(images) % fingers:
         raise HttpProblem(

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -104,7 +104,6 @@ class QueryResult:
         more_grasps: If the verdict is "none of these" and the ranking is clear (`is_clear`): number of further grasps
             like these after which "match" is expected (`Posterior.more_grasps`). None otherwise, and if too many are
             needed.
-        embeddings: Embeddings (G, embedding_dim) of the grasps, if they were encoded in this process; absent from JSON.
 
     >>> with retrieval.open("index") as searcher:
     ...     answer = searcher.query(["a.png", "b.png"])
@@ -123,7 +122,6 @@ class QueryResult:
     posterior: dict[str, Any] | None
     results: list[Match]
     more_grasps: int | None = None
-    embeddings: NDArray[np.float32] | None = field(default=None, repr=False, compare=False)
 
     @property
     def top(self) -> Match | None:

@@ -270,7 +270,7 @@ class Searcher:
             scored.append(self._score(query, top, candidates, none_prior, clock))
         timing_ms = clock.finish(len(spans))
         return [
-            self._result(grasps[span], classes[span].tolist(), codes.embeddings[span], timing_ms, found, none_prior)
+            self._result(grasps[span], classes[span].tolist(), timing_ms, found, none_prior)
             for span, found in zip(spans, scored, strict=True)
         ]
 
@@ -294,7 +294,6 @@ class Searcher:
         self,
         grasps: Sequence[Sequence[InputImage]],
         classes: list[str],
-        embeddings: Floats,
         timing_ms: dict[str, float],
         scored: _ScoredQuery | None,
         none_prior: float,
@@ -325,7 +324,6 @@ class Searcher:
             posterior=self._formula(scored, none_prior) if scored else None,
             results=self._ranking(scored) if scored else [],
             more_grasps=self._more_grasps(scored, none_prior) if verdict == NONE_OF_THESE and scored else None,
-            embeddings=embeddings,
         )
 
     def _more_grasps(self, scored: _ScoredQuery, none_prior: float) -> int | None:

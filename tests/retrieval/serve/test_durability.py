@@ -68,12 +68,12 @@ def test_a_database_of_a_killed_writer_is_complete(tmp_path, searcher, touch):
     import shutil
 
     store = HistoryStore(tmp_path / "a" / "history.sqlite", 10, 2**30)
-    store.add_query("1", [[path.read_bytes() for path in touch]], None, searcher.query(touch), "m")
+    store.add_query("1", [[path.read_bytes() for path in touch]], None, searcher.query(touch))
     store.add_feedback("1", "object", "mug", b"photo")
     shutil.copytree(tmp_path / "a", tmp_path / "b")
     copy = HistoryStore(tmp_path / "b" / "history.sqlite", 10, 2**30)
     assert copy.recordable() == [("1", "mug")]
-    assert copy.picture("1", 1, "a") == touch[0].read_bytes()
+    assert copy.pictures("1")[1, "a"] == touch[0].read_bytes()
     assert copy.photo("1") == b"photo"
     copy.close()
     store.close()

@@ -1,10 +1,6 @@
-"""Failures of a service: failing writes, a full disk, a deleted database, a hanging rig or disk."""
+"""Failures of a service: failing writes, a full disk, a hanging rig or disk."""
 
-import asyncio
-import base64
-import errno
 import signal
-import sqlite3
 import subprocess
 import sys
 import threading
@@ -15,28 +11,12 @@ from contextlib import ExitStack
 import httpx
 import pytest
 
-from retrieval.errors import RetrievalError
+from retrieval.serve import history_writer
 from retrieval.serve.app import MAX_RIG_GRASPS
-from retrieval.serve.history_writer import MAX_PENDING_WRITES, HistoryWriter
-from retrieval.serve.metrics import Metrics
-from retrieval.serve.queue import QueryAnswer
 from retrieval.serve.service import GraspResult, LiveRig
-from retrieval.serve.settings import ServiceSettings
-from retrieval.serve.uploads import Options, ParsedQuery, pictures_of
-from robot.recording.folder import RecordingWriter
 from tests.retrieval.serve.test_connections import opened
-from tests.serving import INFO, listening, problem, with_history
+from tests.serving import listening, problem, with_history
 from tests.waiting import wait_until
-
-
-@pytest.fixture(scope="module")
-def grasp(touch):
-    return [path.read_bytes() for path in touch]
-
-
-@pytest.fixture(scope="module")
-def body(grasp):
-    return {"touches": [[base64.b64encode(data).decode() for data in grasp]]}
 
 
 @pytest.fixture
@@ -56,123 +36,34 @@ def ask(client, body):
     return response.headers.get("x-query-id")
 
 
-# The writer of the history -------------------------------------------------------------------------------------------
-
-
-class Unforeseen(BaseException):
-    """An exception that no program expects."""
-
-
-UNFORESEEN = (
-    lambda: ValueError("x"),
-    lambda: KeyError("x"),
-    lambda: MemoryError(),
-    lambda: RecursionError("x"),
-    lambda: StopIteration("x"),
-    lambda: StopAsyncIteration("x"),
-    lambda: GeneratorExit("x"),
-    lambda: KeyboardInterrupt(),
-    lambda: SystemExit(1),
-    lambda: asyncio.CancelledError(),
-    lambda: OSError(errno.ENOSPC, "No space left on device"),
-    lambda: sqlite3.ProgrammingError("x"),
-    lambda: UnicodeEncodeError("utf-8", "\ud83d", 0, 1, "surrogates not allowed"),
-    lambda: Unforeseen("x"),
-)
-
-
-def test_the_writer_survives_a_thousand_unforeseen_exceptions(index, folder, grasp, body, monkeypatch):
-    raised = []
-
-    def fail(*_):
-        error = UNFORESEEN[len(raised) % len(UNFORESEEN)]()
-        raised.append(error)
-        raise error
-
-    with with_history(index, folder) as client:
-        writer, names = client.app.state.service.history_writer, []
-        with monkeypatch.context() as patch:
-            patch.setattr(writer.store, "add_query", fail)
-            for _ in range(1_000):
-                wait_until(lambda: len(writer._pending) < MAX_PENDING_WRITES)
-                query = ParsedQuery(pictures_of([[grasp]], None), Options())
-                names.append(writer.submit(query, QueryAnswer(None, "m")))
-            wait_until(lambda: len(raised) == 1_000)
-        assert client.get("/v1/history").json()["total"] == 0
-        assert "could not be stored: 'x'" in problem(client.get(f"/v1/history/{names[1]}"), 404, "unknown")
-        assert b'retrieve_history_failures_total{kind="query"} 1000.0' in client.get("/metrics").content
-        query = ask(client, body)
-        assert [item["id"] for item in client.get("/v1/history").json()["items"]] == [query]
-        began = time.monotonic()
-    assert time.monotonic() - began < 10
-
-
-def test_the_history_answers_while_the_writer_hangs_and_reports_pending_queries(client, body, monkeypatch):
-    go, store = threading.Event(), client.app.state.service.history_writer.store
-    add_query = store.add_query
-    monkeypatch.setattr(store, "add_query", lambda *row: go.wait(60) and add_query(*row))
-    query = ask(client, body)
-    assert client.get("/v1/history").json()["total"] == 0
-    response = client.post("/v1/feedback", json={"query": query, "feedback": "none"})
-    assert problem(response, 503, "not-ready") == f"Query {query} is still being stored. Try again."
-    for _ in range(MAX_PENDING_WRITES):
-        last = ask(client, body)
-    assert last is None  # too many queries wait, so the answer has no id
-    go.set()
-    wait_until(lambda: client.get("/v1/history").json()["total"] == MAX_PENDING_WRITES)
-
-
 # The disk ------------------------------------------------------------------------------------------------------------
 
 
-def test_a_query_refused_by_a_full_disk_is_reported_with_the_reason(client, body):
+def test_a_query_is_answered_without_an_id_while_the_disk_is_full(client, body, searcher):
     store = client.app.state.service.history_writer.store
     first = ask(client, body)
-    client.get("/v1/history")
     (pages,) = store._database.execute("PRAGMA page_count").fetchone()
     store._database.execute(f"PRAGMA max_page_count = {pages}")
-    query = ask(client, body)
-    for response in (
-        client.get(f"/v1/history/{query}"),
-        client.post("/v1/feedback", json={"query": query, "feedback": "none"}),
-    ):
-        detail = problem(response, 404, "unknown")
-        assert detail.startswith(f"Query {query} could not be stored: ")
-        assert detail.endswith("cannot be written: database or disk is full")
+    assert ask(client, body) is None
+    feedback = {"query": first, "feedback": "object", "object_id": searcher.generation.rows[0]["object_id"]}
+    response = client.post("/v1/feedback", json=feedback)
+    assert "cannot be written: database or disk is full" in problem(response, 500, "failed")
+    assert b'retrieve_history_failures_total{kind="query"} 1.0' in client.get("/metrics").content
     store._database.execute("PRAGMA max_page_count = 1000000")
-    assert client.get(f"/v1/history/{first}").status_code == 200
-    assert client.get(f"/v1/history/{ask(client, body)}").status_code == 200
+    second = ask(client, body)
+    assert [item["id"] for item in client.get("/v1/history").json()["items"]] == [second, first]
 
 
-@pytest.mark.parametrize("name", ["history.sqlite", "history.sqlite-wal"])
-@pytest.mark.parametrize("replaced", [False, True])
-def test_no_feedback_is_acknowledged_after_the_database_is_deleted_or_replaced(client, body, folder, name, replaced):
-    query = ask(client, body)
-    assert client.get(f"/v1/history/{query}").status_code == 200
-    data = (folder / name).read_bytes()
-    (folder / name).unlink()
-    if replaced:
-        (folder / f"{name}.new").write_bytes(data)
-        (folder / f"{name}.new").rename(folder / name)
-    detail = problem(client.post("/v1/feedback", json={"query": query, "feedback": "none"}), 500, "failed")
-    assert detail == (
-        f"{folder / 'history.sqlite'} was deleted or replaced while the service ran, so nothing can be stored. "
-        "Start the service again."
-    )
-    problem(client.get("/v1/history"), 500, "failed")
-    later = ask(client, body)  # queries are answered
-    writer = client.app.state.service.history_writer
-    writer._writer.submit(int).result()
-    assert writer.missing_query_problem(later).detail.endswith("Start the service again.")
-
-
-def test_a_hanging_database_is_reported_and_does_not_delay_closing(folder, monkeypatch):
-    monkeypatch.setattr("retrieval.serve.store._LOCK_S", 0.1)
-    with RecordingWriter(folder / "recording", INFO) as recorder:
-        writer = HistoryWriter(folder, recorder, ServiceSettings(index="x"), Metrics())
-        with writer.store._lock, pytest.raises(RetrievalError, match="sqlite does not respond"):
-            writer.store.names()
-        writer.close()
+def test_queries_are_answered_without_an_id_while_the_disk_hangs(client, body, monkeypatch):
+    monkeypatch.setattr(history_writer, "STORE_S", 0.1)
+    monkeypatch.setattr(history_writer, "MAX_PENDING_WRITES", 2)
+    go, writer = threading.Event(), client.app.state.service.history_writer
+    add_query = writer.store.add_query
+    monkeypatch.setattr(writer.store, "add_query", lambda *row: go.wait(60) and add_query(*row))
+    assert [ask(client, body) for _ in range(4)] == [None] * 4
+    go.set()
+    wait_until(lambda: client.get("/v1/history").json()["total"] == 2)  # the others would fill the memory
+    assert ask(client, body)
 
 
 # The rig -------------------------------------------------------------------------------------------------------------
@@ -215,7 +106,7 @@ def test_a_grasp_and_a_picture_that_hang_end_at_the_deadline(index, hanging):
         problem(httpx.post(f"{url}/v1/grasp", params={"object": "nobody's"}), 504, "late")  # the rig is still busy
 
 
-@pytest.mark.parametrize("error", [StopIteration("x"), SystemExit(1), KeyboardInterrupt(), OSError("unplugged")])
+@pytest.mark.parametrize("error", [StopIteration("x"), SystemExit(1), OSError("unplugged")])
 def test_the_next_grasp_succeeds_after_any_exception_of_the_rig(index, error):
     raised = iter([error])
 
@@ -254,8 +145,6 @@ with RecordingWriter(Path(folder) / "recording", {"source": "s", "sensor": "t"})
             generation.shard.page = hang
         if where == "write":
             parts.history_writer.store.add_query = hang
-        if where == "commit":
-            parts.history_writer.store._lock.acquire()
         if where == "generation":
             import retrieval.serve.generations
             retrieval.serve.generations.manifest_of = hang
@@ -269,13 +158,10 @@ REQUESTS = {
     "query": ("POST", "/v1/query"),
     "page": ("GET", "/v1/catalogue"),
     "write": ("POST", "/v1/query"),
-    "commit": ("POST", "/v1/query"),
     "generation": ("GET", "/healthz"),
     "headers": None,
 }
-
-
-ENDED = {"stream": {200, None}, "write": {200}, "commit": {200}, "generation": {200}, "headers": set()}
+ENDED = {"stream": {200, None}, "write": {200}, "generation": {200}, "headers": set()}
 """Statuses of the requests in flight; 503 if the work hangs."""
 
 

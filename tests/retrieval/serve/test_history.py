@@ -1,20 +1,18 @@
 """The history: stored queries, feedback as a recording for training, and trials of the human baseline."""
 
 import base64
-import io
-import json
 import shutil
-import zipfile
+import sqlite3
 
 import pytest
 
 from retrieval.data.check.recording import check_recording
 from retrieval.data.dataset import load_grasps
+from retrieval.errors import BadInput
 from retrieval.serve.store import HistoryStore
 from robot.recording.folder import RecordingWriter
 from tests import synthetic
 from tests.serving import INFO, problem, service, with_history
-from tests.waiting import wait_until
 
 
 @pytest.fixture(scope="module")
@@ -131,74 +129,44 @@ def test_unrecorded_feedback_is_recorded_at_the_next_start(index, touches, folde
         response = add_feedback(client, query, "object", name)
         assert (response.status_code, response.json()["recorded"]) == (201, False)
         assert b'retrieve_history_failures_total{kind="feedback"} 1.0' in client.get("/metrics").content
-    with with_history(index, folder):  # recorded in a thread that the end of the service does not wait for
-        wait_until(lambda: (folder / "recording" / "metadata.jsonl").read_text().count("\n") == 2)
+    with with_history(index, folder):
+        pass
     assert [grasp.object_id for grasp in load_grasps(folder / "recording")] == [name, name]
 
 
-def test_the_nearest_touch_of_a_touch_is_its_copy(client, touches):
-    queries = [ask(client, grasps[:1])[0] for grasps in touches.values()]
-    copy, _ = ask(client, next(iter(touches.values()))[:1])
-    similar = client.get(f"/v1/history/{copy}/nearest").json()
-    assert similar["compared"] == 4
-    assert similar["items"][0]["id"] == queries[0]
-    assert similar["items"][0]["score"] == pytest.approx(1, abs=1e-5)
-    assert copy not in [item["id"] for item in similar["items"]]
-
-
-def test_oldest_queries_without_feedback_are_deleted(index, touches, tmp_path, searcher):
-    store = HistoryStore(tmp_path / "h.sqlite", max_queries=2, max_bytes=2**40)
+def test_oldest_queries_without_feedback_are_deleted(touches, tmp_path, searcher):
     result = searcher.query(next(iter(touches.values())))
-    for number in range(40):
-        store.add_query(f"{number:03}", [[b"a"]], None, result, "m")
-        if number == 3:
-            store.add_feedback("003", "none", None, None)
-    assert store.names() == ["003", *(f"{number:03}" for number in range(30, 40))]
-    store.close()
-    small = HistoryStore(tmp_path / "h.sqlite", max_queries=1000, max_bytes=3)
-    for number in range(40, 72):
-        small.add_query(f"{number:03}", [[b"a"]], None, result, "m")
-    assert small.names() == ["003", "069", "070", "071"]
-    small.close()
 
+    def add(first, last, **limits):
+        store = HistoryStore(tmp_path / "h.sqlite", **limits)
+        for number in range(first, last):
+            store.add_query(f"{number:03}", [[b"a"]], None, result)
+            if number == 3:
+                store.add_feedback("003", "none", None, None)
+        names = [stored.id for stored in store.history()[1]]
+        store.close()
+        return names
 
-def test_feedback_on_a_deleted_query_is_refused(client, touches, monkeypatch):
-    name, _ = ask(client, next(iter(touches.values())))
-    assert client.get(f"/v1/history/{name}").status_code == 200  # it is written
-    store = client.app.state.service.history_writer.store
-    read = iter([store.query(name)])  # the first read, just before the query is deleted
-    store._database.execute("DELETE FROM queries")
-    monkeypatch.setattr(store, "query", lambda name: next(read, None))
-    assert "only the newest are kept" in problem(add_feedback(client, name, "none"), 404, "unknown")
+    newest = [f"{number:03}" for number in range(39, 29, -1)]
+    assert add(0, 40, max_queries=2, max_bytes=2**40) == [*newest, "003"]  # deleted after every 32 queries
+    assert add(40, 72, max_queries=1000, max_bytes=3) == ["071", "070", "069", "003"]
 
 
 def test_a_file_of_another_program_is_no_history(tmp_path):
-    from retrieval.errors import BadInput
-
     (tmp_path / "x").write_bytes(b"not a database, for sure" * 100)
-    with pytest.raises(BadInput, match="must be the history of a service"):
-        HistoryStore(tmp_path / "x", 1, 1)
-
-
-def test_the_export_contains_the_recording_and_every_query(client, touches, tmp_path):
-    queries = []
-    for name, grasps in touches.items():
-        query, _ = ask(client, grasps)
-        add_feedback(client, query, "object", name)
-        queries.append(query)
-    archive = zipfile.ZipFile(io.BytesIO(client.get("/v1/export.zip").content))
-    assert archive.testzip() is None
-    archive.extractall(tmp_path / "out")
-    assert len(load_grasps(tmp_path / "out" / "recording")) == 6
-    lines = (tmp_path / "out" / "history.jsonl").read_text().splitlines()
-    assert [json.loads(line)["id"] for line in lines] == queries
+    other = sqlite3.connect(tmp_path / "y")
+    other.execute("CREATE TABLE mine (x)")
+    other.close()
+    for name in "xy":
+        with pytest.raises(BadInput, match="must be the history of a service"):
+            HistoryStore(tmp_path / name, 1, 1)
 
 
 def test_service_without_history_reports_it(index, touches):
     with service(index) as client:
         encoded = [[base64.b64encode(image).decode() for image in next(iter(touches.values()))[0]]]
         assert "x-query-id" not in client.post("/v1/query", json={"touches": encoded}).headers
-        for path in ("/v1/history", "/v1/export.zip", "/v1/history/x", "/v1/trials"):
+        for path in ("/v1/history", "/v1/history/x", "/v1/trials"):
             problem(client.get(path), 404, "unknown")
 
 

@@ -152,17 +152,6 @@ def test_the_probability_of_unlisted_objects_is_that_of_the_service(opened, file
     assert opened.locator(".photo.rest .p").inner_text() == "43.8\u00a0%"
 
 
-def test_an_answer_without_advice_of_an_earlier_version_is_shown(opened, files, searcher):
-    """The history may contain such answers."""
-    document = searcher.query(files[:2], none_prior=0.999).to_dict()
-    del document["advice"], document["more_grasps"], document["unlisted_probability"]
-    for match in document["results"]:
-        del match["probability_if_present"]
-    show_answer(document, opened, files)
-    opened.locator(".verdict").get_by_text("The nearest objects are shown.").wait_for()
-    assert opened.locator(".advice, .if-present").count() == 0
-
-
 def test_similar_photos_open_their_objects(opened, files):
     ask(opened, files[:2])
     opened.locator(".photo.object button").first.click()

@@ -1,8 +1,6 @@
 """The page in a real browser: feedback, the history, the catalogue, the human baseline."""
 
-import io
 import json
-import zipfile
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
@@ -68,7 +66,7 @@ def test_feedback_right_and_none_take_one_click_and_appear_in_the_history(opened
     opened.locator(".query").first.get_by_text(text.removesuffix(".")).wait_for()
 
 
-def test_the_history_is_searched_and_exported(opened, files):
+def test_the_history_is_searched(opened, files):
     ask(opened, files[:2])
     open_view(opened, "History")
     opened.locator(".query").first.wait_for()
@@ -76,20 +74,6 @@ def test_the_history_is_searched_and_exported(opened, files):
     opened.get_by_text("No matching queries.").wait_for()
     opened.get_by_role("searchbox", name="Search").fill("")
     opened.locator(".query").first.wait_for()
-    with opened.expect_download() as download:
-        opened.get_by_role("link", name="Export all").click()
-    with zipfile.ZipFile(io.BytesIO(download.value.path().read_bytes())) as archive:
-        assert "history.jsonl" in archive.namelist()
-        assert len(archive.read("history.jsonl").splitlines()) >= 1
-
-
-def test_similar_touches_are_found_from_a_touch(opened, files):
-    ask(opened, files[:2])
-    ask(opened, files[2:])
-    open_view(opened, "History")
-    opened.get_by_role("button", name="Similar").first.click()
-    opened.get_by_role("heading", name="Similar touches").wait_for()
-    opened.get_by_role("region", name="Similar touches").locator(".query").first.wait_for()
 
 
 def test_the_catalogue_is_searched_and_its_photos_open_similar_photos(opened, catalogue):

@@ -1,13 +1,11 @@
 """Hostile bodies: the service refuses them quickly with a clear message, before memory is spent."""
 
 import base64
-import io
 import socket
 import time
 
 import httpx
 import pytest
-from PIL import Image
 
 from retrieval.serve.uploads import MAX_LARGE_BODIES, MAX_SMALL_BODIES_BYTES, PICTURE_PATHS
 from tests.hostile_pictures import png_file
@@ -24,19 +22,11 @@ def post(client, *images):
     return client.post("/v1/query", json={"touches": [[base64.b64encode(image).decode() for image in images]]})
 
 
-@pytest.mark.parametrize(("width", "height"), [(4473, 4473), (50_000, 50_000), (2**31 - 1, 2**31 - 1)])
+@pytest.mark.parametrize(("width", "height"), [(4473, 4473), (2**31 - 1, 2**31 - 1)])
 def test_a_picture_of_more_than_20_million_pixels_is_refused_by_its_header(client, width, height):
     detail = problem(post(client, png_file(width, height), png_file(8, 8)), 422, "bad-image")
     assert detail.startswith("grasp 1, finger a: ")
     assert "20" in detail
-
-
-def test_a_large_jpeg_is_refused_although_it_could_be_decoded_at_reduced_size(client):
-    file = io.BytesIO()
-    Image.new("L", (6000, 4000)).save(file, "JPEG")
-    assert "6000 x 4000 pixels exceed the limit of 20,000,000" in problem(
-        post(client, file.getvalue(), file.getvalue()), 422, "bad-image"
-    )
 
 
 @pytest.mark.parametrize(
@@ -118,8 +108,8 @@ def test_only_bodies_with_pictures_may_be_large(client):
     posted = {path for path, operations in paths.items() if "post" in operations} - PICTURE_PATHS
     assert posted == {"/v1/session", "/v1/feedback", "/v1/trials", "/v1/trials/{name}/{number}", "/v1/grasp"}
     for path in posted - {"/v1/grasp"}:
-        large_bodies = client.post(path.format(name="x", number=1), content=b"[" * 16_385, headers=JSON)
-        assert "at most 16,384 bytes" in problem(large_bodies, 413, "too-large")
+        large = client.post(path.format(name="x", number=1), content=b"[" * 16_385, headers=JSON)
+        assert "at most 16,384 bytes" in problem(large, 413, "too-large")
         nested = client.post(path.format(name="x", number=1), content=b"[" * 16_384, headers=JSON)
         assert nested.status_code in (400, 422)
 
@@ -127,24 +117,33 @@ def test_only_bodies_with_pictures_may_be_large(client):
 # Forms ----------------------------------------------------------------------------------------------------------------
 
 FORM = {"content-type": "multipart/form-data; boundary=x"}
-PART = b'\r\n--x\r\ncontent-disposition: form-data; name="top"\r\n\r\n3'
+OPTION = b'\r\n--x\r\ncontent-disposition: form-data; name="top"\r\n\r\n3'
+FILE = b'\r\n--x\r\ncontent-disposition: form-data; name="gelsight"; filename="a"\r\n\r\n3'
+FORMS = {
+    "fields": (OPTION * 300_000 + b"\r\n--x--", 400, "Maximum number of fields is 8"),
+    "files": (FILE * 200_000 + b"\r\n--x--", 400, "Maximum number of files is 128"),
+    "headers": (b"--x\r\n" + b"a: b\r\n" * 3_000_000 + OPTION + b"\r\n--x--", 400, "Invalid multipart data"),
+    "long header": (b"--x\r\na: " + b"b" * 19_000_000, 400, "Invalid multipart data"),
+    "partial boundaries": (
+        FILE + b"\r\n--" * 4_500_000 + b"\r\n--x--",
+        422,
+        "must occur 2 times for each grasp, got 1",
+    ),
+    "no name": (b"--x\r\n\r\n\r\n3\r\n--x--", 400, "must be provided"),
+    "long option": (OPTION + b"1" * 2000 + b"\r\n--x--", 400, "exceeded maximum size of 1KB"),
+    "option as file": (OPTION.replace(b'"top"', b'"top"; filename="a"') + b"\r\n--x--", 422, "'top'"),
+    "picture as text": (FILE.replace(b'; filename="a"', b"") + b"\r\n--x--", 422, "'gelsight'"),
+    "unknown option": (OPTION.replace(b"top", b"tip") + b"\r\n--x--", 422, "tip: Extra inputs are not permitted"),
+    "empty": (b"", 422, "must occur 2 times for each grasp, got 0"),
+}
 
 
-@pytest.mark.parametrize(
-    ("body", "message"),
-    [
-        (PART * 300_000 + b"\r\n--x--", "A form may have at most 136 parts, got 300000"),
-        (b"--x\r\n" + b"a: b\r\n" * 3_000_000 + PART + b"\r\n--x--", "with headers of at most 4096 bytes"),
-        (b"--x\r\n" + b"\r\n--" * 4_000_000, "The form is incomplete"),
-        (b"--x\r\n\r\n\r\n3\r\n--x--", "must name its field"),
-        (PART[:-1] + b"1" * 2000 + b"\r\n--x--", "'top' must be a text of at most"),
-        (b"", "The form is incomplete"),
-    ],
-    ids=["parts", "headers", "partial boundaries", "no name", "long", "empty"],
-)
-def test_a_hostile_form_is_refused_soon(client, body, message):
+@pytest.mark.parametrize("name", FORMS)
+def test_a_hostile_form_is_refused_soon(client, name):
+    body, status, message = FORMS[name]
     begun = time.process_time()
-    assert message in problem(client.post("/v1/query", content=body, headers=FORM), 422, "bad-input")
+    response = client.post("/v1/query", content=body, headers=FORM)
+    assert message in problem(response, status, "malformed" if status == 400 else "bad-input")
     assert time.process_time() - begun < 1
 
 
@@ -167,7 +166,7 @@ def answer(connection):
     return int(data.split(b" ", 2)[1]), data
 
 
-@pytest.mark.parametrize("kind", ["application/json", "multipart/form-data; boundary=x", "text/plain"])
+@pytest.mark.parametrize("kind", ["application/json", "multipart/form-data; boundary=x"])
 def test_an_announced_body_of_two_gigabytes_is_refused_before_the_first_byte(url, kind):
     with line(url) as connection:
         connection.sendall((HEAD.format(kind=kind) + f"content-length: {2 * 2**30}\r\n\r\n").encode())

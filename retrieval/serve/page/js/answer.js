@@ -36,8 +36,7 @@ function probabilityParts(answer) {
   const none = { kind: "none", p: answer.none_probability };
   const shown = [...objects, none].sort((one, other) => other.p - one.p);
   const others = (answer.posterior?.objects ?? 0) - objects.length;
-  const rest = answer.unlisted_probability; // absent in stored answers of earlier versions
-  if (others > 0 && rest !== undefined) shown.push({ kind: "rest", p: rest, others });
+  if (others > 0) shown.push({ kind: "rest", p: answer.unlisted_probability, others });
   return shown;
 }
 

@@ -73,7 +73,6 @@ function decoded(text) {
 export const photoURL = (id) => `/v1/photos/${encodedPath(id)}`;
 export const thumbnailURL = (id, px = 480) => `/v1/thumbnails/${encodedPath(id)}?px=${px}`;
 export const streamURL = (name, rate = 10) => `/v1/sensors/${encodeURIComponent(name)}/stream?rate=${rate}`;
-export const EXPORT = "/v1/export.zip";
 
 export const index = () => json("/v1/index");
 export const session = (token) => reply("/v1/session", jsonPost({ token }));
@@ -116,8 +115,6 @@ export const noContactFrames = (id, letters) =>
   Promise.all(letters.map((letter) => blob(`/v1/history/${encodeURIComponent(id)}/touches/0/${letter}`))).catch(
     () => null,
   );
-export const nearestTouches = (id, count = 8) =>
-  json(withParameters(`/v1/history/${encodeURIComponent(id)}/nearest`, { count }));
 export const feedback = (query, value, objectId = null) =>
   json("/v1/feedback", jsonPost({ query, feedback: value, ...(objectId && { object_id: objectId }) }));
 

@@ -1,7 +1,7 @@
 // The history view: queries, answers and feedback.
 
 import * as api from "./api.js";
-import { announce, h, picture, problemCard, debounce } from "./dom.js";
+import { h, picture, problemCard, debounce } from "./dom.js";
 import { count, moment, percent, feedbackText } from "./wording.js";
 
 const PAGE = 30;
@@ -27,16 +27,10 @@ export function historyView() {
     { type: "button", class: "quiet more", hidden: true, onclick: () => load(list.children.length) },
     "Older",
   );
-  const similar = h("section", { class: "similar-touches", hidden: true, "aria-label": "Similar touches" });
   const element = h(
     "div",
     { class: "history" },
-    h(
-      "div",
-      { class: "view-head" },
-      h("h1", { tabindex: "-1" }, "History"),
-      h("a", { class: "quiet button", href: api.EXPORT, download: "" }, "Export all"),
-    ),
+    h("div", { class: "view-head" }, h("h1", { tabindex: "-1" }, "History")),
     h(
       "div",
       { class: "filters" },
@@ -44,7 +38,6 @@ export function historyView() {
       h("div", { class: "field" }, h("label", { for: "history-feedback" }, "Feedback"), feedbackSelect),
     ),
     total,
-    similar,
     list,
     more,
   );
@@ -58,7 +51,7 @@ export function historyView() {
     const filters = { offset, limit: PAGE, search: search.value.trim(), feedback: feedbackSelect.value };
     try {
       const page = await api.history(filters);
-      const items = page.items.map((item) => entry(item, showSimilarTouches));
+      const items = page.items.map(entry);
       if (offset) list.append(...items);
       else list.replaceChildren(...items);
       more.hidden = page.next === null;
@@ -74,47 +67,14 @@ export function historyView() {
     }
   }
 
-  async function showSimilarTouches(item) {
-    similar.hidden = false;
-    const close = h("button", { type: "button", class: "link", onclick: () => (similar.hidden = true) }, "Close");
-    const head = h(
-      "div",
-      { class: "live-head" },
-      h("h2", { tabindex: "-1" }, "Similar touches"),
-      close,
-    );
-    try {
-      const found = await api.nearestTouches(item.id);
-      const items = found.items.map((each) => entry(each, showSimilarTouches));
-      similar.replaceChildren(
-        head,
-        thumbs(item),
-        items.length
-          ? h("ul", { class: "queries" }, items)
-          : h("p", { class: "muted" }, "There are no other touches yet."),
-      );
-    } catch (error) {
-      similar.replaceChildren(head, problemCard(error));
-    }
-    similar.scrollIntoView({ block: "nearest" });
-    head.firstChild.focus();
-    announce("Similar touches are shown.");
-  }
-
-  return {
-    element,
-    show: () => {
-      similar.hidden = true;
-      load();
-    },
-  };
+  return { element, show: () => load() };
 }
 
 function empty({ search, feedback }) {
   return search || feedback ? "No matching queries." : "No queries yet. Queries of the view Ask appear here.";
 }
 
-function entry(item, showSimilarTouches) {
+function entry(item) {
   const named = item.verdict === "match" || item.verdict === "uncalibrated";
   const claim = named ? item.best : item.verdict[0].toUpperCase() + item.verdict.slice(1);
   return h(
@@ -130,12 +90,6 @@ function entry(item, showSimilarTouches) {
       "span",
       { class: `feedback-mark${item.feedback ? "" : " muted"}` },
       item.feedback ? feedbackText(item.feedback, item.object_id) : "",
-    ),
-    h(
-      "button",
-      { type: "button", class: "link", onclick: () => showSimilarTouches(item) },
-      "Similar",
-      h("span", { class: "visually-hidden" }, ` touches to that of ${moment(item.time)}`),
     ),
   );
 }

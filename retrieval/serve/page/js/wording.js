@@ -97,9 +97,8 @@ export function verificationVerdict({ decision, expected, bounds, log_ratios: ra
   }
 }
 
-/** A sentence on the first object given that the catalogue contains it; older stored answers lack this probability. */
+/** A sentence on the first object given that the catalogue contains it. */
 function ifPresent(best) {
-  if (best.probability_if_present == null) return "The nearest objects are shown.";
   return `If it contains the object, this is ${best.object_id} with probability ${percent(best.probability_if_present)}.`;
 }
 
