@@ -272,7 +272,7 @@ def test_a_missing_system_library_is_named(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "pyrealsense2", raising=False)
     (tmp_path / "pyrealsense2.py").write_text("raise ImportError('libusb-1.0.so.0: cannot open shared object file')")
-    with pytest.raises(DeviceError, match=r"pyrealsense2, which missing or incomplete \(libusb-1\.0\.so\.0"):
+    with pytest.raises(DeviceError, match=r"pyrealsense2, which is missing or incomplete \(libusb-1\.0\.so\.0"):
         realsense().connect()
 
 
