@@ -23,8 +23,7 @@ def check(
     json: Json = False,
 ) -> None:
     """Check a recording for broken files, duplicates, leakage and swapped folders."""
-    from retrieval.data.check.appearance_checks import COMPARED_COPIES
-    from retrieval.data.check.recording import check_recording
+    from retrieval.data.check.recording import COMPARED_COPIES, check_recording
     from retrieval.data.dataset import recording_licence
     from robot.recording.folder import read_recording
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from retrieval.console.progress import Bar
 from retrieval.data.check.near_copies import PictureSet, Thumbnail, load_thumbnail
-from retrieval.data.check.recording import check_split
+from retrieval.data.check.split import check_split
 from retrieval.data.dataset import Grasp, Split, finger_count
 from retrieval.data.loading import worker_pool
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from retrieval.data.check.recording import require_fit
+from retrieval.data.check.split import require_fit
 from retrieval.data.dataset import Grasp, Split, data_digest, finger_count, load_grasps, make_split, recording_source
 from retrieval.errors import DatasetError
 from retrieval.methods.late_fusion import frozen_matcher

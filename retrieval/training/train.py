@@ -20,7 +20,7 @@ from torch.autograd.graph import increment_version
 from retrieval.console.interruption import interruption
 from retrieval.console.output import say
 from retrieval.console.progress import Bar
-from retrieval.data.check.recording import require_fit
+from retrieval.data.check.split import require_fit
 from retrieval.data.dataset import (
     AnyRecording,
     Grasp,

@@ -1,4 +1,4 @@
-"""Checks whether light, gel or the order of capture identify the object, so that a model may use them instead of touch.
+"""Check whether the no-contact frames or the order of capture identify the object: a model could use them, not touch.
 
 Light and gels drift. If the objects of a recording were touched one after another, a no-contact frame shows the time of
 the grasp, and the time identifies the object. The measures are leave-one-out accuracies of the nearest neighbour.
@@ -10,90 +10,69 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.data.check.findings import Finding, ImageRecords
+from retrieval.data.check.pictures import Finding, ImageRecords
 from retrieval.data.dataset import Grasp
 from retrieval.metrics.intervals import summarise
 from retrieval.metrics.measure import Measure, object_means
 
-_MAX_BY_DRIFT, _MAX_BY_TOUCH = 0.2, 0.6
-"""Thresholds of (accuracy - chance) / (1 - chance): the first one on no-contact frames and on the order of capture, the
-second one on the mean colour of touches. The mean colour depends a little on the touched object (0.2 to 0.35 on
-simulated recordings)."""
+_MAX_BY_DRIFT = 0.2
+"""Threshold of (accuracy - chance) / (1 - chance)."""
 _ADVICE = (
     "a model can learn drift instead of touch: touch the objects in rounds (each object once, then again), not one "
     "object after another, and compare with the controls of `retrieve evaluate`"
 )
 
 
-def check_light(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
+def check_drift(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
     """Report how well the no-contact frame alone, and the order of capture alone, identify the object.
 
-    Grasps of one object with the same no-contact frame count once, since a common frame is no drift. If these measures
-    are low or undefined, the mean colour of the touch must not identify the object either.
+    Grasps of one object with the same no-contact frame count once, since a common frame is no drift. Without different
+    frames only the order is reported: it does not show whether light changed.
 
     Args:
         grasps: Grasps in the order of capture.
         records: Data of their pictures.
     """
-    owners = np.unique([grasp.object_id for grasp in grasps], return_inverse=True)[1]
-    by_order = nearest_grasp_accuracy(np.arange(len(grasps))[:, None], owners) if grasps else None
+    by_order = _by_order(grasps)
     if by_order is None:
         yield Finding(
             "note", "unchecked-light", "light that identifies the object cannot be checked: no object has two grasps"
         )
         return
-    drift = _check_no_contact_frames(grasps, records) or _check_order(by_order)
-    yield drift
-    if drift.severity == "warning":
-        return
-    fingers = range(min(len(grasp.touches) for grasp in grasps))
-    colours = [[records[grasp.touches[finger]].small for finger in fingers] for grasp in grasps]
-    by_colour = nearest_grasp_accuracy(np.array(colours).mean(axis=(2, 3)), owners)
-    if by_colour is not None and by_colour.exceeds_chance(_MAX_BY_TOUCH):
-        yield Finding(
-            "warning",
-            "light",
-            f"the mean colour of the touch alone identifies the object in {by_colour}: light or gel changed from "
-            f"object to object, and {_ADVICE}",
-        )
-
-
-def _check_no_contact_frames(grasps: Sequence[Grasp], records: ImageRecords) -> Finding | None:
-    """Return the finding on no-contact frames and their order, or None if no object has two different ones."""
-    if any(len(grasp.backgrounds) != len(grasp.touches) for grasp in grasps):
-        return None
     frames: dict[tuple[str, ...], Grasp] = {}
-    for grasp in grasps:
-        frames.setdefault((grasp.object_id, *(records[path].digest for path in grasp.backgrounds)), grasp)
-    names, owners = np.unique([grasp.object_id for grasp in frames.values()], return_inverse=True)
-    small = [[records[path].small for path in grasp.backgrounds] for grasp in frames.values()]
-    found = nearest_grasp_accuracy(np.array(small), owners)
-    by_order = nearest_grasp_accuracy(np.arange(len(frames))[:, None], owners)
-    if found is None or by_order is None:
-        return None
+    if all(len(grasp.backgrounds) == len(grasp.touches) for grasp in grasps):
+        for grasp in grasps:
+            frames.setdefault((grasp.object_id, *(records[path].digest for path in grasp.backgrounds)), grasp)
+    different = list(frames.values())
+    by_frame_order = _by_order(different)
+    if by_frame_order is None:
+        text = (
+            f"the order of capture alone identifies the object in {by_order}; without a separate no-contact frame for "
+            "every grasp, light that identifies the object cannot be found"
+        )
+        yield Finding("note", "unchecked-light", f"{text}, and {_ADVICE}" if by_order.is_above_chance else text)
+        return
+    small = np.array([[records[path].small for path in grasp.backgrounds] for grasp in different])
+    found = nearest_grasp_accuracy(small, _owners(different))
+    assert found is not None  # as for the order
     text = (
-        f"the no-contact frames alone identify the object in {found}, the order of their capture alone in {by_order} "
-        f"({found.queries} different frames of {found.objects} objects)"
+        f"the no-contact frames alone identify the object in {found}, the order of their capture alone in "
+        f"{by_frame_order} ({found.queries} different frames of {found.objects} objects)"
     )
-    if left_out := len(names) - found.objects:
+    if left_out := len({grasp.object_id for grasp in different}) - found.objects:
         text += f"; {left_out} object(s) with one no-contact frame for all grasps are left out"
-    if found.exceeds_chance(_MAX_BY_DRIFT):
-        return Finding("warning", "drift", f"{text}: light or gel drifted, and {_ADVICE}")
-    return Finding("note", "drift", text)
+    if found.is_above_chance:
+        yield Finding("warning", "drift", f"{text}: light or gel drifted, and {_ADVICE}")
+    else:
+        yield Finding("note", "drift", text)
 
 
-def _check_order(by_order: "NearestGraspAccuracy") -> Finding:
-    """Return the finding on the order of capture of a recording without different no-contact frames."""
-    text = (
-        f"the order of capture alone identifies the object in {by_order}; without a separate no-contact frame for "
-        "every grasp, light that identifies the object is found only if its effect is strong"
-    )
-    return Finding(
-        "note", "unchecked-light", f"{text}, and {_ADVICE}" if by_order.exceeds_chance(_MAX_BY_DRIFT) else text
-    )
+def _owners(grasps: Sequence[Grasp]) -> NDArray[np.int64]:
+    return np.unique([grasp.object_id for grasp in grasps], return_inverse=True)[1]
 
 
-# Statistics --------------------------------------------------------------------------------------------------
+def _by_order(grasps: Sequence[Grasp]) -> "NearestGraspAccuracy | None":
+    return nearest_grasp_accuracy(np.arange(len(grasps))[:, None], _owners(grasps)) if grasps else None
 
 
 @dataclass(frozen=True)
@@ -116,10 +95,11 @@ class NearestGraspAccuracy:
     queries: int
     objects: int
 
-    def exceeds_chance(self, part: float) -> bool:
-        """Return whether accuracy is more than `part` of the way from chance to 1, and significantly above chance."""
+    @property
+    def is_above_chance(self) -> bool:
+        """Whether the accuracy is far above chance (`_MAX_BY_DRIFT`), and significantly so."""
         deviation = np.sqrt(self.chance * (1 - self.chance) / self.queries)
-        return bool(self.accuracy > self.chance + max(part * (1 - self.chance), 5 * deviation))
+        return bool(self.accuracy > self.chance + max(_MAX_BY_DRIFT * (1 - self.chance), 5 * deviation))
 
     def __str__(self) -> str:
         interval = f"[{100 * self.low:.0f}, {100 * self.high:.0f}]"

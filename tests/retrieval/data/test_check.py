@@ -1,23 +1,26 @@
-"""Checks of a recording: each fault gives its finding, and a clean recording gives none."""
+"""Checks of a recording: each planted fault gives its finding, and a clean recording gives none."""
 
 import json
+import re
 import shutil
 
+import cv2
+import numpy as np
 import pytest
 
-from retrieval.data.check.recording import check_recording, check_split
+from retrieval.commands.main import main
+from retrieval.data.check.recording import check_gel_layout, check_recording
+from retrieval.data.check.split import check_split
 from retrieval.data.dataset import Split, load_grasps, make_split
 from retrieval.errors import DatasetError
+from robot.recording.folder import RecordingWriter
 from tests import synthetic
 
-
-def remarks(folder, split=None):
-    """Return the findings without notes."""
-    return [finding for finding in check_recording(folder, split) if finding.severity != "note"]
+GELS = ("touch_a", "touch_b", "touch_a_before", "touch_b_before")
 
 
 class Broken:
-    """A copy of a recording that a test breaks."""
+    """A copy of a recording that a test breaks; lines and grasps have the same numbers."""
 
     def __init__(self, recording, folder):
         self.folder = folder
@@ -38,21 +41,54 @@ class Broken:
             change(rows[number])
         self.rows = rows
 
+    def exchange(self, numbers, *columns):
+        """Exchange the files of pairs of columns."""
+
+        def exchange(row):
+            for first, second in zip(columns[::2], columns[1::2], strict=True):
+                keys = f"{first}_file_name", f"{second}_file_name"
+                row[keys[0]], row[keys[1]] = row[keys[1]], row[keys[0]]
+
+        self.change(numbers, exchange)
+
     def file(self, number, column):
         return self.folder / self.rows[number][f"{column}_file_name"]
+
+    def copy(self, source, target):
+        """Copy the bytes of a file: (number, column) each."""
+        shutil.copyfile(self.file(*source), self.file(*target))
+
+    def edit(self, number, column, change):
+        """Rewrite a picture."""
+        path = self.file(number, column)
+        cv2.imwrite(str(path), change(cv2.imread(str(path))))
 
     def names(self, numbers):
         """Return the grasp ids of these lines."""
         return tuple(self.rows[number]["grasp_id"] for number in numbers)
 
-    def findings(self, split=None):
-        return remarks(self.folder, split)
+
+def remarks(folder, split=None):
+    """Return the findings without notes."""
+    return [finding for finding in check_recording(folder, split) if finding.severity != "note"]
+
+
+def note(folder, kind):
+    (found,) = [finding for finding in check_recording(folder) if finding.kind == kind]
+    return found
 
 
 @pytest.fixture(scope="module")
 def clean(tmp_path_factory):
-    """8 objects, 3 grasps each, with a photo and two gel images: 72 pictures."""
+    """8 objects, 5 grasps each and one miss, object by object."""
     folder = tmp_path_factory.mktemp("clean") / "recording"
+    return synthetic.write_recording(folder, synthetic.make_objects(8), 5, misses=1)
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """8 objects, 3 grasps each, without no-contact frames."""
+    folder = tmp_path_factory.mktemp("plain") / "recording"
     return synthetic.write_recording(folder, synthetic.make_objects(8), 3, before=False)
 
 
@@ -61,24 +97,15 @@ def broken(clean, tmp_path):
     return Broken(clean, tmp_path / "r")
 
 
-def swap_photo_and_touch(row):
-    row["photo_file_name"], row["touch_a_file_name"] = row["touch_a_file_name"], row["photo_file_name"]
-
-
-def one(findings):
-    (finding,) = findings
-    return finding.severity, finding.kind, finding.message
-
-
-def good_split(folder):
-    return make_split(load_grasps(folder), validation=0.25, test=0.2, seed=0)
-
-
 # Clean -----------------------------------------------------------------------------------------------------
 
 
-def test_a_clean_recording_and_a_drawn_split_have_no_finding(recording):
-    assert remarks(recording, good_split(recording)) == []
+def test_a_clean_recording_and_a_drawn_split_have_no_finding(clean, capsys):
+    assert remarks(clean, good_split(clean)) == []
+    assert check_gel_layout(clean) == []
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert "check: 240/240 images" in output.err  # 48 grasps; a photo, two touches, two no-contact frames
 
 
 @pytest.mark.parametrize(("seed", "fingers"), [(1, "a"), (2, "ab")])
@@ -88,204 +115,366 @@ def test_other_clean_recordings_have_no_finding(tmp_path, seed, fingers):
     assert remarks(folder) == []
 
 
+@pytest.mark.slow
+def test_a_clean_simulated_recording_has_no_finding(tmp_path):
+    options = ["--objects", "5", "--grasps", "4", "--seed", "0", "--out", str(tmp_path / "r")]
+    assert main(["collect", "--rig", "sim", *options]) == 0
+    assert [finding for finding in remarks(tmp_path / "r") if finding.kind != "one-grasp"] == []
+
+
 def test_a_folder_that_is_not_a_recording_is_an_error(tmp_path):
     with pytest.raises(DatasetError, match=r"recording\.json"):
         check_recording(tmp_path)
 
 
-def test_progress_goes_to_stderr(recording, capsys):
-    check_recording(recording)
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert "check: 180/180 images" in err  # 12 objects, 3 grasps; a photo, two touches, two no-contact frames
-
-
 # Files -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("column", ["photo", "touch_a", "touch_b"])
-def test_a_missing_file_is_named(broken, column):
-    path = broken.file(4, column)
-    path.unlink()
-    assert one(broken.findings()) == ("error", "broken", f"images/{path.name}: no such file")
+@pytest.mark.parametrize("column", ["photo", "touch_b", "touch_a_before"])
+@pytest.mark.parametrize("fraction", [None, 0.0, 0.9])
+def test_missing_and_truncated_pictures_are_named_and_others_are_still_checked(broken, column, fraction):
+    """Also in a rejected grasp, the sixth of each object."""
+    broken.exchange([20], "photo", "touch_a")
+    paths = [broken.file(number, column) for number in (4, 5)]
+    for path in paths:
+        data = path.read_bytes()
+        path.unlink()
+        if fraction is not None:
+            path.write_bytes(data[: int(fraction * len(data))])
+    *found, swapped = remarks(broken.folder)
+    assert [(finding.severity, finding.kind) for finding in found] == [("error", "broken")] * 2
+    assert [finding.message.split(": ")[0] for finding in found] == [f"images/{path.name}" for path in paths]
+    assert (swapped.kind, swapped.grasps) == ("swapped", broken.names([20]))
 
 
-def test_a_missing_no_contact_frame_is_named(recording, tmp_path):
-    broken = Broken(recording, tmp_path / "r")
-    path = broken.file(4, "touch_a_before")
-    path.unlink()
-    assert one(broken.findings()) == ("error", "broken", f"images/{path.name}: no such file")
-
-
-@pytest.mark.parametrize("fraction", [0.0, 0.9])
-@pytest.mark.parametrize("column", ["photo", "touch_b"])
-def test_a_truncated_picture_is_named(broken, column, fraction):
-    path = broken.file(7, column)
-    data = path.read_bytes()
-    path.write_bytes(data[: int(fraction * len(data))])
-    severity, kind, message = one(broken.findings())
-    assert (severity, kind) == ("error", "broken")
-    assert message.startswith(f"images/{path.name}: ")
-
-
-def test_every_broken_file_has_a_finding_and_other_files_are_still_checked(broken):
-    for number in (0, 5, 9):
-        broken.file(number, "touch_a").write_bytes(b"no picture")
-    broken.file(12, "photo").write_bytes(broken.file(20, "photo").read_bytes())
-    assert [finding.kind for finding in broken.findings()] == ["broken"] * 3 + ["duplicate"]
-
-
-def test_a_recording_without_any_readable_picture_gives_findings(broken):
+def test_a_recording_without_any_readable_picture_gives_findings(plain, tmp_path):
+    broken = Broken(plain, tmp_path / "r")
     for path in (broken.folder / "images").iterdir():
         path.write_bytes(b"")
-    findings = broken.findings()
-    assert {finding.kind for finding in findings} == {"broken"}
-    assert len(findings) == 72
-
-
-# Grasps ----------------------------------------------------------------------------------------------------
+    assert [finding.kind for finding in remarks(broken.folder)] == ["broken"] * 72
 
 
 @pytest.mark.parametrize("column", ["photo", "touch_a"])
-def test_the_same_picture_under_two_objects_names_both(broken, column):
-    """The second file is a copy of the first; a shared photo would be positive and negative at once."""
-    one_file, other = broken.file(1, column), broken.file(10, column)
-    other.write_bytes(one_file.read_bytes())
-    severity, kind, message = one(broken.findings())
-    assert (severity, kind) == ("error", "duplicate")
-    assert message.startswith("2 objects share one image: ")
-    for number, path in ((1, one_file), (10, other)):
-        assert f"{broken.rows[number]['object_id']} (images/{path.name})" in message
-
-
-def test_one_photo_file_in_the_lines_of_two_objects_is_found(broken):
-    name = broken.rows[0]["photo_file_name"]
-    broken.change([8], lambda row: row.update(photo_file_name=name))
-    severity, kind, message = one(broken.findings())
-    assert (severity, kind) == ("error", "duplicate")
-    assert message.count(f"({name})") == 2
-
-
-def test_a_photo_shared_by_the_grasps_of_one_object_is_fine(broken):
-    name = broken.rows[0]["photo_file_name"]
-    assert broken.rows[0]["object_id"] == broken.rows[1]["object_id"]
-    broken.change([1], lambda row: row.update(photo_file_name=name))
-    assert broken.findings() == []
-
-
-def test_two_fingers_with_the_same_picture_are_a_warning(broken):
-    broken.file(3, "touch_b").write_bytes(broken.file(3, "touch_a").read_bytes())
-    message = f"two fingers have the same image in 1 of 24 grasps: {broken.rows[3]['grasp_id']}"
-    assert one(broken.findings()) == ("warning", "same-fingers", message)
-
-
-@pytest.mark.parametrize("column", ["touch_a_file_name", "touch_b_file_name"])
-def test_a_photo_that_is_also_the_touch_is_an_error_although_nothing_looks_swapped(broken, column):
-    broken.change(range(24), lambda row: row.update({column: row["photo_file_name"]}))
-    severity, kind, message = one(broken.findings())
-    assert (severity, kind) == ("error", "same-modality")
-    assert message.startswith("photo and touch are the same image in 24 of 24 grasps: ")
+@pytest.mark.parametrize("same_file", [True, False])
+def test_the_same_picture_under_two_objects_names_both(broken, column, same_file):
+    """A shared photo would be positive and negative at once. Grasps of one object may share a photo."""
+    broken.copy((0, "photo"), (2, "photo"))
+    if same_file:
+        name = broken.rows[1][f"{column}_file_name"]
+        broken.change([10], lambda row: row.update({f"{column}_file_name": name}))
+    else:
+        broken.copy((1, column), (10, column))
+    (finding,) = remarks(broken.folder)
+    assert (finding.severity, finding.kind) == ("error", "duplicate")
+    assert all(broken.rows[number]["object_id"] in finding.message for number in (1, 10))
+    assert broken.file(10, column).name in finding.message
 
 
 def test_objects_with_one_grasp_give_a_warning_that_names_the_first_five(tmp_path):
     folder = synthetic.write_recording(tmp_path / "r", synthetic.make_objects(7), 1, before=False)
     names = sorted(obj.object_id for obj in synthetic.make_objects(7))
-    severity, kind, message = one(remarks(folder))
-    assert (severity, kind) == ("warning", "one-grasp")
-    assert message.startswith("7 of 7 object(s) have only one grasp, ")
-    assert message.endswith(f": {', '.join(names[:5])} and 2 more")
+    (finding,) = remarks(folder)
+    assert (finding.severity, finding.kind) == ("warning", "one-grasp")
+    assert finding.message.endswith(f": {', '.join(names[:5])} and 2 more")
 
 
-def test_one_object_with_one_grasp_is_named(broken):
-    rows = broken.rows
-    broken.rows = [rows[0], *rows[3:]]
-    severity, kind, message = one(broken.findings())
-    assert (severity, kind) == ("warning", "one-grasp")
-    assert message.startswith("1 of 8 object(s) have only one grasp")
-    assert message.endswith(f": {rows[0]['object_id']}")
+def flat(level):
+    return lambda image: np.full_like(image, level)
 
 
-# Swapped modalities ----------------------------------------------------------------------------------------
+FEW, MANY = (1, 8, 13, 20, 33), tuple(range(0, 48, 3))
+BOTH_MOMENTS = ("touch_a", "touch_a_before", "touch_b", "touch_b_before")
+FAULTS = {
+    "touch is the photo": (
+        lambda broken: broken.change(FEW, lambda row: row.update(touch_b_file_name=row["photo_file_name"])),
+        {("error", "same-modality", FEW)},
+    ),
+    "fingers are the same": (
+        lambda broken: broken.copy((3, "touch_a"), (3, "touch_b")),
+        {("warning", "same-fingers", (3,))},
+    ),
+    "touch is the no-contact frame": (
+        lambda broken: broken.copy((8, "touch_b_before"), (8, "touch_b")),
+        {("error", "frozen-frame", (8,))},
+    ),
+    "touch of another grasp": (
+        lambda broken: broken.copy((3, "touch_a"), (4, "touch_a")),
+        {("warning", "repeated-touch", (3, 4))},
+    ),
+    "dead photo": (lambda broken: broken.edit(4, "photo", flat((3, 90, 201))), {("error", "dead-frame", (4,))}),
+    "dead touch": (lambda broken: broken.edit(4, "touch_b", flat(0)), {("error", "dead-frame", (4,))}),
+    "dead no-contact frame": (
+        lambda broken: [broken.edit(number, "touch_a_before", flat(128)) for number in (4, 16)],
+        {("error", "dead-frame", (4, 16))},
+    ),
+    "photo and touch": (lambda broken: broken.exchange(FEW, "photo", "touch_a"), {("error", "swapped", FEW)}),
+    "all photos and touches": (
+        lambda broken: broken.exchange(range(48), "photo", "touch_a"),
+        {("error", "swapped", tuple(range(48)))},
+    ),
+    "fingers": (
+        lambda broken: broken.exchange(MANY, "touch_a", "touch_b", "touch_a_before", "touch_b_before"),
+        {("error", "swapped-fingers", MANY)},
+    ),
+    "touch and no-contact frame": (
+        lambda broken: broken.exchange(FEW, *BOTH_MOMENTS),
+        {("error", "swapped-moments", FEW)},
+    ),
+    "all touches and no-contact frames": (
+        lambda broken: broken.exchange(range(48), *BOTH_MOMENTS),
+        {("error", "swapped-moments", tuple(range(48)))},
+    ),
+    "red and blue": (
+        lambda broken: [
+            broken.edit(number, column, lambda image: image[..., ::-1])
+            for number in FEW
+            for column in ("touch_b", "touch_b_before")
+        ],
+        {("warning", "colour-layout", FEW)},
+    ),
+}
 
 
-def test_photos_and_touches_swapped_throughout_are_found(broken):
-    broken.change(range(24), swap_photo_and_touch)
-    severity, kind, message = one(broken.findings())
-    assert (severity, kind) == ("error", "swapped")
-    assert "throughout" in message
-    assert "exchange the columns" in message
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_of_single_grasps_gives_its_finding_with_the_names_of_the_grasps(broken, fault):
+    plant, expected = FAULTS[fault]
+    plant(broken)
+    found = {(finding.severity, finding.kind, finding.grasps) for finding in remarks(broken.folder)}
+    assert found == {(severity, kind, broken.names(numbers)) for severity, kind, numbers in expected}
 
 
-@pytest.mark.parametrize("numbers", [[0], [5, 20], [1, 2, 3, 10, 11, 22, 23]])
-def test_the_grasps_with_photo_and_touch_swapped_are_named(broken, numbers):
-    broken.change(numbers, swap_photo_and_touch)
-    names = [broken.rows[number]["grasp_id"] for number in numbers]
-    severity, kind, message = one(broken.findings())
-    assert (severity, kind) == ("error", "swapped")
-    assert message.startswith(f"touch and photo look swapped in {len(numbers)} of 24 grasps: {', '.join(names[:5])}")
-    assert message.endswith("and 2 more" if len(numbers) == 7 else names[-1])
+def test_a_small_copy_of_the_photo_in_place_of_the_touch_is_named(tmp_path):
+    folder = synthetic.write_recording(tmp_path / "one", synthetic.make_objects(6), 2, fingers="a", before=False)
+    broken = Broken(folder, tmp_path / "r")
+    photo = cv2.resize(cv2.imread(str(broken.file(3, "photo"))), (160, 120), interpolation=cv2.INTER_AREA)
+    broken.edit(3, "touch_a", lambda _: photo)
+    assert {("error", "same-modality", broken.names([3]))} == {
+        (finding.severity, finding.kind, finding.grasps) for finding in remarks(broken.folder)
+    }
+
+
+def test_a_dark_frame_with_noise_is_not_dead(broken):
+    dark = np.random.default_rng(0).integers(0, 12, (120, 160, 3), dtype=np.uint8)
+    broken.edit(2, "photo", lambda image: dark)
+    assert "dead-frame" not in {finding.kind for finding in remarks(broken.folder)}
+
+
+def test_a_sequence_with_swapped_folders_is_named(broken):
+    """TVL's first upload had this problem: `vision` and `tactile` exchanged below one timestamp."""
+    broken.change((6, 7, 20), lambda row: row.update(sequence_id="one folder"))
+    broken.change((21,), lambda row: row.update(sequence_id="half"))
+    broken.exchange((6, 7, 20, 22), "photo", "touch_a")
+    (finding,) = remarks(broken.folder)
+    assert "throughout the sequence(s) one folder," in finding.message
 
 
 def test_two_grasps_are_too_few_to_find_a_swap(tmp_path):
     folder = synthetic.write_recording(tmp_path / "r", synthetic.make_objects(1), 2, before=False)
     broken = Broken(folder, tmp_path / "copy")
-    broken.change([0], swap_photo_and_touch)
-    assert broken.findings() == []
+    broken.exchange([0], "photo", "touch_a")
+    assert remarks(broken.folder) == []
+
+
+def test_one_no_contact_frame_for_many_objects_is_a_warning_with_counts(broken):
+    first = broken.rows[0]
+    broken.change(
+        range(48), lambda row: row.update({f"{gel}_file_name": first[f"{gel}_file_name"] for gel in GELS[2:]})
+    )
+    (finding,) = remarks(broken.folder)
+    assert (finding.severity, finding.kind) == ("warning", "one-background")
+    assert finding.message.startswith("2 no-contact frame(s) serve 40 of 40 grasps, of 8 objects: ")
+
+
+def test_an_import_prints_the_warning_about_exchanged_channels_and_succeeds(tmp_path, capsys):
+    down, right = np.meshgrid(np.linspace(0, 255, 120), np.linspace(0, 255, 160), indexing="ij")
+    gel = np.stack([down, right / 2 + 60, 255 - right], axis=-1)
+    for number in range(8):
+        folder = tmp_path / "src" / f"mug-{number // 2}"
+        folder.mkdir(parents=True, exist_ok=True)
+        image = np.clip(gel + np.random.default_rng(number).normal(0, 9, gel.shape), 0, 255).astype(np.uint8)
+        cv2.imwrite(str(folder / f"touch_{number}.png"), image[..., ::-1] if number == 5 else image)
+        cv2.imwrite(str(folder / f"photo_{number}.png"), image // (number + 1))
+    assert main(["import", "folder", str(tmp_path / "src"), "--out", str(tmp_path / "out")]) == 0
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning")]
+    assert "touch of finger a looks as if it had red and blue exchanged" in line
+    assert "in 1 of 8 grasps" in line
+
+
+# Near copies -----------------------------------------------------------------------------------------------
+
+COPIES = {
+    "JPEG 20": lambda image: cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 20])[1], 1),
+    "gain 1.1": lambda image: np.clip(np.rint(1.1 * image), 0, 255).astype(np.uint8),
+    "2 px": lambda image: np.pad(image, ((2, 0), (0, 2), (0, 0)), "reflect")[:-2, 2:],
+    "mirrored": lambda image: image[:, ::-1],
+    "upside down": lambda image: image[::-1],
+}
+GENTLE = ("gain 1.1", "mirrored", "upside down")
+"""Changes that keep the fine relief of drawn touches; the others erase it."""
+
+
+@pytest.mark.parametrize("how", COPIES)
+def test_near_copies_of_another_object_are_named(broken, how):
+    for column in ("photo", "touch_a", "touch_b"):
+        image = cv2.imread(str(broken.file(3, column)))
+        broken.edit(20, column, lambda _, image=image: COPIES[how](image))
+    found = [finding for finding in remarks(broken.folder) if finding.kind == "near-copy"]
+    kinds = {re.search(r"images \((.*?)\) of two objects", finding.message)[1]: finding for finding in found}
+    assert kinds.keys() >= ({"photo", "touch a", "touch b"} if how in GENTLE else {"photo"})
+    for kind, finding in kinds.items():
+        assert finding.severity == ("error" if kind == "photo" else "warning")
+        assert set(finding.message.split(": ")[1].split(" and ")) == set(broken.names((3, 20)))
+
+
+def test_the_last_note_counts_the_pictures_compared_for_copies_and_explains_the_others(broken, capsys):
+    """Touches hardly differ from the no-contact frame, each with its own noise; two photos are broken."""
+    rng = np.random.default_rng(0)
+    gel = cv2.imread(str(broken.file(0, "touch_a_before")))
+    for number in range(48):
+        broken.edit(number, "touch_a", lambda _: np.clip(gel + rng.normal(0, 1.5, gel.shape), 0, 255).astype(np.uint8))
+    for number in (0, 1):
+        broken.file(number, "photo").write_bytes(b"no picture")
+    assert main(["check", str(broken.folder)]) == 1
+    last = capsys.readouterr().err.splitlines()[-2]
+    assert last.startswith(f"{broken.folder}: 2 error(s), ")
+    assert re.search(r"searched for in \d+ of 40 images \(photo\), 0 of 40 images \(touch a\)", last)
+    assert "show too little to recognise a copy" in last
+    assert "6 belong to grasps that are named above" in last
+
+
+# Drift -----------------------------------------------------------------------------------------------------
+
+
+def let_drift(broken, columns=GELS):
+    """Raise the brightness of the gel images by 20 %, evenly over the lines."""
+    for number in range(len(broken.rows)):
+        gain = 0.8 + 0.2 * number / len(broken.rows)
+        for column in columns:
+            broken.edit(number, column, lambda image, gain=gain: np.clip(image * gain, 0, 255).astype(np.uint8))
+
+
+def in_rounds(rows):
+    return [row for turn in range(6) for row in rows[turn::6]]
+
+
+def test_drift_identifies_objects_that_were_touched_one_after_another(broken):
+    """In a block of 5, the outer lines have one neighbour of two in the block: (3 + 2 / 2) / 5 = 80 %."""
+    let_drift(broken)
+    (finding,) = remarks(broken.folder)
+    assert (finding.severity, finding.kind) == ("warning", "drift")
+    found = re.match(
+        r"the no-contact frames alone identify the object in (\d+)% \[.*?\] \(chance 10%\), the order of their capture "
+        r"alone in 8\d% .*? \(40 different frames of 8 objects\): light or gel drifted",
+        finding.message,
+    )
+    assert int(found[1]) >= 70
+    assert "touch the objects in rounds (each object once, then again)" in finding.message
+
+
+def test_the_same_drift_does_not_identify_objects_that_were_touched_in_rounds(broken):
+    broken.rows = in_rounds(broken.rows)
+    let_drift(broken)
+    assert remarks(broken.folder) == []
+    found = re.search(
+        r"alone identify the object in (\d+)%.*alone in 0% \[0, 0\] \(chance 10%\)",
+        note(broken.folder, "drift").message,
+    )
+    assert int(found[1]) <= 10
+
+
+def test_times_give_the_order_of_capture_whatever_the_order_of_the_lines(broken):
+    captured = {row["grasp_id"]: place for place, row in enumerate(in_rounds(broken.rows))}
+    broken.change(range(48), lambda row: row.update(time_s=float(captured[row["grasp_id"]])))
+    assert "the order of their capture alone in 0% [0, 0]" in note(broken.folder, "drift").message
+
+
+def test_an_error_in_the_photos_does_not_hide_the_drift(broken):
+    """Recordings without photos have the touch in place of the photo."""
+    let_drift(broken)
+    broken.change(range(48), lambda row: row.update(photo_file_name=row["touch_a_file_name"]))
+    assert {finding.kind for finding in remarks(broken.folder)} == {"same-modality", "drift"}
+
+
+def test_a_no_contact_frame_that_all_grasps_of_an_object_share_does_not_count(broken):
+    """Each object has its own light and one frame: nothing is left to compare, and the order is reported."""
+    let_drift(broken, GELS[2:])
+    for number in range(48):
+        for column in GELS[2:]:
+            if number % 6:
+                broken.copy((number - number % 6, column), (number, column))
+    assert remarks(broken.folder) == []
+    message = note(broken.folder, "unchecked-light").message
+    assert message.startswith("the order of capture alone identifies the object in 8")
+    assert "touch the objects in rounds" in message
+
+
+def test_objects_with_a_common_no_contact_frame_are_left_out(broken):
+    for number in range(1, 6):
+        for column in GELS[2:]:
+            broken.copy((0, column), (number, column))
+    message = note(broken.folder, "drift").message
+    assert "(35 different frames of 7 objects); 1 object(s) with one no-contact frame for all grasps" in message
 
 
 # Splits ----------------------------------------------------------------------------------------------------
 
 
-def with_test(split, *names):
-    return Split(split.seed, split.train, split.validation, (*split.test, *names))
+def good_split(folder):
+    return make_split(load_grasps(folder), validation=0.25, test=0.2, seed=0)
 
 
-def test_an_object_in_two_parts_is_an_error_and_so_are_its_sequences(clean):
-    split = good_split(clean)
-    first, second = split.train[:2]
-    objects, sequences = remarks(clean, with_test(split, second, first))
-    names = ", ".join(sorted([first, second]))
+def split_kinds(folder, split):
+    return {(finding.severity, finding.kind) for finding in remarks(folder, split)}
+
+
+def test_objects_and_sequences_in_two_parts_are_errors_and_objects_in_none_are_warnings(plain, tmp_path):
+    split = good_split(plain)
+    grasps = load_grasps(plain)
+    shared = Split(0, split.train, split.validation, (*split.test, split.train[1], split.train[0]))
+    objects, sequences = check_split(grasps, shared)
     assert (objects.severity, objects.kind) == ("error", "split-objects")
-    assert objects.message == f"the split shares 2 object(s): {names}"
+    assert objects.message.endswith(f"2 object(s): {', '.join(sorted(split.train[:2]))}")
     assert (sequences.severity, sequences.kind) == ("error", "split-sequences")
+    assert split_kinds(plain, Split(0, split.train[1:], split.validation, split.test)) == {("warning", "split-absent")}
+    ghost = Split(0, (*split.train, "ghost"), split.validation, split.test)
+    assert split_kinds(plain, ghost) == {("warning", "split-unknown")}
+    broken = Broken(plain, tmp_path / "r")
+    numbers = [n for n, row in enumerate(broken.rows) if row["object_id"] in (split.train[0], split.test[0])]
+    broken.change(numbers, lambda row: row.update(sequence_id="one take"))  # an earlier split separates the objects
+    assert split_kinds(broken.folder, split) == {("error", "split-sequences")}
+    assert split_kinds(broken.folder, good_split(broken.folder)) == set()
 
 
-def test_an_object_in_two_parts_without_sequences_is_one_error(broken):
-    broken.change(range(24), lambda row: row.pop("sequence_id"))
-    split = good_split(broken.folder)
-    assert one(broken.findings(with_test(split, split.validation[0])))[:2] == ("error", "split-objects")
+def write_videos(folder, sequences, frames=6, mixed=True):
+    """Write frames of videos: one press each, which moves by a pixel a frame, with sensor noise.
+
+    With `mixed`, every second frame of a video belongs to another object, as in splits that ignore videos.
+    """
+    rng = np.random.default_rng(0)
+    with RecordingWriter(folder, {"source": "videos", "sensor": "drawn gel"}) as writer:
+        for sequence, drawn in enumerate(synthetic.make_objects(sequences)):
+            press = synthetic.draw_touch(drawn, 0, fingers="a")["a"]
+            for frame in range(frames):
+                noise = rng.normal(0, 2, press.shape)
+                touch = np.clip(np.roll(press, frame, axis=1) + noise, 0, 255).astype(np.uint8)
+                part = "odd" if mixed and frame % 2 else "even"
+                photo = synthetic.draw_photo(drawn, frame, px=96)
+                writer.append(f"{sequence:02d}-{frame}", f"{sequence:02d}-{part}", {"photo": photo, "touch_a": touch})
+    return folder
 
 
-def test_a_sequence_cut_in_two_is_an_error(broken):
-    """Two objects are in one video, and an earlier split separates them."""
-    split = good_split(broken.folder)
-    take = {split.train[0], split.test[0]}
-    numbers = [number for number, row in enumerate(broken.rows) if row["object_id"] in take]
-    broken.change(numbers, lambda row: row.update(sequence_id="one take"))
-    cut, leak = broken.findings(split)
-    assert (cut.severity, cut.kind) == ("error", "split-sequences")
-    assert cut.message.startswith("the split cuts 1 sequence(s) in two")
-    assert cut.message.endswith(": one take")
-    assert (leak.severity, leak.kind) == ("error", "sequences-in-training")
-    assert broken.findings(good_split(broken.folder)) == []
+def test_neighbouring_frames_on_both_sides_of_a_split_are_a_warning_with_both_fractions(tmp_path):
+    folder = write_videos(tmp_path / "r", 10)
+    objects = sorted({grasp.object_id for grasp in load_grasps(folder)})
+    even, odd = ([name for name in objects if name.endswith(part)] for part in ("even", "odd"))
+    split = Split(0, tuple(even), (), tuple(odd))
+    (finding,) = [one for one in remarks(folder, split) if one.kind == "sequences-in-training"]
+    assert finding.severity == "warning"
+    assert int(finding.message.split("%")[0]) > 90
+    assert "(0% of the training touches have one)" in finding.message
 
 
-def test_an_object_that_the_split_leaves_out_is_a_warning(clean):
-    split = good_split(clean)
-    left_out = Split(0, split.train[1:], split.validation, split.test)
-    found = one(remarks(clean, left_out))
-    assert found == ("warning", "split-absent", f"the split leaves out 1 object(s): {split.train[0]}")
-
-
-def test_an_object_of_the_split_that_was_not_recorded_is_a_warning(clean):
-    split = good_split(clean)
-    found = one(remarks(clean, Split(0, (*split.train, "ghost"), split.validation, split.test)))
-    assert found == ("warning", "split-unknown", "the split names 1 object(s) not recorded: ghost")
-
-
-def test_a_split_is_checked_without_reading_pictures(broken):
-    shutil.rmtree(broken.folder / "images")
-    grasps = load_grasps(broken.folder)
-    split = make_split(grasps, validation=0.25, test=0.2, seed=0)
-    assert list(check_split(grasps, split)) == []
-    assert one(check_split(grasps, Split(0, split.train, (), split.test)))[1] == "split-absent"
+def test_a_split_that_keeps_videos_together_has_no_such_finding(tmp_path):
+    folder = write_videos(tmp_path / "r", 10, mixed=False)
+    split = make_split(load_grasps(folder), validation=0.2, test=0.3, seed=0)
+    assert "sequences-in-training" not in {finding.kind for finding in remarks(folder, split)}

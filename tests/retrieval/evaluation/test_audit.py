@@ -10,7 +10,7 @@ from retrieval.data.dataset import Split, load_grasps
 from retrieval.errors import ImageError
 from retrieval.evaluation.audit import audit
 from tests import synthetic
-from tests.retrieval.data.test_appearance_checks import COPIES, GENTLE
+from tests.retrieval.data.test_check import COPIES, GENTLE
 
 
 @pytest.fixture(scope="module")

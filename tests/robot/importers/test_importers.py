@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.reference import DATA_SETS, data_sets
 from retrieval.commands.main import main
-from retrieval.data.check.recording import check_split
+from retrieval.data.check.split import check_split
 from retrieval.data.dataset import Split, load_grasps
 from robot.errors import ImporterError, RecordingError, RobotError, UnknownName
 from robot.importers import IMPORTERS, data_set_of, load_importer, options_of, read_options, title_of

@@ -1,0 +1,166 @@
+"""Statistics of the checks of a recording, compared with plain loops and with hand-made images."""
+
+import cv2
+import numpy as np
+import pytest
+
+from retrieval.data.check.appearance import CHANGES, changed_layout, swapped_fingers
+from retrieval.data.check.drift import nearest_grasp_accuracy
+from retrieval.data.check.near_copies import (
+    PX,
+    PictureSet,
+    distorted_copies,
+    flip_thumbnails,
+    shapes,
+    thumbnail,
+)
+from tests.data import touch_data
+
+# Near copies -----------------------------------------------------------------------------------------------
+
+
+def scene(seed, size=(120, 160)):
+    """Return a gel of one tint, dark at its edges, with a soft random dent."""
+    y, x = np.mgrid[-1 : 1 : size[0] * 1j, -1 : 1 : size[1] * 1j]
+    dent = cv2.resize(np.random.default_rng(seed).normal(size=(5, 6)), size[::-1], interpolation=cv2.INTER_CUBIC)
+    gel = 140 - 30 * (x * x + y * y) + 12 * dent
+    return np.clip(gel, 0, 255)[..., None].repeat(3, axis=2).astype(np.float32) / 255
+
+
+def pictures(images):
+    return PictureSet([thumbnail(b"", image) for image in images], [f"object {row}" for row in range(len(images))])
+
+
+def test_a_shape_ignores_a_constant_and_any_multiple_of_the_common_picture():
+    rng = np.random.default_rng(0)
+    grey, common = rng.normal(size=(2, PX**2)).astype(np.float32)
+    plain = shapes(grey[None], common)
+    np.testing.assert_allclose(shapes((3 * grey + 7 + 2 * common)[None], common), plain, atol=1e-5)  # float32
+    assert float(np.linalg.norm(plain)) == pytest.approx(1, rel=1e-5)
+    assert (shapes((5 + 2 * common)[None], common) == 0).all()
+
+
+def test_the_nearest_picture_of_another_object_equals_that_of_plain_loops():
+    images = [scene(seed) for seed in range(7)]
+    all_of_them = pictures(images)
+    unit = [shapes(one[None], all_of_them.common)[0] for one in all_of_them.greys]
+    found = all_of_them.nearest(np.array([0, 3]), np.array([1, 2, 4, 5, 6]))
+    for at, query in enumerate((0, 3)):
+        turned = [
+            shapes(flip_thumbnails(all_of_them.greys[[query]], flip), all_of_them.common)[0]
+            for flip in ((1, 1), (1, -1), (-1, 1), (-1, -1))
+        ]
+        distances = {row: min(1 - float(turn @ unit[row]) for turn in turned) for row in (1, 2, 4, 5, 6)}
+        assert found.row[at] == min(distances, key=distances.get)
+        assert found.distance[at] == pytest.approx(min(distances.values()), abs=1e-5)  # float32
+
+
+@pytest.mark.parametrize("change", range(5))
+def test_a_distorted_copy_is_within_its_limit_and_no_other_picture_is(change):
+    images = [scene(seed) for seed in range(9)]
+    picture = np.rint(255 * images[2]).astype(np.uint8)
+    copy = [*distorted_copies(picture), picture[::-1]][change].astype(np.float32) / 255
+    found = pictures([*images, copy]).nearest(np.arange(10), np.arange(10))
+    assert np.flatnonzero(found.copy).tolist() == [2, 9]
+    assert found.row[[2, 9]].tolist() == [9, 2]
+    assert found.checked.all()
+
+
+def test_without_pictures_nothing_is_found():
+    nothing = np.zeros(0, dtype=np.int64)
+    assert len(pictures([]).nearest(nothing, nothing).row) == 0
+    found = pictures([scene(0)]).nearest(np.array([0]), nothing)
+    assert (found.distance.tolist(), found.checked.tolist(), found.copy.tolist()) == ([np.inf], [False], [False])
+
+
+# Fingers and layouts ---------------------------------------------------------------------------------------
+
+
+def test_similar_fingers_cannot_be_checked_and_are_not_reported_as_swapped():
+    frames = np.random.default_rng(0).normal(0.5, 0.02, (2, 40, 6, 8, 3)).astype(np.float32)
+    assert swapped_fingers(*frames) is None
+    assert swapped_fingers(frames[0], frames[0]) is None
+    assert swapped_fingers(frames[0], frames[1] + np.float32([0.1, 0, -0.1])).tolist() == []
+
+
+def gels(count=20):
+    """Red is bright above, blue on the right; contact and noise have a tenth of this contrast."""
+    down, right = np.meshgrid(np.linspace(0, 1, 6), np.linspace(0, 1, 8), indexing="ij")
+    layout = np.stack([1 - 0.8 * down, np.full((6, 8), 0.4), 0.6 * right], axis=-1)
+    return (layout + 0.05 * np.random.default_rng(0).standard_normal((count, 6, 8, 3))).astype(np.float32)
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("rows", [[3], [0, 1, 2, 3, 4], [4, 6, 8, 10, 12, 14, 16, 18, 19]])
+def test_a_minority_of_changed_images_is_named_with_its_change(change, rows):
+    images = gels()
+    images[rows] = images[rows][CHANGES[change]]
+    found = changed_layout(images)
+    assert (found.change, found.rows.tolist()) == (change, rows)
+
+
+def test_if_half_of_the_images_are_changed_the_first_image_is_the_reference():
+    images = gels()
+    images[10:] = images[10:, :, :, ::-1]
+    assert changed_layout(images).rows.tolist() == list(range(10, 20))
+    assert changed_layout(images[::-1]).rows.tolist() == list(range(10, 20))
+
+
+def grey_with_noise():
+    grey = np.repeat(gels()[..., :1], 3, axis=-1)
+    return (grey + 0.01 * np.random.default_rng(1).standard_normal(grey.shape)).astype(np.float32)
+
+
+def some_of_another_sensor():
+    """Each difference of red and blue has the other sign, but no change makes them fit."""
+    images = gels()
+    images[:5] = 1 - images[:5]
+    return images
+
+
+def one_of_three():
+    images = gels(3)
+    images[0] = images[0, :, :, ::-1]
+    return images
+
+
+@pytest.mark.parametrize(
+    "images", [gels, lambda: gels()[..., ::-1], grey_with_noise, some_of_another_sensor, one_of_three]
+)
+def test_unchanged_images_and_images_that_cannot_be_checked_give_nothing(images):
+    assert changed_layout(images()) is None
+
+
+def test_real_touches_with_exchanged_channels_are_found_and_unchanged_ones_are_not():
+    paths = sorted(touch_data("billets").glob("*/*_touch.png"))
+    images = np.array([cv2.resize(cv2.imread(str(path)), (8, 6), interpolation=cv2.INTER_AREA) for path in paths]) / 255
+    images = images[..., ::-1].astype(np.float32)
+    assert changed_layout(images) is None
+    images[40:50] = images[40:50, ..., ::-1]
+    assert changed_layout(images).rows.tolist() == list(range(40, 50))
+
+
+# Drift -----------------------------------------------------------------------------------------------------
+
+
+def test_only_values_that_identify_their_objects_are_above_chance():
+    objects = np.repeat(np.arange(10), 6)
+    rng = np.random.default_rng(0)
+    assert not nearest_grasp_accuracy(rng.normal(size=(60, 18)), objects).is_above_chance
+    result = nearest_grasp_accuracy(objects[:, None] + rng.normal(0, 0.05, (60, 18)), objects)
+    assert (result.accuracy, result.low, result.high) == (1.0, 1.0, 1.0)
+    assert (result.chance, result.queries, result.objects) == (pytest.approx(5 / 59), 60, 10)
+    assert result.is_above_chance
+
+
+def test_equal_values_have_exactly_the_accuracy_of_chance():
+    objects = np.array([0, 0, 0, 1, 1, 2])
+    result = nearest_grasp_accuracy(np.ones((6, 4)), objects)
+    assert result.accuracy == pytest.approx((2 / 5 + 1 / 5) / 2)
+    assert result.chance == pytest.approx(result.accuracy)
+    assert (result.queries, result.objects) == (5, 2)
+
+
+def test_one_object_or_single_grasps_have_no_accuracy():
+    assert nearest_grasp_accuracy(np.arange(5)[:, None], np.arange(5)) is None
+    assert nearest_grasp_accuracy(np.arange(5)[:, None], np.zeros(5, int)) is None
