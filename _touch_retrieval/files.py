@@ -1,14 +1,11 @@
 """Crash-safe files: write the whole content, flush it to the disk, then rename.
 
-A replacement is written in the same folder under a hidden name and then renamed. The writer locks this temporary file
-while it writes, and the system releases the lock when the writer dies. The next write to the same name deletes
-unlocked temporary files, on any host and independent of process numbers.
+A replacement is written in the same folder under a hidden name that ends in .tmp, and then renamed.
 
 Only regular files are opened for reading: a pipe cannot block the reader, and no device is read without end.
 """
 
 import errno
-import fcntl
 import hashlib
 import json
 import math
@@ -16,13 +13,12 @@ import os
 import secrets
 import shutil
 import stat
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
 from typing import Any, BinaryIO
 
-_ENDING = ".tmp"
 _UNFLUSHED = (errno.EACCES, errno.EPERM, errno.EINVAL, errno.ENOTSUP)
 """Errors of folders that are writable but not readable, and of disks that cannot flush folders."""
 
@@ -69,12 +65,15 @@ def write_atomically(path: Path, data: bytes) -> None:
 def atomic_file(path: Path) -> Iterator[BinaryIO]:
     """Open a file that replaces `path` when the block ends (`write_atomically`); after an error nothing changes."""
     place = path.resolve() if path.is_symlink() else path
-    _sweep(place)
-    with _temporary_file(place) as (temporary, descriptor):
-        with open(descriptor, "wb", closefd=False) as file:
+    short = os.fsdecode(os.fsencode(place.name)[:200])  # for the longest names that disks allow
+    temporary = place.with_name(f".{short}.{secrets.token_hex(8)}.tmp")
+    try:
+        with temporary.open("xb") as file:
             yield file
-        os.fsync(descriptor)
+            finish(file)
         temporary.replace(place)
+    finally:
+        temporary.unlink(missing_ok=True)
     try:
         sync(place.parent)
     except OSError as error:
@@ -91,46 +90,6 @@ def named_write_errors(path: Path) -> Iterator[None]:
         raise OSError(error.errno, f"cannot be written: {error.strerror or error}", str(path)) from error
     except RuntimeError as error:  # a link that leads to itself
         raise OSError(errno.ELOOP, "cannot be written: its links form a circle", str(path)) from error
-
-
-@contextmanager
-def _temporary_file(path: Path) -> Iterator[tuple[Path, int]]:
-    """Create a locked temporary file in the folder of `path`, and delete it after the block unless it was renamed."""
-    while True:
-        name = path.with_name(f"{_temporary_prefix(path)}{secrets.token_hex(8)}{_ENDING}")
-        descriptor = os.open(name, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
-        try:
-            with suppress(OSError):  # on a disk without locks no other writer deletes it either
-                fcntl.flock(descriptor, fcntl.LOCK_EX)
-            if not os.fstat(descriptor).st_nlink:  # deleted before it was locked
-                continue
-            yield name, descriptor
-            return
-        finally:
-            name.unlink(missing_ok=True)
-            os.close(descriptor)
-
-
-def _sweep(path: Path) -> None:
-    """Delete the temporary files that killed writers of `path` left."""
-    with suppress(OSError), os.scandir(path.parent) as entries:
-        names = [
-            one.path for one in entries if one.name.startswith(_temporary_prefix(path)) and one.name.endswith(_ENDING)
-        ]
-        for name in names:
-            _delete_unless_locked(name)
-
-
-def _delete_unless_locked(name: str) -> None:
-    with suppress(OSError), open_regular(name) as file:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if os.path.samestat(os.fstat(file.fileno()), os.lstat(name)):
-            os.unlink(name)
-
-
-def _temporary_prefix(path: Path) -> str:
-    """Return the prefix of the hidden temporary names for `path`, short enough for every disk."""
-    return f".{os.fsdecode(os.fsencode(path.name)[:200])}."
 
 
 def remove_folder(folder: Path) -> None:
@@ -163,20 +122,16 @@ MAX_FILE_BYTES = 512 * 2**20
 MAX_JSON_BYTES = 64 * 2**20
 """Default limit of a JSON file. A parsed document takes up to 25 times as much memory."""
 
-_WORDS = {
-    stat.S_IFIFO: "is a pipe",
-    stat.S_IFSOCK: "is a socket",
-    stat.S_IFCHR: "is a device",
-    stat.S_IFBLK: "is a device",
-}
-
 
 def open_regular(path: str | Path) -> BufferedReader:
-    """Open a regular file for reading. Raises OSError; its `strerror` names the kind of any other file."""
-    _require_regular(os.stat(path).st_mode, path)
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # a pipe swapped in since does not block
+    """Open a regular file for reading. Raises OSError; its `strerror` says that any other file is not one."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # a pipe does not block
     try:
-        _require_regular(os.fstat(descriptor).st_mode, path)
+        mode = os.fstat(descriptor).st_mode
+        if stat.S_ISDIR(mode):
+            raise IsADirectoryError(errno.EISDIR, "is a folder, not a file", str(path))
+        if not stat.S_ISREG(mode):
+            raise OSError(errno.EINVAL, "is a pipe, a device or a socket, not a regular file", str(path))
         return os.fdopen(descriptor, "rb")
     except BaseException:
         os.close(descriptor)
@@ -233,7 +188,12 @@ def is_deep(document: Any) -> bool:
     """Whether a document is nested deeper than `MAX_DEPTH` levels."""
     level = [document]
     for _ in range(MAX_DEPTH):
-        level = [inner for each in level if isinstance(each, dict | list | tuple) for inner in _inside(each)]
+        level = [
+            inner
+            for each in level
+            if isinstance(each, dict | list | tuple)
+            for inner in (each.values() if isinstance(each, dict) else each)
+        ]
     return any(isinstance(each, dict | list | tuple) for each in level)
 
 
@@ -250,14 +210,3 @@ def _finite(text: str) -> float:
     if not math.isfinite(number):
         raise ValueError(f"{text} is not a finite number")
     return number
-
-
-def _inside(each: Any) -> Iterable[Any]:
-    return each.values() if isinstance(each, dict) else each
-
-
-def _require_regular(mode: int, path: str | Path) -> None:
-    if stat.S_ISDIR(mode):
-        raise IsADirectoryError(errno.EISDIR, "is a folder, not a file", str(path))
-    if not stat.S_ISREG(mode):
-        raise OSError(errno.EINVAL, f"{_WORDS.get(stat.S_IFMT(mode), 'is not a file')}, not a regular file", str(path))

@@ -273,7 +273,7 @@ def test_broken_files_are_left_out_with_the_reason_and_the_rest_is_read(tmp_path
     assert list(skipped) == ["b.png", "c.png", "d.png", "e.png"]
     assert skipped["c.png"] == "the file is empty"
     assert skipped["d.png"] == "no such file"
-    assert skipped["e.png"].startswith("cannot be read: is a pipe, not a regular file")
+    assert skipped["e.png"].startswith("cannot be read: is a pipe, a device or a socket, not a regular file")
     assert len(results) == 6
 
 

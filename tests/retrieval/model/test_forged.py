@@ -149,7 +149,7 @@ def test_a_checkpoint_that_is_not_a_regular_file_is_refused_without_being_read(t
     (tmp_path / "zero").symlink_to("/dev/zero")
     for name in ("pipe", "zero", "."):
         for read in (load_checkpoint, read_checkpoint_info, load_gate):
-            with pytest.raises(CheckpointError, match=r"is a (pipe|device|folder), not a"):
+            with pytest.raises(CheckpointError, match=r"not a regular file|is a folder, not a file"):
                 read(tmp_path / name)
 
 
@@ -165,7 +165,7 @@ def test_hostile_settings_are_refused(tmp_path, text):
 
 def test_settings_in_a_pipe_are_refused_without_waiting(tmp_path):
     os.mkfifo(tmp_path / "c.toml")
-    with pytest.raises(ConfigError, match="is a pipe, not a regular file"):
+    with pytest.raises(ConfigError, match="not a regular file"):
         load_config(str(tmp_path / "c.toml"))
     with pytest.raises(ConfigError):
         load_config("n" * 10_000)
