@@ -29,9 +29,7 @@ def collect(
             help="one accepted grasp of each object, then the next round, so that drift does not identify the object",
         ),
     ] = False,
-    preview: Annotated[
-        bool, typer.Option("--preview", help="write an overview image, OUT-preview.png (simulated rig only)")
-    ] = False,
+    preview: Annotated[bool, typer.Option("--preview", help="write an overview image, OUT-preview.png")] = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="print the motions of one attempt per object; arm and gripper do not move")
     ] = False,
@@ -103,7 +101,7 @@ def collect(
         + f", {skipped} skipped" * bool(skipped)
     )
     if preview:
-        from robot.sim.preview import write_preview
+        from robot.recording.preview import write_preview
 
         say(f"preview: {write_preview(out, sheet)}")
 

@@ -11,13 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.devices import Arm, Camera, Gripper, TactileSensor, VirtualDevice
-from robot.errors import DeviceError, RecordingError, RobotConfigError
+from robot.errors import DeviceError, RobotConfigError
 from robot.gel_settings import parse_gel_settings
 from robot.grasping.planner import load_planner
 from robot.grasping.settings import GraspSettings, parse_attempt_settings
 from robot.readings import RGBD, Frame, GripperState, Intrinsics, Pose, Region
 from robot.recording.folder import UNITS
-from robot.recording.grasp import RecordedGrasp
 from robot.rig import Rig, check_seed
 from robot.settings import TypedSettings, bounded
 from robot.sim.camera import PinholeCamera, Placement
@@ -256,21 +255,6 @@ class SimRig(Rig):
             return {}
         names = [f"touch_{finger}{moment}" for finger in sorted(self.sensors) for moment in ("", "_before")]
         return {name: scene.image(name) for name in names}
-
-    def walls(self, grasp: RecordedGrasp) -> dict[str, Array]:
-        """Return the distance (mm) of the object from each gel at first contact, simulated again from the record.
-
-        Each array is (rows, columns) of the contact grid, inf where the finger meets nothing. A miss gives an empty
-        dictionary.
-
-        Raises:
-            RecordingError: The grasp has no pose or force.
-        """
-        if grasp.pose is None or grasp.force_n is None:
-            raise RecordingError(f"{grasp.grasp_id} must have a pose and a force to be simulated again")
-        self.prepare(grasp.object_id, int(grasp.grasp_id.rsplit("-", 1)[-1]))
-        scene = replace(self.sim_state.current_scene(), grip=Grip(Pose(*grasp.pose), grasp.force_n))
-        return {} if scene.pinch.miss_reason else {finger: scene.pinch.gap(finger) for finger in self.sensors}
 
     def _find_object(self, object_id: str) -> SimObject:
         """Return the object of this name."""

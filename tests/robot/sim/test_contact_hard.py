@@ -144,12 +144,3 @@ def test_the_nearest_pressure_of_a_given_sum_beats_every_other():
     rng = np.random.default_rng([7])
     others = rng.dirichlet(np.ones(4), 200) * 2.0
     assert (np.linalg.norm(others - values, axis=1) >= np.linalg.norm(nearest - values)).all()
-
-
-def test_a_press_does_not_depend_on_earlier_presses():
-    gap = hard_gaps()["rough"]
-    first = press(gap, 1.0, Layer(0.2, 0.48, 10.0), force_n=1.0)
-    for other in hard_gaps().values():
-        press(other, 1.0, Layer(0.2, 0.48, 10.0), force_n=3.0)
-    again = press(gap, 1.0, Layer(0.2, 0.48, 10.0), force_n=1.0)
-    assert (first.pressure_mpa == again.pressure_mpa).all()

@@ -72,14 +72,6 @@ def test_fitted_colours_are_clipped_to_the_limits_of_the_presses():
     assert fitted()._neighbourhood(steep)[0].max() > 1
 
 
-def test_places_outside_the_presses_use_the_nearest_weights():
-    model = fitted(degree=1, places=3, reaches=(), left=-0.2, right=0.2, top=-0.2, bottom=0.2)
-    tilted = Surface(0.2 * np.broadcast_to(SMALL.positions()[0], (24, 32)), SMALL)
-    change = model.colours(tilted, tilted.slopes) - model.backdrop(SMALL)
-    np.testing.assert_allclose(change[0, 0], change[5, 8], atol=1e-3)
-    assert np.abs(change[12, 16] - change[5, 8]).max() > 0.05
-
-
 def test_fitted_optics_survive_their_file_and_damaged_ones_are_refused():
     model = fitted()
     content = json.loads(json.dumps({"format": 1, "model": fitted_optics.optics_to_json(model)}))
@@ -92,18 +84,6 @@ def test_fitted_optics_survive_their_file_and_damaged_ones_are_refused():
         fitted_optics.optics_from_json({"format": 1, "model": {}})
     with pytest.raises(BadRobotInput, match="weights and flat"):
         replace(model, degree=3)
-
-
-@pytest.mark.parametrize("place", ["weights", "flat", "limits"])
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_fitted_numbers_that_are_not_finite_are_refused_by_the_reader(place, value):
-    """Python's JSON reader accepts NaN; a sensor with NaN would render black."""
-    model = fitted_optics.optics_to_json(fitted())
-    part = model["limits"] if place == "limits" else model[place][1]
-    part["steepest" if place == "limits" else 2] = value
-    content = json.loads(json.dumps({"format": 1, "model": model}))
-    with pytest.raises(BadRobotInput, match=f"^{place}.* must be a finite number"):
-        fitted_optics.optics_from_json(content)
 
 
 @pytest.mark.parametrize("name", fitted_names())

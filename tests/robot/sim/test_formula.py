@@ -6,11 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.errors import SceneError
 from robot.sim.jit import jit
 from robot.sim.objects.draw import draw_object
 from robot.sim.objects.formula import trace_formula
-from robot.sim.objects.packets import LANES, OPERATIONS, evaluate_formula, interpolate_heights
+from robot.sim.objects.packets import LANES, OPERATIONS, evaluate_formula
 from robot.sim.objects.shapes import SHAPES
 from robot.sim.objects.shapes.shape import arctan2, rounded_corner
 
@@ -49,33 +48,6 @@ def test_exactly_rounded_operations_are_bitwise_equal():
         np.testing.assert_array_equal(evaluate_formula(trace_formula(function, 2), *operands)[0], function(*operands))
 
 
-def test_a_repeated_expression_is_computed_once_and_rows_are_reused():
-    formula = trace_formula(lambda a: (a + 1) * (a + 1) + (a + 1), 1)
-    assert [OPERATIONS[name] for name in formula.code[:, 0]] == ["add", "multiply", "add"]
-
-    def long(a):
-        for _ in range(100):
-            a = a * 0.5 + 1
-        return a
-
-    assert len(trace_formula(long, 1).start) == 5  # the operand, two constants, two alternating rows
-
-
-def test_no_operation_overwrites_its_operands():
-    """The compiled loops are vectorised on this condition."""
-    for name in SHAPES:
-        shape = draw_object(0, 1, family=name).body.shape
-        for function in (shape.distance_xyz, shape.chart.locate):
-            for _, result, *read in trace_formula(function, 3).code:
-                assert result not in read
-
-
-def test_a_result_may_be_an_operand_or_a_constant():
-    constant, same = evaluate_formula(trace_formula(lambda a: (np.full_like(a, 3.0), a), 1), *numbers(1, 70))
-    np.testing.assert_array_equal(constant, 3)
-    np.testing.assert_array_equal(same, *numbers(1, 70))
-
-
 @given(st.lists(st.floats(width=32, allow_nan=False), min_size=1, max_size=130), st.floats(-5, 5))
 def test_any_number_comes_through_comparisons_as_in_numpy(values, limit):
     def function(a):
@@ -84,20 +56,6 @@ def test_any_number_comes_through_comparisons_as_in_numpy(values, limit):
     operand = np.array(values, np.float32)
     for ours, exact in zip(evaluate_formula(trace_formula(function, 1), operand), function(operand), strict=True):
         np.testing.assert_array_equal(ours, exact.astype(np.float32))
-
-
-@pytest.mark.parametrize(
-    ("function", "message"),
-    [
-        (lambda a: np.arctan(a), "arctan"),
-        (lambda a: np.add.reduce(a), "add"),
-        (lambda a: np.linalg.norm(a), "norm"),
-        (lambda a: np.clip(a, 0, 1, out=a), "clip"),
-    ],
-)
-def test_a_function_of_other_operations_is_refused_by_name(function, message):
-    with pytest.raises(SceneError, match=f"(?s)a formula may only use.*{message}"):
-        trace_formula(function, 1)
 
 
 # Against plain numpy -----------------------------------------------------------------------------------------
@@ -124,13 +82,6 @@ def test_normals_in_packets_are_differences_of_the_field():
     plain = np.sum([value[:, None] * side for value, side in zip(values, sides, strict=True)], axis=0)
     plain /= np.linalg.norm(plain, axis=1, keepdims=True)
     np.testing.assert_allclose(body.normals(points, h), plain, atol=2e-3)
-
-
-def test_heights_lie_between_pixels_and_end_at_the_border():
-    grid = np.array([[0, 1, 2], [10, 11, 12]], np.float32)
-    u, v = np.array([0.25, 1.5, 9, -3, 2], np.float32), np.array([0, 0.5, 9, -3, 1], np.float32)
-    np.testing.assert_allclose(interpolate_heights(grid, u, v), [0.25, 6.5, 12, 0, 12])
-    assert interpolate_heights(grid, u[:0], v[:0]).shape == (0,)
 
 
 def test_hits_do_not_depend_on_the_order_of_rays():

@@ -27,12 +27,6 @@ def test_radiance_is_that_of_lambert_blinn_and_the_sky():
     np.testing.assert_allclose(ours, exact, atol=2e-6, rtol=1e-5)  # sixty times a float32 logarithm
 
 
-def test_a_point_without_light_is_black():
-    surfaces, lamps = surfaces_and_lamps()
-    dark = lamps._replace(sky=np.zeros(3))
-    assert not radiance(surfaces._replace(lamp_visibility=np.zeros(5000, np.float32)), dark).any()
-
-
 def test_grey_levels_follow_the_gamma_and_are_clipped():
     linear = np.float32([[[0, 0.5, 1], [1.5, 1e-7, 0.25]]])
     flat = develop(linear, np.zeros((1, 2, 3)))

@@ -2,14 +2,13 @@
 
 import builtins
 import functools
-import pickle
 import sys
 
 import numpy as np
 import pytest
 
 from robot.collection import CollectSettings, collect
-from robot.errors import RecordingError, RobotConfigError, SceneError, UnknownName
+from robot.errors import RecordingError, RobotConfigError, SceneError
 from robot.rig import load_rig
 from robot.sim.objects.mesh import Mesh
 from tests.meshes import CORNERS, CUBE, load_mesh_object, obj, ply, sphere, stl
@@ -55,19 +54,6 @@ def test_only_geometry_is_read(tmp_path, monkeypatch):
     assert not [name for name in opened if name.endswith((".mtl", ".png"))]
 
 
-def test_the_same_file_and_seed_give_the_same_object(tmp_path):
-    path = obj(tmp_path / "my cube.obj", 20 * CORNERS, CUBE)
-    one, two = load_mesh_object(path, 4), load_mesh_object(path, 4)
-    assert (one.object_id, one.relief, one.material, one.appearance) == (
-        two.object_id,
-        two.relief,
-        two.material,
-        two.appearance,
-    )
-    assert one.object_id.startswith("mesh.my_cube-")
-    assert load_mesh_object(path, 5).appearance != one.appearance
-
-
 # Refusals --------------------------------------------------------------------------------------------------
 
 
@@ -93,12 +79,6 @@ def test_a_surface_that_is_not_a_closed_solid_is_refused(tmp_path, vertices, fac
         load_mesh_object(ply(tmp_path / "bad.ply", vertices, faces), 0)
 
 
-def test_a_box_that_is_wide_in_one_direction_only_is_accepted_even_when_turned(tmp_path):
-    turn = np.array([[0.8, 0.6, 0], [-0.6, 0.8, 0], [0, 0, 1]])
-    item = load_mesh_object(obj(tmp_path / "plank.obj", (CORNERS * [100, 10, 30]) @ turn, CUBE), 0)
-    assert item.body.upper[0] - item.body.lower[0] > 150
-
-
 @pytest.mark.parametrize("name", ["bad.stl", "bad.obj", "bad.ply"])
 @pytest.mark.parametrize(
     "content", [b"", b"\x00" * 84, b"nonsense", b"ply\nformat ascii 1.0\nelement vertex 9", b"v 1 2 x\n"]
@@ -109,15 +89,6 @@ def test_broken_files_are_one_clear_error(tmp_path, name, content):
         load_mesh_object(tmp_path / name, 0)
 
 
-def test_a_binary_file_cut_off_is_not_blamed_on_a_missing_package(tmp_path):
-    """trimesh reads it as text and imports an optional encoding detector; with that, it finds no triangle."""
-    path = tmp_path / "cut.stl"
-    path.write_bytes(bytes([0xFF, 0xFE, 0x9D]) * 100)
-    with pytest.raises(SceneError, match=r"not a readable STL mesh|has no triangles") as caught:
-        load_mesh_object(path, 0)
-    assert "No module" not in str(caught.value)
-
-
 def test_truncated_files_never_load_as_something_else(tmp_path):
     vertices, faces = sphere(8)
     content = stl(tmp_path / "ball.stl", 30 * vertices, faces).read_bytes()
@@ -125,16 +96,6 @@ def test_truncated_files_never_load_as_something_else(tmp_path):
         (tmp_path / "cut.stl").write_bytes(content[:length])
         with pytest.raises(SceneError):
             load_mesh_object(tmp_path / "cut.stl", 0)
-
-
-def test_other_kinds_missing_files_and_wrong_settings_are_refused(tmp_path):
-    path = obj(tmp_path / "cube.obj", 20 * CORNERS, CUBE)
-    with pytest.raises(SceneError, match=r"stl, obj, ply.*'cube\.glb'"):
-        load_mesh_object(tmp_path / "cube.glb", 0)
-    with pytest.raises(SceneError, match="No such file"):
-        load_mesh_object(tmp_path / "none.stl", 0)
-    with pytest.raises(UnknownName, match="knurl"):
-        load_mesh_object(path, 0, relief="fur")
 
 
 @pytest.mark.parametrize("package", ["trimesh", "embreex"])
@@ -200,15 +161,6 @@ def test_relief_moves_hits_by_its_height_and_tilts_normals(tmp_path):
     assert np.ptp(lift) > 0.6 * amplitude
     points = origins + textured.cast(origins, directions)[:, None] * directions
     assert np.abs(textured.normals(points) - smooth.normals(points)).max() > 0.1
-
-
-def test_casting_is_the_same_again_and_after_a_pickle(ball):
-    origins, directions = rays_at(ball.body, 500)
-    expected = ball.body.cast(origins, directions)
-    again = pickle.loads(pickle.dumps(ball))  # noqa: S301
-    np.testing.assert_array_equal(again.body.cast(origins, directions), expected)
-    points = (origins + expected[:, None] * directions)[np.isfinite(expected)]
-    np.testing.assert_array_equal(again.body.normals(points), ball.body.normals(points))
 
 
 def test_the_mass_is_that_of_the_volume_or_of_a_shell(ball):

@@ -17,8 +17,8 @@ from robot.recording.folder import read_recording
 from robot.rig import load_rig
 from robot.sim.antipodal import find_grasps
 from robot.sim.objects.mesh import Mesh, mesh_object, read_mesh
-from robot.sim.objects.resting import UP, rotation_to_up, stable_up_directions, tipping_angle
-from tests.meshes import BOTTLE, box, load_mesh_object, revolved, sphere, stl
+from robot.sim.objects.resting import UP, stable_up_directions
+from tests.meshes import BOTTLE, box, revolved, sphere, stl
 
 pytest.importorskip("trimesh", reason="needs touch-retrieval[mesh]")
 pytest.importorskip("embreex", reason="needs touch-retrieval[mesh]")
@@ -53,40 +53,11 @@ def test_a_box_rests_on_its_six_sides_upright_first_then_the_most_stable():
     np.testing.assert_allclose(ups[5], [0, 0, -1], atol=1e-9)
 
 
-def test_a_box_falls_over_when_its_centre_passes_the_edge():
-    vertices, _ = box(60, 90, 180)
-    assert tipping_angle(vertices, -UP) == pytest.approx(math.atan2(30, 90))
-    assert tipping_angle(vertices, np.array([1.0, 0, 0])) == pytest.approx(math.atan2(45, 30))
-    assert tipping_angle(vertices, np.array([0.6, 0, 0.8])) < 0  # on an edge
-
-
-def test_a_leaning_mesh_is_placed_on_its_nearest_side(tmp_path):
-    vertices, faces = box(60, 90, 180)
-    lean = rotation_to_up(np.array([math.sin(0.1), 0.0, math.cos(0.1)]))
-    mesh = Mesh(vertices @ lean, faces)
-    up = stable_up_directions(mesh.vertices, np.zeros(3))[0]
-    np.testing.assert_allclose(np.ptp(mesh.rest_on_table(up).vertices, axis=0), [60, 90, 180], atol=1e-6)
-
-
-def test_a_pencil_on_end_lies_down():
-    vertices, faces = box(6, 6, 150)
-    mesh = Mesh(vertices, faces)
-    assert np.ptp(mesh.rest_on_table(stable_up_directions(vertices, np.zeros(3))[0]).vertices[:, 2]) == pytest.approx(6)
-
-
 def test_the_centre_of_mass_is_that_of_the_solid_at_any_position():
     (vertices, faces), away = box(60, 90, 180), [500, -7, 90]
     np.testing.assert_allclose(Mesh(vertices + np.array(away), faces).centre_of_mass, away, atol=1e-9)
     cone = Mesh(*revolved([(30, 0), (0.001, 80)]))
     np.testing.assert_allclose(cone.centre_of_mass, [0, 0, 20], atol=0.01)  # a quarter of its height
-
-
-@pytest.mark.parametrize("up", [[0, 0, 1.0], [0, 0, -1.0], [1.0, 0, 0], [0.6, -0.64, 0.48]])
-def test_the_rotation_maps_the_given_direction_to_up(up):
-    turn = rotation_to_up(np.array(up))
-    np.testing.assert_allclose(turn @ up, [0, 0, 1], atol=1e-12)
-    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(turn) == pytest.approx(1)
 
 
 # Grasps -----------------------------------------------------------------------------------------------------
@@ -164,12 +135,6 @@ def test_a_ball_that_is_too_large_has_no_grasp_and_the_reason_has_its_width(tmp_
         rig.prepare(rig.object_ids(1)[0], 0)
         with pytest.raises(UngraspableError, match=r"wider than the gripper opens: 13\d mm .* 110 mm less 5 mm"):
             rig.planner.plan(rig, None, SETTINGS, np.random.default_rng(0))
-
-
-def test_slopes_beyond_the_friction_cone_are_not_opposite_sides(tmp_path):
-    """A cone whose wall goes 15 mm inwards for 10 mm up; the friction cone ends at 3 for 10."""
-    _, grasps = grasps_of(tmp_path, *revolved([(46, 0), (1, 30)]))
-    assert (len(grasps), grasps.min_width_mm) == (0, math.inf)
 
 
 def test_an_object_that_no_allowed_force_lifts_is_reported_as_too_heavy(tmp_path):
@@ -302,15 +267,6 @@ def test_a_file_chooses_the_planner_and_the_mesh_planner_needs_meshes(tmp_path):
     (tmp_path / "rig.toml").write_text('rig = "sim"\n[planner]\nname = "mesh"\n')
     with pytest.raises(RobotConfigError, match=r'rig\.toml: \[planner\]: name = "mesh" plans for meshes'):
         load_rig(str(tmp_path / "rig.toml"), seed=0)
-
-
-def test_a_mesh_that_is_upright_in_its_file_is_not_turned(tmp_path):
-    vertices, faces = box(60, 90, 180)
-    path = stl(tmp_path / "box.stl", vertices, faces)
-    with load_rig("sim", seed=0, meshes=str(tmp_path)) as rig:
-        rig.prepare(rig.object_ids(1)[0], 0)
-        body = rig.sim_state.scene.obj.body
-    np.testing.assert_array_equal(body.mesh.vertices, load_mesh_object(path, 0).body.mesh.vertices)
 
 
 def test_a_recording_of_meshes_documents_tilted_poses(tmp_path):

@@ -1,8 +1,7 @@
-"""A contact sheet of a recording: photo, depth, gels before and during, and the surface that each gel met."""
+"""A contact sheet of a recording: photo, depth, and the gels before and during the grasp."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -11,22 +10,16 @@ import numpy.typing as npt
 from _touch_retrieval.files import write_atomically
 from robot.errors import RecordingError
 from robot.recording.folder import RecordedGrasp, read_recording
-from robot.rig import load_rig
-from robot.sim.rig import SimRig
 from robot.storage import file_content, storage_errors
 
 Picture = npt.NDArray[np.uint8]
 TILE_PX = 160
 _HEADER_PX = 24
 _CAPTION_PX = 20
-_MAX_DEPTH_MM = 3.0
-"""Surfaces are drawn from contact (bright) to this far behind (dark)."""
 
 
 def write_preview(folder: str | Path, out: str | Path, rows: int = 12) -> Path:
-    """Write a PNG with one grasp of each of up to `rows` objects of a simulated recording, evenly chosen.
-
-    The surfaces are simulated again from seed, attempt, pose and force.
+    """Write a PNG with one grasp of each of up to `rows` objects of a recording, evenly chosen.
 
     Args:
         folder: the recording.
@@ -37,27 +30,20 @@ def write_preview(folder: str | Path, out: str | Path, rows: int = 12) -> Path:
         The path of the PNG file.
 
     Raises:
-        RecordingError: The recording is invalid, empty or not of the simulated rig.
+        RecordingError: The recording is invalid or empty.
         StorageError: The file cannot be written.
     """
     recording = read_recording(folder)
-    rig = _rig(recording.folder, recording.info)
     chosen = _pick_grasps(recording.grasps, rows)
-    sheet = np.vstack([_header(tuple(rig.sensors)), *(_row(recording.folder, grasp, rig) for grasp in chosen)])
+    fingers = sorted({finger for grasp in chosen for finger in grasp.touches})
+    titles = ["photo", "depth", *(f"gel {finger} {moment}" for finger in fingers for moment in ("before", "during"))]
+    header = np.hstack([_caption(title, TILE_PX, _HEADER_PX) for title in titles])
+    sheet = np.vstack([header, *(_row(recording.folder, grasp, fingers) for grasp in chosen)])
     data, _ = file_content("preview", sheet)
     with storage_errors(Path(out)):
         Path(out).parent.mkdir(parents=True, exist_ok=True)
         write_atomically(Path(out), data)
     return Path(out)
-
-
-def _rig(folder: Path, info: Mapping[str, Any]) -> SimRig:
-    """Load the rig that made the recording."""
-    if info.get("rig") != "sim":
-        raise RecordingError(f"a preview needs a recording of the simulated rig; {folder} is of {info.get('rig')!r}")
-    rig = load_rig("sim", seed=info["seed"], **info["rig_settings"])
-    assert isinstance(rig, SimRig)
-    return rig
 
 
 def _pick_grasps(grasps: Sequence[RecordedGrasp], rows: int) -> list[RecordedGrasp]:
@@ -73,21 +59,11 @@ def _pick_grasps(grasps: Sequence[RecordedGrasp], rows: int) -> list[RecordedGra
     return [first[names[index]] for index in picked]
 
 
-def _header(fingers: Sequence[str]) -> Picture:
-    titles = ["photo", "depth"]
-    for finger in fingers:
-        titles += [f"gel {finger} before", f"gel {finger} during", f"wall at {finger}, mm"]
-    return np.hstack([_caption(title, TILE_PX, _HEADER_PX) for title in titles])
-
-
-def _row(folder: Path, grasp: RecordedGrasp, rig: SimRig) -> Picture:
+def _row(folder: Path, grasp: RecordedGrasp, fingers: Sequence[str]) -> Picture:
     """Return the tiles of one grasp, with its name and force below."""
     tiles = [_tile(_read(folder, grasp.photo)), _tile(_depth(folder, grasp))]
-    walls = rig.walls(grasp)
-    for finger in rig.sensors:
-        for images in (grasp.touches_before, grasp.touches):
-            tiles.append(_tile(_read(folder, images.get(finger))))
-        tiles.append(_tile(_apply_colormap(walls.get(finger), _MAX_DEPTH_MM)))
+    for finger in fingers:
+        tiles += [_tile(_read(folder, images.get(finger))) for images in (grasp.touches_before, grasp.touches)]
     row = np.hstack(tiles)
     text = (
         f"{grasp.object_id}   {grasp.force_n or 0:.1f} N   jaws {grasp.opening_mm or 0:.1f} mm   {grasp.outcome or ''}"
@@ -110,16 +86,10 @@ def _depth(folder: Path, grasp: RecordedGrasp) -> Picture | None:
         return None
     depth = image.astype(np.float64)
     known = depth > 0
-    return _apply_colormap(np.where(known, depth - depth[known].min(), np.inf), float(np.ptp(depth[known])))
-
-
-def _apply_colormap(distance: npt.NDArray[Any] | None, deepest: float) -> Picture | None:
-    """Colour distances: near is bright, `deepest` and beyond dark, inf black."""
-    if distance is None:
-        return None
-    level = 255 * (1 - np.clip(distance / max(deepest, 1e-6), 0, 1))
+    near, far = depth[known].min(), depth[known].max()
+    level = 255 * (1 - np.clip((depth - near) / max(far - near, 1.0), 0, 1))
     colours = cv2.applyColorMap(level.astype(np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1]
-    return np.where(np.isfinite(distance)[..., None], colours, 0).astype(np.uint8)
+    return np.where(known[..., None], colours, 0).astype(np.uint8)
 
 
 def _tile(image: Picture | None) -> Picture:
