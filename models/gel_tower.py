@@ -14,7 +14,6 @@ import argparse
 import math
 import sys
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -23,17 +22,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.utils.data import DataLoader, Dataset
 
 from _touch_retrieval.files import atomic_file, write_atomically
+from models.labels import LabelHead
+from models.pictures import LabelledPicture, collect_pictures
 from models.random_surfaces import RandomSurface, presses
-from models.shipped import retrieve
 from retrieval.console.interruption import interruption
 from retrieval.console.memory import keep_freed_memory
 from retrieval.console.output import say
 from retrieval.console.progress import Bar
 from retrieval.data.images import read_rgb, to_float
-from retrieval.data.labelled_pictures import LabelledPicture, load_labelled
-from retrieval.data.loading import prefetch
 from retrieval.data.resize import resize
 from retrieval.model.checkpoint import as_float16, write_tensors
 from retrieval.model.encode import autocast, default_device
@@ -41,9 +40,7 @@ from retrieval.model.towers import build_tower
 from retrieval.model.towers.tower import Tower
 from retrieval.model.towers.weights import initialise_tower
 from retrieval.training.augmentation import sample_grid
-from retrieval.training.disk_image_cache import DiskImageCache
 from retrieval.training.fit import RATE, Plan, fit, freeze_batch_norm
-from retrieval.training.labels import LabelHead
 from retrieval.training.state import load_state, save_state, state_path
 from robot.sim.gel.sensor import draw_sensor
 from robot.workers import Work, WorkerPool
@@ -62,6 +59,8 @@ STEPS, LEARNING_RATE, WEIGHT_DECAY, SAVE_EVERY = 500, 1.2e-4, 0.02, 100
 EARLY_LAYERS, EARLY_RATE, HEAD_RATE = 7, 0.3, 5.0
 """Layers whose learning rate is a fraction of that of the others, this fraction, and the factor of the heads."""
 SENSORS_OF_STEP, SURFACES_OF_STEP, LABELLED_OF_STEP = 2, 22, 40
+WORKERS = 2
+"""Processes that prepare batches."""
 TEMPERATURE, EMBEDDING = 0.1, 256
 LABEL_WEIGHT, DISTIL_WEIGHT = 0.5, 0.3
 
@@ -82,10 +81,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     keep_freed_memory()
     folder = arguments.folder
     files = press_surfaces(folder / "surfaces", arguments.sensors, arguments.jobs)
-    size = ("--objects", arguments.labelled, "--seed", SEED_LABELLED, "--jobs", arguments.jobs)
-    if code := retrieve("collect", "--touches-only", "--rig", RIG, *size, "--out", folder / "labelled"):
-        return code
-    training = GelTowerTraining(files, load_labelled(folder / "labelled")[1], str(arguments.init), folder / "images")
+    size: dict[str, Any] = {"objects": arguments.labelled, "seed": SEED_LABELLED, "rig": str(RIG)}
+    labelled = collect_pictures("touch", folder / "labelled", jobs=arguments.jobs, **size)
+    training = GelTowerTraining(files, labelled, str(arguments.init))
     out = folder / "gel-tower.safetensors"
     if training.run(out, arguments.steps):
         return 0
@@ -231,22 +229,19 @@ def normal(rng: Rng, deviation: float, *shape: int) -> Tensor:
 # Training ------------------------------------------------------------------------------------------------------
 
 
-class GelTowerTraining:
-    """The tower in training, the frozen ImageNet tower, the heads, and the pictures."""
+class GelTowerTraining(Dataset[Batch]):
+    """The tower in training, the frozen ImageNet tower, the heads, and the pictures. As a data set: the batches."""
 
-    def __init__(self, files: Sequence[Path], labelled: list[LabelledPicture], init: str, cache: Path) -> None:
+    def __init__(self, files: Sequence[Path], labelled: list[LabelledPicture], init: str) -> None:
         """Load the pictures and make the towers.
 
         Args:
             files: Files of `press_surfaces`.
             labelled: Labelled presses.
             init: Initial weights.
-            cache: Folder of decoded labelled presses.
         """
         self.sensors = [np.load(file, mmap_mode="r", allow_pickle=False) for file in files]
         self.labelled, self.step, self.device = labelled, 0, default_device()
-        self.images = DiskImageCache(lambda file: stored(read_rgb(file)), cache, "gel", str(STORED_PX))
-        self.images.cache_decoded([(picture.file,) for picture in labelled])
         self.published, tower = (build_tower("mobilenet_v2", "stages").to(self.device).eval() for _ in range(2))
         for each in (self.published, tower):
             initialise_tower(each, init)
@@ -274,8 +269,8 @@ class GelTowerTraining:
             save_state(out, self.modules, self.optimizer, {"step": self.step, **identity})
 
         plan = Plan(steps, LEARNING_RATE, "warmup", SAVE_EVERY)
-        with interruption() as stop, Bar("train", steps, "steps", done=self.step) as bar, ThreadPoolExecutor(1) as pool:
-            batches = prefetch((pool.submit(self.batch, step) for step in range(self.step, steps)), 1)
+        batches = DataLoader(self, batch_size=None, sampler=range(self.step, steps), num_workers=WORKERS)
+        with interruption() as stop, Bar("train", steps, "steps", done=self.step) as bar:
             fit(
                 self.optimizer,
                 plan,
@@ -310,13 +305,13 @@ class GelTowerTraining:
         )
         return "\n".join((*lines, ""))
 
-    def batch(self, step: int) -> Batch:
+    def __getitem__(self, step: int) -> Batch:
         """Return the images of a step, sensor by sensor and then labelled, and the labelled pictures."""
         rng = np.random.default_rng([0, 7, step])
         chosen = rng.choice(len(self.sensors), SENSORS_OF_STEP, replace=False)
         parts = [sensor_batch(self.sensors[number], rng) for number in chosen]
         pictures = [self.labelled[row] for row in rng.choice(len(self.labelled), LABELLED_OF_STEP, replace=False)]
-        parts.append(labelled_batch(np.stack([self.images(picture.file) for picture in pictures]), rng))
+        parts.append(labelled_batch(np.stack([stored(read_rgb(picture.file)) for picture in pictures]), rng))
         return torch.cat(parts).contiguous(memory_format=torch.channels_last), pictures
 
     def loss(self, batch: Batch) -> Tensor:

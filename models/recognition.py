@@ -3,11 +3,11 @@
     python -m models.recognition RECORDING --distractors PHOTOS --out FOLDER --model old=A --model new=B
 
 RECORDING holds grasps of objects that no model was trained on; rows with five grasps and three photos need eight of
-each. PHOTOS is a folder of `retrieve collect --photos-only`: one photo of each further object of the catalogue. Every
-query is one to five grasps of an object. Every candidate has photos that were not taken in these grasps. Top-1
-accuracies are means over draws of the other candidates; intervals resample the touched objects. A model with late
-interaction is also scored without its cells, as in an index of `build-index --no-cells`. Differences are to the first
-model, on the same queries. It writes FOLDER/recognition.json, and reuses the features of RECORDING.
+each. PHOTOS is a folder to which one photo of each of 1,000 further objects of the catalogue is collected. Every query
+is one to five grasps of an object. Every candidate has photos that were not taken in these grasps. Top-1 accuracies are
+means over draws of the other candidates; intervals resample the touched objects. A model with late interaction is also
+scored without its cells, as in an index of `build-index --no-cells`. Differences are to the first model, on the same
+queries. It writes FOLDER/recognition.json, and reuses the features of RECORDING.
 """
 
 import argparse
@@ -23,9 +23,9 @@ import torch
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
+from models.pictures import collect_pictures
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, load_grasps
-from retrieval.data.labelled_pictures import load_labelled
 from retrieval.data.loading import map_in_order, worker_pool
 from retrieval.evaluation.reject import reject
 from retrieval.metrics.intervals import compare, summarise
@@ -46,6 +46,8 @@ SETS = 4
 CATALOGUE = 100
 """Objects for "none of these"; each catalogue leaves one of them out."""
 DRAWS = 4
+DISTRACTORS, SEED = 1000, 181_000
+"""Photo-only objects, and the seed of their object set."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -149,9 +151,9 @@ def grasp_sets(owner: NDArray[np.int64], count: int, photos: int) -> NDArray[np.
 @torch.inference_mode()
 def distractor_partials(checkpoint: Checkpoint, folder: Path) -> torch.Tensor:
     """Return partial activations (N, partial) of photo-only objects."""
-    files = [picture.file for picture in load_labelled(folder)[1]]
+    files = [each.file for each in collect_pictures("photo", folder, objects=DISTRACTORS, seed=SEED, jobs=2)]
     encoded = []
-    with Bar("encode distractors", len(files), "photos") as bar, worker_pool("auto") as pool:
+    with Bar("encode distractors", len(files), "photos") as bar, worker_pool() as pool:
         for images in batches(map_in_order(pool, checkpoint.config.preprocessing.load_photo, files), 32):
             features = photo_features(checkpoint.matcher, images)
             encoded.append(checkpoint.matcher.photo_encoding(features).partial)

@@ -23,10 +23,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from models.labels import LabelTrainer
+from models.pictures import collect_pictures, load_object_labels
+from models.relief import pretrain
 from retrieval.commands.main import main as run_command
 from retrieval.console.memory import keep_freed_memory
+from retrieval.console.output import say
 from retrieval.data.dataset import Grasp, Split, data_digest, load_grasps
-from retrieval.data.labelled_pictures import load_object_labels
 from retrieval.methods.late_fusion import frozen_matcher, trained_checkpoint
 from retrieval.methods.method import MethodSettings
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint, write_tensors
@@ -39,7 +42,6 @@ from retrieval.training import distil
 from retrieval.training.batches import FrozenFeatures, recorded_features
 from retrieval.training.features import Features, encode_recording, features_by_image
 from retrieval.training.state import finish_training, unfinished_path
-from retrieval.training.train import Trainer
 from retrieval.training.verdicts import calibration_touches, with_verdicts
 
 RIGS = Path(__file__).parent
@@ -102,9 +104,9 @@ def main(argv: list[str] | None = None) -> int:
 def make_shipped(arguments: argparse.Namespace) -> int:
     """Collect, train the towers and both heads, and calibrate; continue an interrupted run."""
     folder = arguments.folder
-    code = collect_training(arguments) or collect_calibration(arguments) or pretrain_towers(arguments)
-    if code:
+    if code := collect_training(arguments) or collect_calibration(arguments):
         return code
+    pretrain_towers(arguments)
     files = {f"init_{side}": str(folder / f"{side}-tower.safetensors") for side in ("photo", "touch")}
     last = train_round(folder, 0, files)
     for number, steps in enumerate(LATER_STEPS, start=1):
@@ -158,7 +160,7 @@ def train_towers(
     training = dataclasses.replace(config.training, **settings)
     labels = {name: each for part in parts for name, each in load_object_labels(part).items()}
     done = folder / "towers.safetensors"
-    trainer = Trainer(
+    trainer = LabelTrainer(
         dataclasses.replace(config, training=training),
         split_of(train, validation),
         [*train, *validation],
@@ -166,7 +168,6 @@ def train_towers(
         source="simulated rigs",
         labels=labels,
     )
-    trainer.features.fill_cache(folder / "images", [*train, *validation])
     return finish_training(trainer, done, quiet=False)
 
 
@@ -257,21 +258,19 @@ def collect_calibration(arguments: argparse.Namespace) -> int:
     )
 
 
-def pretrain_towers(arguments: argparse.Namespace) -> int:
+def pretrain_towers(arguments: argparse.Namespace) -> None:
     """Photograph and press objects of two other seeds, and pretrain each tower on relief with them."""
-    for side, pictures, seed, rig in (
-        ("photo", "photos", SEED_PHOTOS, "sim"),
-        ("touch", "touches", SEED_TOUCHES, TOUCH_RIG),
+    preset = load_config("relief")
+    config = dataclasses.replace(preset, training=dataclasses.replace(preset.training, init=str(arguments.init)))
+    for kind, objects, seed, rig in (
+        ("photo", arguments.photos, SEED_PHOTOS, "sim"),
+        ("touch", arguments.touches, SEED_TOUCHES, str(TOUCH_RIG)),
     ):
-        folder, tower = arguments.folder / pictures, arguments.folder / f"{side}-tower.safetensors"
-        if tower.exists():
-            continue
-        size = ("--objects", getattr(arguments, pictures), "--seed", seed, "--jobs", arguments.jobs)
-        options = ("--config", "relief", "--init", arguments.init, "--iterations", arguments.steps)
-        code = retrieve("collect", f"--{pictures}-only", "--rig", rig, *size, "--out", folder)
-        if code := code or retrieve("train", folder, "--task", "relief", *options, "--out", tower):
-            return code
-    return 0
+        tower = arguments.folder / f"{kind}-tower.safetensors"
+        if not tower.exists():
+            folder = arguments.folder / f"{kind}-pictures"
+            pictures = collect_pictures(kind, folder, objects=objects, seed=seed, rig=rig, jobs=arguments.jobs)
+            say(pretrain(kind, pictures, tower, config, arguments.steps))
 
 
 def calibrate_shipped(arguments: argparse.Namespace) -> int:
@@ -296,10 +295,10 @@ def calibrated(made: Checkpoint, folder: Path, fingers: int) -> Checkpoint:
     validation, verification, gels = parts
     every, device = [*validation, *verification, *gels], default_device()
     features = encode_recording(every, made.matcher, made.config, folder / "features")
-    with FrozenFeatures(made.config, device, features_by_image(every, features, device)) as source:
-        known = [*verification, *gels]
-        made = with_verdicts(made, source, known, validation, foreign=FOREIGN, max_grasps=len(every))
-        touches, photos = recorded_features(made.matcher, source, verification, what="verification")
+    source = FrozenFeatures(made.config, device, features_by_image(every, features, device))
+    known = [*verification, *gels]
+    made = with_verdicts(made, source, known, validation, foreign=FOREIGN, max_grasps=len(every))
+    touches, photos = recorded_features(made.matcher, source, verification, what="verification")
     trials = calibration_touches(made.matcher, verification, touches, photos)
     assert trials is not None
     assert made.posterior is not None
@@ -317,9 +316,7 @@ def distilled(made: Checkpoint, train: Features, validation: Features) -> Checkp
 
 def store(made: Checkpoint, out: Path) -> None:
     """Write a checkpoint as float16, without the paths of its first weights on this machine."""
-    training = dataclasses.replace(
-        made.config.training, init="imagenet", init_photo="", init_touch="", photos="", touches=""
-    )
+    training = dataclasses.replace(made.config.training, init="imagenet", init_photo="", init_touch="")
     made = dataclasses.replace(made, config=dataclasses.replace(made.config, training=training))
     store_checkpoint(made, out, float16=True)
 

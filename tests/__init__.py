@@ -4,7 +4,7 @@
     benchmarks, models, project                 of these folders; of documentation, imports and packaging
     integrations                                tests of `integrations/`, with stubs of the other programs
     conftest                                    pictures and models that several files use
-    synthetic, labelled_pictures                synthetic pictures
+    synthetic                                   synthetic pictures
     synthetic_evaluation, reference_model       synthetic results, and a model with reference calibration
     miniatures, real_data_sets, data            small public data sets, and the folder of real ones
     emulators                                   a WSG-50 and a Sawyer as programs, based on the facts of the drivers

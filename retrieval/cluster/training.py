@@ -28,7 +28,6 @@ def train_on_ray(
     *,
     split: Split | None = None,
     resume: bool = False,
-    cache: Path | None = None,
     workers: int = 2,
     cpus: int | None = None,
 ) -> Checkpoint:
@@ -40,7 +39,6 @@ def train_on_ray(
         config: As for `train`.
         split: As for `train`.
         resume: As for `train`.
-        cache: As for `train`.
         workers: Number of ranks.
         cpus: CPUs of a Ray that is started here; None for all.
 
@@ -60,7 +58,6 @@ def train_on_ray(
         "config": config,
         "split": split,
         "resume": resume,
-        "cache": cache and cache.resolve(),
     }
     with ray_session(cpus) as ray, tempfile.TemporaryDirectory() as notes:
         from ray.train import RunConfig, ScalingConfig, TrainingFailedError
@@ -93,8 +90,8 @@ def train_on_ray(
 def _rank(settings: dict[str, Any]) -> None:
     """Train in a process of Ray Train, which has joined the ranks."""
     resume = settings["resume"] or state_path(settings["out"]).exists()
-    recording, out, config, split, cache = (settings[name] for name in ("recording", "out", "config", "split", "cache"))
-    train(recording, out, config, split=split, resume=resume, cache=cache)
+    recording, out, config, split = (settings[name] for name in ("recording", "out", "config", "split"))
+    train(recording, out, config, split=split, resume=resume)
 
 
 def _error_of_rank(error: BaseException) -> RetrievalError | None:

@@ -1,4 +1,4 @@
-"""`retrieve collect`: collect a recording with a rig, or labelled pictures of simulated objects."""
+"""`retrieve collect`: collect a recording with a rig."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -8,7 +8,7 @@ import typer
 from retrieval.commands.options import COUNT, SEED, Jobs, Objects, announce_resume, refuse_options
 from retrieval.console.output import say, show
 from retrieval.console.progress import CountedBar
-from retrieval.errors import BadInput, RetrievalError
+from retrieval.errors import RetrievalError
 
 
 def collect(
@@ -33,32 +33,12 @@ def collect(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="print the motions of one attempt per object; arm and gripper do not move")
     ] = False,
-    photos_only: Annotated[
-        bool,
-        typer.Option(
-            "--photos-only", help="collect one labelled photo per simulated object instead, for train --task relief"
-        ),
-    ] = False,
-    touches_only: Annotated[
-        bool,
-        typer.Option(
-            "--touches-only", help="collect one labelled press per simulated object instead, for train --task relief"
-        ),
-    ] = False,
 ) -> None:
     """Collect a recording with a rig; stay next to a real rig. Resumes a stopped run."""
     if dry_run:
         ignored = {"gate": gate, "preview": preview, "rounds": rounds}
-        ignored |= {"photos_only": photos_only, "touches_only": touches_only}
         refuse_options("has no effect with --dry-run, which moves and records nothing; leave it out", **ignored)
         _print_motions(rig, objects, seed)
-        return
-    if photos_only or touches_only:
-        if (photos_only and touches_only) or gate or preview or rounds:
-            raise BadInput(
-                "--photos-only and --touches-only cannot be combined with each other, --gate, --preview or --rounds"
-            )
-        _collect_pictures("photo" if photos_only else "touch", rig, objects, out, seed, jobs)
         return
     from functools import partial
 
@@ -118,15 +98,6 @@ def _print_motions(name: str, objects: int, seed: int) -> None:
         for object_id in rig.object_ids(objects):
             attempt = runner.run(object_id, 0)
             say(f"{object_id}: {attempt.reason or 'nothing moved, nothing was recorded'}")
-
-
-def _collect_pictures(kind: str, rig: str, objects: int, out: Path, seed: int, jobs: int) -> None:
-    """Run `--photos-only` or `--touches-only`."""
-    from robot.sim.pictures import collect_pictures
-
-    with announce_resume(f"the pictures so far are stored in {out}"), CountedBar("collect", "objects") as bar:
-        count = collect_pictures(kind, out, objects=objects, seed=seed, rig=rig, jobs=jobs, progress=bar)
-    say(f"{out}: {count} pictures of {objects} objects")
 
 
 def _load_gate(path: Path | None) -> tuple[Any, str | None]:

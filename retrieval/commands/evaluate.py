@@ -10,11 +10,8 @@ from retrieval.commands.options import (
     DEFAULT_PRESET,
     SEED,
     Init,
-    InitTower,
     Iterations,
     Json,
-    LabelledPhotos,
-    LabelledTouches,
     Recording,
     ReportOut,
     SplitFile,
@@ -40,10 +37,6 @@ def evaluate(
     ] = None,
     model: Annotated[Path | None, typer.Option(help="checkpoint to evaluate, instead of fitting one")] = None,
     init: Init = None,
-    init_photo: InitTower = None,
-    init_touch: InitTower = None,
-    photos: LabelledPhotos = None,
-    touches: LabelledTouches = None,
     iterations: Iterations = None,
     seeds: Annotated[int, typer.Option(parser=COUNT, help="training runs per method")] = 1,
     seed: Annotated[
@@ -64,14 +57,13 @@ def evaluate(
     from retrieval.evaluation.evaluate import evaluate as run
     from retrieval.report.evaluation import write_report
 
-    inits = {"init": init, "init_photo": init_photo, "init_touch": init_touch}
-    if model and (preset or any(inits.values())):
+    if model and (preset or init):
         raise BadInput("--model already defines towers and settings; give either --model or --preset and --init")
     with announce_resume(f"results so far are stored in {out}"):
         results = run(
             recording,
             out,
-            config=training_config(preset, iterations, **inits, photos=photos, touches=touches, seed=seed),
+            config=training_config(preset, iterations, init=init, seed=seed),
             preset="of the model" if model else Path(preset or DEFAULT_PRESET).stem,
             methods=methods.split(",") if methods else tuple(METHODS),
             model=model,

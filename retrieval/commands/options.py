@@ -40,19 +40,6 @@ Model = Annotated[
 Init = Annotated[
     str | None, typer.Option(help="initial weights of the towers: random, imagenet, shipped, or a state dict file")
 ]
-InitTower = Annotated[
-    str | None, typer.Option(help="initial weights of this tower: a file written by `train --task relief`")
-]
-LabelledPhotos = Annotated[
-    str | None,
-    typer.Option(
-        "--photos", help="additional labelled photos (from `collect --photos-only`) to train on; needs --touches"
-    ),
-]
-LabelledTouches = Annotated[
-    str | None,
-    typer.Option("--touches", help="labelled touches (from `collect --touches-only`), paired with --photos by label"),
-]
 Recording = Annotated[Path, typer.Argument(help="recording folder", show_default=False)]
 SplitFile = Annotated[Path | None, typer.Option(help=SPLIT)]
 CheckpointOut = Annotated[Path, typer.Option(help="checkpoint to write (.safetensors)")]

@@ -1,7 +1,6 @@
-"""Licences of the data that train a model, and the check of `retrieve train --require-licence`."""
+"""Licences of the data that train a model."""
 
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,14 +10,6 @@ from retrieval.errors import BadInput
 NOT_STATED = "not stated"
 LICENCES = "licences"
 """Key of a checkpoint's provenance: the fields of each DataLicence."""
-OPEN = "open"
-"""Value of `--require-licence` for all licences of `_OPEN_NAMES`."""
-
-_OPEN_NAMES = re.compile(
-    r"(cc0|cc by|cc by sa)( \d(\.\d)?)?|public domain|mit|bsd [23] clause|apache( license)? 2\.0|[al]?gpl v?[23](\.0)?"
-    r"( only| or later)?|(odc by|odbl|pddl)( 1\.0)?"
-)
-"""Licences that allow any use, commercial use included. Some of them have conditions, such as to name the authors."""
 
 
 @dataclass(frozen=True)
@@ -46,28 +37,3 @@ def stored_licences(provenance: Mapping[str, Any]) -> list[DataLicence]:
         BadInput: The provenance is damaged.
     """
     return typed(provenance.get(LICENCES, []), list[DataLicence], LICENCES, error=BadInput)
-
-
-def require_licences(found: Iterable[DataLicence], accepted: Sequence[str]) -> None:
-    """Check that the licence of each source is accepted.
-
-    Args:
-        found: The licences of all training data.
-        accepted: Names of accepted licences; `OPEN` accepts every licence that allows any use.
-
-    Raises:
-        BadInput: A licence is not accepted.
-    """
-    names = {_normalised(name) for name in accepted}
-    for each in found:
-        name = _normalised(each.licence)
-        if name not in names and not (OPEN in names and _OPEN_NAMES.fullmatch(name)):
-            raise BadInput(
-                f"--require-licence accepts {', '.join(accepted)}, but the licence of {each.source} is {each}. Use "
-                'other data, add the name to --require-licence, or correct "licence" in its recording.json'
-            )
-
-
-def _normalised(name: str) -> str:
-    """Return a licence's name in small letters with single spaces: "CC-BY-4.0" and "CC BY 4.0" are one licence."""
-    return " ".join(re.split(r"[\s_-]+", name.strip().lower()))

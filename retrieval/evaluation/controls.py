@@ -34,8 +34,6 @@ CEILINGS = {
 }
 MAX_GRASPS = 12
 """Maximum number of grasps of one object that are encoded for a control."""
-MAX_PAIRS = 2000
-"""Maximum number of labelled pairs, in total, that are encoded for a control."""
 
 
 def control_experiments(experiment: Experiment, data: EvaluationData, cache: Path, seed: int) -> dict[str, Experiment]:
@@ -55,7 +53,6 @@ def control_experiments(experiment: Experiment, data: EvaluationData, cache: Pat
     }
     grasps = thin_grasps(data.grasps, MAX_GRASPS)
     queries = draw_queries(grasps, data.split, seed)
-    pairs = data.pairs[:: len(data.pairs) // MAX_PAIRS + 1]
     for touch_variant in ("no_contact", "low_pass"):
         if touch_variant == "no_contact" and not all(len(grasp.backgrounds) == len(grasp.touches) for grasp in grasps):
             continue
@@ -65,7 +62,6 @@ def control_experiments(experiment: Experiment, data: EvaluationData, cache: Pat
             unfitted,
             folder=folder / touch_variant,
             features=encode(grasps, *towers, photo_features_from=experiment.features),
-            pairs=encode(pairs, *towers, photo_features_from=experiment.pairs) if pairs else None,
             queries=queries,
             role=f"control: {touch_variant}",
         )
@@ -105,7 +101,6 @@ def ceiling_experiments(experiment: Experiment) -> dict[str, Experiment]:
             experiment,
             folder=folder / name,
             features=each,
-            pairs=None,
             checkpoint=None,
             matcher=None,  # the features have no cells
             role=f"ceiling: {name}",

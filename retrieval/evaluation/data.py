@@ -14,7 +14,7 @@ from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
 from retrieval.training.licences import training_licences
 from retrieval.training.state import finish_training, unfinished_path
-from retrieval.training.train import Trainer, labelled_pairs
+from retrieval.training.train import Trainer
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,6 @@ class EvaluationData:
         source: Source of the recording.
         digest: Digest of the grasps.
         grasps: All grasps.
-        pairs: Labelled pairs to train on, in addition to the training objects of the split.
         split: Training, validation and test objects.
         split_from: Origin of the split, in words.
         config: Configuration of the heads that are fitted.
@@ -39,7 +38,6 @@ class EvaluationData:
     source: str
     digest: str
     grasps: list[Grasp]
-    pairs: list[Grasp]
     split: Split
     split_from: str
     config: Config
@@ -59,7 +57,7 @@ def prepare(
         recording: Folder of the recording.
         out: Folder of the results.
         config: Configuration. With a model, the model's own configuration replaces it, except for the number of
-            iterations and the paths of labelled pairs.
+            iterations.
         model: A checkpoint.
         split: The split; None for the split of the model, or without a model for a random one.
         quiet: No progress on stderr.
@@ -88,7 +86,6 @@ def prepare(
         source=recording_source(recording),
         digest=digest,
         grasps=grasps,
-        pairs=labelled_pairs(config),
         split=split,
         split_from=split_from,
         config=config,
@@ -105,8 +102,6 @@ def _of_model(checkpoint: Checkpoint, config: Config) -> Config:
         init_photo="",
         start="",
         init_touch="",
-        photos=config.training.photos,
-        touches=config.training.touches,
         iterations=config.training.iterations,
         freeze_towers=True,
     )

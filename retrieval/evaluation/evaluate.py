@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import AnyRecording, Split, folder_of
@@ -162,7 +161,6 @@ def _experiments(
         config=data.config,
         split=data.split,
         features=encode(data.grasps),
-        pairs=encode(data.pairs) if data.pairs else None,
         queries=draw_queries(data.grasps, data.split, seed),
         checkpoint=data.checkpoint,
         shuffled=False,
@@ -196,7 +194,6 @@ def _about(data: EvaluationData, experiment: Experiment, preset: str, seeds: lis
                 "photo": features.photo.shape[1],
                 "fingers": features.touch.shape[1],
                 "digest": features.digest,
-                "pairs": len(experiment.pairs) if experiment.pairs else 0,
             },
         },
     }
@@ -253,8 +250,8 @@ def _method_times(by_seed: Sequence[Mapping[str, float]]) -> dict[str, float | N
 def _tower_times(data: EvaluationData, count: int = 4, repeats: int = 3) -> dict[str, Any]:
     """Return the median times of the towers for one touch and one photo, on one thread, without reading files."""
     grasps = data.grasps[:count]
-    with BatchImages(data.config, torch.device("cpu"), keep_bytes=0) as images:
-        touches, photos = [images.touch(grasp) for grasp in grasps], [images.photo(grasp.photo) for grasp in grasps]
+    images = BatchImages(data.config, keep_bytes=0)
+    touches, photos = [images.touch(grasp) for grasp in grasps], [images.photo(grasp.photo) for grasp in grasps]
     times: dict[str, list[float]] = {"touch_ms": [], "photo_ms": []}
     for touch, photo in zip(touches * repeats, photos * repeats, strict=True):
         start = time.perf_counter()

@@ -34,7 +34,6 @@ class Experiment:
         config: Configuration of the heads.
         split: Training, validation and test objects.
         features: Tower features of all grasps.
-        pairs: Features of labelled pairs to train on, in addition to the training objects.
         queries: Touches and photos to score.
         checkpoint: A whole model, which late fusion and methods with its weights then use; None to fit them.
         shuffled: Whether touches are permuted among the objects of each part before fitting, as a control.
@@ -50,7 +49,6 @@ class Experiment:
     config: Config
     split: Split
     features: Features
-    pairs: Features | None
     queries: Queries
     checkpoint: Checkpoint | None
     shuffled: bool
@@ -89,7 +87,6 @@ class Experiment:
             "method": name,
             "seed": seed,
             "features": self.features.digest,
-            "pairs": self.pairs.digest if self.pairs else None,
             "queries": self.queries.digest,
             "split": self.split.to_dict(),
             "config": self.config.without_paths(),
@@ -108,8 +105,6 @@ class Experiment:
             return type(method).of_checkpoint(self.checkpoint, method.settings), 0.0
         features = self.features_for(name)
         train, validation = (features.of_objects(part) for part in (self.split.train, self.split.validation))
-        if self.pairs:
-            train = train.concatenate(self.features_for(name, self.pairs))
         if self.shuffled:
             train, validation = _permute_touches(train, seed), _permute_touches(validation, seed)
         start = time.perf_counter()
@@ -117,10 +112,11 @@ class Experiment:
             method.fit(train, validation)
         return method, time.perf_counter() - start
 
-    def features_for(self, name: str, features: Features | None = None) -> Features:
-        """Return the features, or others of the same towers, as a method takes them: without cells, or with them."""
-        features = features or self.features
-        return features if self.matcher is None or METHODS.load(name).uses_cells else features.pooled(self.matcher)
+    def features_for(self, name: str) -> Features:
+        """Return the features as a method takes them: without cells, or with them."""
+        if self.matcher is None or METHODS.load(name).uses_cells:
+            return self.features
+        return self.features.pooled(self.matcher)
 
 
 def _permute_touches(features: Features, seed: int) -> Features:

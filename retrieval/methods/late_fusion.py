@@ -83,8 +83,7 @@ def trained_checkpoint(settings: MethodSettings, train: Features, validation: Fe
     config = dataclasses.replace(
         config,
         matcher=dataclasses.replace(config.matcher, fingers=train.touch.shape[1]),
-        # The features already include the labelled pairs.
-        training=dataclasses.replace(config.training, seed=settings.seed, freeze_towers=True, photos="", touches=""),
+        training=dataclasses.replace(config.training, seed=settings.seed, freeze_towers=True),
     )
     with nullcontext(settings.folder) if settings.folder else tempfile.TemporaryDirectory() as folder:
         path = checkpoint_path(Path(folder), settings.seed)

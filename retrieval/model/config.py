@@ -115,18 +115,15 @@ class TrainingConfig:
     """Settings of a training run.
 
     With every weight 0 the loss is exactly the paper's. Without a loss on embeddings these stay untrained. No result
-    depends on `workers`, `prefetch` and `pinned_memory`, so checkpoints and caches omit them.
+    depends on `workers`, so checkpoints and caches omit it.
 
     Attributes:
         init: Initial weights of the towers: "random", "imagenet", "shipped", "gel" or the path of a state dict.
-        init_touch: Initial weights of the touch tower, if not empty (`retrieval.training.relief` makes such weights).
-            For concatenated towers the part "init" stands for the value of `init`.
+        init_touch: Initial weights of the touch tower, if not empty. For concatenated towers the part "init" stands for
+            the value of `init`.
         init_photo: The same for the photo tower.
         start: Checkpoint of `retrieve train` whose towers and head the training continues from, if not empty, such as
             one with frozen towers. It replaces the initial weights.
-        photos: Folder of labelled photos that are paired with `touches` by label and trained on in addition to the
-            recording (`retrieval.data.labelled_pictures`). Set both or neither.
-        touches: Folder of labelled touches.
         iterations: Optimiser steps.
         touches_per_batch: Touches in a batch. Each forms pairs with its positives and negatives.
         positives_per_touch: Photos of the touch's object in a batch.
@@ -144,24 +141,20 @@ class TrainingConfig:
         freeze_towers: Train only the layers after the towers. Every image is then encoded once per training run.
         freeze_stem: Keep the first layers of the towers (`Tower.stem_layers`) frozen if the towers are trained.
         augment: Change the images of each step at random (`retrieval.training.augmentation`), if towers are trained.
-        predict_labels: Weight of the loss of predicting relief and shape from each tower (`retrieval.training.labels`).
         distil_steps: Steps that distil the candidate encoder after training (`retrieval.training.distil`).
         validation_fraction: Fraction of the objects that are validation objects.
         test_fraction: Fraction of the objects that are test objects.
         validate_every: Steps between two validations.
         precision: "float32", "bfloat16" or "auto" (`retrieval.model.encode.autocast`).
         seed: Seed of all random choices.
-        workers: Threads that decode images; "auto" for one per core.
-        prefetch: Batches that are loaded ahead of the step.
-        pinned_memory: Copy batches to a GPU from page-locked memory while it computes.
+        workers: Processes that decode images, if towers are trained; "auto" for one per core with a GPU, and none on a
+            CPU, whose cores the towers use.
     """
 
     init: str = "imagenet"
     init_touch: str = ""
     init_photo: str = ""
     start: str = ""
-    photos: str = ""
-    touches: str = ""
     iterations: Count = 26_000
     touches_per_batch: Count = 6
     positives_per_touch: Count = 4
@@ -176,16 +169,13 @@ class TrainingConfig:
     freeze_towers: bool = False
     freeze_stem: bool = False
     augment: bool = False
-    predict_labels: Weight = 0.0
     distil_steps: Count = 600
     validation_fraction: Fraction = 0.1
     test_fraction: Fraction = 0.184
     validate_every: Count = 500
     precision: str = "auto"
     seed: Annotated[int, Meta(ge=0, lt=2**32)] = 0
-    workers: Count | str = field(default="auto", compare=False)
-    prefetch: Count = field(default=2, compare=False)
-    pinned_memory: bool = field(default=True, compare=False)
+    workers: Annotated[int, Meta(ge=0)] | str = field(default="auto", compare=False)
 
     def __post_init__(self) -> None:
         own = {name: self.weights[name] for name in sorted(self.weights) if name not in LOSSES}
@@ -195,15 +185,10 @@ class TrainingConfig:
         object.__setattr__(self, "weights", weights)
         check_fields(self, "training", ConfigError)
         auto = not isinstance(self.workers, str) or self.workers == "auto"
-        _require(auto, f'training.workers must be "auto" or a whole number >= 1, got {self.workers!r}')
+        _require(auto, f'training.workers must be "auto" or a whole number >= 0, got {self.workers!r}')
         for name, known in (("schedule", SCHEDULES), ("negatives", NEGATIVES), ("precision", PRECISIONS)):
             value = getattr(self, name)
             _require(value in known, f"training.{name} must be one of {', '.join(known)}, got {value!r}")
-        _require(
-            bool(self.photos) == bool(self.touches),
-            f"labelled photos and labelled touches must be given together; got photos {self.photos!r}, touches "
-            f"{self.touches!r}",
-        )
         held_out = (self.validation_fraction, self.test_fraction)
         _require(
             sum(held_out) < 1, f"validation_fraction and test_fraction must leave objects to train on; got {held_out}"
@@ -221,13 +206,13 @@ class TrainingConfig:
         return any(weight > 0 for name, weight in self.weights.items() if name not in LOGIT_LOSSES)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a plain dictionary, as in a TOML file, without the settings of the loader.
+        """Return a plain dictionary, as in a TOML file, without `workers`.
 
         Each loss weight is a setting of its own, `<loss>_weight`.
         """
         table: dict[str, Any] = {}
         for name, value in dataclasses.asdict(self).items():
-            if name in LOADER_SETTINGS:
+            if name == "workers":
                 continue
             weights = name == "weights"
             table |= {f"{loss}{WEIGHT_SUFFIX}": weight for loss, weight in value.items()} if weights else {name: value}
@@ -240,7 +225,7 @@ class TrainingConfig:
             name.removesuffix(WEIGHT_SUFFIX): value for name, value in table.items() if name.endswith(WEIGHT_SUFFIX)
         }
         rest = {name: value for name, value in table.items() if not name.endswith(WEIGHT_SUFFIX)}
-        known = {*cls().to_dict(), *LOADER_SETTINGS}
+        known = {*cls().to_dict(), "workers"}
         if unknown := [name for name in rest if name not in known]:
             raise ConfigError(f"training has no setting {unknown[0]!r}; known settings: {', '.join(sorted(known))}")
         return cls(**rest, weights=weights)
@@ -250,8 +235,6 @@ class TrainingConfig:
         return dataclasses.replace(self, iterations=iterations, distil_steps=min(self.distil_steps, iterations))
 
 
-LOADER_SETTINGS = ("workers", "prefetch", "pinned_memory")
-"""Settings of the loader, which change no result."""
 WEIGHT_SUFFIX = "_weight"
 """Suffix of the settings that are weights of losses."""
 SCHEDULES: dict[str, Callable[[int, int], float]] = {
@@ -330,7 +313,7 @@ class Config:
         """Return `to_dict` with the names of files and folders in place of their paths on this machine."""
         tables = self.to_dict()
         training = tables["training"]
-        for name in ("init", "init_photo", "init_touch", "start", "photos", "touches"):
+        for name in ("init", "init_photo", "init_touch", "start"):
             training[name] = TOWER_SEPARATOR.join(Path(part).name for part in training[name].split(TOWER_SEPARATOR))
         matcher = tables["matcher"]
         for part in matcher.pop("architectures"):

@@ -1,22 +1,21 @@
 """Features of the distinct images of pairs, from towers in training or from frozen towers with cached features."""
 
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+import signal
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
 
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, ImageCache
-from retrieval.data.loading import TimedFunction, map_in_order, worker_count, worker_pool
+from retrieval.data.loading import map_in_order, worker_count, worker_pool
 from retrieval.data.pairs import PairBatch
-from retrieval.errors import DatasetError, JobInterrupted
+from retrieval.errors import DatasetError, JobInterrupted, RetrievalError
 from retrieval.model.config import Config
 from retrieval.model.encode import (
     Image,
@@ -30,48 +29,31 @@ from retrieval.model.encode import (
 from retrieval.model.fusion import Matcher
 from retrieval.training import distributed
 from retrieval.training.augmentation import augment_photos, augment_touches
-from retrieval.training.disk_image_cache import DiskImageCache
+
+_KEEP_BYTES = 4 << 30
+"""Memory for decoded photos, and for decoded gel images, of all workers together."""
 
 
 @dataclass(frozen=True)
 class LoadedBatch:
-    """A batch with its images, or with the features themselves."""
+    """A batch with this rank's images, or with the features themselves."""
 
     batch: PairBatch
     touches: Tensor
     photos: Tensor
 
+    def pin_memory(self) -> "LoadedBatch":
+        """Return a copy in page-locked memory; a `DataLoader` calls this."""
+        return replace(self, touches=self.touches.pin_memory(), photos=self.photos.pin_memory())
+
 
 class BatchImages:
-    """Loader of the images of batches: worker threads (`retrieval.data.loading`), some batches ahead.
+    """The preprocessed images of grasps; decoded ones are kept in memory."""
 
-    No result depends on the settings of the loader (`TrainingConfig.workers`, `prefetch`, `pinned_memory`).
-    """
-
-    def __init__(self, config: Config, device: torch.device, *, keep_bytes: int = 4 << 30) -> None:
-        self.config, self.device = config, device
-        self.uses_background = config.preprocessing.background != "none"
-        self.decoders = TimedFunction(config.preprocessing.load_touch), TimedFunction(config.preprocessing.load_photo)
-        self._touch: ImageCache | DiskImageCache
-        self._photo: ImageCache | DiskImageCache
-        self._touch, self._photo = (ImageCache(load, keep_bytes) for load in self.decoders)
-        self._ahead = ThreadPoolExecutor(1)
-        self._workers = worker_pool(config.training.workers)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._ahead.shutdown(cancel_futures=True)
-        self._workers.shutdown(cancel_futures=True)
-
-    @property
-    def decode_rate(self) -> float | None:
-        """Images that all workers together can decode each second; None if every image came from the cache."""
-        seconds = [second for decoder in self.decoders for second in decoder.seconds]
-        return worker_count(self.config.training.workers) * len(seconds) / sum(seconds) if seconds else None
+    def __init__(self, config: Config, *, keep_bytes: int = _KEEP_BYTES) -> None:
+        settings = config.preprocessing
+        self.uses_background = settings.background != "none"
+        self._touch, self._photo = (ImageCache(load, keep_bytes) for load in (settings.load_touch, settings.load_photo))
 
     def touch(self, grasp: Grasp) -> list[Image]:
         """Return the preprocessed finger images of a grasp.
@@ -79,72 +61,108 @@ class BatchImages:
         Raises:
             DatasetError: A no-contact frame is missing.
         """
-        return [self._touch(*files) for files in self._fingers(grasp)]
-
-    def _fingers(self, grasp: Grasp) -> list[tuple[Path, ...]]:
-        """Return the files of each finger image of a grasp."""
         if not self.uses_background:
-            return [(path,) for path in grasp.touches]
+            return [self._touch(path) for path in grasp.touches]
         if len(grasp.backgrounds) != len(grasp.touches):
             raise DatasetError(
                 f"the background policy needs a no-contact frame for each finger; {grasp.grasp_id} has "
                 f'{len(grasp.backgrounds)} for {len(grasp.touches)}; set background = "none" or record them'
             )
-        return list(zip(grasp.touches, grasp.backgrounds, strict=True))
-
-    def files(self, grasp: Grasp) -> tuple[Path, ...]:
-        """Return all files of the finger images of a grasp."""
-        return grasp.touches + (grasp.backgrounds if self.uses_background else ())
+        return [self._touch(*files) for files in zip(grasp.touches, grasp.backgrounds, strict=True)]
 
     def photo(self, path: Path) -> Image:
         """Return a preprocessed photo."""
         return self._photo(path)
 
-    def fill_cache(self, folder: Path, grasps: Sequence[Grasp], *, quiet: bool = False) -> None:
-        """Decode the images of grasps into `folder`, and read them from there afterwards (`DiskImageCache`)."""
-        settings = self.config.preprocessing
-        by, workers = settings.digest(), self.config.training.workers
-        self._touch = touches = DiskImageCache(settings.load_touch, folder, "touch", by, workers)
-        touches.cache_decoded([files for grasp in grasps for files in self._fingers(grasp)], quiet=quiet)
-        self._photo = photos = DiskImageCache(settings.load_photo, folder, "photo", by, workers)
-        photos.cache_decoded([(grasp.photo,) for grasp in grasps], quiet=quiet)
+    def files(self, grasp: Grasp) -> tuple[Path, ...]:
+        """Return all files of the finger images of a grasp."""
+        return grasp.touches + (grasp.backgrounds if self.uses_background else ())
 
 
-class TrainedFeatures(BatchImages):
+@dataclass(frozen=True)
+class _RankPart:
+    """What a worker loads: the rows of a batch's touches and photos that rank `rank` encodes in step `step`."""
+
+    step: int
+    batch: PairBatch
+    touch_rows: list[int]
+    photo_rows: list[int]
+    rank: int
+
+
+class _PartLoader(Dataset[LoadedBatch | RetrievalError]):
+    """Loads the images of parts of batches, in the processes of a `DataLoader`."""
+
+    def __init__(self, config: Config, images: BatchImages) -> None:
+        self.config, self.images = config, images
+
+    def __getitem__(self, part: _RankPart) -> LoadedBatch | RetrievalError:
+        """Return the images of a part, or the error: a `DataLoader` would add a worker's traceback to its text."""
+        try:
+            return self._load(part)
+        except RetrievalError as error:
+            return error
+
+    def _load(self, part: _RankPart) -> LoadedBatch:
+        touches = touch_batch([self.images.touch(part.batch.grasps[row]) for row in part.touch_rows])
+        photos = to_batch([self.images.photo(part.batch.photos[row]) for row in part.photo_rows])
+        if self.config.training.augment:
+            touches, photos = self._augment(part, touches, photos)
+        return LoadedBatch(part.batch, touches, photos)
+
+    def _augment(self, part: _RankPart, touches: Tensor, photos: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the images, augmented. The touches and photos of an object are mirrored together."""
+        seed, batch = self.config.training.seed, part.batch
+        is_mirrored = np.random.default_rng([seed, 5, part.step]).random(1 + int(batch.photo_objects.max())) < 0.5
+        rng = np.random.default_rng([seed, 6, part.step, part.rank])
+        return (
+            augment_touches(touches, is_mirrored[batch.touch_objects[part.touch_rows]], rng),
+            augment_photos(
+                photos, len(self.config.preprocessing.views), is_mirrored[batch.photo_objects[part.photo_rows]], rng
+            ),
+        )
+
+
+def _ignore_interruption(worker: int) -> None:
+    """Leave Ctrl-C to the main process, which ends the training after the current step."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+class TrainedFeatures:
     """Features of towers in training: each rank encodes a part of the images and gathers the other parts."""
 
-    def prepare(self, matcher: Matcher, batch: PairBatch, step: int = 0) -> "Future[LoadedBatch]":
-        """Start loading this rank's part of the images of step `step`."""
-        return self._ahead.submit(self._load, batch, step)
+    def __init__(self, config: Config, device: torch.device) -> None:
+        workers = config.training.workers
+        # On a CPU the towers use every core, so workers would only take time from them.
+        self._workers = workers if isinstance(workers, int) else worker_count() if device.type == "cuda" else 0
+        self.config, self.device = config, device
+        self.images = BatchImages(config, keep_bytes=_KEEP_BYTES // max(1, self._workers))
 
-    def _load(self, batch: PairBatch, step: int) -> LoadedBatch:
-        grasps = [batch.grasps[row] for row in distributed.rank_rows(len(batch.grasps))]
-        photos = [batch.photos[row] for row in distributed.rank_rows(len(batch.photos))]
-        touch_futures = [self._workers.submit(self.touch, grasp) for grasp in grasps]
-        photo_futures = [self._workers.submit(self.photo, path) for path in photos]
-        touch_images = touch_batch([future.result() for future in touch_futures])
-        photo_images = to_batch([future.result() for future in photo_futures])
-        if self.config.training.augment:
-            touch_images, photo_images = self._augment(batch, step, touch_images, photo_images)
-        return LoadedBatch(batch, self._to_device(touch_images), self._to_device(photo_images))
-
-    def _augment(self, batch: PairBatch, step: int, touches: Tensor, photos: Tensor) -> tuple[Tensor, Tensor]:
-        """Return this rank's images, augmented. The touches and photos of an object are mirrored together."""
-        seed, objects = self.config.training.seed, 1 + int(batch.photo_objects.max())
-        is_mirrored = np.random.default_rng([seed, 5, step]).random(objects) < 0.5
-        touch_objects = batch.touch_objects[distributed.rank_rows(len(batch.grasps))]
-        photo_objects = batch.photo_objects[distributed.rank_rows(len(batch.photos))]
-        rng = np.random.default_rng([seed, 6, step, distributed.rank()])
-        with one_thread():  # another thread computes the step
-            return (
-                augment_touches(touches, is_mirrored[touch_objects], rng),
-                augment_photos(photos, len(self.config.preprocessing.views), is_mirrored[photo_objects], rng),
+    def batches(self, matcher: Matcher, batches: Iterable[tuple[int, PairBatch]]) -> Iterator[LoadedBatch]:
+        """Yield this rank's part of each batch, given with its step; the same parts for any number of workers."""
+        parts = (
+            _RankPart(
+                step,
+                batch,
+                distributed.rank_rows(len(batch.grasps)),
+                distributed.rank_rows(len(batch.photos)),
+                distributed.rank(),
             )
-
-    def _to_device(self, images: Tensor) -> Tensor:
-        """Copy images to the device, from pinned memory while the device computes."""
-        pinned = self.device.type == "cuda" and self.config.training.pinned_memory
-        return (images.pin_memory() if pinned else images).to(self.device, non_blocking=pinned)
+            for step, batch in batches
+        )
+        loader = DataLoader(
+            _PartLoader(self.config, self.images),
+            batch_size=None,
+            sampler=parts,
+            num_workers=self._workers,
+            pin_memory=self.device.type == "cuda",
+            worker_init_fn=_ignore_interruption,
+        )
+        for loaded in loader:
+            if isinstance(loaded, RetrievalError):
+                raise loaded
+            touches, photos = (each.to(self.device, non_blocking=True) for each in (loaded.touches, loaded.photos))
+            yield replace(loaded, touches=touches, photos=photos)
 
     def step_context(self) -> AbstractContextManager[None]:
         """Return the context of a training step; it changes nothing, since towers use every core."""
@@ -160,11 +178,10 @@ class TrainedFeatures(BatchImages):
 
     def eval_features(self, matcher: Matcher, pairs: PairBatch) -> tuple[Tensor, Tensor]:
         """Return features of the pairs' touches and photos, encoded without gradients."""
-        touch = touch_features(matcher, map_in_order(self._workers, self.touch, pairs.grasps))
-        return touch, photo_features(matcher, map_in_order(self._workers, self.photo, pairs.photos))
+        return _encoded(matcher, self.images, pairs.grasps, pairs.photos)
 
 
-class FrozenFeatures(BatchImages):
+class FrozenFeatures:
     """Features of frozen towers: each image is encoded once."""
 
     def __init__(self, config: Config, device: torch.device, known: Mapping[str | Path, Tensor]) -> None:
@@ -176,29 +193,20 @@ class FrozenFeatures(BatchImages):
             known: Features by grasp id (of the touch) and by photo file that need no encoding
                 (`retrieval.training.features.features_by_image`).
         """
-        super().__init__(config, device, keep_bytes=0)  # images are read once, since their features are cached
+        self.device, self.images = device, BatchImages(config, keep_bytes=0)  # images are read once
         self._features: dict[str | Path, Tensor] = dict(known)
 
-    def prepare(self, matcher: Matcher, batch: PairBatch, step: int = 0) -> "Future[LoadedBatch]":
-        """Return the features of a batch, and encode new images before returning; `step` has no effect.
-
-        This does not use the prefetch thread. PyTorch starts a separate team of workers for every calling thread, and
-        two teams on the same cores wait for each other a hundred times as long as a step computes.
-        """
-        done: Future[LoadedBatch] = Future()
-        done.set_result(self._cached_features(matcher, batch))
-        return done
+    def batches(self, matcher: Matcher, batches: Iterable[tuple[int, PairBatch]]) -> Iterator[LoadedBatch]:
+        """Yield the features of each batch, given with its step; new images are encoded when their batch comes."""
+        return (self._cached_features(matcher, batch) for _, batch in batches)
 
     @torch.inference_mode()
     def _cached_features(self, matcher: Matcher, batch: PairBatch) -> LoadedBatch:
         new = {grasp.grasp_id: grasp for grasp in batch.grasps if grasp.grasp_id not in self._features}
-        if new:
-            images = map_in_order(self._workers, self.touch, new.values())
-            self._features.update(zip(new, touch_features(matcher, images), strict=True))
         photos = [path for path in batch.photos if path not in self._features]
-        if photos:
-            photo_images = map_in_order(self._workers, self.photo, photos)
-            self._features.update(zip(photos, photo_features(matcher, photo_images), strict=True))
+        touch, photo = _encoded(matcher, self.images, list(new.values()), photos)
+        self._features.update(zip(new, touch, strict=True))
+        self._features.update(zip(photos, photo, strict=True))
         touches = torch.stack([self._features[grasp.grasp_id] for grasp in batch.grasps])
         return LoadedBatch(batch, touches, torch.stack([self._features[path] for path in batch.photos]))
 
@@ -212,12 +220,22 @@ class FrozenFeatures(BatchImages):
 
     def eval_features(self, matcher: Matcher, pairs: PairBatch) -> tuple[Tensor, Tensor]:
         """Return the features of the pairs' touches and photos."""
-        loaded = self.prepare(matcher, pairs).result()
+        loaded = self._cached_features(matcher, pairs)
         return loaded.touches, loaded.photos
 
 
 FeatureSource = TrainedFeatures | FrozenFeatures
 """The source of a training run's features."""
+
+
+def _encoded(
+    matcher: Matcher, images: BatchImages, grasps: Sequence[Grasp], photos: Sequence[Path]
+) -> tuple[Tensor, Tensor]:
+    """Return features of the touches of grasps, and of photos, encoded without gradients."""
+    with worker_pool() as pool:
+        touch = touch_features(matcher, map_in_order(pool, images.touch, grasps)) if grasps else torch.zeros(0)
+        photo = photo_features(matcher, map_in_order(pool, images.photo, photos)) if photos else torch.zeros(0)
+    return touch, photo
 
 
 _CHUNK = 64

@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from _touch_retrieval.files import file_digest
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp
 from retrieval.data.images import read_rgb
@@ -30,7 +31,6 @@ from retrieval.model.encode import batches, default_device, photo_features, touc
 from retrieval.model.fusion import Matcher
 from retrieval.model.towers.tower import Tower
 from retrieval.training.batches import BatchImages
-from retrieval.training.disk_image_cache import ImageFiles, part_path
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
@@ -42,6 +42,7 @@ PHOTO_VARIANTS = ("photo", "margin")
 _MARGIN_DIVISOR = 8  # the margin is 1 / _MARGIN_DIVISOR of each side
 _PART = 512
 _BATCH = 32
+_FORMAT = 1  # raised if the features of the same images change
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +200,7 @@ def encode_recording(
     Args:
         grasps: The grasps.
         matcher: The matcher.
-        config: The configuration, for preprocessing and workers.
+        config: The configuration, for preprocessing.
         cache: Folder of cached parts of 512 images; a later or resumed run reads them. A part's name is a digest of
             tower, preprocessing, variant and image files. None to store nothing.
         touch_variant: One of `TOUCH_VARIANTS`.
@@ -215,19 +216,19 @@ def encode_recording(
     device = default_device()
     matcher = deepcopy(matcher).to(device).eval()
     settings = _config_for_variants(config, touch_variant, photo_variant)
-    with BatchImages(settings, device, keep_bytes=0) as images:
-        touch_made_by = (touch_variant, _tower_digest(matcher.touch_tower), settings.preprocessing.digest())
-        workers, encode = config.training.workers, partial(touch_features, matcher)
-        touch = _FeatureCache(cache, touch_made_by, images.touch, encode, images.files, workers, quiet).rows(touched)
-        if photo_features_from is None:
-            photo_made_by = (photo_variant, _tower_digest(matcher.photo_tower), settings.preprocessing.digest())
-            encode = partial(photo_features, matcher)
-            parts = _FeatureCache(cache, photo_made_by, images.photo, encode, lambda file: (file,), workers, quiet)
-            files = {path: row for row, path in enumerate(dict.fromkeys(grasp.photo for grasp in grasps))}
-            photo = parts.rows(list(files))[[files[grasp.photo] for grasp in grasps]]
-        else:
-            row_of = {grasp_id: row for row, grasp_id in enumerate(photo_features_from.grasp_ids)}
-            photo = photo_features_from.photo[[row_of[grasp.grasp_id] for grasp in grasps]]
+    images = BatchImages(settings, keep_bytes=0)
+    touch_made_by = (touch_variant, _tower_digest(matcher.touch_tower), settings.preprocessing.digest())
+    encode = partial(touch_features, matcher)
+    touch = _FeatureCache(cache, touch_made_by, images.touch, encode, images.files, quiet).rows(touched)
+    if photo_features_from is None:
+        photo_made_by = (photo_variant, _tower_digest(matcher.photo_tower), settings.preprocessing.digest())
+        encode = partial(photo_features, matcher)
+        parts = _FeatureCache(cache, photo_made_by, images.photo, encode, lambda file: (file,), quiet)
+        files = {path: row for row, path in enumerate(dict.fromkeys(grasp.photo for grasp in grasps))}
+        photo = parts.rows(list(files))[[files[grasp.photo] for grasp in grasps]]
+    else:
+        row_of = {grasp_id: row for row, grasp_id in enumerate(photo_features_from.grasp_ids)}
+        photo = photo_features_from.photo[[row_of[grasp.grasp_id] for grasp in grasps]]
     return Features(
         tuple(grasp.grasp_id for grasp in grasps),
         tuple(grasp.object_id for grasp in grasps),
@@ -283,7 +284,6 @@ class _FeatureCache(Generic[T]):
         load: Returns the image (or images) of an item.
         encode: Returns features (B, F) of a list of images.
         files: Returns the files of an item.
-        workers: As for `retrieval.data.loading.worker_count`.
         quiet: No progress on stderr.
     """
 
@@ -291,8 +291,7 @@ class _FeatureCache(Generic[T]):
     made_by: tuple[str, ...]
     load: Callable[[T], Any]
     encode: Callable[[list[Any]], Tensor]
-    files: Callable[[T], ImageFiles]
-    workers: int | str
+    files: Callable[[T], tuple[Path, ...]]
     quiet: bool
 
     def rows(self, items: Sequence[T]) -> NDArray[np.float32]:
@@ -301,7 +300,7 @@ class _FeatureCache(Generic[T]):
         unit = "photos" if variant in PHOTO_VARIANTS else "grasps"
         with (
             Bar(f"encode {variant}", len(items), unit, quiet=self.quiet) as bar,
-            worker_pool(self.workers) as pool,
+            worker_pool() as pool,
         ):
             return np.concatenate([self._part(part, pool, bar) for part in batches(items, _PART)])
 
@@ -320,11 +319,19 @@ class _FeatureCache(Generic[T]):
         return features.numpy()
 
     def _path(self, items: list[T]) -> Path | None:
-        """Return the cache file of the features of these items, or None without a cache."""
+        """Return the cache file of the features of these items, or None without a cache.
+
+        Raises:
+            DatasetError: A file cannot be read.
+        """
         if self.cache is None:
             return None
-        files = [self.files(item) for item in items]
-        return part_path(self.cache, self.made_by[0], self.made_by[1:], files).with_suffix(".safetensors")
+        try:
+            digests = [[file_digest(path) for path in self.files(item)] for item in items]
+        except OSError as error:
+            raise DatasetError(f"{error.filename} cannot be read ({error.strerror}); run `retrieve check`") from error
+        key = hashlib.sha256(json.dumps([_FORMAT, *self.made_by, digests]).encode()).hexdigest()
+        return self.cache / f"{self.made_by[0]}-{key[:32]}.safetensors"
 
 
 def _read_cached(path: Path) -> Tensor | None:

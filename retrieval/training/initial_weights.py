@@ -1,4 +1,4 @@
-"""The initial weights of a matcher: random, published, pretrained on relief, or of a checkpoint."""
+"""The initial weights of a matcher: random, published, from a file, or of a checkpoint."""
 
 from functools import partial
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The licences of all data that train a model: of its recording, of labelled pictures and of the start model."""
+"""The licences of all data that train a model: of its recording and of the start model."""
 
 from pathlib import Path
 
@@ -32,7 +32,6 @@ def training_licences(recording: Path, settings: TrainingConfig) -> list[DataLic
         inits = {settings.tower_init(init) for init in (settings.init_touch, settings.init_photo)}
         for name in sorted({part for init in inits for part in init.split(TOWER_SEPARATOR)} - {"random", "imagenet"}):
             found.append(_SHIPPED if name in (SHIPPED, GEL) else DataLicence(name))
-    found += [DataLicence(folder) for folder in (settings.photos, settings.touches) if folder]
     return list(dict.fromkeys(found))
 
 

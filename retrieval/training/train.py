@@ -7,9 +7,7 @@ machine gives the same bits as an uninterrupted run.
 import dataclasses
 import math
 import threading
-import time
-from collections.abc import Mapping, Sequence
-from concurrent.futures import Future
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +16,6 @@ from torch import Tensor, nn
 from torch.autograd.graph import increment_version
 
 from retrieval.console.interruption import interruption
-from retrieval.console.output import say
 from retrieval.console.progress import Bar
 from retrieval.data.check.split import require_fit
 from retrieval.data.dataset import (
@@ -32,11 +29,9 @@ from retrieval.data.dataset import (
     make_split,
     recording_source,
 )
-from retrieval.data.labelled_pictures import ObjectLabels, load_object_labels, pair_by_label
 from retrieval.data.licences import LICENCES, DataLicence
-from retrieval.data.loading import prefetch, worker_count
-from retrieval.data.pairs import PairSampler
-from retrieval.errors import CheckpointError, ConfigError, JobInterrupted
+from retrieval.data.pairs import PairBatch, PairSampler
+from retrieval.errors import CheckpointError, JobInterrupted
 from retrieval.metrics.pairs import fit_calibration, pair_accuracy, pair_auc
 from retrieval.model.checkpoint import (
     Checkpoint,
@@ -55,7 +50,6 @@ from retrieval.training.distil import add_candidate_encoder
 from retrieval.training.features import Features, features_by_image
 from retrieval.training.fit import RATE, Plan, fit, freeze_batch_norm
 from retrieval.training.initial_weights import TOWER_WEIGHTS, build_matcher
-from retrieval.training.labels import LabelLoss
 from retrieval.training.licences import training_licences
 from retrieval.training.state import code_digest, load_state, require_no_unfinished_state, save_state, state_path
 from retrieval.training.step import WeightedLosses, batch_loss, pair_logits, shuffle_fingers
@@ -69,7 +63,6 @@ def train(
     *,
     split: Split | None = None,
     resume: bool = False,
-    cache: Path | None = None,
     quiet: bool = False,
 ) -> Checkpoint:
     """Train on a recording and write the checkpoint with the best validation score to `out`.
@@ -82,7 +75,6 @@ def train(
         config: A `Config` (`Config.using` accepts your own towers and losses), or an argument of `load_config`.
         split: Objects of each part. Default: a random split as the configuration sets it.
         resume: Continue from the state next to `out`.
-        cache: Folder of decoded images. It works only for towers that are trained.
         quiet: No progress on stderr.
 
     Raises:
@@ -98,10 +90,6 @@ def train(
     (2, 7)
     """
     recording, (config, _) = folder_of(recording), named_config(config)
-    if cache and config.training.freeze_towers:
-        raise ConfigError(
-            "a cache of decoded images is only for trained towers; frozen towers read each image once: omit the cache"
-        )
     require_writable(out)
     distributed.start()
     grasps = load_grasps(recording)
@@ -113,15 +101,12 @@ def train(
         )
     else:
         require_fit(split, grasps)
-    labels = load_object_labels(recording) if settings.predict_labels else None
     source, licences = recording_source(recording), training_licences(recording, settings)
-    trainer = Trainer(config, split, grasps, out, source, labels=labels, licences=licences)
+    trainer = Trainer(config, split, grasps, out, source, licences=licences)
     if not resume:
         require_no_unfinished_state(out)
     else:
         trainer.resume()
-    if cache:
-        trainer.features.fill_cache(cache, [*grasps, *labelled_pairs(config)], quiet=quiet or distributed.rank() > 0)
     trainer.run(quiet)
     return load_checkpoint(out)
 
@@ -137,31 +122,25 @@ class Trainer:
         out: Path,
         source: str,
         known: Features | None = None,
-        labels: Mapping[str, ObjectLabels] | None = None,
         licences: Sequence[DataLicence] = (),
     ) -> None:
         """Prepare a run.
 
-        `known`: features of all grasps. They replace the images if the towers are frozen. `labels`: labels by object.
-        `licences`: licences of the data.
+        `known`: features of all grasps. They replace the images if the towers are frozen. `licences`: licences of the
+        data.
         """
         settings = config.training
         self.config, self.split, self.out, self.source = config, split, out, source
         self.licences = [dataclasses.asdict(licence) for licence in licences]
-        pairs = labelled_pairs(config)
-        self.data_digest = known.digest if known else data_digest([*grasps, *pairs])
+        self.data_digest = known.digest if known else data_digest(grasps)
         self.device = default_device()
         torch.manual_seed(settings.seed)
         self.config_without_encoder = config.without_candidate_encoder()
         self.has_images = known is None
         self.matcher = build_matcher(self.config_without_encoder).to(self.device)
-        self.sampler = self._sampler([*split.select(grasps, "train"), *pairs])
+        self.sampler = self._sampler(split.select(grasps, "train"))
         self.losses = WeightedLosses(settings.weights, self.matcher, len(self.sampler.grasps)).to(self.device)
         self.modules = nn.ModuleDict({"matcher": self.matcher, "losses": self.losses})
-        self.label_loss = None
-        if settings.predict_labels:
-            self.label_loss = LabelLoss(self.matcher, self.sampler.objects, labels or {}).to(self.device)
-            self.modules["label_loss"] = self.label_loss
         towers = (module for module in self.matcher.modules() if isinstance(module, Tower))
         self.code = code_digest(*map(type, (*self.losses.terms, *towers)))
         groups: list[dict[str, Any]] = [{"params": []}, {"params": [], RATE: settings.tower_rate}]
@@ -183,7 +162,6 @@ class Trainer:
         for tower in (self.matcher.touch_tower, self.matcher.photo_tower):
             distributed.synchronise_batch_norm(tower, self.device)
         self.step, self.best = 0, -math.inf
-        self._image_count, self._compute_s = 0, 0.0
 
     def _sampler(self, chosen: list[Grasp]) -> PairSampler:
         settings = self.config.training
@@ -201,7 +179,7 @@ class Trainer:
         """Train from the current step to the last."""
         total = self.config.training.iterations
         quiet = quiet or distributed.rank() > 0
-        with interruption() as stop, self.features:
+        with interruption() as stop:
             if self.step < total:
                 self._steps(stop, quiet)
             self._finish(stop, quiet)
@@ -209,11 +187,13 @@ class Trainer:
     def _steps(self, stop: threading.Event, quiet: bool) -> None:
         settings = self.config.training
         plan = Plan(settings.iterations, settings.learning_rate, settings.schedule, settings.validate_every)
+        steps, touches = range(self.step, plan.steps), settings.touches_per_batch
+        batches = ((step, self.sampler.batch(step, touches)) for step in steps)
         with Bar("train", plan.steps, "steps", done=self.step, quiet=quiet) as bar:
             fit(
                 self.optimizer,
                 plan,
-                prefetch(map(self._prepare, range(self.step, plan.steps)), settings.prefetch),
+                self.features.batches(self.matcher, batches),
                 distributed.averaging_gradients(self.modules, self.loss),
                 bar=bar,
                 done=self.step,
@@ -224,37 +204,23 @@ class Trainer:
                 # All ranks must stop after the same step, or the remaining ranks would wait forever.
                 should_stop=lambda: distributed.any_rank(stop.is_set(), self.device),
             )
-        if not quiet and not settings.freeze_towers:
-            say(self._rates())
         if self.step < plan.steps:
             raise JobInterrupted(
                 f"stopped at step {self.step} of {plan.steps}; {self.out} is usable, --resume continues from here"
             )
 
-    def _rates(self) -> str:
-        """Return a sentence on the speed of the loader and of the towers; the slower one limits the training."""
-        towers = f"the towers take {self._image_count / self._compute_s:.0f} images/s"
-        if (rate := self.features.decode_rate) is None:
-            return f"loader: no image was decoded; {towers}"
-        count = worker_count(self.config.training.workers)
-        return f"loader: {count} worker(s) can decode {rate:.0f} images/s; {towers}"
-
-    def _prepare(self, step: int) -> "Future[LoadedBatch]":
-        batch = self.sampler.batch(step, self.config.training.touches_per_batch)
-        return self.features.prepare(self.matcher, batch, step)
-
     def loss(self, loaded: LoadedBatch) -> Tensor:
         """Return the loss of a prepared batch."""
-        settings, batch = self.config.training, loaded.batch
-        self._image_count += loaded.touches.shape[:2].numel() + len(loaded.photos)
-        self._step_start_s = time.perf_counter()
+        settings = self.config.training
         torch.manual_seed(settings.seed * 1_000_003 + self.step)  # the dropout mask, the same on every rank
         touch, photo = self.features.train_features(self.matcher, loaded)
         if settings.shuffle_fingers:
             touch = shuffle_fingers(touch, self.matcher.config.fingers)
+        return self.feature_loss(loaded.batch, touch, photo)
+
+    def feature_loss(self, batch: PairBatch, touch: Tensor, photo: Tensor) -> Tensor:
+        """Return the loss of a batch and the features of its touches and photos (`Matcher.touch_features`)."""
         loss, logits = batch_loss(self.matcher, self.losses, batch, touch, photo)
-        if self.label_loss is not None:
-            loss = loss + settings.predict_labels * self.label_loss(batch, touch, photo)
         self._last_logits = logits.detach(), batch.labels
         return loss
 
@@ -265,7 +231,6 @@ class Trainer:
         self.matcher.clamp_scale()
         self.losses.clamp()
         self.step = done
-        self._compute_s += time.perf_counter() - self._step_start_s
 
     def _note(self) -> str:
         logits, labels = self._last_logits
@@ -377,12 +342,6 @@ class Trainer:
 
 TOWERS = tuple(f"matcher.{prefix}" for prefix in TOWER_WEIGHTS)
 """Prefixes of the names of the towers' weights."""
-
-
-def labelled_pairs(config: Config) -> list[Grasp]:
-    """Return the grasps of the configured folders of labelled pictures; empty without such folders."""
-    photos, touches = config.training.photos, config.training.touches
-    return pair_by_label(Path(photos), Path(touches), config.matcher.fingers) if photos else []
 
 
 def set_training_mode(matcher: Matcher, settings: TrainingConfig) -> None:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from models import gel_tower, random_surfaces
-from models.random_surfaces import BODIES, GRID, RandomSurface, presses
+from models import gel_tower
+from models.random_surfaces import GRID, RandomSurface, presses
 from retrieval.model.checkpoint import read_tensors
 from retrieval.model.towers import build_tower
 from retrieval.model.towers.weights import gel_tower as packaged_gel_tower
@@ -13,43 +13,15 @@ from retrieval.model.towers.weights import initialise_tower
 from robot.sim.gel.sensor import draw_sensor
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_a_surface_touches_the_pad_at_its_highest_point_and_is_nowhere_above_it(seed):
-    gap = RandomSurface.draw(seed).gap_mm(np.random.default_rng(seed), 0.126)
+@pytest.mark.parametrize("seed", range(4))
+def test_a_press_of_a_random_surface_changes_the_gel_image(seed):
+    sensor, surface = draw_sensor(0, "a"), RandomSurface.draw(seed)
+    gap = surface.gap_mm(np.random.default_rng(seed), 0.126)
     assert gap.shape == GRID
-    assert np.isfinite(gap).all()
-    assert gap.min() == 0
-
-
-def test_a_seed_draws_the_same_surface_and_all_outlines_are_drawn():
-    assert np.array_equal(RandomSurface.draw(3).heights_mm, RandomSurface.draw(3).heights_mm)
-    assert {RandomSurface.draw(seed).outline for seed in range(60)} == set(BODIES)
-
-
-@pytest.mark.parametrize("kind", ["noise", "family", "strokes", "patches"])
-def test_textures_vary_between_about_0_and_1(kind):
-    for seed in range(4):
-        heights = getattr(random_surfaces, kind)(np.random.default_rng(seed))
-        assert heights.shape == (random_surfaces.NODES, random_surfaces.NODES)
-        assert heights.dtype == np.float32
-        assert -0.1 <= heights.min() < 0.5 < heights.max() <= 1.1
-
-
-def test_a_press_changes_the_gel_image():
-    sensor = draw_sensor(0, "a")
-    made = list(presses(RandomSurface.draw(1), sensor, np.random.default_rng(0), 3))
-    assert made
+    assert gap.min() == 0  # it touches the pad at its highest point
     frame = sensor.background(1).astype(float)
+    made = list(presses(surface, sensor, np.random.default_rng(0), 3))
     assert all(np.abs(picture - frame).mean() > 1 for picture in made)
-
-
-def test_the_changes_of_another_day_differ_by_press_and_stay_in_0_to_1():
-    pictures = np.full((1 + gel_tower.SURFACES * gel_tower.PRESSES, 32, 32, 3), 120, np.uint8)
-    batch = gel_tower.sensor_batch(pictures, np.random.default_rng(0))
-    side = gel_tower.TOUCH_PX
-    assert batch.shape == (2 * gel_tower.SURFACES_OF_STEP, 3, side, side)
-    assert 0 <= batch.min() < batch.max() <= 1
-    assert batch.mean((1, 2, 3)).std() > 0.005
 
 
 def test_the_contrast_is_lowest_if_the_presses_of_a_surface_are_alike():
@@ -73,19 +45,8 @@ def test_the_distance_from_imagenet_ignores_a_common_offset():
 def test_a_training_writes_a_tower_that_loads(tmp_path, monkeypatch):
     for name, value in {"SURFACES": 4, "SURFACES_OF_STEP": 3, "LABELLED_OF_STEP": 4, "TOUCH_PX": 64}.items():
         monkeypatch.setattr(gel_tower, name, value)
-    line = [
-        str(tmp_path),
-        "--init",
-        str(packaged_gel_tower()),
-        "--sensors",
-        "2",
-        "--labelled",
-        "12",
-        "--jobs",
-        "1",
-        "--steps",
-    ]
-    assert gel_tower.main([*line, "2"]) == 0
+    line = f"{tmp_path} --init {packaged_gel_tower()} --sensors 2 --labelled 12 --jobs 1 --steps 2"
+    assert gel_tower.main(line.split()) == 0
     tower = build_tower("mobilenet_v2", "stages")
     initialise_tower(tower, str(tmp_path / "gel-tower.safetensors"))
     before = read_tensors(packaged_gel_tower())[0]["features.10.conv.0.0.weight"]

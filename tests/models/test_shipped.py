@@ -1,17 +1,68 @@
-"""A small evaluation of the shipped checkpoint."""
+"""The making of the shipped checkpoints on a few objects, and a small evaluation of them."""
 
+import argparse
 import json
 
+import numpy as np
 import pytest
 import torch
 
 from models import shipped
+from models.labels import LabelHead
+from models.pictures import METADATA, ObjectLabels, collect_pictures
 from retrieval.data.images import to_float
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import touch_features
 from retrieval.model.fusion_scorer import NOT_A_GEL
+from retrieval.model.towers import build_tower
 from retrieval.search import defaults
 from robot.rig import load_rig
+
+
+@pytest.mark.slow
+def test_towers_are_pretrained_trained_with_labels_and_get_a_head_for_each_number_of_fingers(tmp_path, monkeypatch):
+    init, rigs = tmp_path / "mobilenet.pth", {"shipped_training.toml": (1, 1, 6)}
+    torch.save(build_tower("mobilenet_v2", "stages").state_dict(), init)
+    small = {"ROUNDS": (rigs,), "VALIDATED": (4, 3), "VERIFIED": (2, 1), "GELS": (2, 1), "HEAD_STEPS": 2}
+    for name, value in small.items():
+        monkeypatch.setattr(shipped, name, value)
+    arguments = argparse.Namespace(folder=tmp_path, init=init, photos=8, touches=8, steps=2, jobs=1)
+    assert (shipped.collect_training(arguments), shipped.collect_calibration(arguments)) == (0, 0)
+    shipped.pretrain_towers(arguments)
+    files = {f"init_{side}": str(tmp_path / f"{side}-tower.safetensors") for side in ("photo", "touch")}
+    steps = {"iterations": 2, "validate_every": 2, "touches_per_batch": 4}
+    trained = shipped.train_round(tmp_path, 0, files | steps)
+    pretrained = torch.load(init)["features.17.conv.0.0.weight"]
+    for fingers in (1, 2):
+        made = shipped.train_head(shipped.for_fingers(trained, fingers))
+        assert made.config.matcher.fingers == fingers
+        assert made.split == shipped.split_of(*trained.grasps)
+        assert not torch.equal(made.matcher.touch_tower.state_dict()["features.17.conv.0.0.weight"], pretrained)
+
+
+def test_a_stopped_collection_of_pictures_continues(tmp_path):
+    options = {"seed": 3, "jobs": 1}
+    whole = collect_pictures("touch", tmp_path / "whole", objects=3, **options)
+    assert {picture.before is None for picture in whole} == {False}
+    collect_pictures("touch", tmp_path / "parts", objects=2, **options)
+    metadata = tmp_path / "parts" / METADATA
+    metadata.write_bytes(metadata.read_bytes()[:-9])  # as a crash leaves it
+    again = collect_pictures("touch", tmp_path / "parts", objects=3, **options)
+    assert [(each.object_id, each.labels) for each in again] == [(each.object_id, each.labels) for each in whole]
+    assert [each.file.read_bytes() for each in again] == [each.file.read_bytes() for each in whole]
+
+
+def test_an_untrained_head_guesses_alike_and_ignores_the_sizes_of_smooth_objects():
+    rough, fine, smooth = (
+        ObjectLabels(("grid", "box"), (4.0, 0.5, 1.0, 0.5)),
+        ObjectLabels(("dots", "box"), (1.0, 0.1, 2.0, 1.0)),
+        ObjectLabels(("smooth", "tube"), (1.0, 0.0, 1.0, 0.0)),
+    )
+    head = LabelHead(5, [rough, fine, smooth]).eval()
+    guess = np.log(3) + np.log(2)  # cross-entropy of equal logits of three reliefs and of two shapes
+    # Each size differs from the mean of the two rough objects by one standard deviation.
+    assert head.loss(torch.randn(2, 5), [rough, fine]).item() == pytest.approx(guess + 1.0, rel=1e-4)
+    assert head.loss(torch.randn(1, 5), [smooth]).item() == pytest.approx(guess, rel=1e-4)
 
 
 @pytest.mark.slow

@@ -363,7 +363,6 @@ class _ProtocolRun:
             config=towers.config,
             split=split,
             features=features,
-            pairs=None,
             queries=draw_queries(self.facts.grasps, split, seed, MAX_GRASPS),
             checkpoint=towers.checkpoint if condition.kind in ("touch", "low_pass") else None,
             shuffled=condition.kind == "permuted",

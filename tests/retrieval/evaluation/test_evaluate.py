@@ -24,7 +24,6 @@ from retrieval.training.features import Features
 from retrieval.training.train import Trainer, train
 from tests import synthetic
 from tests.conftest import TINY
-from tests.labelled_pictures import label_recording
 
 TRAINING = dataclasses.replace(TINY.training, freeze_towers=True, validation_fraction=0.2, test_fraction=0.34)
 CONFIG = dataclasses.replace(TINY, training=TRAINING)
@@ -119,25 +118,6 @@ def test_a_users_own_method_appears_in_the_report(run, tmp_path, grasped, monkey
     monkeypatch.setattr(Method, "fit", lambda self, *_: fitted.append(self) or setattr(self, "fitted", True))
     run(out, methods=("constant", Loudest), seeds=2)
     assert [type(method) for method in fitted] == [Loudest]
-
-
-def test_labelled_pairs_train_but_neither_validate_nor_test(run, cache, tmp_path):
-    other = synthetic.write_recording(tmp_path / "apart", synthetic.make_objects(5, seed=7), 1)
-    training = dataclasses.replace(CONFIG.training, **label_recording(other, tmp_path))
-    config = dataclasses.replace(CONFIG, training=training)
-    fitted_on = []
-    with pytest.MonkeyPatch.context() as patch:
-        fit = Method.fit
-        patch.setattr(Method, "fit", lambda self, *parts: fitted_on.append(parts) or fit(self, *parts))
-        results = run(tmp_path / "report", config=config, methods=("cca", "late_fusion"))
-    assert results["setting"]["features"]["pairs"] == 5
-    assert results["setting"]["config"]["training"]["photos"] == "photos"  # without its folder
-    assert len(fitted_on) == 7  # two methods, three controls, two ceilings
-    for fitted, validation in fitted_on[:5]:
-        assert len({name for name in fitted.object_ids if name.startswith("like ")}) == 5
-        assert len(set(fitted.object_ids)) == 8 + 5
-        assert not any(name.startswith("like ") for name in validation.object_ids)
-    assert not any("like" in name for part in ("train", "validation", "test") for name in results["split"][part])
 
 
 def test_each_measure_has_an_interval_and_ten_candidates_need_ten_objects(made):

@@ -12,7 +12,7 @@ import pytest
 import retrieval
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import ConfigError
-from retrieval.model.config import LOADER_SETTINGS, Config, MatcherConfig, TrainingConfig, load_config, preset_names
+from retrieval.model.config import Config, MatcherConfig, TrainingConfig, load_config, preset_names
 from retrieval.model.fusion import Matcher
 from retrieval.model.losses import LOSSES
 from retrieval.model.towers import OUTPUTS, TOWER_SEPARATOR, TOWERS
@@ -150,7 +150,7 @@ def test_an_unknown_table_is_refused_with_the_known_ones():
 
 @pytest.mark.parametrize("table", TABLES)
 def test_an_unknown_key_is_refused_with_the_known_ones(table):
-    known = ", ".join(sorted({*TABLES[table], *(LOADER_SETTINGS if table == "training" else ())}))
+    known = ", ".join(sorted({*TABLES[table], *(["workers"] if table == "training" else [])}))
     with pytest.raises(ConfigError, match=rf"{table} has no setting 'colour'; known settings: {known}"):
         Config.from_dict({table: {"colour": 1}})
 

@@ -1,7 +1,6 @@
 """Batches of pairs over distinct images: shared images give the same gradients."""
 
 import dataclasses
-import threading
 
 import numpy as np
 import pytest
@@ -9,12 +8,14 @@ import torch
 
 from retrieval.data.dataset import load_grasps
 from retrieval.data.pairs import PairSampler
+from retrieval.errors import BadInput
 from retrieval.model.fusion import Matcher
 from retrieval.model.losses.match import match_loss
 from retrieval.training.batches import TrainedFeatures
 from retrieval.training.step import WeightedLosses, batch_loss
 from retrieval.training.train import set_training_mode
 from tests.conftest import TINY
+from tests.retrieval.training.test_train import load, same_weights, trainer_for, with_training
 
 # The paper's loss and numbers, on small pictures.
 PAPER = dataclasses.replace(
@@ -28,8 +29,7 @@ PAPER = dataclasses.replace(
 def loaded(recording):
     """A loaded batch of three touches, each with two matching and two other photos, with shared photos."""
     sampler = PairSampler(load_grasps(recording), seed=0, positives=2, negatives=2, share_photos=True)
-    with TrainedFeatures(PAPER, torch.device("cpu")) as source:
-        return source.prepare(None, sampler.batch(0, 3)).result()
+    return load(TrainedFeatures(PAPER, torch.device("cpu")), sampler.batch(0, 3))
 
 
 def new_matcher():
@@ -74,29 +74,33 @@ def test_shared_images_give_the_gradients_of_one_pair_at_a_time(loaded):
     assert max(float(grad.abs().max()) for grad in one.values()) > 1e-4
 
 
-def test_a_batch_is_loaded_on_another_thread_while_its_caller_continues(recording):
-    """A step that loads its own images would wait for each of them."""
-    batch = PairSampler(load_grasps(recording), seed=0).batch(0, 2)
-    proceed, threads = threading.Event(), set()
-    with TrainedFeatures(PAPER, torch.device("cpu")) as source:
-        load = source._photo
-
-        def waiting(path):
-            threads.add(threading.current_thread())
-            assert proceed.wait(10)
-            return load(path)
-
-        source._photo = waiting
-        upcoming = source.prepare(None, batch)
-        assert not upcoming.done()
-        proceed.set()
-        assert len(upcoming.result().photos) == len(batch.photos)
-    assert threading.main_thread() not in threads
-
-
 def test_every_distinct_image_is_loaded_once_for_a_batch(recording):
     batch = PairSampler(load_grasps(recording), seed=0, share_photos=True).batch(0, 6)
-    with TrainedFeatures(PAPER, torch.device("cpu")) as source:
-        loaded = source.prepare(None, batch).result()
+    loaded = load(TrainedFeatures(PAPER, torch.device("cpu")), batch)
     assert len(loaded.photos) == len(batch.photos) < len(np.unique(batch.photo_index)) + 1 <= 25
     assert len(loaded.touches) == 6
+
+
+@pytest.mark.parametrize("augment", [False, True])
+def test_any_number_of_workers_gives_the_same_checkpoint(augment, recording, tmp_path):
+    for workers in (0, 2):
+        config = with_training(TINY, workers=workers, augment=augment)
+        trainer_for(recording, tmp_path / f"{workers}.safetensors", config).run(quiet=True)
+    assert (tmp_path / "0.safetensors").read_bytes() == (tmp_path / "2.safetensors").read_bytes()
+
+
+def test_a_training_resumes_with_another_number_of_workers(recording, tmp_path):
+    first, other = (trainer_for(recording, tmp_path / "m.safetensors", with_training(TINY, workers=n)) for n in (0, 2))
+    first._validate_and_save()
+    other.resume()
+    assert same_weights(first.matcher.state_dict(), other.matcher.state_dict())
+
+
+def test_an_error_in_a_worker_is_the_plain_error(recording):
+    source = TrainedFeatures(with_training(TINY, workers=1), torch.device("cpu"))
+    batch = PairSampler(load_grasps(recording), seed=0).batch(0, 2)
+    missing = dataclasses.replace(batch.grasps[0], touches=(recording / "gone.png",) * 2)
+    with pytest.raises(BadInput) as failed:
+        load(source, dataclasses.replace(batch, grasps=[missing, *batch.grasps[1:]]))
+    assert "gone.png" in str(failed.value)
+    assert "Traceback" not in str(failed.value)

@@ -1,4 +1,4 @@
-"""Licences: which ones --require-licence accepts, and that checkpoint, model card and export repeat them."""
+"""Licences of training data: checkpoint, model card and export repeat them."""
 
 import dataclasses
 import json
@@ -8,9 +8,8 @@ import onnx
 import pytest
 
 from retrieval.adaptation.recipe import adapt
-from retrieval.commands.main import main
 from retrieval.data.dataset import recording_licence
-from retrieval.data.licences import DataLicence, require_licences, stored_licences
+from retrieval.data.licences import DataLicence, stored_licences
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.export import touch_encoder_to_onnx
@@ -37,49 +36,6 @@ def licensed(recording, tmp_path):
     return copy
 
 
-@pytest.mark.parametrize(
-    "licence",
-    [
-        "CC0 1.0",
-        "CC BY 4.0",
-        "cc-by-sa-4.0",
-        "MIT",
-        "Apache-2.0",
-        "BSD-3-Clause",
-        "GPL-3.0",
-        "LGPL-3.0-or-later",
-        "ODbL",
-    ],
-)
-def test_open_accepts_licences_that_allow_any_use(licence):
-    require_licences([DataLicence("data", licence)], ["open"])
-
-
-@pytest.mark.parametrize(
-    "licence",
-    [
-        "not stated",
-        "",
-        "CC BY-NC 4.0",
-        "CC-BY-NC-SA-4.0",
-        "CC BY-ND 4.0",
-        "MIT, research only",
-        "see its page",
-        "openly",
-    ],
-)
-def test_open_refuses_all_other_licences(licence):
-    with pytest.raises(BadInput, match="--require-licence accepts open, but the licence of data is"):
-        require_licences([DataLicence("data", licence)], ["open"])
-
-
-def test_a_licence_is_accepted_by_its_name_in_any_spelling():
-    found = [DataLicence("data", "CC BY-NC 4.0"), DataLicence("more", "MIT")]
-    require_licences(found, ["open", "cc-by-nc-4.0"])
-    with pytest.raises(BadInput, match="the licence of more is MIT"):
-        require_licences(found, ["cc-by-nc-4.0"])
-
-
 def test_a_recording_without_a_licence_is_not_stated(recording, licensed):
     assert recording_licence(recording).licence == "not stated"
     assert str(recording_licence(licensed("MIT"))) == f"MIT ({TERMS})"
@@ -88,11 +44,11 @@ def test_a_recording_without_a_licence_is_not_stated(recording, licensed):
 def test_the_licences_of_a_training_are_those_of_all_its_data(recording, licensed, tmp_path):
     start = tmp_path / "start.safetensors"
     train(licensed("CC BY 4.0"), start, TINY, quiet=True)
-    settings = dataclasses.replace(SETTINGS, init_touch="tower.safetensors", photos="p", touches="t")
-    own, *others = DataLicence(recording_licence(recording).source), DataLicence("p"), DataLicence("t")
-    assert training_licences(recording, settings) == [own, DataLicence("tower.safetensors"), *others]
+    settings = dataclasses.replace(SETTINGS, init_touch="tower.safetensors")
+    own = DataLicence(recording_licence(recording).source)
+    assert training_licences(recording, settings) == [own, DataLicence("tower.safetensors")]
     started = dataclasses.replace(settings, start=str(start))  # the towers of the checkpoint replace the file
-    assert training_licences(recording, started) == [own, DataLicence(own.source, "CC BY 4.0", TERMS), *others]
+    assert training_licences(recording, started) == [own, DataLicence(own.source, "CC BY 4.0", TERMS)]
 
 
 def test_a_shipped_model_is_mit_and_an_older_checkpoint_not_stated(model, tmp_path):
@@ -124,20 +80,3 @@ def test_an_adapted_model_lists_the_licences_of_both_data(licensed, model, tmp_p
     adapt(licensed("CC BY 4.0"), out, load_checkpoint(model), init="none", quiet=True)
     licences = stored_licences(load_checkpoint(out).provenance)
     assert [each.licence for each in licences] == ["not stated", "CC BY 4.0"]
-
-
-@pytest.mark.parametrize("task", ["match", "grasp-success"])
-def test_the_command_refuses_a_licence_before_it_trains(task, licensed, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    command = ["train", str(licensed("CC BY-NC 4.0")), "--task", task, "--out", "m.safetensors"]
-    assert main([*command, "--require-licence", "open"]) == 2
-    error = capsys.readouterr().err
-    assert f": CC BY-NC 4.0 ({TERMS})" in error
-    assert "--require-licence accepts open, but the licence of" in error
-    assert "add the name to --require-licence" in error
-    assert not (tmp_path / "m.safetensors").exists()
-
-
-def test_pretraining_on_labelled_pictures_refuses_the_option(tmp_path, capsys):
-    assert main(["train", "r", "--task", "relief", "--out", "t.safetensors", "--require-licence", "open"]) == 2
-    assert "--require-licence does not apply to --task relief" in capsys.readouterr().err

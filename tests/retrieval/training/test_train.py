@@ -30,7 +30,6 @@ from retrieval.training.state import state_path
 from retrieval.training.step import WeightedLosses, batch_loss, shuffle_fingers
 from retrieval.training.train import Trainer, set_training_mode, train
 from tests.conftest import TINY
-from tests.labelled_pictures import label_recording
 from tests.waiting import run_process, wait_until
 
 CPU = torch.device("cpu")
@@ -38,6 +37,11 @@ CPU = torch.device("cpu")
 
 def with_training(config, **changes):
     return dataclasses.replace(config, training=dataclasses.replace(config.training, **changes))
+
+
+def load(source, batch, step=0):
+    """Return the loaded batch of a step."""
+    return next(iter(source.batches(None, [(step, batch)])))
 
 
 def trainer_for(recording, out, config=TINY):
@@ -58,24 +62,8 @@ def test_each_distinct_image_passes_through_its_tower_once(recording, tmp_path, 
         tower.register_forward_hook(
             lambda _, images, __, name=name: counts.update({name: counts[name] + len(images[0])})
         )
-    with trainer.features as features:
-        trainer.loss(features.prepare(trainer.matcher, batch).result())
+    trainer.loss(load(trainer.features, batch))
     assert counts == {"touch": 2 * 4, "photo": len(set(batch.photos))}
-
-
-def test_labelled_pairs_are_for_training_only(recording, tmp_path):
-    config = with_training(TINY, **label_recording(recording, tmp_path))
-    trainer, plain = (trainer_for(recording, tmp_path / "m.safetensors", each) for each in (config, TINY))
-    assert len(trainer.sampler.objects) == len(plain.sampler.objects) + 12
-    assert {name for name in trainer.sampler.objects if not name.startswith("like ")} == set(plain.sampler.objects)
-    assert trainer.validation.grasps == plain.validation.grasps
-    assert trainer.data_digest != plain.data_digest
-    assert trainer.split == plain.split
-
-
-def test_labelled_photos_without_touches_are_refused():
-    with pytest.raises(ConfigError, match="labelled photos and labelled touches must be given together"):
-        with_training(TINY, photos="photos")
 
 
 def test_the_loss_of_a_batch_is_the_mean_over_its_single_pairs(recording):
@@ -85,14 +73,10 @@ def test_the_loss_of_a_batch_is_the_mean_over_its_single_pairs(recording):
     torch.manual_seed(0)
     matcher = build_matcher(config)
     sampler = PairSampler(load_grasps(recording), seed=0)
-    with TrainedFeatures(config, CPU) as source:
-        loaded = source.prepare(matcher, sampler.batch(0, 3)).result()
-        loss, logits = batch_loss(
-            matcher,
-            WeightedLosses(config.training.weights, matcher, 9),
-            loaded.batch,
-            *source.train_features(matcher, loaded),
-        )
+    source = TrainedFeatures(config, CPU)
+    loaded = load(source, sampler.batch(0, 3))
+    losses = WeightedLosses(config.training.weights, matcher, 9)
+    loss, logits = batch_loss(matcher, losses, loaded.batch, *source.train_features(matcher, loaded))
     batch = loaded.batch
     one_by_one = torch.cat(
         [
@@ -109,9 +93,9 @@ def test_each_loss_is_added_with_its_weight(recording):
     config = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, dropout=0.0))
     torch.manual_seed(0)
     matcher = build_matcher(config)
-    with TrainedFeatures(config, CPU) as source:
-        loaded = source.prepare(matcher, PairSampler(load_grasps(recording), seed=0).batch(0, 3)).result()
-        features = [part.detach() for part in source.train_features(matcher, loaded)]
+    source = TrainedFeatures(config, CPU)
+    loaded = load(source, PairSampler(load_grasps(recording), seed=0).batch(0, 3))
+    features = [part.detach() for part in source.train_features(matcher, loaded)]
     matcher.eval()
     loss, logits = batch_loss(matcher, WeightedLosses(config.training.weights, matcher, 9), loaded.batch, *features)
     touch, photo = matcher.touch_encoding(features[0]), matcher.photo_encoding(features[1])
@@ -419,8 +403,7 @@ from retrieval.training.step import WeightedLosses, batch_loss
 from retrieval.training.initial_weights import build_matcher
 from retrieval.training.train import set_training_mode
 from tests.conftest import TINY
-from tests.labelled_pictures import label_recording
-from tests.retrieval.training.test_train import with_training
+from tests.retrieval.training.test_train import load, with_training
 
 torch.set_num_threads(1)
 distributed.start()
@@ -450,11 +433,11 @@ def loss(loaded):
     return batch_loss(matcher, losses, batch, touch, photo)[0]
 
 
-with TrainedFeatures(config, torch.device("cpu")) as source:
-    loaded = source.prepare(matcher, PairSampler(load_grasps(Path(sys.argv[1])), seed=0).batch(0, 5)).result()
-    torch.manual_seed(1)
-    averaged = distributed.averaging_gradients(torch.nn.ModuleList([matcher, losses]), loss)
-    averaged(loaded).backward()
+source = TrainedFeatures(config, torch.device("cpu"))
+loaded = load(source, PairSampler(load_grasps(Path(sys.argv[1])), seed=0).batch(0, 5))
+torch.manual_seed(1)
+averaged = distributed.averaging_gradients(torch.nn.ModuleList([matcher, losses]), loss)
+averaged(loaded).backward()
 if distributed.rank() == 0:
     torch.save({name: value.grad for name, value in matcher.named_parameters() if value.grad is not None}, sys.argv[2])
 distributed.stop()

@@ -1,21 +1,15 @@
-"""Training of towers: a frozen stem, augmentation, and the loss of predicting labels."""
+"""Training of towers: a frozen stem and augmentation."""
 
 import dataclasses
-import json
-import math
-import shutil
 
 import numpy as np
 import pytest
 import torch
 
-from retrieval.data.dataset import load_grasps, make_split
-from retrieval.data.labelled_pictures import ObjectLabels, load_object_labels
-from retrieval.errors import ConfigError, DatasetError
+from retrieval.errors import ConfigError
 from retrieval.training.augmentation import augment_photos, augment_touches
-from retrieval.training.labels import LabelHead, LabelLoss
-from retrieval.training.train import Trainer, train
 from tests.conftest import TINY
+from tests.retrieval.training.test_train import load, trainer_for, with_training
 
 CONFIG = dataclasses.replace(
     TINY,
@@ -33,36 +27,11 @@ CONFIG = dataclasses.replace(
     ),
     preprocessing=dataclasses.replace(TINY.preprocessing, touch_px=32, photo_px=32, views=("whole", "zoom")),
 )
-ROUGH = ObjectLabels(("grid", "box"), (4.0, 0.5, 1.0, 0.5))
-FINE = ObjectLabels(("dots", "box"), (1.0, 0.1, 2.0, 1.0))
-SMOOTH = ObjectLabels(("smooth", "tube"), (1.0, 0.0, 1.0, 0.0))
-
-
-def with_training(config, **settings):
-    return dataclasses.replace(config, training=dataclasses.replace(config.training, **settings))
 
 
 @pytest.fixture
 def new_trainer(recording, tmp_path):
-    def new(config=CONFIG, labels=None):
-        grasps = load_grasps(recording)
-        split = make_split(grasps, validation=0.25, test=0.2, seed=0)
-        return Trainer(config, split, grasps, tmp_path / "m.safetensors", source="test", labels=labels)
-
-    return new
-
-
-@pytest.fixture
-def labelled(recording, tmp_path):
-    """Return a function that copies the recording, with labels of its objects, as the simulated rig writes them."""
-
-    def make(labels):
-        folder = shutil.copytree(recording, tmp_path / "labelled", dirs_exist_ok=True)
-        info = json.loads((recording / "recording.json").read_text())
-        (folder / "recording.json").write_text(json.dumps(info | {"objects": labels}))
-        return folder
-
-    return make
+    return lambda config=CONFIG: trainer_for(recording, tmp_path / "m.safetensors", config)
 
 
 # The stem --------------------------------------------------------------------------------------------------------
@@ -114,76 +83,10 @@ def test_the_views_of_a_photo_are_flipped_together_left_to_right_and_stay_in_the
 def test_a_step_depends_on_its_number_alone_and_no_two_steps_show_the_same_images(new_trainer):
     trainer = new_trainer(with_training(CONFIG, augment=True))
     batch = trainer.sampler.batch(0, 4)
-    with trainer.features as source:
-        first, again, next_step = (source.prepare(trainer.matcher, batch, step).result() for step in (3, 3, 4))
+    first, again, next_step = (load(trainer.features, batch, step) for step in (3, 3, 4))
     assert torch.equal(first.touches, again.touches)
     assert torch.equal(first.photos, again.photos)
     assert not torch.equal(first.touches, next_step.touches)
     plain = new_trainer()
-    with plain.features as source:
-        one, other = (source.prepare(plain.matcher, batch, step).result() for step in (3, 4))
+    one, other = (load(plain.features, batch, step) for step in (3, 4))
     assert torch.equal(one.touches, other.touches)
-
-
-# Labels ----------------------------------------------------------------------------------------------------------
-
-
-def test_an_untrained_head_predicts_every_family_alike_and_the_mean_size():
-    head = LabelHead(5, [ROUGH, FINE, SMOOTH]).eval()
-    relief, shape, sizes = head(torch.randn(2, 5))
-    assert head.families == [["dots", "grid", "smooth"], ["box", "tube"]]
-    assert torch.equal(relief, torch.zeros(2, 3))
-    assert torch.equal(shape, torch.zeros(2, 2))
-    assert torch.equal(sizes, torch.zeros(2, 4))
-
-
-def test_sizes_are_standardised_over_the_objects_with_a_relief_and_those_of_smooth_objects_are_left_out_of_the_loss():
-    head = LabelHead(5, [ROUGH, FINE, SMOOTH]).eval()
-    # Two values differ from their mean by one standard deviation, on either side.
-    np.testing.assert_allclose(head.size_targets([ROUGH, FINE]).numpy(), [[1, 1, -1, -1], [-1, -1, 1, 1]], rtol=1e-4)
-    guess = math.log(3) + math.log(2)  # cross-entropy of equal logits of three reliefs and of two shapes
-    assert head.loss(torch.randn(2, 5), [ROUGH, FINE]).item() == pytest.approx(guess + 1.0, rel=1e-4)
-    assert head.loss(torch.randn(1, 5), [SMOOTH]).item() == pytest.approx(guess, rel=1e-4)
-
-
-def test_the_loss_of_labels_is_added_with_its_weight_and_reaches_both_towers(new_trainer, recording):
-    objects = sorted({grasp.object_id for grasp in load_grasps(recording)})
-    labels = {name: (ROUGH, FINE)[number % 2] for number, name in enumerate(objects)}
-    found = []
-    for weight in (0.0, 2.0):
-        trainer = new_trainer(with_training(CONFIG, predict_labels=weight), labels)
-        trainer.matcher.eval()  # statistics of random weights are extreme in training mode
-        batch = trainer.sampler.batch(0, 4)
-        with trainer.features as source:
-            loaded = source.prepare(trainer.matcher, batch, 0).result()
-            found.append(float(trainer.loss(loaded).detach()))
-    touch, photo = trainer.features.train_features(trainer.matcher, loaded)
-    assert isinstance(trainer.label_loss, LabelLoss)
-    extra = trainer.label_loss(batch, touch, photo)
-    assert found[1] - found[0] == pytest.approx(2.0 * math.log(2) * 2 + 4.0, rel=0.05)
-    for head in (trainer.label_loss.touch, trainer.label_loss.photo):
-        torch.nn.init.normal_(head.layers[-1].weight)
-    trainer.label_loss(batch, touch, photo).backward()
-    assert extra.item() > 0
-    for tower in (trainer.matcher.touch_tower, trainer.matcher.photo_tower):
-        assert float(tower.features[17].conv[2].weight.grad.abs().sum()) > 0
-
-
-def test_labels_come_from_the_recording_and_an_object_without_them_is_named(labelled, recording, tmp_path):
-    config = with_training(CONFIG, predict_labels=1.0)
-    row = {"relief": "grid", "shape": "box", "pitch_mm": 2, "amplitude_mm": 0.2, "aspect": 1, "sharpness": 0.5}
-    other = {**row, "relief": "dots", "pitch_mm": 3, "amplitude_mm": 0.3, "aspect": 2, "sharpness": 1.0}
-    objects = sorted({grasp.object_id for grasp in load_grasps(recording)})
-    with pytest.raises(DatasetError, match=r"needs the labels .*; \S+ has none: set predict_labels = 0"):
-        train(labelled({}), tmp_path / "a.safetensors", config, quiet=True)
-    folder = labelled({name: (row, other)[number % 2] for number, name in enumerate(objects)})
-    assert load_object_labels(folder)[objects[0]] == ObjectLabels(("grid", "box"), (2.0, 0.2, 1.0, 0.5))
-    assert train(folder, tmp_path / "b.safetensors", config, quiet=True).provenance["step"] == 2
-
-
-def test_impossible_labels_are_refused_with_the_value(labelled):
-    row = {"relief": "grid", "shape": "box", "pitch_mm": -2, "amplitude_mm": 1, "aspect": 1, "sharpness": 0.5}
-    with pytest.raises(
-        DatasetError, match=r"must hold the labels of each object; pitch .* got \(-2.0, 1.0, 1.0, 0.5\)"
-    ):
-        load_object_labels(labelled({"mug": row}))

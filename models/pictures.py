@@ -1,0 +1,158 @@
+"""Labelled pictures of simulated objects, which need no grasp: photos, or presses of both fingers.
+
+    metadata.jsonl    a line for each object: object_id, its labels (`robot.sim.objects.draw.SimObject.labels`), and
+                      the names of its pictures under "pictures": photo, or touch_a, touch_a_before, touch_b, ...
+    images/           the pictures
+
+A photographed object takes a tenth of the time of a grasp, and a press a third. An object's line is written when its
+pictures are on disk; an interrupted collection continues.
+"""
+
+import functools
+import itertools
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.console.progress import Bar
+from retrieval.data.dataset import recorded_objects
+from robot.rig import load_rig
+from robot.sim.rig import SimRig
+from robot.storage import append_line, file_content, sync_threads, write_files
+from robot.workers import Work, WorkerPool
+
+FAMILIES = ("relief", "shape")
+SIZES = ("pitch_mm", "amplitude_mm", "aspect", "sharpness")
+MIN_AMPLITUDE_MM = 0.05
+"""Smaller amplitudes are raised to this one."""
+MAX_PRESSES = 3
+"""Maximum number of presses of one object until the jaws meet it."""
+IMAGES, METADATA = "images", "metadata.jsonl"
+Pictures = dict[str, NDArray[np.uint8]]
+
+
+@dataclass(frozen=True)
+class ObjectLabels:
+    """The properties of a simulated object that both its touches and its photos show.
+
+    Attributes:
+        families: Its relief and shape families, in the order of `FAMILIES`.
+        sizes: Sizes of its relief, in the order of `SIZES`; the amplitude of a smooth object is 0.
+    """
+
+    families: tuple[str, ...]
+    sizes: tuple[float, ...]
+
+    @property
+    def is_smooth(self) -> bool:
+        """Whether the object has no relief; its pitch, aspect and sharpness then have no meaning."""
+        return self.sizes[SIZES.index("amplitude_mm")] == 0
+
+    @property
+    def size_targets(self) -> tuple[float, ...]:
+        """`sizes` for regression: logarithms of all but the sharpness."""
+        pitch, amplitude, aspect, sharpness = self.sizes
+        return math.log(pitch), math.log(max(amplitude, MIN_AMPLITUDE_MM)), math.log(aspect), sharpness
+
+    @classmethod
+    def from_dict(cls, row: Mapping[str, Any]) -> "ObjectLabels":
+        """Read the labels that the simulated rig writes."""
+        return cls(tuple(row[name] for name in FAMILIES), tuple(float(row[name]) for name in SIZES))
+
+
+@dataclass(frozen=True)
+class LabelledPicture:
+    """A photo, or one finger's gel image with its no-contact frame, and the labels of its object."""
+
+    file: Path
+    before: Path | None
+    object_id: str
+    labels: ObjectLabels
+
+
+def load_object_labels(recording: Path) -> dict[str, ObjectLabels]:
+    """Return the labels of the objects of a simulated recording, from its recording.json."""
+    return {name: ObjectLabels.from_dict(row) for name, row in recorded_objects(recording).items()}
+
+
+def collect_pictures(
+    kind: str, folder: Path, *, objects: int, seed: int, rig: str = "sim", jobs: int = 1
+) -> list[LabelledPicture]:
+    """Photograph or press the first objects of a simulated rig, or continue; return all pictures.
+
+    Args:
+        kind: "photo" (one picture of each object) or "touch" (one of each finger).
+        folder: The folder to write or continue. It must belong to the same kind, seed and rig.
+        objects: Number of objects.
+        seed: Seed of the rig.
+        rig: "sim" or the TOML file of a simulated rig.
+        jobs: Number of worker processes.
+    """
+    make = functools.partial(_worker, kind, rig, seed)
+    names = _sim_rig(rig, seed).object_ids(objects)
+    (folder / IMAGES).mkdir(parents=True, exist_ok=True)
+    lines = (folder / METADATA).read_bytes().splitlines(keepends=True) if (folder / METADATA).exists() else []
+    whole = [line for line in lines if line.endswith(b"\n")]  # a crash may cut the last one
+    (folder / METADATA).write_bytes(b"".join(whole))
+    done = {json.loads(line)["object_id"] for line in whole}
+    missing = iter([name for name in names if name not in done])
+    with (
+        Bar(f"collect {kind}", len(names), "objects", done=len(done)) as bar,
+        WorkerPool(jobs, make(), make) as workers,
+        sync_threads() as threads,
+        open(folder / METADATA, "r+b", buffering=0) as metadata,
+    ):
+        waiting = [(name, workers.submit(name, 0)) for name in itertools.islice(missing, workers.window)]
+        while waiting:
+            name, result = waiting.pop(0)
+            waiting += [(new, workers.submit(new, 0)) for new in itertools.islice(missing, 1)]
+            pictures, labels = result()
+            files, contents = {}, {}
+            for which, pixels in pictures.items():
+                data, suffix = file_content(which, pixels)
+                files[which] = f"{IMAGES}/{name}-{which}{suffix}"
+                contents[folder / files[which]] = data
+            write_files(contents, threads)
+            row = json.dumps({"object_id": name, **labels, "pictures": files}) + "\n"
+            append_line(metadata, metadata.seek(0, 2), row.encode())
+            bar.advance()
+    return load_pictures(folder)
+
+
+def load_pictures(folder: Path) -> list[LabelledPicture]:
+    """Return the pictures that `collect_pictures` wrote; each finger of a press is one picture."""
+    pictures = []
+    for line in (folder / METADATA).read_text().splitlines():
+        row = json.loads(line)
+        files = {name: folder / file for name, file in row["pictures"].items()}
+        for name, file in files.items():
+            if not name.endswith("_before"):
+                before = files.get(f"{name}_before")
+                pictures.append(LabelledPicture(file, before, row["object_id"], ObjectLabels.from_dict(row)))
+    return pictures
+
+
+def _sim_rig(rig: str, seed: int) -> SimRig:
+    loaded = load_rig(rig, seed=seed)
+    assert isinstance(loaded, SimRig)
+    return loaded
+
+
+def _worker(kind: str, rig: str, seed: int) -> Work[tuple[Pictures, Mapping[str, Any]]]:
+    sim_rig = _sim_rig(rig, seed)
+
+    def photograph(object_id: str, number: int) -> tuple[Pictures, Mapping[str, Any]]:
+        sim_rig.prepare(object_id, number)
+        return {"photo": sim_rig.sim_state.current_scene().image("photo")}, sim_rig.labels(object_id)
+
+    def press(object_id: str, number: int) -> tuple[Pictures, Mapping[str, Any]]:
+        tries = (sim_rig.press(object_id, number + each) for each in range(MAX_PRESSES))
+        return next((pictures for pictures in tries if pictures), {}), sim_rig.labels(object_id)
+
+    return photograph if kind == "photo" else press
