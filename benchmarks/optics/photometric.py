@@ -26,7 +26,7 @@ from benchmarks.optics.least_squares import Matrix
 from benchmarks.optics.model_choice import Fit, fit, held_out_error, picture_error, select, to_optics
 from benchmarks.optics.real_presses import BALLS_MM, Presses, find_presses, read_presses
 from robot.errors import BadRobotInput, RobotError
-from robot.sim.gel.fitted_optics import FORMAT, optics_to_json
+from robot.sim.gel.fitted_optics import optics_to_json
 
 FIT_COUNT = {"gelsight": 36, "gelsight_mini": 18}
 SPLITS = 5
@@ -113,7 +113,6 @@ def document(presses: Presses, scores: dict[str, Scores]) -> dict[str, Any]:
     fitted = fit(presses, everything, setting, align=True)
     figures = {name: one.summary() for name, one in scores.items()}
     return {
-        "format": FORMAT,
         "sensor": presses.name,
         "source": SOURCE,
         "setting": asdict(setting),

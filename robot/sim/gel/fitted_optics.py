@@ -21,12 +21,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from robot.errors import BadRobotInput, UnknownName
-from robot.settings import TypedSettings, build
+from _touch_retrieval.documents import typed
+from robot.errors import UnknownName
 from robot.sim.gel.optics import Optics
 from robot.sim.gel.surface import Array, Field, Surface, resized
 
-FORMAT = 1
 CHANNELS = 3
 _COARSE = 4  # image pixels per point of the smoothed maps; the shortest reach is many pixels
 
@@ -34,7 +33,7 @@ Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class FittedLimits(TypedSettings):
+class FittedLimits:
     """Ranges of the fitted presses; every input is clipped to them.
 
     Attributes:
@@ -57,7 +56,7 @@ class FittedLimits(TypedSettings):
 
 
 @dataclass(frozen=True)
-class FittedOptics(TypedSettings, Optics):
+class FittedOptics(Optics):
     """Optics of a fitted sensor.
 
     Attributes:
@@ -68,9 +67,6 @@ class FittedOptics(TypedSettings, Optics):
         flat_degree: degree of the backdrop.
         flat: (terms, 3) coefficients of the backdrop.
         limits: ranges of the fitted presses.
-
-    Raises:
-        BadRobotInput: The sizes do not match, or a number is not finite.
     """
 
     degree: int
@@ -80,16 +76,6 @@ class FittedOptics(TypedSettings, Optics):
     flat_degree: int
     flat: tuple[tuple[float, ...], ...]
     limits: FittedLimits
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        weights = (feature_count(self.degree, len(self.reaches_mm)) * self.places, CHANNELS)
-        flat = (len(place_powers(self.flat_degree)), CHANNELS)
-        if np.shape(self.weights) != weights or np.shape(self.flat) != flat:
-            raise BadRobotInput(
-                f"weights and flat must be {weights} and {flat} numbers for this degree, "
-                f"got {np.shape(self.weights)} and {np.shape(self.flat)}; fit again"
-            )
 
     def backdrop(self, field: Field) -> Array:
         """Return the fitted backdrop (rows, cols, 3)."""
@@ -202,18 +188,8 @@ def load_fitted(name: str) -> FittedOptics:
 
 
 def optics_from_json(content: dict[str, Any]) -> FittedOptics:
-    """Build the optics from a fitted file.
-
-    Raises:
-        BadRobotInput: The format is another one, or keys are missing.
-    """
-    if content.get("format") != FORMAT:
-        raise BadRobotInput(f"a fitted sensor must have format {FORMAT}, got {content.get('format')!r}; fit again")
-    model = content.get("model")
-    if not isinstance(model, dict) or not isinstance(model.get("limits"), dict):
-        raise BadRobotInput("a fitted sensor must have a model with its limits; fit again")
-    limits = build(FittedLimits, model["limits"], where="limits")
-    return build(FittedOptics, {name: value for name, value in model.items() if name != "limits"}, limits=limits)
+    """Build the optics from the content of a fitted file."""
+    return typed(content["model"], FittedOptics, "model")
 
 
 def optics_to_json(optics: FittedOptics) -> dict[str, Any]:

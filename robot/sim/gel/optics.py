@@ -19,7 +19,6 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from robot.errors import RobotConfigError
 from robot.sim.gel.pixels import shade_by_bars
 from robot.sim.gel.surface import Array, Field, Surface, resized
 
@@ -60,11 +59,6 @@ class LedBar:
     length_mm: float = 12.0
     points: int = 4
     order: float = 1.0
-
-    def __post_init__(self) -> None:
-        lengths = (self.distance_mm, self.height_mm)
-        if not all(0 < value < math.inf for value in lengths) or self.points < 1 or self.order < 0:
-            raise RobotConfigError(f"a bar of LEDs must be above the gel and have at least one LED, got {self}")
 
     def positions(self) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
         """Return x, y, z (points, 3) of the LEDs in mm, y down."""
@@ -121,9 +115,6 @@ class LedOptics(Optics):
         ambient: fraction of the light that comes from all directions (reflected inside the gel).
         shadow: fraction of a bar's light that the surface can block; 0 skips cast shadows.
         gamma: exponent of the camera's response; the flat gel does not depend on it.
-
-    Raises:
-        RobotConfigError: A fraction is outside 0 to 1, `gamma` is not above 0, or `mix` does not fit the bars.
     """
 
     bars: tuple[LedBar, ...] = MINI_BARS
@@ -132,16 +123,6 @@ class LedOptics(Optics):
     ambient: float = 0.38
     shadow: float = 0.25
     gamma: float = 1.0
-
-    def __post_init__(self) -> None:
-        if not (0 <= self.ambient <= 1 and 0 <= self.shadow <= 1):
-            raise RobotConfigError(f"ambient and shadow must be 0 to 1, got {self.ambient} and {self.shadow}")
-        if not self.bars or any(len(row) != len(self.bars) for row in self.mix):
-            raise RobotConfigError(f"mix must have a column for each of the {len(self.bars)} bars, got {self.mix}")
-        if any(abs(sum(row) - 1) > 1e-6 or min(row) < 0 for row in self.mix):
-            raise RobotConfigError(f"each row of mix must be fractions that add up to 1, got {self.mix}")
-        if not 0 < self.gamma < math.inf:
-            raise RobotConfigError(f"gamma must be above 0, got {self.gamma}")
 
     def backdrop(self, field: Field) -> Array:
         """Return the three backdrops (rows, cols, 3)."""

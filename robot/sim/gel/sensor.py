@@ -63,9 +63,6 @@ class GelSensor:
         markers: printed dots, or None.
         detail: resolution of the camera as a fraction of the picture's; the picture is scaled down and up again.
         jpeg_quality: quality (1 to 100) at which the camera compresses the picture; None: no compression.
-
-    Raises:
-        RobotConfigError: A setting is out of range.
     """
 
     layer: Layer
@@ -81,19 +78,6 @@ class GelSensor:
     markers: Markers | None = None
     detail: float = 1.0
     jpeg_quality: int | None = None
-
-    def __post_init__(self) -> None:
-        Field(self.rows, self.cols, self.pixel_mm)
-        factors = (*self.tint, self.exposure)
-        if not all(0 < factor < math.inf for factor in factors) or not 0 <= self.blur_px < math.inf:
-            raise RobotConfigError(f"tint and exposure must be above 0 and blur_px 0 or more, got {self}")
-        if not (0 <= self.noise.read < math.inf and 0 <= self.noise.shot < math.inf):
-            raise RobotConfigError(f"noise must be 0 or more grey levels, got {self.noise}")
-        if not 0 < self.detail <= 1 or not (self.jpeg_quality is None or 1 <= self.jpeg_quality <= 100):
-            raise RobotConfigError(
-                f"detail must be above 0 and at most 1 and jpeg_quality 1 to 100 or None, got {self.detail} and "
-                f"{self.jpeg_quality}"
-            )
 
     @property
     def gel(self) -> GelSettings:

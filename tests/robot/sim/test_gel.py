@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from robot.errors import RobotConfigError, SceneError, UnknownName
+from robot.errors import SceneError, UnknownName
 from robot.gel_settings import GelSettings
 from robot.sim.contact.layer import Layer
 from robot.sim.gel import optics
@@ -236,21 +236,6 @@ def test_drawn_gels_lie_in_their_ranges_and_their_pictures_are_rarely_saturated(
         background = sensor.background(0)
         assert np.mean((background <= 5) | (background >= 250)) < 0.01
         assert 60 < background.mean() < 170
-
-
-def test_other_wrong_settings_are_refused():
-    with pytest.raises(RobotConfigError, match="modulus"):
-        GelSensor(Layer(-0.3))
-    with pytest.raises(RobotConfigError, match="LEDs"):
-        LedBar(0.0, height_mm=0.0)
-    with pytest.raises(RobotConfigError, match="ambient"):
-        LedOptics(ambient=1.5)
-    with pytest.raises(RobotConfigError, match="mix"):
-        LedOptics(mix=((1.0, 0.5, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
-    with pytest.raises(RobotConfigError, match="dots"):
-        Markers(radius_mm=1.0)
-    with pytest.raises(RobotConfigError, match="finger"):
-        draw_sensor(0, "")
 
 
 def test_gamma_is_the_exponent_of_the_light_relative_to_the_flat_gel():
