@@ -14,15 +14,15 @@ differ most from the first is the touch. If the episodes have fields for object 
 """
 
 import json
-import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 
 from robot.errors import ImporterError
@@ -39,7 +39,7 @@ from robot.importers.importing import (
     safe_name,
 )
 from robot.recording.folder import Recording
-from robot.storage import decode_picture, read_json_object
+from robot.storage import decode_picture, read_content
 
 DATA_SET = DataSet(
     source="LeRobot data set",
@@ -60,7 +60,7 @@ DATA_SET = DataSet(
     unverified=("that the first step of an episode is without contact",),
 )
 _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
-_PATHS = {"data_path": f"data/{_FILE}.parquet", "video_path": "videos/{video_key}/" + f"{_FILE}.mp4"}
+_DATA_PATH, _VIDEO_PATH = f"data/{_FILE}.parquet", "videos/{video_key}/" + f"{_FILE}.mp4"
 _GEL = re.compile("touch|tactile|gel|digit", re.IGNORECASE)
 _FIELDS = ("force_n", "opening_mm", "touch_skew_s", "time_s", "outcome", "grasped", "pose")
 _MOMENTS = (["before", "during"], ["during", "after"], ["before", "during", "after"], ["during"])
@@ -102,25 +102,45 @@ def import_lerobot(
     )
 
 
+class _Feature(msgspec.Struct):
+    dtype: str
+
+
+class _Info(msgspec.Struct):
+    """The keys of info.json that are read; `recording` is of our own exports."""
+
+    codebase_version: str
+    fps: Annotated[float, msgspec.Meta(gt=0, le=1e6)]
+    features: dict[str, _Feature]
+    data_path: str = _DATA_PATH
+    video_path: str = _VIDEO_PATH
+    robot_type: str | None = None
+    splits: dict[str, Any] = {}
+    recording: dict[str, Any] = {}
+
+
+def _read_info(path: Path) -> _Info:
+    """Read info.json; raise ImporterError for another version of LeRobot or other paths."""
+    try:
+        info = msgspec.json.decode(read_content(path, ImporterError), type=_Info)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise ImporterError(f"{path} must be that of a LeRobot data set: {error}") from error
+    if not re.fullmatch(r"v3(\.\d+)*", info.codebase_version):
+        raise ImporterError(f"{path} must have LeRobot version 3, got {info.codebase_version}; convert it with lerobot")
+    if (info.data_path, info.video_path) != (_DATA_PATH, _VIDEO_PATH):
+        raise ImporterError(
+            f"{path} must have the paths {_DATA_PATH} and {_VIDEO_PATH}, got {info.data_path} and {info.video_path}"
+        )
+    return info
+
+
 class _LeRobotSource:
     """A data set on disk: its cameras, and its episodes as grasps."""
 
     def __init__(self, src: Path, touch: str, photo: str) -> None:
-        self.src = src
-        self.info = read_json_object(src / "meta" / "info.json", ImporterError)
-        version = str(self.info.get("codebase_version"))
-        if not re.fullmatch(r"v3(\.\d+)*", version):
-            raise ImporterError(f"{src} must have LeRobot version 3, got {version}; convert it with lerobot")
-        for key, known in _PATHS.items():
-            if self.info.get(key) not in (known, None):
-                raise ImporterError(f"{src}: {key} of info.json must be {known}, got {str(self.info[key])[:80]!r}")
-        features = self.info.get("features")
-        kinds = {
-            str(name): about["dtype"]
-            for name, about in (features.items() if isinstance(features, dict) else ())
-            if isinstance(about, dict) and about.get("dtype") in ("video", "image")
-        }
-        self._kinds: dict[str, str] = kinds
+        self.src, self._info = src, _read_info(src / "meta" / "info.json")
+        kinds = {name: each.dtype for name, each in self._info.features.items() if each.dtype in ("video", "image")}
+        self._kinds = kinds
         self.touch = [name.strip() for name in touch.split(",")] if touch else sorted(filter(_GEL.search, kinds))
         self.photo = photo or next((name for name in kinds if name not in self.touch), "")
         if not self.touch or any(name not in kinds for name in (*self.touch, self.photo)):
@@ -130,21 +150,13 @@ class _LeRobotSource:
             )
         if len(self.touch) > 26 or any("/" in name or ".." in name for name in kinds):
             raise ImporterError(f"{src} must have at most 26 gel cameras, and no camera name that is a path")
-        try:
-            self._fps = float(self.info["fps"])
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise ImporterError(f"{src}: info.json must contain fps") from error
-        if not 0 < self._fps < math.inf:
-            raise ImporterError(f"{src}: fps of info.json must be above 0 and finite, got {self._fps:g}")
-        recording = self.info.get("recording")
-        self._recording: dict[str, Any] = recording if isinstance(recording, dict) else {}
-        moments = self._recording.get("moments")
+        moments = self._info.recording.get("moments")
         self._moments = moments if moments in _MOMENTS else None
         self._videos: dict[str, tuple[Path, Any]] = {}
 
     def stored_facts(self) -> dict[str, Any]:
         """Return source, licence, terms, citation, rig and sensor from info.json, as far as it contains them."""
-        facts = self._recording or {"rig": self.info.get("robot_type")}
+        facts = self._info.recording or {"rig": self._info.robot_type}
         keys = ("source", "licence", "terms", "citation", "rig", "sensor")
         texts = {key: facts[key] for key in keys if isinstance(facts.get(key), str)}
         own_terms = {"terms": ""} if "licence" in texts else {}
@@ -152,20 +164,18 @@ class _LeRobotSource:
 
     def splits(self) -> dict[str, dict[str, list[str]]]:
         """Return the split of info.json ("0:80" for each part) if it has several parts."""
-        published = self.info.get("splits")
-        ranges = {
-            str(part): (int(found[1]), int(found[2]))
-            for part, text in (published.items() if isinstance(published, dict) else ())
-            if (found := re.fullmatch(r"(\d{1,9}):(\d{1,9})", str(text)))
-        }
+        found = {part: re.fullmatch(r"(\d{1,9}):(\d{1,9})", str(text)) for part, text in self._info.splits.items()}
+        ranges = {part: range(int(match[1]), int(match[2])) for part, match in found.items() if match}
         if len(ranges) < 2:
             return {}
-        parts: dict[str, set[str]] = {part: set() for part in ranges}
-        for number, row in enumerate(self.episodes(("object_id", "tasks"))):
-            for part, (start, stop) in ranges.items():
-                if start <= number < stop:
-                    parts[part].add(_object(row))
-        return {"published": {part: sorted(objects) for part, objects in parts.items()}}
+        objects = [_object(row) for row in self.episodes(("object_id", "tasks"))]
+        return {
+            "published": {
+                part: sorted({objects[episode] for episode in episodes if episode < len(objects)})
+                for part, episodes in ranges.items()
+                if len(episodes) <= len(objects)
+            }
+        }
 
     # Episodes ----------------------------------------------------------------------------------------------
 
@@ -210,15 +220,10 @@ class _LeRobotSource:
     # Pictures ----------------------------------------------------------------------------------------------
 
     def _steps(self, row: _Row) -> Iterator[Step]:
-        cameras = [self._frames(key, row) for key in (self.photo, *self.touch)]
+        read = {"image": self._image_frames, "video": self._video_frames}
+        cameras = [read[self._kinds[key]](key, row) for key in (self.photo, *self.touch)]
         for pictures in zip(*cameras, strict=False):
             yield pictures[0], pictures[1:]
-
-    def _frames(self, key: str, row: _Row) -> Iterator[Picture]:
-        """Yield the pictures of one camera in an episode."""
-        if self._kinds[key] == "image":
-            return self._image_frames(key, row)
-        return self._video_frames(key, row)
 
     def _video_frames(self, key: str, row: _Row) -> Iterator[Picture]:
         av = import_extra("av", _WHAT)
@@ -226,13 +231,13 @@ class _LeRobotSource:
         start = row.get(f"videos/{key}/from_timestamp")
         if not isinstance(start, float) or not path.is_file():
             raise ImporterError("its video is missing")
-        end = start + (row["length"] - 0.5) / self._fps
+        end = start + (row["length"] - 0.5) / self._info.fps
         try:
             video = self._open_video(key, path)
             stream = video.streams.video[0]
             video.seek(int(start / stream.time_base), stream=stream)
             for frame in video.decode(stream):
-                if frame.time is not None and frame.time >= start - 0.5 / self._fps:
+                if frame.time is not None and frame.time >= start - 0.5 / self._info.fps:
                     if frame.time >= end:
                         return
                     yield frame.to_ndarray(format="rgb24")
