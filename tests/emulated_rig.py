@@ -3,8 +3,8 @@
     python -m tests.emulated_rig --grasps 500 --out faulty/       # with faults in 1 of 50 operations, counted
 
 The gripper's driver is connected to an emulated WSG-50 over TCP or a pseudo-terminal, the gels' driver to computed
-cameras through OpenCV's interface. The arm is either an emulated Sawyer over a websocket or an arm of this file that
-reaches its target at once. The camera is also from this file. Every device can have faults, counted by kind.
+cameras through OpenCV's interface. The arm, which reaches its target at once, and the camera are from this file. Every
+device can have faults, counted by kind.
 """
 
 import argparse
@@ -23,7 +23,6 @@ import numpy as np
 
 from robot.collection import CollectSettings, collect
 from robot.devices import Arm, Camera
-from robot.drivers.sawyer.driver import Sawyer
 from robot.drivers.usb_camera import stream as opencv_stream
 from robot.drivers.usb_camera.driver import OpencvTactile
 from robot.drivers.wsg50.driver import WSG50
@@ -33,7 +32,6 @@ from robot.readings import RGBD, Intrinsics, Pose, Region
 from robot.recording.folder import read_recording
 from robot.rig import Rig
 from tests import views
-from tests.emulators.sawyer import server as rosbridge_emulator
 from tests.emulators.wsg50.faults import LineFaults
 from tests.emulators.wsg50.gripper import EmulatedWSG50
 from tests.emulators.wsg50.server import serve_pty, serve_tcp
@@ -45,8 +43,6 @@ HOLDING = 4
 SPEED_UP = 50.0
 FRAMES = 4
 """Packets per operation of the gripper: command, pending, state, result. Each can have a fault."""
-LOW_WORKSPACE = Region((-150.0, -150.0, 0.0), (150.0, 150.0, 300.0))
-"""Workspace of the emulated Sawyer."""
 QUICK = AttemptSettings(
     GraspSettings(lift_mm=100.0), settle_s=0.1, hold_s=0.1, travel_mm_s=1000.0, closing_mm_s=400.0, retries=4
 )
@@ -61,7 +57,7 @@ class EmulatedRigState:
         self.rng, self.counts = np.random.default_rng([7, seed]), Counter()
         self.emulator = EmulatedWSG50(speed_up=SPEED_UP, referenced=True)
         self.line = LineFaults(rate / FRAMES, seed=seed)
-        self.arm_faults, self.left_moving = None, 0
+        self.left_moving = 0
         self.pose, self.solid, self.slips, self.noise = Pose(0, 0, 300, 0), None, False, 0
 
     def fault(self, device, *kinds):
@@ -75,9 +71,7 @@ class EmulatedRigState:
     @property
     def all_counts(self):
         """Counts of faults so far, by device and kind."""
-        lines = {"gripper's line": self.line.counts, "arm's line": self.arm_faults.counts if self.arm_faults else {}}
-        of_lines = {f"{line}: {kind}": count for line, counts in lines.items() for kind, count in counts.items()}
-        return dict(self.counts) | of_lines
+        return dict(self.counts) | {f"gripper's line: {kind}": count for kind, count in self.line.counts.items()}
 
     @property
     def holding(self):
@@ -126,21 +120,6 @@ class EmulatedArm(Arm):
         return self.shared.pose
 
 
-class TrackedSawyer(Sawyer):
-    """The driver of Sawyer, which reports its pose to the common state."""
-
-    def __init__(self, shared, port):
-        mount = {"base_xyz_mm": [500.0, 0.0, -100.0], "base_yaw_deg": 180.0, "tool_mm": 150.0}
-        quick = {"joint_speed_rad_s": 1.5, "max_speed_mm_s": 1000.0, "max_state_age_s": 1.0, "timeout_s": 0.5}
-        super().__init__(workspace=LOW_WORKSPACE, host="127.0.0.1", port=port, **mount, **quick)
-        self.shared = shared
-
-    def _move_to(self, pose, speed_mm_s):
-        reached = super()._move_to(pose, speed_mm_s)
-        self.shared.hand_at(reached)
-        return reached
-
-
 class WatchedWSG50(WSG50):
     """The driver of the gripper; the common state counts calls that return or fail with moving jaws."""
 
@@ -166,21 +145,6 @@ class WatchedWSG50(WSG50):
             yield
         finally:
             self.shared.left_moving += self.shared.emulator.moves
-
-
-@contextlib.contextmanager
-def _at_once(shared):
-    yield EmulatedArm(shared)
-
-
-@contextlib.contextmanager
-def _sawyer(shared):
-    shared.arm_faults = rosbridge_emulator.MessageFaults(shared.rate, seed=shared.seed)
-    with rosbridge_emulator.serve(rosbridge_emulator.EmulatedSawyer(faults=shared.arm_faults)) as url:
-        yield TrackedSawyer(shared, int(url.rpartition(":")[2]))
-
-
-ARMS = {"at once": _at_once, "sawyer": _sawyer}
 
 
 class EmulatedCamera(Camera):
@@ -243,12 +207,12 @@ class EmulatedGel(FakeVideoDevice):
 class EmulatedRig(Rig):
     """The rig. Objects are cylinders by name with a random position for each attempt; some slip."""
 
-    def __init__(self, url, shared, gels, arm, **gripper):
+    def __init__(self, url, shared, gels):
         self.shared, self.gels = shared, gels
         quick = {"timeout_s": 0.25, "reconnect_s": 0.02, "acknowledge_faults": True, "max_speed_mm_s": 400.0}
         super().__init__(
-            arm,
-            WatchedWSG50(shared, port=url, **quick | gripper),
+            EmulatedArm(shared),
+            WatchedWSG50(shared, port=url, **quick),
             {
                 finger: OpencvTactile(finger=finger, device=gel_path(finger), warmup_s=0.0, timeout_s=1.0, frozen_s=0.2)
                 for finger in gels
@@ -276,17 +240,16 @@ def gel_path(finger):
 
 
 @contextlib.contextmanager
-def emulated_rig(seed=0, *, port="tcp", arm="at once", rate=0.0, **gripper):
+def emulated_rig(seed=0, *, port="tcp", rate=0.0):
     """Yield an EmulatedRig, not connected; its devices exist while the context is open."""
     shared = EmulatedRigState(seed, rate)
     gels = {finger: EmulatedGel(shared, finger) for finger in "ab"}
     by_path = {gel_path(finger): gel for finger, gel in gels.items()}
     with (
         SERVERS[port](shared.emulator, shared.line) as url,
-        ARMS[arm](shared) as hand,
         patch.object(opencv_stream, "open_capture", lambda device: by_path[device].open(device)),
     ):
-        yield EmulatedRig(url, shared, gels, hand, **gripper)
+        yield EmulatedRig(url, shared, gels)
 
 
 @dataclass
@@ -308,13 +271,13 @@ class Outcome:
         yield from (f"{count:6} {kind}" for kind, count in sorted(self.faults.items()))
 
 
-def collect_among_faults(out, grasps, *, rate=0.02, seed=0, port="tcp", arm="at once", objects=5):
+def collect_among_faults(out, grasps, *, rate=0.02, seed=0, port="tcp", objects=5):
     """Collect `grasps` accepted grasps with faults at every device; start again after each stop, as a person would."""
     outcome = Outcome(0, 0, [], Counter(), 0, 0)
     names = [f"can-{number}" for number in range(objects)]
     options = {"objects": names, "seed": seed, "settings": CollectSettings(grasps // objects)}
     while not outcome.grasps:
-        with emulated_rig(seed + len(outcome.stops), port=port, arm=arm, rate=rate) as rig:
+        with emulated_rig(seed + len(outcome.stops), port=port, rate=rate) as rig:
             try:
                 tallies = collect(lambda rig=rig: rig, out, **options)
                 outcome.grasps = sum(tally.accepted for tally in tallies)
@@ -339,14 +302,11 @@ def main():
     parser.add_argument("--grasps", type=int, default=500)
     parser.add_argument("--rate", type=float, default=0.02, help="fraction of operations with a fault")
     parser.add_argument("--port", choices=sorted(SERVERS), default="tcp")
-    parser.add_argument("--arm", choices=sorted(ARMS), default="at once")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, required=True, help="recording folder")
     options = parser.parse_args()
     logging.disable(logging.WARNING)  # each fault logs a warning
-    outcome = collect_among_faults(
-        options.out, options.grasps, rate=options.rate, seed=options.seed, port=options.port, arm=options.arm
-    )
+    outcome = collect_among_faults(options.out, options.grasps, rate=options.rate, seed=options.seed, port=options.port)
     print("\n".join(outcome.lines()))
     grasps = read_recording(options.out).grasps
     print(f"{len(grasps)} grasps in {options.out}, {len(broken_images(options.out))} damaged pictures")
