@@ -18,7 +18,6 @@ import numpy.typing as npt
 
 from robot.devices import Camera, Device, TactileSensor, read_together
 from robot.drivers.discover import usb_port
-from robot.drivers.usb_camera.stream import Arrival
 from robot.errors import DeviceError, RobotError
 from robot.rig import Rig
 
@@ -164,18 +163,14 @@ class _WatchedFrames:
 
     Attributes:
         device: The camera or gel.
-        times_s: Times of the frames that differ from the frame before.
-        arrived_s: Times of all frames.
+        times_s: Times of the frames.
         ages_s: Age of the newest frame at each read.
-        repeated: Number of frames that equal the frame before; None if the driver does not count them.
         picture: The last frame.
     """
 
     device: Camera | TactileSensor
     times_s: set[float] = field(default_factory=set)
-    arrived_s: set[float] = field(default_factory=set)
     ages_s: list[float] = field(default_factory=list)
-    repeated: int | None = None
     picture: Any = None
 
     @property
@@ -192,15 +187,12 @@ class _WatchedFrames:
     @property
     def dropped(self) -> int:
         """Estimated number of dropped frames: a gap of n median intervals counts as n - 1 frames."""
-        intervals = np.diff(sorted(self.arrived_s))
+        intervals = np.diff(sorted(self.times_s))
         return int(np.sum(np.rint(intervals / np.median(intervals)) - 1)) if len(intervals) else 0
 
 
 def _watch_frames(rig: Rig, devices: Sequence[Camera | TactileSensor]) -> list[_WatchedFrames]:
-    """Read the frames of all cameras at the same time for `MEASURE_S`.
-
-    A driver that records arrivals sees every frame; of other drivers, this loop sees the newest frame at each read.
-    """
+    """Read the newest frames of all cameras at the same time for `MEASURE_S`."""
     watched, began = [_WatchedFrames(device) for device in devices], rig.clock()
     while True:
         for each in watched:
@@ -212,14 +204,6 @@ def _watch_frames(rig: Rig, devices: Sequence[Camera | TactileSensor]) -> list[_
         if rig.clock() - began >= MEASURE_S:
             break
         rig.sleep(_POLL_S)
-    for each in watched:
-        each.arrived_s = each.times_s
-        arrivals: list[Arrival] | None = getattr(each.device, "arrivals", None)
-        if arrivals is not None:
-            recent = [arrival for arrival in arrivals if arrival.time_s >= began]
-            each.times_s = {arrival.time_s for arrival in recent if not arrival.is_repeat}
-            each.arrived_s = {arrival.time_s for arrival in recent}
-            each.repeated = sum(arrival.is_repeat for arrival in recent)
     return watched
 
 
@@ -232,8 +216,6 @@ def _describe_frames(watched: _WatchedFrames, alone: dict[str, float]) -> dict[s
     )
     promised = {"promised": f"{settings['fps']:g} frames/s"} if settings.get("fps") else {}
     measured = {"rate": rate, **promised, "dropped": str(watched.dropped)}
-    if watched.repeated is not None:
-        measured["repeated"] = str(watched.repeated)
     measured["age"] = f"{1000 * median(watched.ages_s):.0f} ms"
     if (port := usb_port(str(settings.get("device", "")))) is not None:
         measured["USB"] = str(port)

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.devices import Camera, Clock, Device, TactileSensor
-from robot.drivers.usb_camera.stream import Arrival, CaptureReader, CaptureSettings, UsbCameraSettings
+from robot.drivers.usb_camera.stream import CaptureReader, CaptureSettings, UsbCameraSettings
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import RGBD, Frame
 from robot.settings import bounded
@@ -28,11 +28,6 @@ class UsbDevice(Device):
 
     _reader: CaptureReader
     _options: UsbCameraSettings
-
-    @property
-    def arrivals(self) -> list[Arrival]:
-        """The newest frames of the stream, as they arrived."""
-        return self._reader.arrivals
 
     def _connect(self) -> None:
         self._reader = CaptureReader(self, self._options)

@@ -41,8 +41,6 @@ MAX_CAMERA_WAIT_S = 600.0
 _CLOSING_S = 5.0
 """Time in which the thread must return from the camera's driver before `close` raises."""
 
-ARRIVALS = 1000
-"""Number of frames whose arrival is remembered."""
 
 _GRAB_LIMIT_S = 1
 _DAMAGED_IN_A_ROW = 10
@@ -298,14 +296,6 @@ def _connected_cameras() -> str:
     return f" Connected: {', '.join(names)}" if names else ""
 
 
-@dataclass(frozen=True)
-class Arrival:
-    """One frame of the stream: its time, and whether it equals the frame before."""
-
-    time_s: float
-    is_repeat: bool
-
-
 class FrameReader:
     """Reads streams in a thread of its own, from `start` to `close`.
 
@@ -332,7 +322,6 @@ class FrameReader:
     ) -> None:
         self.name, self.settings, self.clock, self.backoff_s = name, settings, clock, backoff_s
         self.frame_count = self.lost_count = 0
-        self._arrivals: deque[Arrival] = deque(maxlen=ARRIVALS)
         self._open_stream = open_stream
         self._frames: deque[Frame] = deque(maxlen=settings.keep)
         self._changed = threading.Condition()
@@ -341,12 +330,6 @@ class FrameReader:
         self._last: Frame | None = None
         self._warm_s = 0.0
         self._last_error = "no frame arrived"
-
-    @property
-    def arrivals(self) -> list[Arrival]:
-        """The newest ARRIVALS frames, dropped ones included."""
-        with self._changed:
-            return list(self._arrivals)
 
     def start(self) -> None:
         """Open the stream and wait for its first frame; after a DeviceError or OSError, call `close`."""
@@ -433,9 +416,7 @@ class FrameReader:
         """Buffer a new frame; drop a repeat of the last frame, whose time stays unchanged."""
         with self._changed:
             self.frame_count += 1
-            is_repeat = self._last is not None and np.array_equal(self._last.pixels, frame.pixels)
-            self._arrivals.append(Arrival(frame.time_s, is_repeat))
-            if self._last is not None and is_repeat:
+            if self._last is not None and np.array_equal(self._last.pixels, frame.pixels):
                 if (still_s := frame.time_s - self._last.time_s) > self.settings.frozen_s:
                     raise DeviceError(f"its stream is frozen: the same picture for {still_s:.1f} s")
                 return
