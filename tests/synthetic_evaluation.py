@@ -14,14 +14,10 @@ from retrieval.model.posterior import Posterior
 
 SKILL = {
     "late_fusion": 1.6,
-    "set_fusion": 1.7,
     "retrieve_rerank": 1.55,
     "contrastive": 1.2,
-    "contrastive_sigmoid": 1.1,
     "cca": 0.7,
-    "plsca": 0.45,
     "chance": 0.0,
-    "constant": 0.0,
 }
 RANKS = ("recall_1", "recall_5", "recall_10", "mrr", "map")
 

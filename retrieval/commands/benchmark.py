@@ -26,7 +26,7 @@ from retrieval.search.defaults import SHIPPED_NAMES, shipped_model
 
 HELP = "Measure methods on public data sets of real touches, with controls."
 PRESET = "real"
-METHODS = "cca_towers,cca_pca,cca,late_fusion,chance"
+METHODS = "cca_towers,cca,late_fusion,chance"
 PRESET_METHODS = {"adapt": "cca_towers,chance"}
 """Default methods of presets that fit only some of the methods."""
 

@@ -47,10 +47,6 @@ def evaluate(
     cache: Annotated[
         Path | None, typer.Option(help="folder that stores image features (default: OUT/features)")
     ] = None,
-    trec: Annotated[
-        bool,
-        typer.Option("--trec", help="also write OUT/trec: rankings and relevant photos in the formats of trec_eval"),
-    ] = False,
     json: Json = False,
 ) -> None:
     """Compare methods on unseen objects and write a report. Resumes a stopped run."""
@@ -70,7 +66,6 @@ def evaluate(
             seeds=seeds,
             split=read_split(split),
             cache=cache,
-            trec=trec,
         )
     text, page, *_ = write_report(out, recording)
     say(f"report: {text}, {page}")

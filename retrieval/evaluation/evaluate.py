@@ -29,8 +29,7 @@ from retrieval.evaluation.experiment import Experiment
 from retrieval.evaluation.low_contact import find_low_contact_touches, score_low_contact
 from retrieval.evaluation.predictions import Predictions
 from retrieval.evaluation.queries import draw_queries
-from retrieval.evaluation.scoring import Measures, MethodScores, score_method
-from retrieval.evaluation.trec import TREC_FOLDER, write_trec
+from retrieval.evaluation.scoring import Measures, score_method
 from retrieval.evaluation.verification import score_verification
 from retrieval.methods import METHODS
 from retrieval.methods.method import Method
@@ -59,7 +58,6 @@ def evaluate(
     seeds: int = 1,
     split: Split | None = None,
     cache: Path | None = None,
-    trec: bool = False,
     quiet: bool = False,
 ) -> dict[str, Any]:
     """Compare methods on unseen objects; write results.json and timings.json.
@@ -78,8 +76,6 @@ def evaluate(
         seeds: Number of training runs of each method; the first seed is that of `config`.
         split: Objects of each part. Default: the split of `model`; without a model, a random split.
         cache: Folder of encoded features. Default: `out`/features.
-        trec: Also write `out`/trec: rankings of test touches (first seed) and relevant photos in the formats of
-            trec_eval.
         quiet: No progress on stderr.
 
     Returns:
@@ -144,10 +140,6 @@ def evaluate(
     }
     write_document(out / "results.json", results)
     write_document(out / "timings.json", _timings(data, predictions))
-    for name, by_seed in predictions.items() if trec else ():
-        scores = MethodScores(queries, by_seed[0], seed)
-        ids = scores.ids(experiment.features.grasp_ids, "test")
-        write_trec(out / TREC_FOLDER, name, scores.touches("test", "test"), *ids)
     return results
 
 

@@ -9,7 +9,6 @@ from retrieval.frontier.clock import time_points
 from retrieval.frontier.pixels import SLACK, load_touch
 from retrieval.frontier.points import ApproximationResult, Panel, miss_rate_point
 from retrieval.frontier.sample import Array, Sample
-from retrieval.methods.selection import next_rows_of_object
 from retrieval.model.encode import encode_touches
 
 COUNTS = (1, 2, 3, 4, 5, 8)
@@ -26,7 +25,7 @@ def grasps(sample: Sample) -> ApproximationResult:
         miss_rate_point(
             "",
             f"{count} grasp{'s' * (count > 1)}",
-            _wrong(sample, table, next_rows_of_object(owner, count), owner),
+            _wrong(sample, table, _next_rows_of_object(owner, count), owner),
             count == 1,
         )
         for count in counts
@@ -61,3 +60,12 @@ def _query(sample: Sample, count: int) -> Array:
     return sample.logits(
         encode_touches(sample.checkpoint.matcher, touches).partial.numpy(), sample.real_photo_codes["partial"]
     )
+
+
+def _next_rows_of_object(owner: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Return (n, count): each row and the next rows of its object, cyclically."""
+    groups = np.empty((len(owner), count), dtype=np.int64)
+    for name in np.unique(owner):
+        rows = np.flatnonzero(owner == name)
+        groups[rows] = rows[(np.arange(len(rows))[:, None] + np.arange(count)) % len(rows)]
+    return groups

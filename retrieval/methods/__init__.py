@@ -17,20 +17,15 @@ METHODS: "Registry[type[Method]]" = Registry(
     "methods",
     {
         "late_fusion": "retrieval.methods.late_fusion:LateFusion",
-        "set_fusion": "retrieval.methods.set_fusion:SetFusion",
         "retrieve_rerank": "retrieval.methods.retrieve_rerank:RetrieveRerank",
         "contrastive": "retrieval.methods.contrastive:ContrastiveEmbedding",
-        "contrastive_sigmoid": "retrieval.methods.contrastive:SigmoidEmbedding",
         "cca": "retrieval.methods.cca:Cca",
-        "cca_pca": "retrieval.methods.cca:CcaPca",
         "cca_towers": "retrieval.methods.cca_towers:CcaTowers",
-        "plsca": "retrieval.methods.plsca:Plsca",
-        "chance": "retrieval.methods.trivial:Chance",
-        "constant": "retrieval.methods.trivial:Constant",
+        "chance": "retrieval.methods.chance:Chance",
     },
     error=ConfigError,
     base="retrieval.methods.method:Method",
 )
 
-TRIVIAL_BASELINES = frozenset({"chance", "constant"})
-"""Methods that ignore their input."""
+CHANCE = "chance"
+"""Name of the method that ignores its input."""

@@ -8,7 +8,7 @@ decomposition of the centred data. Only `leading_svd` uses X'X, which squares th
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import scipy.linalg
@@ -218,11 +218,15 @@ class CcaGridPoint:
 
 
 class Cca(Method):
-    """Cosine of canonical variates weighted by rho^p; ranking on validation objects chooses ridge, components and p."""
+    """Cosine of canonical variates weighted by rho^p; ranking on validation objects chooses ridge, components and p.
+
+    A subclass may set `max_directions`: then only that many principal components of touch and of photo are used. A few
+    dozen objects do not determine which of a thousand features correlate across touch and photo. The ridge damps the
+    narrow directions; principal components drop them, which is faster.
+    """
 
     is_seeded = False
-
-    max_directions: int | None = None
+    max_directions: ClassVar[int | None] = None
 
     def _fit(self, train: "Features", validation: "Features") -> None:
         touch, photo = (decompose(part, self.max_directions) for part in (train.touch, train.photo))
@@ -244,7 +248,8 @@ class Cca(Method):
     ) -> Iterator[tuple[CcaGridPoint, CanonicalCorrelations]]:
         touch = self._standardise[0](validator.features.touch) @ found.touch_weights
         photo = self._standardise[1](validator.features.photo) @ found.photo_weights
-        for components in component_counts(COMPONENTS, len(found.correlations)):
+        limit = len(found.correlations)
+        for components in sorted({min(count, limit) for count in COMPONENTS}):
             for power in POWERS:
                 weights = found.correlations[:components] ** power
                 encodings = unit_rows(touch[:, :components] * weights), unit_rows(photo[:, :components] * weights)
@@ -272,19 +277,3 @@ class Cca(Method):
 
     def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
         return cosine(touch_encodings, photo_encodings)
-
-
-class CcaPca(Cca):
-    """`Cca` after principal components, at most `max_directions` of touch and of photo: for few objects.
-
-    A few dozen objects do not determine which of a thousand features correlate across touch and photo. The ridge of
-    `Cca` damps the narrow directions; this method drops them. On 36 everyday objects of VT60 it is no better than `Cca`
-    but faster, so the controls of the benchmark on real data use it.
-    """
-
-    max_directions = 96
-
-
-def component_counts(counts: tuple[int, ...], limit: int) -> list[int]:
-    """Return the counts up to `limit`, and `limit` itself in place of larger ones."""
-    return sorted({min(count, limit) for count in counts})

@@ -1,6 +1,7 @@
 """Two projections into one metric space, trained by a contrastive loss on fixed tower features."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import torch
@@ -9,11 +10,9 @@ from torch.nn import functional
 
 from retrieval.console.progress import Bar
 from retrieval.methods.method import Array, Method
-from retrieval.methods.object_sampler import ObjectSampler, seeded_generator
 from retrieval.methods.selection import Validator
 from retrieval.methods.standardise import Standardiser
 from retrieval.model.losses.contrastive import LOG_SCALE_INIT, LOG_SCALE_MAX, contrastive_loss
-from retrieval.model.losses.sigmoid import SIGMOID_BIAS_INIT, SIGMOID_LOG_SCALE_INIT, sigmoid_loss
 from retrieval.training.fit import BestStep, Plan, fit_best
 
 if TYPE_CHECKING:
@@ -30,68 +29,42 @@ REGULARISATIONS = ((0.5, 0.0), (0.8, 0.0), (0.9, 0.0), (0.8, 1.0))
 class Projections(nn.Module):
     """Linear maps from standardised features to unit embeddings, as in the matcher, with dropout before them."""
 
-    log_scale_init, bias_init = LOG_SCALE_INIT, 0.0
-
     def __init__(self, touch_features: int, photo_features: int, dim: int, dropout: float) -> None:
         super().__init__()
         self.dropout = nn.Dropout(dropout)
         self.touch, self.photo = nn.Linear(touch_features, dim), nn.Linear(photo_features, dim)
-        self.log_scale = nn.Parameter(torch.tensor(self.log_scale_init))
-        self.bias = nn.Parameter(torch.tensor(self.bias_init))
+        self.log_scale = nn.Parameter(torch.tensor(LOG_SCALE_INIT))
 
     def forward(self, features: Tensor, projection: nn.Linear) -> Tensor:
         """Return unit embeddings (B, dim) of features (B, F)."""
         embedding: Tensor = projection(self.dropout(features))
         return functional.normalize(embedding, dim=-1, eps=1e-6)
 
-    def loss(self, touch: Tensor, photo: Tensor, touch_objects: Tensor, photo_objects: Tensor) -> Tensor:
-        """Return the loss (scalar) of a batch of embeddings. InfoNCE does not depend on a bias, which stays 0."""
-        return contrastive_loss(touch, photo, touch_objects, photo_objects, self.log_scale)
-
     @torch.no_grad()
     def clamp_scale(self) -> None:
         """Clamp the scale to 1..100. The parameter is clamped, so that its gradient can reduce it again."""
         self.log_scale.clamp_(0.0, LOG_SCALE_MAX)
 
-    @torch.no_grad()
-    def logit_map(self) -> tuple[float, float]:
-        """Return scale and bias that map cosines to logits."""
-        return self.log_scale.exp().item(), self.bias.item()
-
-
-class SigmoidProjections(Projections):
-    """Projections with the sigmoid loss and its learned bias."""
-
-    log_scale_init, bias_init = SIGMOID_LOG_SCALE_INIT, SIGMOID_BIAS_INIT
-
-    def loss(self, touch: Tensor, photo: Tensor, touch_objects: Tensor, photo_objects: Tensor) -> Tensor:
-        """Return the loss (scalar) of a batch of embeddings."""
-        return sigmoid_loss(touch, photo, touch_objects, photo_objects, self.log_scale, self.bias)
-
 
 class ContrastiveEmbedding(Method):
     """Scaled cosine of InfoNCE embeddings; regularisation and steps are chosen by ranking on validation objects."""
-
-    name = "contrastive"
-    projections: type[Projections] = Projections
 
     def _fit(self, train: "Features", validation: "Features") -> None:
         self._touch, self._photo = Standardiser.fit(train.touch), Standardiser.fit(train.photo)
         validator = Validator.of(validation)
         steps = min(self.settings.config.training.iterations, MAX_STEPS)
-        with Bar(f"fit {self.name}", steps * len(REGULARISATIONS), "steps", quiet=self.settings.quiet) as bar:
+        with Bar("fit contrastive", steps * len(REGULARISATIONS), "steps", quiet=self.settings.quiet) as bar:
             fits = [self._train(train, validator, *cell, steps, bar) for cell in REGULARISATIONS]
         aucs = [best.value for _, best in fits]
         place = aucs.index(max(aucs))
         self._module, best = fits[place]
-        scale, bias = self._module.logit_map()
+        self._scale = self._module.log_scale.exp().item()
         self.best_params = {
             "dropout": REGULARISATIONS[place][0],
             "weight_decay": REGULARISATIONS[place][1],
             "steps": best.step,
             "validation_auc": best.value,
-            "scale": scale,
-            "bias": bias,
+            "scale": self._scale,
         }
 
     def _train(
@@ -100,7 +73,7 @@ class ContrastiveEmbedding(Method):
         """Return projections trained with one regularisation, at their best step."""
         with seeded_generator(self.settings.seed) as generator:
             dim = self.settings.config.matcher.embedding_dim
-            module = self.projections(len(self._touch.columns), len(self._photo.columns), dim, dropout)
+            module = Projections(len(self._touch.columns), len(self._photo.columns), dim, dropout)
             plan = Plan(steps, LEARNING_RATE, validate_every=VALIDATE_EVERY)
             loss, validation_auc = (
                 self._training_loss(module, train, generator),
@@ -127,7 +100,7 @@ class ContrastiveEmbedding(Method):
             objects = draws.distinct_objects(OBJECTS_PER_BATCH).repeat(IMAGES_PER_OBJECT)
             touches = module(touch[draws.rows(objects)], module.touch)
             photos = module(photo[draws.rows(objects)], module.photo)
-            return module.loss(touches, photos, objects, objects)
+            return contrastive_loss(touches, photos, objects, objects, module.log_scale)
 
         return loss
 
@@ -147,12 +120,41 @@ class ContrastiveEmbedding(Method):
         return embeddings
 
     def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
-        scale, bias = self._module.logit_map()
-        return scale * (touch_encodings @ photo_encodings.T) + bias
+        return self._scale * (touch_encodings @ photo_encodings.T)
 
 
-class SigmoidEmbedding(ContrastiveEmbedding):
-    """Contrastive embeddings with the sigmoid loss: the scores are log-odds of a match."""
+# Draws -----------------------------------------------------------------------------------------------
 
-    name = "contrastive_sigmoid"
-    projections = SigmoidProjections
+
+@contextmanager
+def seeded_generator(seed: int) -> Iterator[torch.Generator]:
+    """Yield a seeded generator for draws; seed torch's own stream (initial weights, dropout), and restore it after."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        yield torch.Generator().manual_seed(seed)
+
+
+class ObjectSampler:
+    """Samples grasps by object, without a loop over items."""
+
+    def __init__(self, owner: Tensor, generator: torch.Generator) -> None:
+        """Index the rows.
+
+        Args:
+            owner: (n,) object of each row, from 0.
+            generator: Source of the draws.
+        """
+        self._rows = torch.argsort(owner, stable=True)
+        self._counts = torch.bincount(owner)
+        self._starts = self._counts.cumsum(0) - self._counts
+        self._generator = generator
+        self.objects = len(self._counts)
+
+    def distinct_objects(self, count: int) -> Tensor:
+        """Return (count,) objects, each at most once."""
+        return torch.randperm(self.objects, generator=self._generator)[:count]
+
+    def rows(self, objects: Tensor) -> Tensor:
+        """Return one row of each of `objects` (any shape), uniformly."""
+        drawn = torch.rand(objects.shape, generator=self._generator, dtype=torch.float64)
+        return self._rows[self._starts[objects] + (drawn * self._counts[objects]).long()]

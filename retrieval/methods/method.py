@@ -27,7 +27,7 @@ class MethodSettings:
         seed: Seed of the fit.
         folder: Folder in which the method may store files, such as a checkpoint; None to store nothing.
         quiet: Show no progress on stderr.
-        fit_on_validation: A method that can (`cca_towers`, `cca`, `cca_pca`) also fits on validation objects once its
+        fit_on_validation: A method that can (`cca`, `cca_towers`) also fits on validation objects once its
             settings are chosen. A calibration on their scores is then overconfident.
         kind_of: The kind of each object, if the recording names it. Half of each kind is then held out together to
             choose settings.

@@ -66,23 +66,8 @@ class Validator:
 
     def touch_auc(self, scores: NDArray[np.floating[Any]]) -> float:
         """Return the AUC of scores (n, n) of every touch with every photo."""
-        return self.set_auc(scores, np.arange(len(self.features))[:, None])
-
-    def set_auc(self, scores: NDArray[np.floating[Any]], sets: NDArray[np.int64]) -> float:
-        """Return the AUC of scores (S, n) of sets (S, G) of touches with every photo."""
-        excluded = np.zeros(scores.shape, dtype=np.bool_)
-        np.put_along_axis(excluded, sets, True, axis=1)
         owner = self.features.owner
-        return ranking_auc(scores, owner[sets[:, 0]], owner, excluded)
-
-
-def next_rows_of_object(owner: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """Return (n, count): each row and the next rows of its object, cyclically."""
-    groups = np.empty((len(owner), count), dtype=np.int64)
-    for name in np.unique(owner):
-        rows = np.flatnonzero(owner == name)
-        groups[rows] = rows[(np.arange(len(rows))[:, None] + np.arange(count)) % len(rows)]
-    return groups
+        return ranking_auc(scores, owner, owner, np.eye(len(owner), dtype=np.bool_))
 
 
 MIN_OBJECTS_FOR_FOUR_FOLDS = 12

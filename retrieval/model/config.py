@@ -293,8 +293,8 @@ class Config:
         Raises:
             ConfigError: A name is unknown.
 
-        >>> config = retrieval.load_config("small").using(tower="resnet18", losses={"sigmoid": 0.5})
-        >>> config.matcher.tower, config.training.weights["sigmoid"]
+        >>> config = retrieval.load_config("small").using(tower="resnet18", losses={"listwise": 0.5})
+        >>> config.matcher.tower, config.training.weights["listwise"]
         ('resnet18', 0.5)
         """
         config = self

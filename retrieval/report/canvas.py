@@ -47,16 +47,11 @@ class Style:
 # The palette of Okabe and Ito for the main methods, and a marker for each method, for readers without colours.
 _STYLES = {
     "late_fusion": Style("#0072b2", "o"),
-    "set_fusion": Style("#56b4e9", "s"),
     "retrieve_rerank": Style("#009e73", "D"),
     "contrastive": Style("#d55e00", "^"),
-    "contrastive_sigmoid": Style("#e69f00", "v"),
     "cca": Style("#aa3377", "P"),
-    "cca_pca": Style("#882255", "p"),
     "cca_towers": Style("#44aa99", "h"),
-    "plsca": Style("#6f4e37", "X"),
     "chance": Style("#6b7580", ".", ":"),
-    "constant": Style("#aab2ba", "|", ":"),
 }
 
 

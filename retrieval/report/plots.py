@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.methods import TRIVIAL_BASELINES
+from retrieval.methods import CHANCE
 from retrieval.metrics.registry import PHOTO_COUNTS, SET_SIZES, grasps_metric_name, photos_metric_name
 from retrieval.report.canvas import MUTED_COLOUR, PART_COLOURS, Axes, Figure, Style, canvas, percent_axis, style_of
 from retrieval.report.results import IMPOSTORS, Results, measure_label, method_label, percent, shortened
@@ -61,7 +61,7 @@ def topn_curves(results: Results) -> Figure:
             panel.plot(ranks, _percents(summary["chance"]), color=MUTED_COLOUR, ls="--", lw=1.2, zorder=1)
             (line,) = panel.plot(ranks, value, color=style.colour, marker=style.marker, ls=style.line)
             line.set_gid(f"{name} {key}")
-            if name not in TRIVIAL_BASELINES:
+            if name != CHANCE:
                 panel.fill_between(ranks, low, high, color=style.colour, alpha=0.13, lw=0)
         panel.set_title(f"{key.removeprefix('topn_k')} candidate objects")
         panel.set_xlabel("N")

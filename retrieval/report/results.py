@@ -9,7 +9,7 @@ from typing import Any
 from _touch_retrieval.files import read_json
 from retrieval.errors import BadInput
 from retrieval.evaluation import SCHEMA_VERSION
-from retrieval.methods import TRIVIAL_BASELINES
+from retrieval.methods import CHANCE
 from retrieval.metrics.intervals import FEW_OBJECTS
 from retrieval.metrics.registry import METRICS
 
@@ -18,16 +18,11 @@ MISSING_VALUE = "–"
 # Order of every table and figure. Other methods come last, under their own names.
 METHOD_LABELS = {
     "late_fusion": "late fusion",
-    "set_fusion": "set fusion",
     "retrieve_rerank": "retrieve + rerank",
     "contrastive": "contrastive, InfoNCE",
-    "contrastive_sigmoid": "contrastive, sigmoid",
     "cca_towers": "CCA, tower by tower",
-    "cca_pca": "CCA, principal components",
     "cca": "CCA",
-    "plsca": "PLS-CA",
     "chance": "random scores",
-    "constant": "constant score",
 }
 IMPOSTORS = {"random": "random", "similar": "most similar object"}
 """Labels of the impostors of verification."""
@@ -49,8 +44,8 @@ class Results:
 
     @property
     def learned(self) -> list[str]:
-        """The methods without the trivial baselines."""
-        return [name for name in self.methods if name not in TRIVIAL_BASELINES]
+        """The methods without chance."""
+        return [name for name in self.methods if name != CHANCE]
 
     def summary(self, method: str, measure: str) -> Summary | None:
         """Return value, interval, chance and basis of a measure; None if the method lacks it."""

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from retrieval.methods import TRIVIAL_BASELINES
+from retrieval.methods import CHANCE
 from retrieval.metrics.registry import METRICS
 from retrieval.model.posterior import FORMULA
 from retrieval.report.document import Table
@@ -189,12 +189,12 @@ def ceilings(results: Results) -> Table:
 
 
 def low_contact(results: Results) -> Table:
-    """Return the measures of low-contact touches and of all others, without the trivial baselines."""
+    """Return the measures of low-contact touches and of all others, without chance."""
     keys = ("pair_accuracy", "topn_k5", "topn_k10")
     rows = [
         (method_label(name), label, *(with_interval(parts[part].get(key)) for key in keys))
         for name, parts in results.data["low_contact"]["methods"].items()
-        if name not in TRIVIAL_BASELINES
+        if name != CHANCE
         for part, label in (("low_contact", "low-contact"), ("others", "others"))
     ]
     header = ("method", "touches", *(f"{measure_label(key)}, %" for key in keys))

@@ -83,7 +83,7 @@ def train(
 
     >>> import dataclasses
     >>> from pathlib import Path
-    >>> config = retrieval.load_config("tiny").using(losses={"contrastive": 1.0, "sigmoid": 0.1})
+    >>> config = retrieval.load_config("tiny").using(losses={"contrastive": 1.0, "listwise": 0.1})
     >>> config = dataclasses.replace(config, training=config.training.with_iterations(2))  # preset small: 500 steps
     >>> made = retrieval.train("lab", Path("lab.safetensors"), config, quiet=True)
     >>> made.provenance["step"], len(made.split.train)

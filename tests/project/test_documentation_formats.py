@@ -100,14 +100,14 @@ def test_the_results_of_an_evaluation(tmp_path, recording):
 def test_the_results_of_the_benchmark_of_real_data(tmp_path):
     real_data_sets.write_billets(tmp_path / "billets")
     physiclear.write(tmp_path / "physiclear")
-    quick = ["--preset", "tiny", "--seeds", "1", "--methods", "cca_pca", "--protocols", "billets-places,physiclear,rct"]
+    quick = ["--preset", "tiny", "--seeds", "1", "--methods", "cca", "--protocols", "billets-places,physiclear,rct"]
     assert main(["benchmark", "real", str(tmp_path), "--out", str(tmp_path / "out"), *quick]) == 0
     results = json.loads((tmp_path / "out" / "results.json").read_text())
     check(10, results)
     assert set(results["skipped"]) == {"rct"}
     entry = results["protocols"]["billets-places"]
     check(11, entry)
-    row, control = entry["rows"]["cca_pca"], entry["controls"]["permuted"]
+    row, control = entry["rows"]["cca"], entry["controls"]["permuted"]
     page = text_of(PAGE).partition("### `results.json` of the benchmark")[2]
     documented = {key: re.search(rf"^\| `{key}` .*$", page, re.M)[0] for key in ("rows", "controls")}
     touch_to_touch = next(iter(results["protocols"]["physiclear"]["rows"].values()))

@@ -43,14 +43,14 @@ from retrieval.evaluation.real.reference_rows import (
 from retrieval.evaluation.real.touch_to_touch import FROZEN, TouchToTouch, touch_to_touch_entry
 from retrieval.evaluation.real.verdict import Aggregation, MeasuresBySeed, control_entry, reliability_entry, row_entry
 from retrieval.evaluation.scoring import MethodScores
-from retrieval.methods import METHODS, TRIVIAL_BASELINES
+from retrieval.methods import CHANCE, METHODS
 from retrieval.methods.method import Method
 from retrieval.model.config import Config, named_config
 from retrieval.training.features import Features
 from retrieval.version import __version__
 
 PRESET = "real"
-DEFAULT_METHODS = ("cca_towers", "cca_pca", "cca", "late_fusion", "chance")
+DEFAULT_METHODS = ("cca_towers", "cca", "late_fusion", "chance")
 DRAWS = 10_000
 MAX_GRASPS = {"train": 1, "validation": 12, "test": 40}
 """Maximum number of scored grasps of one object, by part."""
@@ -289,8 +289,7 @@ class _ProtocolRun:
         conditions = []
         for row in self.rows:
             conditions += [
-                Condition(row, kind)
-                for kind in (("touch",) if row.method in TRIVIAL_BASELINES else ("touch", "low_pass"))
+                Condition(row, kind) for kind in (("touch",) if row.method == CHANCE else ("touch", "low_pass"))
             ]
         control = BenchmarkRow(CONTROL_METHOD, CONTROL_METHOD, self._frozen)
         return conditions + [Condition(control, kind) for kind in CONTROLS if self._missing_reason(kind) is None]
@@ -340,8 +339,8 @@ class _ProtocolRun:
         return entries
 
     def _examples(self, found: Mapping[str, list[list[FoldMeasures]]]) -> dict[str, Any]:
-        """Return the best and the worst queries of the first seed, for the first row that is no trivial baseline."""
-        row = next((row for row in self.rows if row.method not in TRIVIAL_BASELINES), self.rows[0])
+        """Return the best and the worst queries of the first seed, for the first row that is not chance."""
+        row = next((row for row in self.rows if row.method != CHANCE), self.rows[0])
         folds = found[f"{row.name}-touch"][0]
         every = {kind: [one for fold in folds for one in fold.examples[kind]] for kind in ("best", "worst")}
         best = sorted(every["best"], key=lambda one: float(one["true_rank"]))

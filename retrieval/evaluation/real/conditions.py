@@ -11,14 +11,21 @@ from numpy.typing import NDArray
 from retrieval.data.dataset import Grasp, finger_count
 from retrieval.errors import DatasetError
 from retrieval.methods import METHODS
+from retrieval.methods.cca import Cca
 from retrieval.methods.late_fusion import frozen_matcher
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
 from retrieval.training.features import Features, encode_recording
 
-CONTROL_METHOD = "cca_pca"
-"""Method of the controls; it accepts features of any width."""
+
+class ControlCca(Cca):
+    """Method of the controls: it accepts features of any width, and principal components make it fast."""
+
+    max_directions = 96
+
+
+CONTROL_METHOD = METHODS.name_of(ControlCca)
 CONTROLS = {
     "permuted": "touches are randomly assigned to other objects before fitting, so there is nothing to learn",
     "no_contact": "no-contact frames replace the touches, in fitting and in scoring",

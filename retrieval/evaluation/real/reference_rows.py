@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 MAX_QUERIES = 30
 """Maximum number of queries of one object, evenly spaced; more slow down the fits and add little information."""
-ANY_WIDTH_METHODS = ("cca_towers", "cca_pca", "cca", "plsca", "chance", "constant")
+ANY_WIDTH_METHODS = ("cca_towers", "cca", "chance")
 """Methods that accept entries of any width; the others have heads for photos."""
 
 

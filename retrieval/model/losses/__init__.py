@@ -19,7 +19,6 @@ LOSSES: "Registry[type[Loss]]" = Registry(
         "contrastive": "retrieval.model.losses.contrastive:ContrastiveLoss",
         "listwise": "retrieval.model.losses.listwise:ListwiseLoss",
         "pooled_listwise": "retrieval.model.losses.pooled_listwise:PooledListwiseLoss",
-        "sigmoid": "retrieval.model.losses.sigmoid:SigmoidLoss",
     },
     error=ConfigError,
     base="retrieval.model.losses.loss:Loss",

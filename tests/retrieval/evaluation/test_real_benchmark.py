@@ -16,7 +16,7 @@ from retrieval.metrics.measure import Measure
 from tests import real_data_sets
 from tests.data import touch_data
 
-TINY = ["--preset", "tiny", "--iterations", "2", "--seeds", "2", "--methods", "cca_pca,chance"]
+TINY = ["--preset", "tiny", "--iterations", "2", "--seeds", "2", "--methods", "cca,chance"]
 PROTOCOL_NAMES = ("vt60-random", "billets-places")
 
 
@@ -49,8 +49,8 @@ def results(out):
 def test_trained_rows_have_a_low_pass_control_and_a_verdict(results):
     assert list(results["protocols"]) == sorted(PROTOCOL_NAMES)
     for entry in results["protocols"].values():
-        assert set(entry["rows"]) == {"cca_pca", "chance"}
-        row, chance = entry["rows"]["cca_pca"], entry["rows"]["chance"]
+        assert set(entry["rows"]) == {"cca", "chance"}
+        row, chance = entry["rows"]["cca"], entry["rows"]["chance"]
         assert set(row["measures"]) == set(row["low_pass"]) == set(row["low_pass_differences"])
         difference = row["low_pass_differences"][entry["main"]]
         against_order = row["order_differences"][entry["main"]]
@@ -64,18 +64,18 @@ def test_trained_rows_have_a_low_pass_control_and_a_verdict(results):
 
 
 def test_a_seed_tests_every_object_and_chance_is_that_of_the_gallery(results):
-    summary = results["protocols"]["vt60-random"]["rows"]["cca_pca"]["measures"]["topn_k9"]
+    summary = results["protocols"]["vt60-random"]["rows"]["cca"]["measures"]["topn_k9"]
     assert (summary["objects"], summary["queries"], len(summary["by_seed"])) == (18, 18 * 4, 2)
     assert summary["chance"][0] == pytest.approx(1 / 9)
 
 
 def test_a_billet_gallery_has_the_places_of_one_billet_and_right_answers_are_counted(results):
     entry = results["protocols"]["billets-places"]
-    summary = entry["rows"]["cca_pca"]["measures"]["topn_k4"]
+    summary = entry["rows"]["cca"]["measures"]["topn_k4"]
     assert (entry["unit"], summary["objects"], summary["queries"]) == ("sequence", 3, 48)
     assert summary["few_objects"]
     assert "4 test objects, 4 photos" in summary["gallery"]
-    counts = entry["rows"]["cca_pca"]["correct_counts"]
+    counts = entry["rows"]["cca"]["correct_counts"]
     assert counts["queries"] == 48
     assert np.mean(counts["right"]) / 48 == pytest.approx(summary["value"][0])
     assert counts["low"] < summary["value"][0] < counts["high"]
@@ -98,7 +98,7 @@ def test_the_report_has_verdicts_tables_and_queries(out, results):
     text, page = (out / "report.md").read_text(), (out / "report.html").read_text()
     for entry in results["protocols"].values():
         assert entry["title"] in text
-        words = entry["rows"]["cca_pca"]["verdict"]["words"].split(":")[0]
+        words = entry["rows"]["cca"]["verdict"]["words"].split(":")[0]
         assert f"{words}:" in re.sub(r"\\", "", text)
         assert words in page
     assert "counts as touch only if" in text
@@ -114,8 +114,8 @@ def test_reference_catalogue_has_low_pass_control_on_both_sides(data, out, tmp_p
     shutil.copytree(out, again)
     assert benchmark(data, again, "--protocols", "vt60-references,vt60-references-photos", "--seeds", "1") == 0
     for entry in json.loads((again / "results.json").read_text())["protocols"].values():
-        assert set(entry["rows"]) == {"cca_pca", "chance"}
-        assert entry["rows"]["cca_pca"]["low_pass"]
+        assert set(entry["rows"]) == {"cca", "chance"}
+        assert entry["rows"]["cca"]["low_pass"]
         assert entry["controls"]["background"]["reason"] == "the catalogue entries are touches"
         assert entry["controls"]["order"]["measures"]["topn_k9"]["value"][0] > 0.5
     assert "reference touch of each object" in (again / "report.md").read_text()
@@ -259,12 +259,12 @@ def test_a_checkpoint_trained_on_test_objects_is_refused(data, out, tmp_path, ca
 def test_every_protocol_runs_on_its_miniature(tmp_path):
     data = tmp_path / "data"
     real_data_sets.write(data)
-    methods = "cca_pca,late_fusion,set_fusion,chance"
+    methods = "cca,late_fusion,chance"
     assert benchmark(data, tmp_path / "out", "--seeds", "1", "--methods", methods) == 0
     entries = json.loads((tmp_path / "out" / "results.json").read_text())["protocols"]
     assert set(entries) == set(PROTOCOLS)
     assert entries["feeling-of-success"]["controls"]["no_contact"]["measures"]
-    measures = entries["feeling-of-success"]["rows"]["cca_pca"]["measures"]
+    measures = entries["feeling-of-success"]["rows"]["cca"]["measures"]
     assert "pair_auc" in measures
     assert "pair_accuracy" not in measures  # too few validation objects for a threshold
     assert any("64.3" in sentence for sentence in entries["feeling-of-success"]["published_results"])
@@ -272,8 +272,8 @@ def test_every_protocol_runs_on_its_miniature(tmp_path):
         if name == "physiclear":
             assert set(entry["rows"]) == {"frozen-difference", "frozen-common-frame"}
             continue
-        heads = set() if "references" in name else {"late_fusion", "set_fusion"}
-        assert set(entry["rows"]) == {"cca_pca", "chance"} | heads
+        heads = set() if "references" in name else {"late_fusion"}
+        assert set(entry["rows"]) == {"cca", "chance"} | heads
 
 
 @pytest.mark.slow
@@ -282,10 +282,10 @@ def test_real_bottles_and_balls_beat_the_low_pass_control(tmp_path, monkeypatch)
     weights = touch_data("weights/mobilenet_v2_imagenet_features.pt")
     data = touch_data("vt60").parent
     monkeypatch.setattr(real_benchmark, "MAX_GRASPS", {"train": 1, "validation": 12, "test": 20})
-    options = ["--protocols", "vt60-seen-classes", "--seeds", "1", "--methods", "cca_pca", "--init", str(weights)]
+    options = ["--protocols", "vt60-seen-classes", "--seeds", "1", "--methods", "cca", "--init", str(weights)]
     assert benchmark(data, tmp_path, methods=options) == 0
     entry = json.loads((tmp_path / "results.json").read_text())["protocols"]["vt60-seen-classes"]
-    row = entry["rows"]["cca_pca"]
+    row = entry["rows"]["cca"]
     assert row["measures"]["topn_k9"]["value"][0] > 0.55
     assert row["low_pass_differences"]["topn_k9"]["difference"] > 0.04
     assert entry["controls"]["permuted"]["measures"]["topn_k9"]["value"][0] < 0.2
@@ -295,10 +295,10 @@ def test_real_bottles_and_balls_beat_the_low_pass_control(tmp_path, monkeypatch)
 def test_unseen_real_billets_are_near_chance(tmp_path):
     weights = touch_data("weights/mobilenet_v2_imagenet_features.pt")
     data = touch_data("billets").parent
-    options = ["--protocols", "billets-unseen", "--seeds", "1", "--methods", "cca_pca", "--init", str(weights)]
+    options = ["--protocols", "billets-unseen", "--seeds", "1", "--methods", "cca", "--init", str(weights)]
     assert benchmark(data, tmp_path, methods=options) == 0
     entry = json.loads((tmp_path / "results.json").read_text())["protocols"]["billets-unseen"]
-    counts = entry["rows"]["cca_pca"]["correct_counts"]
+    counts = entry["rows"]["cca"]["correct_counts"]
     assert counts["queries"] == 80
     assert counts["low"] < 0.25
     assert (tmp_path / "report.html").is_file()

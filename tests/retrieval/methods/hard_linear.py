@@ -1,4 +1,4 @@
-"""Canonical correlation, partial least squares, whitening, standardising and cosines of degenerate features."""
+"""Canonical correlation, whitening, standardising and cosines of degenerate features."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -7,11 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.methods.cca import CanonicalCorrelations, canonical_correlations, cosine, decompose, unit_rows
-from retrieval.methods.method import MethodSettings
-from retrieval.methods.plsca import Plsca
 from retrieval.methods.standardise import Standardiser
-from retrieval.model.config import Config
-from retrieval.training.features import Features
 from tests.hard_case import HardCase, error_of
 
 Matrix = NDArray[np.float64]
@@ -25,7 +21,6 @@ def hard_cases() -> Iterator[HardCase]:
     yield _every_scale()
     yield _more_components_than_rank()
     yield _nan_feature()
-    yield _partial_least_squares()
     yield _narrow_direction()
     yield _constant_feature()
     yield _far_feature()
@@ -142,44 +137,6 @@ def _nan_feature() -> HardCase:
     naive = _tried(lambda: naive_correlations(touch, photo))
     ours, holds = error_of(lambda: decompose(touch), "NaN")
     return HardCase(_CCA, "one feature is NaN", "refused", _text(naive), ours, holds, bool(np.isfinite(naive).all()))
-
-
-def naive_pls(touch: Matrix, photo: Matrix, components: int) -> Matrix:
-    """Return touch weights (F, components) by power iteration and deflation, for any number of directions."""
-    x, y = touch - touch.mean(0), photo - photo.mean(0)
-    weights = []
-    for _ in range(components):
-        other = y[:, 0]
-        for _ in range(50):
-            weight = x.T @ other
-            weight = weight / np.linalg.norm(weight)
-            score = x @ weight
-            turned = y.T @ score
-            other = y @ turned / np.linalg.norm(turned)
-        weights.append(weight)
-        x = x - np.outer(score, score @ x) / (score @ score)
-        y = y - np.outer(other, other @ y) / (other @ other)
-    return np.stack(weights, axis=1)
-
-
-def _partial_least_squares() -> HardCase:
-    """A touch with two values has one component; after it the residual is zero, and 0/0 is NaN."""
-    rng = np.random.default_rng([13])
-    objects = np.repeat(np.arange(10), 4)
-    touch = np.stack([objects % 2 * 2.0 - 1, np.zeros(40)], axis=1).astype(np.float32)
-    photo = (touch[:, :1] + rng.normal(size=(40, 8))).astype(np.float32)
-    naive = naive_pls(touch.astype(np.float64), photo.astype(np.float64), 4)
-    features = Features(tuple(map(str, range(40))), tuple(map(str, objects)), touch[:, None], photo)
-    method = Plsca(MethodSettings(Config()))
-    method.fit(features.of_objects(map(str, range(8))), features.of_objects(["8", "9"]))
-    encodings, columns = method.encode_touch(touch[:, None]), int(method.best_params["max_components"])
-    finite = bool(np.isfinite(encodings).all())
-    expected = "1 component, finite encodings"
-    words = f"4 components: {_text(naive[0])}"
-    text = f"{columns} component, encodings {'finite' if finite else 'NaN'}"
-    return HardCase(
-        "PLS", "4 components of rank 1", expected, words, text, finite and columns == 1, bool(np.isfinite(naive).all())
-    )
 
 
 # Whitening and standardising ---------------------------------------------------------------------------------

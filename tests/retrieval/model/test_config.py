@@ -257,7 +257,7 @@ def test_a_checkpoint_is_usable_without_the_loss_that_trained_it():
 
 def test_a_file_names_a_weight_after_its_loss():
     config = Config.from_dict({"training": {"listwise_weight": 1}})
-    assert config.training.weights == {"contrastive": 0.0, "listwise": 1.0, "pooled_listwise": 0.0, "sigmoid": 0.0}
+    assert config.training.weights == {"contrastive": 0.0, "listwise": 1.0, "pooled_listwise": 0.0}
     table = config.to_dict()["training"]
     assert (table["contrastive_weight"], table["listwise_weight"]) == (0.0, 1.0)
     assert "weights" not in table
@@ -274,7 +274,7 @@ def test_the_held_out_fractions_must_leave_objects_to_train_on():
     [
         (MatcherConfig, {"fingers": 1, "hidden": 1, "embedding_dim": 1, "dropout": 0.0}),
         (TrainingConfig, {"validation_fraction": 0.0, "test_fraction": 0.0}),
-        (TrainingConfig, {"weights": {"contrastive": 0.0, "listwise": 1e9, "pooled_listwise": 0.0, "sigmoid": 0.0}}),
+        (TrainingConfig, {"weights": {"contrastive": 0.0, "listwise": 1e9, "pooled_listwise": 0.0}}),
         (TrainingConfig, {"iterations": 1, "touches_per_batch": 1, "validate_every": 1, "seed": 2**32 - 1}),
         (Preprocessing, {"touch_px": 1, "photo_px": 4096}),
     ],

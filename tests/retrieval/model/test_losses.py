@@ -5,12 +5,9 @@ import math
 import pytest
 import torch
 
-from retrieval.model.fusion import ImageEncoding
 from retrieval.model.losses.contrastive import LOG_SCALE_MAX, contrastive_loss
 from retrieval.model.losses.listwise import listwise_loss, pick_loss
-from retrieval.model.losses.loss import EncodedBatch
 from retrieval.model.losses.match import match_loss
-from retrieval.model.losses.sigmoid import SIGMOID_BIAS_INIT, SIGMOID_LOG_SCALE_INIT, SigmoidLoss, sigmoid_loss
 
 
 def unit(*shape, seed=0):
@@ -103,49 +100,16 @@ def at_angles(*degrees):
     return torch.stack([radians.cos(), radians.sin()], 1)
 
 
-def sigmoid_loss_by_loops(cosines, rows, columns, scale, bias):
-    total = 0.0
-    for i, row in enumerate(rows):
-        for j, column in enumerate(columns):
-            sign = 1 if row == column else -1
-            total += math.log(1 + math.exp(-sign * (scale * cosines[i][j] + bias)))
-    return total / len(rows)
-
-
-def test_both_losses_at_known_angles_equal_those_of_two_loops():
+def test_the_contrastive_loss_at_known_angles_equals_that_of_two_loops():
     touch, photo = at_angles(0, 90), at_angles(0, 60, 180)
     cosines = [[1.0, 0.5, -1.0], [0.0, math.sqrt(3) / 2, 0.0]]
     rows, columns = [0, 1], [0, 1, 0]
     labels = torch.tensor(rows), torch.tensor(columns)
-    got = sigmoid_loss(touch, photo, *labels, torch.tensor(math.log(3.0)), torch.tensor(-1.0))
-    assert got.item() == pytest.approx(sigmoid_loss_by_loops(cosines, rows, columns, 3.0, -1.0), rel=1e-6)
     scores = [[3 * cosine for cosine in row] for row in cosines]
     turned = [list(column) for column in zip(*scores, strict=True)]
     expected = (loss_by_loops(scores, rows, columns) + loss_by_loops(turned, columns, rows)) / 2
     got = contrastive_loss(touch, photo, *labels, torch.tensor(math.log(3.0)))
     assert got.item() == pytest.approx(expected, rel=1e-6)
-
-
-def test_the_sigmoid_loss_starts_near_the_cost_of_calling_every_pair_false():
-    """Scale 10 and bias -10: of orthogonal pairs only the positives cost; with a bias of 0 every pair would."""
-    touch, photo, objects = torch.eye(16)[:8], torch.eye(16)[8:], torch.arange(8)
-    scale, bias = torch.tensor(SIGMOID_LOG_SCALE_INIT), torch.tensor(SIGMOID_BIAS_INIT)
-    loss = sigmoid_loss(touch, photo, objects, objects, scale, bias)
-    assert loss.item() == pytest.approx(10.0, abs=1e-3)
-
-
-def test_a_sigmoid_loss_equals_the_function_of_its_parameters_and_its_scale_ends_at_100():
-    objects, touch, photo = torch.arange(3), unit(3, 4).float(), unit(3, 4, seed=1).float()
-    loss = SigmoidLoss(embedding_dim=4, objects=3)
-    batch = EncodedBatch(None, ImageEncoding(touch, touch), ImageEncoding(photo, photo), objects, objects)
-    scale, bias = torch.tensor(SIGMOID_LOG_SCALE_INIT), torch.tensor(SIGMOID_BIAS_INIT)
-    assert torch.equal(loss(batch), sigmoid_loss(touch, photo, objects, objects, scale, bias))
-    loss(batch).backward()
-    assert all(parameter.grad.abs() > 0 for parameter in loss.parameters())
-    with torch.no_grad():
-        loss.log_scale.fill_(7.0)
-    loss.clamp()
-    assert loss.log_scale.item() == pytest.approx(LOG_SCALE_MAX)
 
 
 def test_logits_of_plus_and_minus_ten_thousand_give_finite_loss_and_gradient():
@@ -154,16 +118,11 @@ def test_logits_of_plus_and_minus_ten_thousand_give_finite_loss_and_gradient():
     photo = torch.tensor([[-1.0, 0.0], [1.0, 0.0]])
     objects, scale = torch.tensor([0, 1]), torch.tensor(math.log(1e4))
     assert torch.isinf(-torch.log(torch.sigmoid(torch.tensor(-1e4))))
-    for loss in (
-        sigmoid_loss(touch, photo, objects, objects, scale, torch.tensor(0.0)),
-        contrastive_loss(touch, photo, objects, objects, scale),
-    ):
-        (gradient,) = torch.autograd.grad(loss, touch)
-        assert loss.item() == pytest.approx(2e4, rel=1e-4)  # both of a touch's pairs, or the gap between them
-        assert torch.isfinite(gradient).all()
-        assert float(gradient.abs().sum()) > 1e4
-    correct = sigmoid_loss(touch, -photo, objects, objects, scale, torch.tensor(0.0))
-    assert correct.item() == 0.0
+    loss = contrastive_loss(touch, photo, objects, objects, scale)
+    (gradient,) = torch.autograd.grad(loss, touch)
+    assert loss.item() == pytest.approx(2e4, rel=1e-4)  # the gap between both of a touch's pairs
+    assert torch.isfinite(gradient).all()
+    assert float(gradient.abs().sum()) > 1e4
 
 
 @pytest.mark.parametrize("logit", [1e4, -1e4])
@@ -172,34 +131,20 @@ def test_the_match_loss_at_ten_thousand_is_the_logit_or_nothing(logit):
     assert match_loss(torch.tensor([logit]), torch.tensor([float(logit > 0)])).item() == 0.0
 
 
-def test_one_touch_and_its_photo_have_a_sigmoid_loss_and_no_contrast():
+def test_one_touch_and_its_photo_have_no_contrast():
     touch, photo, own = at_angles(0), at_angles(60), torch.tensor([0])
-    loss = sigmoid_loss(touch, photo, own, own, torch.tensor(0.0), torch.tensor(0.0))
-    assert loss.item() == pytest.approx(math.log(1 + math.exp(-0.5)), rel=1e-6)
     assert contrastive_loss(touch, photo, own, own, torch.tensor(0.0)).item() == 0.0
-
-
-def test_an_object_twice_in_a_batch_is_never_its_own_negative():
-    """Pulling its touches and photos together can only lower the loss; as negatives the second ones would raise it."""
-    photo, objects = at_angles(0, 0, 180), torch.tensor([0, 0, 1])
-    scale, bias = torch.tensor(math.log(10.0)), torch.tensor(0.0)
-    together = sigmoid_loss(at_angles(0, 0, 180), photo, objects, objects, scale, bias)
-    apart = sigmoid_loss(at_angles(0, 90, 180), photo, objects, objects, scale, bias)
-    assert together.item() < 0.001 < apart.item()
-    naive = sigmoid_loss(at_angles(0, 0, 180), photo, torch.arange(3), torch.arange(3), scale, bias)
-    assert naive.item() > 5
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_half_precision_embeddings_lose_only_their_own_rounding(dtype):
     touch, photo = unit(5, 16), unit(6, 16, seed=1)
     labels = torch.tensor([0, 1, 2, 3, 3]), torch.tensor([0, 1, 2, 3, 3, 4])
-    scale, bias = torch.tensor(LOG_SCALE_MAX), torch.tensor(-10.0)
-    for loss in (contrastive_loss, lambda *inputs: sigmoid_loss(*inputs, bias)):
-        rounded = loss(touch.to(dtype), photo.to(dtype), *labels, scale)
-        exact = loss(touch.to(dtype).double(), photo.to(dtype).double(), *labels, scale)
-        assert rounded.dtype == torch.float32
-        assert rounded.item() == pytest.approx(exact.item(), rel=1e-5)  # the sums are in float32
+    scale = torch.tensor(LOG_SCALE_MAX)
+    rounded = contrastive_loss(touch.to(dtype), photo.to(dtype), *labels, scale)
+    exact = contrastive_loss(touch.to(dtype).double(), photo.to(dtype).double(), *labels, scale)
+    assert rounded.dtype == torch.float32
+    assert rounded.item() == pytest.approx(exact.item(), rel=1e-5)  # the sums are in float32
     # The loss of the same arithmetic in half precision, at 100 times a cosine:
     naive = (100 * touch.to(dtype) @ photo.to(dtype).T).double() - 100 * touch.to(dtype).double() @ photo.to(
         dtype

@@ -287,7 +287,7 @@ def test_unknown_methods_and_measures_are_shown_under_their_names(report, tmp_pa
     assert "objects-test-brand-new_method.png" in {path.name for path in files}
 
 
-@pytest.mark.parametrize("methods", [("chance",), ("late_fusion",), ("chance", "constant")])
+@pytest.mark.parametrize("methods", [("chance",), ("late_fusion",)])
 def test_one_method_is_enough(folder, tmp_path, methods):
     out = write_synthetic_results(folder, tmp_path, methods)
     assert write_report(out, None)

@@ -117,12 +117,12 @@ class Proxies(Loss):
         return functional.cross_entropy(batch.touch.embedding @ self.proxies.weight.T, batch.touch_objects)
 
 
-OWN = TINY.using(losses={"sigmoid": 0.5, Proxies: 0.5})
+OWN = TINY.using(losses={"contrastive": 0.5, Proxies: 0.5})
 
 
 def test_the_parameters_of_a_loss_are_trained_and_not_stored_in_the_checkpoint(recording, tmp_path):
     trainer = trainer_for(recording, tmp_path / "m.safetensors", OWN)
-    assert list(trainer.losses.weights) == ["sigmoid", f"{__name__}:Proxies"]
+    assert list(trainer.losses.weights) == ["contrastive", f"{__name__}:Proxies"]
     first = {name: tensor.clone() for name, tensor in trainer.losses.state_dict().items()}
     assert first["terms.1.proxies.weight"].shape == (len(trainer.split.train), 16)
     trainer.run(quiet=True)

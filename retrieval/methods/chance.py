@@ -1,4 +1,4 @@
-"""Trivial baselines: scores without information, which show the values of every metric by chance."""
+"""Random scores, which show the value of every metric by chance."""
 
 from hashlib import blake2b
 from typing import TYPE_CHECKING
@@ -37,21 +37,3 @@ class Chance(Method):
             content = int.from_bytes(blake2b(item.tobytes(), digest_size=8).digest())
             drawn[row] = np.random.default_rng([self.settings.seed, modality, content]).standard_normal(DIM)
         return np.asarray(drawn / np.linalg.norm(drawn, axis=1, keepdims=True))
-
-
-class Constant(Method):
-    """Scores of 0: every pair is equally good, so every metric must give exactly chance."""
-
-    is_seeded = False
-
-    def _fit(self, train: "Features", validation: "Features") -> None:
-        pass
-
-    def _encode_touch(self, touch: Array) -> Array:
-        return np.zeros((len(touch), 1), dtype=np.float32)
-
-    def _encode_photo(self, photo: Array) -> Array:
-        return np.zeros((len(photo), 1), dtype=np.float32)
-
-    def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
-        return np.zeros((len(touch_encodings), len(photo_encodings)), dtype=np.float32)
