@@ -61,7 +61,6 @@ def measures(rng, skill):
             for index, key in enumerate(RANKS)
         }
     flat |= dict.fromkeys(("objectfolder_touch_to_photo", "objectfolder_photo_to_touch"), (0.08 + 0.2 * skill, 0.07))
-    flat |= {"paired_top1": (0.002 + 0.02 * skill, 0.0013), "paired_top5": (0.006 + 0.06 * skill, 0.0063)}
     return {name: summary(rng, value, chance) for name, (value, chance) in flat.items()}
 
 
@@ -113,20 +112,6 @@ def examples(rng, grasps, objects, best):
     return queries
 
 
-def example_grasps(rng, grasps, objects):
-    """Return two touches of these objects, each with the grasp of a found photo."""
-    candidates = [grasp for grasp in grasps if grasp.object_id in objects]
-    found = [grasp.grasp_id for grasp in grasps]
-    return [
-        {
-            "grasp_id": candidates[index].grasp_id,
-            "object_id": candidates[index].object_id,
-            "found": str(rng.choice(found)),
-        }
-        for index in rng.permutation(len(candidates))[:2]
-    ]
-
-
 def method(rng, name, grasps, split):
     """Return the entry of one method in results.json."""
     skill = SKILL.get(name, 0.9)
@@ -142,10 +127,9 @@ def method(rng, name, grasps, split):
         "measures": measures(rng, skill),
         "per_object": {"test_candidates": {item: by_object[item] for item in test}, "all_candidates": by_object},
         "confusions": [
-            {"object_id": a, "mistaken_for": b, "share": float(fraction), "grasps": example_grasps(rng, grasps, [a])}
+            {"object_id": a, "mistaken_for": b, "share": float(fraction)}
             for (a, b), fraction in zip(pairs, fractions, strict=True)
         ],
-        "examples_by_rank": {str(k): [example_grasps(rng, grasps, test) for _ in range(k)] for k in (5, 10)},
         "reliability": {kind: reliability(rng) for kind in ("pairs", "k5", "k10", "k5_g5")},
         "calibration": {
             "pairs": {"1": {"slope": 0.9, "intercept": -0.1}},
@@ -238,17 +222,6 @@ def synthetic_results(recording, methods=tuple(SKILL), seed=0):
                 },
             }
             for name, text in CEILINGS.items()
-        },
-        "low_contact": {
-            "change": 2.5,
-            "touches": 40,
-            "methods": {
-                name: {
-                    part: {"topn_k5": summary(rng, curve(skill, 5), np.arange(1, 6) / 5)}
-                    for part, skill in (("low_contact", 0.2), ("others", 0.8))
-                }
-                for name in methods
-            },
         },
         "verification": verification(np.random.default_rng([seed, 1])),
         "comparisons": [

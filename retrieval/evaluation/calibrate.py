@@ -7,14 +7,14 @@ is treated as one grasp with the score of the set.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.errors import BadInput
-from retrieval.metrics.pairs import Calibration, Threshold, fit_calibration, reliability_bins
+from retrieval.metrics.pairs import Calibration, fit_calibration, reliability_bins
 from retrieval.metrics.table import ScoreTable, object_scores
 from retrieval.model.posterior import (
     MIN_OBJECTS,
@@ -64,8 +64,8 @@ class Calibrations:
     def to_dict(self) -> dict[str, Any]:
         """Return JSON types: {"pairs": {"1": {...}}, "posteriors": {"1": {...}}}."""
         return {
-            kind: {str(grasps): one.to_dict() for grasps, one in fitted.items()}
-            for kind, fitted in (("pairs", self.pairs), ("posteriors", self.posteriors))
+            "pairs": {str(grasps): asdict(one) for grasps, one in self.pairs.items()},
+            "posteriors": {str(grasps): one.to_dict() for grasps, one in self.posteriors.items()},
         }
 
 
@@ -91,45 +91,34 @@ def calibrate_pairs(validation: ScoreTable, *, seed: int = 0) -> Calibration:
     return fit_calibration(*draw_pairs(validation, seed))
 
 
-@dataclass(frozen=True)
-class PairRule:
-    """Rule that classifies a pair as match or no match.
+class PairThreshold(NamedTuple):
+    """The score above which a pair is classified as a match, with its source; or why there is none."""
 
-    Attributes:
-        rule: The calibration or the threshold; None if there is none.
-        source: "the checkpoint" or "validation objects"; empty without a rule.
-        reason: Why there is no rule.
-    """
-
-    rule: Calibration | Threshold | None
-    source: str = ""
-    reason: str = ""
+    at: float | None
+    source: str | None = None
+    reason: str | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return "pair_threshold" of results.json: {"at": score above which a pair matches, "from", "reason"}."""
-        at = -self.rule.intercept / self.rule.slope if isinstance(self.rule, Calibration) else None
-        at = self.rule.at if isinstance(self.rule, Threshold) else at
-        return {"at": at, "from": self.source or None, "reason": self.reason or None}
+        """Return "pair_threshold" of results.json."""
+        return {"at": self.at, "from": self.source, "reason": self.reason}
 
 
-def pair_rule(best_params: Mapping[str, Any], validation: ScoreTable, *, seed: int = 0) -> PairRule:
+def pair_threshold(best_params: Mapping[str, Any], validation: ScoreTable, *, seed: int = 0) -> PairThreshold:
     """Return the pair threshold of a checkpoint, else one that is fitted on validation objects.
 
     Args:
         best_params: Parameters of the method; "pair_threshold" is the checkpoint's own threshold.
-        validation: Scores of validation objects. Fewer than `MIN_THRESHOLD_OBJECTS` objects give no rule, because a
-            threshold for so few objects is arbitrary.
+        validation: Scores of validation objects. Fewer than `MIN_THRESHOLD_OBJECTS` objects give no threshold, because
+            one for so few objects is arbitrary.
         seed: Seed of the drawn pairs.
     """
     if (own := best_params.get("pair_threshold")) is not None:
-        return PairRule(Threshold(own), "the checkpoint")
+        return PairThreshold(own, "the checkpoint")
     if (count := len(validation.with_targets.objects)) < MIN_THRESHOLD_OBJECTS:
-        return PairRule(
-            None,
-            reason="pair accuracy needs a threshold of the checkpoint, or one fitted on at least "
-            f"{MIN_THRESHOLD_OBJECTS} validation objects; the split has {count}",
-        )
-    return PairRule(calibrate_pairs(validation, seed=seed), "validation objects")
+        reason = "pair accuracy needs a threshold of the checkpoint, or one fitted on at least "
+        return PairThreshold(None, None, f"{reason}{MIN_THRESHOLD_OBJECTS} validation objects; the split has {count}")
+    fitted = calibrate_pairs(validation, seed=seed)
+    return PairThreshold(-fitted.intercept / fitted.slope, "validation objects")
 
 
 def has_enough_objects(table: ScoreTable) -> bool:

@@ -13,7 +13,7 @@ from retrieval.console.progress import Bar
 from retrieval.data.dataset import AnyRecording, Split, folder_of
 from retrieval.errors import BadInput
 from retrieval.evaluation import SCHEMA_VERSION
-from retrieval.evaluation.audit import UNIT, audit
+from retrieval.evaluation.audit import audit
 from retrieval.evaluation.cache import cached_document, resumable, write_document
 from retrieval.evaluation.controls import (
     CEILING_METHOD,
@@ -26,7 +26,6 @@ from retrieval.evaluation.controls import (
 )
 from retrieval.evaluation.data import EvaluationData, prepare
 from retrieval.evaluation.experiment import Experiment
-from retrieval.evaluation.low_contact import find_low_contact_touches, score_low_contact
 from retrieval.evaluation.predictions import Predictions
 from retrieval.evaluation.queries import draw_queries
 from retrieval.evaluation.scoring import Measures, score_method
@@ -118,19 +117,14 @@ def evaluate(
             }
             for group, descriptions, method, experiments in groups
         }
-    queries = experiment.queries
-    tested = [data.grasps[row] for row in queries.touches[queries.of_part(queries.touch_owner, "test")]]
     results = {
         **_about(data, experiment, preset_name, seed_list),
         "audit": cached_document(
             out / "audit.json",
-            {"recording": data.digest, "split": data.split.to_dict(), "distance": UNIT},
+            {"recording": data.digest, "split": data.split.to_dict()},
             lambda: audit(data.grasps, data.split, quiet=quiet),  # reads every image
         ),
         **_score_methods(experiment, predictions, seed, quiet),
-        "low_contact": score_low_contact(
-            find_low_contact_touches(tested, quiet=quiet), queries, predictions, draws=DRAWS, seed=seed
-        ),
         "verification": (
             score_verification(experiment, predictions["late_fusion"], jobs["late_fusion"], seed)
             if "late_fusion" in jobs

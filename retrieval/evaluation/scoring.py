@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from retrieval.evaluation.calibrate import (
     Calibrations,
     KWayTest,
-    PairRule,
+    PairThreshold,
     calibrate,
     has_enough_objects,
-    pair_rule,
+    pair_threshold,
     reliability,
 )
-from retrieval.evaluation.example_grasps import ExampleGrasps
+from retrieval.evaluation.example_grasps import example_queries
 from retrieval.evaluation.predictions import Predictions
 from retrieval.evaluation.queries import Queries
 from retrieval.evaluation.reject import Rejection, reject
@@ -29,7 +29,6 @@ from retrieval.metrics.table import ScoreTable
 
 CHOICES = (KWayTest(5), KWayTest(10), KWayTest(5, 5, PHOTOS_PER_CANDIDATE))
 _CONFUSIONS = 12
-_TOPN_CANDIDATES = (5, 10)
 
 Measures = dict[str, Measure]
 
@@ -106,7 +105,7 @@ class MethodScores:
             test=self.touches("test", "test"),
             all_objects=self.touches("test", None),
             sets=self.sets("test"),
-            rule=self.pair_rule.rule,
+            threshold=self.pair_threshold.at,
             seed=self.seed,
         )
 
@@ -115,9 +114,9 @@ class MethodScores:
         return compute(self.score_tables(), names)
 
     @cached_property
-    def pair_rule(self) -> PairRule:
-        """Return the rule that classifies a single touch and a photo as match or no match."""
-        return pair_rule(self.predictions.best_params, self.touches("validation", "validation"), seed=self.seed)
+    def pair_threshold(self) -> PairThreshold:
+        """Return the threshold that classifies a single touch and a photo as match or no match."""
+        return pair_threshold(self.predictions.best_params, self.touches("validation", "validation"), seed=self.seed)
 
 
 def _of(queries: Queries, owner: NDArray[np.int64], part: str | None) -> NDArray[np.int64]:
@@ -145,20 +144,20 @@ def score_method(
         seed: Seed of drawn tests, pairs and resamples.
     """
     scored = [MethodScores(queries, predictions, seed) for predictions in by_seed]
-    examples = ExampleGrasps(scored[0].touches("test", "test"), queries.objects, *scored[0].ids(grasp_ids, "test"))
     calibrations = [calibrate(one.by_grasps("validation"), seed=seed) for one in scored]
     measures = [compute(one.score_tables()) for one in scored]
     entry = {
         "best_params": [predictions.best_params for predictions in by_seed],
-        "pair_threshold": scored[0].pair_rule.to_dict(),
+        "pair_threshold": scored[0].pair_threshold.to_dict(),
         "measures": summaries(measures, draws, seed),
         "per_object": _per_object(queries, scored, measures, seed),
-        "confusions": _confusions(queries, scored, examples, seed),
+        "confusions": _confusions(queries, scored, seed),
         "calibration": calibrations[0].to_dict(),
         "reliability": reliability(calibrations[0], scored[0].by_grasps("test"), CHOICES, seed=seed),
         "reject": _reject(scored, calibrations, draws, seed),
-        "examples": examples.examples(),
-        "examples_by_rank": {str(k): found for k in _TOPN_CANDIDATES if (found := examples.examples_by_rank(k, seed))},
+        "examples": example_queries(
+            scored[0].touches("test", "test"), queries.objects, *scored[0].ids(grasp_ids, "test")
+        ),
     }
     return entry, measures
 
@@ -183,9 +182,7 @@ def _mean_by_name(queries: Queries, by_seed: Iterable[Mapping[int, float]]) -> d
     return {name: float(np.mean(values)) for name, values in found.items()}
 
 
-def _confusions(
-    queries: Queries, scored: Sequence[MethodScores], examples: ExampleGrasps, seed: int
-) -> list[dict[str, Any]]:
+def _confusions(queries: Queries, scored: Sequence[MethodScores], seed: int) -> list[dict[str, Any]]:
     """Return the most frequent wrong top-1 answers among all test objects."""
     fractions: dict[tuple[int, int], float] = {}
     for one in scored:
@@ -194,12 +191,7 @@ def _confusions(
     largest = sorted(fractions.items(), key=lambda item: (-item[1], item[0]))[:_CONFUSIONS]
     names = queries.objects
     return [
-        {
-            "object_id": names[true],
-            "mistaken_for": names[predicted],
-            "share": fraction,
-            "grasps": examples.confusion_examples(true, predicted),
-        }
+        {"object_id": names[true], "mistaken_for": names[predicted], "share": fraction}
         for (true, predicted), fraction in largest
     ]
 

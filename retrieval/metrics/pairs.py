@@ -3,7 +3,6 @@
 Ranking uses logits and never these probabilities, which are for people to read.
 """
 
-import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,29 +19,10 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 @dataclass(frozen=True)
 class Calibration:
-    """`log_odds = slope * logit + intercept`, fitted on validation pairs at even odds.
-
-    Attributes:
-        slope: Factor of the logit.
-        intercept: Offset.
-        reject_log_odds: Threshold for "no match". It has the largest balanced accuracy on those pairs.
-        positives: Pairs of one object in the fit.
-        negatives: Pairs of two objects in the fit.
-        nll_before: Mean negative log-likelihood in nats on the same pairs, before the fit.
-        nll_after: The same after the fit.
-        ece_before: Expected calibration error (15 equal bins) on the same pairs, before the fit.
-        ece_after: The same after the fit.
-    """
+    """`log_odds = slope * logit + intercept`, fitted on validation pairs at even odds."""
 
     slope: float
     intercept: float
-    reject_log_odds: float
-    positives: int
-    negatives: int
-    nll_before: float
-    nll_after: float
-    ece_before: float
-    ece_after: float
 
     def log_odds(self, logit: ArrayLike) -> NDArray[np.float64]:
         """Return the calibrated log-odds of match logits.
@@ -58,21 +38,6 @@ class Calibration:
     def probability(self, logit: ArrayLike) -> NDArray[np.float64]:
         """Return the probability of a match at even odds, for people; never rank by it."""
         return _expit(self.log_odds(logit))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return a plain dictionary, as in `results.json`."""
-        return dataclasses.asdict(self)
-
-
-@dataclass(frozen=True)
-class Threshold:
-    """A fixed rule: scores above `at` are matches."""
-
-    at: float
-
-    def log_odds(self, score: ArrayLike) -> NDArray[np.float64]:
-        """Return how far scores lie above the threshold."""
-        return np.asarray(score, dtype=np.float64) - self.at
 
 
 def fit_calibration(logits: ArrayLike, labels: ArrayLike) -> Calibration:
@@ -90,19 +55,7 @@ def fit_calibration(logits: ArrayLike, labels: ArrayLike) -> Calibration:
         NumericalError: A logit is not a finite float32.
     """
     z, y = _checked(logits, labels)
-    slope, intercept = _likeliest(z, y)
-    x = slope * z + intercept
-    return Calibration(
-        slope=slope,
-        intercept=intercept,
-        reject_log_odds=_best_threshold(x, y),
-        positives=int(y.sum()),
-        negatives=int((1 - y).sum()),
-        nll_before=_nll(z, y),
-        nll_after=_nll(x, y),
-        ece_before=reliability_bins(_expit(z), y)["ece"],
-        ece_after=reliability_bins(_expit(x), y)["ece"],
-    )
+    return Calibration(*_likeliest(z, y))
 
 
 def _likeliest(z: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
@@ -148,6 +101,12 @@ def pair_accuracy(logits: ArrayLike, labels: ArrayLike) -> float:
     z, y = _checked(logits, labels)
     correct = np.where(z == 0, 0.5, (z > 0) == (y == 1))
     return float(correct.mean())
+
+
+def negative_log_likelihood(logits: ArrayLike, labels: ArrayLike) -> float:
+    """Return the mean negative log-likelihood of pairs in nats, with the logits as log-odds."""
+    z, y = _checked(logits, labels)
+    return float(-np.mean(-np.logaddexp(0, np.where(y == 1, -z, z))))
 
 
 def pair_auc(logits: ArrayLike, labels: ArrayLike) -> float:
@@ -197,25 +156,6 @@ def _checked(logits: ArrayLike, labels: ArrayLike) -> tuple[NDArray[np.float64],
     if not (true and false and true + false == len(y)):
         raise BadInput(f"pairs of both classes are needed, labelled 0 and 1; of {len(y)}, {true} are 1 and {false} 0")
     return z, y
-
-
-def _best_threshold(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
-    """Return the threshold with the largest balanced accuracy.
-
-    It is midway between the lowest accepted value and the next lower value, if there is one.
-    """
-    values, place = np.unique(x, return_inverse=True)
-    true_below = np.cumsum(np.bincount(place, weights=y)) / y.sum()
-    false_below = np.cumsum(np.bincount(place, weights=1 - y)) / (1 - y).sum()
-    # If values[i] and all higher values are accepted, the gain is the fraction of false pairs below values[i] minus
-    # that of true pairs. With values[0] all pairs are accepted, and the gain is 0.
-    best = int(np.argmax(np.append(0.0, (false_below - true_below)[:-1])))
-    middle = (values[best] + values[max(best - 1, 0)]) / 2
-    return float(middle if best == 0 or middle > values[best - 1] else values[best])
-
-
-def _nll(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
-    return float(-np.mean(-np.logaddexp(0, np.where(y == 1, -x, x))))
 
 
 def _expit(x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,9 +1,9 @@
 """Evaluation metrics: each turns a score table into one value per query, with its gallery and the value of chance.
 
-The gallery of a row excludes the photos of its own grasps, which have object, light and pose in common with it. The
-protocols `with_own` and `paired` of other benchmarks include them. Rows without another photo of their object
-are not queries; the description of the gallery states how many there are. In pair and K-way tests other objects have
-equal weight, however many photos they have; in rankings of the whole gallery each photo counts.
+The gallery of a row excludes the photos of its own grasps, which have object, light and pose in common with it; the
+protocols of other benchmarks include them (`with_own`). Rows without another photo of their object are not queries;
+the description of the gallery states how many there are. In pair and K-way tests other objects have equal weight,
+however many photos they have; in rankings of the whole gallery each photo counts.
 """
 
 import numpy as np
@@ -13,24 +13,22 @@ from retrieval.errors import BadInput
 from retrieval.metrics import ranking
 from retrieval.metrics.k_way import k_way_accuracies
 from retrieval.metrics.measure import Measure, object_means, object_weights, weight_below
-from retrieval.metrics.pairs import Calibration, Threshold
 from retrieval.metrics.table import ScoreTable, object_scores
 
 
-def pair_accuracy(table: ScoreTable, rule: Calibration | Threshold) -> Measure:
+def pair_accuracy(table: ScoreTable, threshold: float) -> Measure:
     """The paper's test, half true and half false pairs, in closed form over ALL pairs.
 
-    A row is correct on a photo of its object if the calibrated log-odds are above 0, and on another object's photo if
-    they are below; exactly 0 counts half. The value is the mean of two fractions: over its object's photos, and over
-    other photos (a uniform object, then a uniform photo of it). Chance is 1/2.
+    A row is correct on a photo of its object if the score is above the threshold, and on another object's photo if it
+    is below; exactly the threshold counts half. The value is the mean of two fractions: over its object's photos, and
+    over other photos (a uniform object, then a uniform photo of it). Chance is 1/2.
 
     Args:
         table: The scores.
-        rule: A calibration that was fitted on such rows of validation objects, or a threshold of the scores.
+        threshold: The threshold, from validation objects.
     """
     queries = table.with_targets
-    odds = rule.log_odds(queries.scores)
-    own, others = _same_and_other_object_means(queries, (np.sign(odds) + 1) / 2)
+    own, others = _same_and_other_object_means(queries, (np.sign(queries.scores.astype(float) - threshold) + 1) / 2)
     return _measure(table, (own + 1 - others) / 2, 0.5)
 
 
@@ -111,28 +109,6 @@ def average_precision(table: ScoreTable) -> Measure:
     queries = table.with_targets
     values = ranking.average_precision(queries.scores, queries.relevant, ~queries.own)
     return _measure(table, values, ranking.chance_of_average_precision(queries.relevant, ~queries.own))
-
-
-def paired(table: ScoreTable, k: int) -> Measure:
-    """Top-k accuracy of the whole set as one batch, averaged over both directions, as in TVL.
-
-    Only the photo (or touch) of the same grasp is correct; other photos of the object are wrong. Raises BadInput unless
-    rows and columns are the same grasps.
-    """
-    if not is_paired(table):
-        raise BadInput("a paired batch needs one photo for each touch; give a table of single grasps and their photos")
-    every, count = np.ones_like(table.own), len(table.own)
-    there = ranking.first_relevant(table.scores, table.own, every)
-    back = ranking.first_relevant(table.scores.T, table.own.T, every)
-    values = (ranking.recall_at(k, there) + ranking.recall_at(k, back)[table.own.argmax(1)]) / 2
-    words = f"{count} grasps in one batch, {len(table.objects)} {table.object_words}; only the same grasp is correct"
-    return Measure(values[:, None], table.touch_owner, np.array([min(1.0, k / count)]), words)
-
-
-def is_paired(table: ScoreTable) -> bool:
-    """Whether rows and columns are the same grasps, each once. Photos that several grasps share are not paired."""
-    square = table.own.shape[0] == table.own.shape[1]
-    return square and bool((table.own.sum(1) == 1).all() and (table.own.sum(0) == 1).all())
 
 
 def _measure(table: ScoreTable, values: NDArray[np.float64], chance: NDArray[np.float64] | float) -> Measure:

@@ -9,7 +9,6 @@ from functools import cached_property, partial
 
 from retrieval.metrics import protocols
 from retrieval.metrics.measure import Measure
-from retrieval.metrics.pairs import Calibration, Threshold
 from retrieval.metrics.table import ScoreTable
 
 SET_SIZES = (1, 2, 3, 5, 8, 12, 20)
@@ -28,14 +27,14 @@ class MethodScoreTables:
         test: Touches with photos of test objects.
         all_objects: The same touches with the photos of all objects.
         sets: By number of grasps, sets of test touches with photos of test objects.
-        rule: Decides which pairs of a touch and a photo are matches; None without a rule.
+        threshold: Score above which a touch and a photo are classified as a match; None without a threshold.
         seed: Seed of random draws.
     """
 
     test: ScoreTable
     all_objects: ScoreTable
     sets: dict[int, ScoreTable]
-    rule: Calibration | Threshold | None
+    threshold: float | None
     seed: int
 
     @cached_property
@@ -98,10 +97,6 @@ def _if_enough_photos(tables: MethodScoreTables, count: int) -> Measure | None:
     return k_way_measure(tables.test, 5, tables.seed, count) if tables.test.min_photos >= count else None
 
 
-def _paired(table: ScoreTable, k: int) -> Measure | None:
-    return protocols.paired(table, k) if protocols.is_paired(table) else None
-
-
 TOUCH_TO_PHOTO, PHOTO_TO_TOUCH = "touch to photo", "photo to touch"
 
 
@@ -123,7 +118,7 @@ METRICS: dict[str, Metric] = {
         "pair accuracy",
         "pair accuracy",
         "main",
-        lambda tables: protocols.pair_accuracy(tables.test, tables.rule) if tables.rule else None,
+        lambda tables: None if tables.threshold is None else protocols.pair_accuracy(tables.test, tables.threshold),
     ),
     "pair_auc": Metric("pair AUC", "pair AUC", "main", lambda tables: protocols.pair_auc(tables.test)),
     "topn_k5": Metric(
@@ -166,8 +161,6 @@ METRICS: dict[str, Metric] = {
         "objectfolder",
         lambda tables: protocols.average_precision(tables.photos.with_own()),
     ),
-    "paired_top1": Metric("top 1", "top 1", "paired", lambda tables: _paired(tables.test, 1)),
-    "paired_top5": Metric("top 5", "top 5", "paired", lambda tables: _paired(tables.test, 5)),
 }
 """Name in results.json -> metric, in the order of every table."""
 

@@ -1,12 +1,11 @@
 """Builder of the sections of an evaluation's report."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from string import ascii_lowercase
 from typing import Any
 
 from retrieval.report.canvas import draw
-from retrieval.report.document import Block, Card, Details, Picture, Spot
+from retrieval.report.document import Block, Details, Picture
 from retrieval.report.galleries import Grasps
 from retrieval.report.results import Results, capitalized, measure_label, method_label, percent
 
@@ -29,15 +28,7 @@ class Builder:
         self.main = (results.learned or results.methods)[0]
         self.figures: list[Path] = []
 
-    def picture(
-        self,
-        name: str,
-        alt: str,
-        caption: str,
-        make: Callable[..., Any],
-        *arguments: Any,
-        spots: Mapping[str, Sequence[tuple[str, Sequence[Any]]]] | None = None,
-    ) -> Picture:
+    def picture(self, name: str, alt: str, caption: str, make: Callable[..., Any], *arguments: Any) -> Picture:
         """Write a figure and return its block.
 
         Args:
@@ -46,35 +37,11 @@ class Builder:
             caption: Caption.
             make: Function that draws the figure.
             *arguments: Arguments of `make`.
-            spots: `gid` of an artist of the figure -> label and grasps (of results.json) for each of its points.
-
-        Returns:
-            The block of the figure, with its clickable spots.
         """
         path = self.out / "figures" / name
-        places = draw(path, make, *arguments)
+        draw(path, make, *arguments)
         self.figures.append(path)
-        clickable = [
-            Spot(box, label, tuple(map(self._card, grasps)))
-            for gid, labelled_grasps in (spots or {}).items()
-            for box, (label, grasps) in zip(places.get(gid, ()), labelled_grasps, strict=False)
-            if grasps and self.grasps
-        ]
-        return Picture(f"figures/{name}", alt, caption, tuple(clickable))
-
-    def _card(self, example: Any) -> Card:
-        """Return the card of a grasp in results.json: gel images, its object's photo, and the found photo."""
-        own, found = self.grasps.get(example["grasp_id"]), self.grasps.get(example["found"])
-        found_object = found.object_id if found else example["found"]
-        touches = own.touches if own else ()
-        gels = [(f"finger {ascii_lowercase[place]}", path) for place, path in enumerate(touches)]
-        # The grasps of a confusion come from all seeds: in this seed the object itself may be the first result.
-        status = "found" if found_object == example["object_id"] else "found, wrong"
-        photos = [
-            (f"the object: {example['object_id']}", own.photo if own else None),
-            (f"{status}: {found_object}", found.photo if found else None),
-        ]
-        return Card(f"Grasp {example['grasp_id']}", (*gels, *photos))
+        return Picture(f"figures/{name}", alt, caption)
 
     def any(self, *measures: str) -> bool:
         """Return whether any method has one of these measures."""

@@ -74,26 +74,13 @@ def percent_axis(panel: Axes, label: str) -> None:
     panel.set_ylabel(label)
 
 
-@dataclass(frozen=True)
-class RelativeBox:
-    """Position in a figure, as fractions of its width and height, from its upper left corner."""
-
-    left: float
-    top: float
-    width: float
-    height: float
-
-
-def draw(path: Path, make: Callable[..., Figure], *arguments: Any) -> dict[str, list[RelativeBox]]:
+def draw(path: Path, make: Callable[..., Figure], *arguments: Any) -> None:
     """Write the figure that `make(*arguments)` returns.
 
     Args:
         path: File to write; .jpg for photographs, .png for plots.
         make: Function that draws the figure.
         *arguments: Arguments of `make`.
-
-    Returns:
-        `gid` of an artist -> its positions: the points of a line, the box of anything else.
 
     Raises:
         RetrievalError: matplotlib is not installed.
@@ -108,7 +95,7 @@ def draw(path: Path, make: Callable[..., Figure], *arguments: Any) -> dict[str, 
     path.parent.mkdir(parents=True, exist_ok=True)
     with rc_context(_RC), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # names in scripts that the font lacks
-        agg: Any = FigureCanvasAgg(figure := make(*arguments))
+        agg: Any = FigureCanvasAgg(make(*arguments))
         agg.draw()
     image, data = Image.fromarray(np.ascontiguousarray(np.asarray(agg.buffer_rgba())[..., :3])), io.BytesIO()
     if path.suffix == ".jpg":
@@ -116,15 +103,3 @@ def draw(path: Path, make: Callable[..., Figure], *arguments: Any) -> dict[str, 
     else:  # a palette of 256 colours makes the file of a plot three times smaller
         image.quantize(256, dither=Image.Dither.NONE).save(data, "PNG", optimize=True)
     write_atomically(path, data.getvalue())
-    width, height = agg.get_width_height()
-    named = figure.findobj(lambda artist: artist.get_gid() is not None)
-    places = {}
-    for artist in named:
-        corners = [artist.get_window_extent().extents]  # left, bottom, right, top in pixels from the lower left
-        if hasattr(artist, "get_xydata"):
-            corners = [(x, y, x, y) for x, y in artist.get_transform().transform(artist.get_xydata())]
-        places[artist.get_gid()] = [
-            RelativeBox(left / width, 1 - top / height, (right - left) / width, (top - bottom) / height)
-            for left, bottom, right, top in corners
-        ]
-    return places

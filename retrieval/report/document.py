@@ -13,11 +13,10 @@ from typing import Any, ClassVar
 from PIL import Image
 
 from retrieval.console.files import text_bytes, write_output
-from retrieval.report.canvas import FIGURE_DPI, RelativeBox
-from retrieval.report.pages import data_uri, jpeg, render, script, thumbnail
+from retrieval.report.canvas import FIGURE_DPI
+from retrieval.report.pages import data_uri, render, script
 
 _PAGE_DPI = 96
-_CARD_PX = 128
 
 
 @dataclass(frozen=True)
@@ -63,23 +62,6 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Card:
-    """A line of text, and photographs with their captions; the path None means a missing photograph."""
-
-    text: str
-    pictures: tuple[tuple[str, Path | None], ...]
-
-
-@dataclass(frozen=True)
-class Spot:
-    """A clickable place of a picture, which shows cards; `label` is its text and the heading of the cards."""
-
-    box: RelativeBox
-    label: str
-    cards: tuple[Card, ...]
-
-
-@dataclass(frozen=True)
 class Picture:
     """A picture in a file under the document's folder; `alt` is its text alternative."""
 
@@ -87,7 +69,6 @@ class Picture:
     file: str
     alt: str
     caption: str
-    spots: tuple[Spot, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -139,16 +120,7 @@ def write_document(document: Document, out: Path) -> list[Path]:
 
 
 def to_html(document: Document, folder: Path) -> str:
-    """Return one HTML page that embeds the pictures under `folder`; photographs of cards are embedded once each."""
-    photographs: dict[Path, str] = {}
-
-    def photograph_id(path: Path) -> str:
-        """Return the id by which a card finds its photograph on the page."""
-        return photographs.setdefault(path, f"p{len(photographs)}")
-
-    def photograph(path: Path) -> str | None:
-        image = thumbnail(path, _CARD_PX)
-        return None if image is None else data_uri(jpeg(image), "jpeg")
+    """Return one HTML page that embeds the pictures under `folder`."""
 
     def uri(file: str) -> str:
         return data_uri((folder / file).read_bytes(), "png" if file.endswith(".png") else "jpeg")
@@ -167,11 +139,7 @@ def to_html(document: Document, folder: Path) -> str:
         uri=uri,
         width=width,
         anchor=anchor,
-        percent="{:.2%}".format,
-        photograph_id=photograph_id,
-        photographs=photographs,
-        photograph=photograph,
-        scripts=[script("tables.js"), script("spots.js")],
+        script=script("tables.js"),
     )
 
 

@@ -14,14 +14,6 @@ TOO_FEW = "Not evaluated: the open-set decision requires at least three validati
 def objects(builder: Builder) -> Iterator[Block | None]:
     """Yield the top-1 accuracy of every object, among test objects and among all."""
     yield from builder.each("per_object", _per_object_blocks)
-    if len(plots.test_object_accuracy(builder.results)) > 1:
-        yield builder.picture(
-            "objects-methods.png",
-            "Top-1 accuracy of every test object and method; results.json contains the numbers.",
-            f"Top-1 accuracy of each test object under each method, sorted by {method_label(builder.main)}.",
-            plots.objects_by_method,
-            builder.results,
-        )
 
 
 def _per_object_blocks(builder: Builder, name: str) -> Iterator[Block]:
@@ -59,15 +51,10 @@ def _confusion_blocks(builder: Builder, name: str) -> Iterator[Block]:
         f"confusions-{file_name(name)}.jpg",
         f"Objects next to the objects that they were mistaken for, {method_label(name)}: {'; '.join(descriptions)}.",
         f"Left: the object. Right (red): the object that {method_label(name)} mistook it for, with the fraction of the "
-        "object's touches for which it ranked first in the full gallery of unseen objects. On the page, click a pair "
-        "to see such touches.",
+        "object's touches for which it ranked first in the full gallery of unseen objects.",
         galleries.confusions,
         pairs,
         {grasp.object_id: grasp.photo for grasp in reversed(list(builder.grasps.values()))},
-        spots={
-            str(place): [(f"{one['object_id']} mistaken for {one['mistaken_for']}", one.get("grasps", ()))]
-            for place, one in enumerate(pairs)
-        },
     )
 
 

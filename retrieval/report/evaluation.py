@@ -117,10 +117,6 @@ def _setting(builder: Builder) -> Iterator[Block | None]:
         yield Details("Parameters selected on validation objects, for each seed", (Listing.of_json(selected),))
 
 
-def _everything(builder: Builder) -> Iterator[Block | None]:
-    yield Details("Every measure of every method", (tables.everything(builder.results),))
-
-
 SECTIONS: dict[str, Callable[[Builder], Iterator[Block | None]]] = {
     "Comparison of methods": method_comparison.method_overview,
     "Top-N accuracy": method_comparison.topn_curves,
@@ -130,7 +126,6 @@ SECTIONS: dict[str, Callable[[Builder], Iterator[Block | None]]] = {
     "Differences between methods": method_comparison.comparisons,
     "Controls": method_comparison.controls,
     "Ceilings": method_comparison.ceilings,
-    "Low-contact touches": method_comparison.low_contact,
     "Leakage audit": method_comparison.audit,
     "Accuracy by object": error_analysis.objects,
     "Confusions": error_analysis.confusions,
@@ -139,5 +134,4 @@ SECTIONS: dict[str, Callable[[Builder], Iterator[Block | None]]] = {
     "Is the object in the catalogue?": error_analysis.reject,
     "Is it the expected object?": error_analysis.verification,
     "Settings": _setting,
-    "All measures": _everything,
 }

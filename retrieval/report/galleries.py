@@ -1,4 +1,4 @@
-"""Figures of photographs: confusions, best and worst queries, and the nearest frames of an audit.
+"""Figures of photographs: confusions, and the best and worst queries.
 
 All pictures of a figure share one pair of axes, in units of a tile, because the layout of many axes is slow.
 """
@@ -50,12 +50,7 @@ def examples(queries: Sequence[Any], grasps: Grasps) -> Figure:
 
 
 def confusions(pairs: Sequence[Any], photo_of: Mapping[str, Path]) -> Figure:
-    """Draw each object next to the object that it was mistaken for, with the fraction of its queries.
-
-    The `gid` of the Nth pair is N.
-    """
-    from matplotlib.patches import Rectangle
-
+    """Draw each object next to the object that it was mistaken for, with the fraction of its queries."""
     columns = min(3, len(pairs))
     rows = -(-len(pairs) // columns)
     figure, panel = _sheet(3.1 * columns - 0.4, 1.45 * rows - 0.15)
@@ -72,25 +67,6 @@ def confusions(pairs: Sequence[Any], photo_of: Mapping[str, Path]) -> Figure:
         )
         _tile(panel, left + 1.75, top, photo_of.get(pair["mistaken_for"]), _WRONG, 2)
         _label(panel, left + 1.75, top, _two_lines(pair["mistaken_for"]))
-        panel.add_patch(Rectangle((left, top), 2.67, 0.92, fill=False, lw=0, gid=str(place)))
-    return figure
-
-
-def nearest_frames(frames: Mapping[str, Any], grasps: Grasps) -> Figure:
-    """Draw the nearest pairs of the audit, a row for each kind: test frame next to training or validation frame."""
-    kinds = [kind for kind in frames if frames[kind]["nearest"]]
-    count = min(3, max(len(frames[kind]["nearest"]) for kind in kinds))
-    figure, panel = _sheet(2.35 * count - 0.35, 1.5 * len(kinds) - 0.1)
-    for row, kind in enumerate(kinds):
-        for column, pair in enumerate(frames[kind]["nearest"][:count]):
-            left, top = 2.35 * column, 1.5 * row
-            panel.text(left, top - 0.05, f"{kind}: distance {pair['distance']:.2f}", fontsize=8)
-            for side, part in enumerate(("test", "train_validation")):
-                grasp, path = grasps.get(pair[part]), None
-                if grasp is not None:
-                    path = grasp.photo if kind == "photo" else grasp.touches[ascii_lowercase.index(kind[-1])]
-                _tile(panel, left + side, top, path)
-                _label(panel, left + side, top, f"{part}: {_two_lines(grasp.object_id if grasp else pair[part], 6)}")
     return figure
 
 

@@ -10,10 +10,9 @@ from retrieval.metrics.registry import (
     grasps_metric_name,
     photos_metric_name,
 )
-from retrieval.report import galleries, plots, tables
+from retrieval.report import plots, tables
 from retrieval.report.builder import Builder
 from retrieval.report.document import Block, Details, Listing, Text
-from retrieval.report.results import method_label
 
 INTERVALS = (
     "Brackets contain 95 % intervals of a bootstrap that resamples objects, because queries of one object are "
@@ -27,8 +26,6 @@ SECTIONS = {
     TOUCH_TO_PHOTO: "From a touch to all photos of the unseen objects; any photo of the object is right.",
     PHOTO_TO_TOUCH: "From a photo to all touches of the unseen objects.",
     "objectfolder": "ObjectFolder's cross-sensory retrieval: mAP over all instances, including the query's grasp.",
-    "paired": "Paired, as in TVL: the whole test set is one batch, and only the photo of the same grasp is right; "
-    "mean of both directions.",
 }
 """Sections of the full gallery, with the text above each table."""
 
@@ -53,22 +50,13 @@ def topn_curves(builder: Builder) -> Iterator[Block | None]:
     """Yield the top-N accuracy: how often the object is among the first N answers."""
     if not builder.any("topn_k5", "topn_k10"):
         return
-    methods = builder.results.data["methods"]
     yield builder.picture(
         "guess-curves.png",
         f"Rising curves. {builder.values('topn_k5')}. {builder.values('topn_k10')}.",
         "How often the object is among the first N answers, with K − 1 other objects as candidates. Bands: 95 % "
-        "intervals. On the page, click a point to see grasps with this rank.",
+        "intervals.",
         plots.topn_curves,
         builder.results,
-        spots={
-            f"{name} topn_k{k}": [
-                (f"{method_label(name)}: rank {number} of {k}", grasps)
-                for number, grasps in enumerate(methods[name].get("examples_by_rank", {}).get(str(k), []), start=1)
-            ]
-            for name in reversed(builder.results.learned)  # the last lies on top
-            for k in (5, 10)
-        },
     )
     for k in (5, 10):
         if table := tables.ranks(builder.results, f"topn_k{k}"):
@@ -107,7 +95,7 @@ def time(builder: Builder) -> Iterator[Block | None]:
 
 
 def gallery(builder: Builder) -> Iterator[Block | None]:
-    """Yield ranks in the full gallery, in both directions, and the protocols of ObjectFolder and TVL."""
+    """Yield ranks in the full gallery, in both directions, and the protocol of ObjectFolder."""
     for name, text in SECTIONS.items():
         if table := tables.section(builder.results, name):
             yield Text(text)
@@ -143,35 +131,13 @@ def ceilings(builder: Builder) -> Iterator[Block | None]:
         yield tables.ceilings(builder.results)
 
 
-def low_contact(builder: Builder) -> Iterator[Block | None]:
-    """Yield the accuracy on low-contact touches, and on all others."""
-    if found := builder.results.data.get("low_contact"):
-        yield Text(
-            f"Low-contact: the {found['touches']} test touches that changed the gel image least, by at most "
-            f"{found['change']:.1f} grey levels on average (of the finger with the larger change). Others: all other "
-            "test touches."
-        )
-        yield tables.low_contact(builder.results)
-
-
 def audit(builder: Builder) -> Iterator[Block | None]:
     """Yield the audit of leakage between the parts of the split."""
-    if not (found := builder.results.data.get("audit")):
-        return
-    yield Text(found["verdict"], warn=not found["clean"])
-    if examples := found["identical"]["examples"]:
-        yield Listing("\n".join("  =  ".join(places) for places in examples))
-    yield tables.audit(found)
-    if builder.grasps and any(frames["nearest"] for frames in found["frames"].values()):
-        gaps = [
-            f"{kind} {one['nearest'][0]['distance']:.2f}" for kind, one in found["frames"].items() if one["nearest"]
+    if found := builder.results.data.get("audit"):
+        yield Text(found["verdict"], warn=not found["clean"])
+        examples = [
+            *found["identical"]["examples"],
+            *(pair for one in found["frames"].values() for pair in one["examples"]),
         ]
-        yield builder.picture(
-            "nearest.jpg",
-            f"Test frames next to the nearest training or validation frames; distances: {', '.join(gaps)}.",
-            "The nearest frames on both sides of the split. Copies would look the same; two low-contact touches look "
-            "similar without being copies.",
-            galleries.nearest_frames,
-            found["frames"],
-            builder.grasps,
-        )
+        if examples:
+            yield Listing("\n".join("  =  ".join(places) for places in examples))

@@ -59,8 +59,7 @@ def topn_curves(results: Results) -> Figure:
             value, low, high = (_percents(summary[part]) for part in ("value", "low", "high"))
             ranks, style = np.arange(1, len(value) + 1), style_of(name)
             panel.plot(ranks, _percents(summary["chance"]), color=MUTED_COLOUR, ls="--", lw=1.2, zorder=1)
-            (line,) = panel.plot(ranks, value, color=style.colour, marker=style.marker, ls=style.line)
-            line.set_gid(f"{name} {key}")
+            panel.plot(ranks, value, color=style.colour, marker=style.marker, ls=style.line)
             if name != CHANCE:
                 panel.fill_between(ranks, low, high, color=style.colour, alpha=0.13, lw=0)
         panel.set_title(f"{key.removeprefix('topn_k')} candidate objects")
@@ -169,34 +168,6 @@ def _bars(
     panel.set_xlim(-0.7, len(bars) - 0.3)
     panel.grid(axis="x", visible=False)
     percent_axis(panel, "top-1 accuracy, %")
-
-
-def test_object_accuracy(results: Results) -> dict[str, dict[str, float]]:
-    """Return the top-1 accuracy among test objects, by method and test object."""
-    found = {name: results.data["methods"][name].get("per_object", {}) for name in results.learned}
-    return {name: entry["test_candidates"] for name, entry in found.items() if entry.get("test_candidates")}
-
-
-def objects_by_method(results: Results) -> Figure:
-    """Plot every test object against every method, to show whether all methods fail on the same objects."""
-    accuracies = test_object_accuracy(results)
-    names = list(accuracies)
-    objects = sorted(accuracies[names[0]], key=lambda item: (-accuracies[names[0]][item], item))
-    values = np.array([[100 * accuracies[name].get(item, math.nan) for name in names] for item in objects])
-    figure = canvas(3.2 + 0.95 * len(names), 1.6 + 0.24 * len(objects))
-    panel = figure.subplots()
-    image = panel.imshow(values, cmap="cividis", vmin=0, vmax=100, aspect="auto")
-    for (row, column), value in np.ndenumerate(values):
-        if len(objects) <= _LABELLED_OBJECTS and not math.isnan(value):
-            colour = "white" if value < 55 else "black"
-            panel.text(column, row, f"{value:.0f}", ha="center", va="center", fontsize=7.5, color=colour)
-    labels = [method_label(name).replace(", ", ",\n").replace(" + ", " +\n") for name in names]
-    panel.set_xticks(range(len(names)), labels, fontsize=8)
-    panel.set_yticks(range(len(objects)), [shortened(item, 40) for item in objects], fontsize=8)
-    panel.tick_params(length=0, top=True, labeltop=True, bottom=False, labelbottom=False)
-    panel.grid(visible=False)
-    figure.colorbar(image, ax=panel, label="top-1 accuracy of 5, %", shrink=0.9)
-    return figure
 
 
 # Decisions -------------------------------------------------------------------------------------------

@@ -8,7 +8,6 @@ from typing import Any
 from retrieval.console.output import show
 from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.evaluation.real import PROTOCOLS, SCHEMA_VERSION
-from retrieval.evaluation.real.fold_measures import QUARTILES, quartile_name
 from retrieval.evaluation.real.protocol import PHOTO, TOUCHES
 from retrieval.evaluation.real.reference_rows import replace_photos_by_references
 from retrieval.evaluation.real.verdict import CONTROL_NAMES, RULE
@@ -126,7 +125,7 @@ def _section(name: str, entry: Entry, grasps: Grasps, out: Path, figures: list[P
     yield from (Text(anchor) for anchor in entry["published_results"])
     yield Text("Controls:")
     yield controls(entry)
-    for table in (choices(entry), contact(entry), reliability(entry)):
+    for table in (choices(entry), reliability(entry)):
         if table:
             yield table
     yield Details("Against the controls, all measures", (differences(entry),))
@@ -273,25 +272,6 @@ def choices(entry: Entry) -> Table | None:
 def _spread(summary: Mapping[str, Any]) -> list[str]:
     values = (summary[key][0] for key in ("value", "min", "max"))
     return [*map(percent, values), str(len(summary["by_split"]))]
-
-
-def contact(entry: Entry) -> Table | None:
-    """Return the main measure by quartile of contact; None if the recording has no no-contact frames."""
-    names = [quartile_name(entry["main"], quartile) for quartile in range(1, QUARTILES + 1)]
-    rows = []
-    for name, row in entry["rows"].items():
-        if not row["verdict"] or not set(names) <= set(row["measures"]):  # objects with few touches lack quartiles
-            continue
-        rows.append((_label(name, row), *(with_interval(row["measures"][key]) for key in names)))
-        rows.append((LOW_PASS_LABEL, *(with_interval(row["low_pass"][key]) for key in names)))
-        for which, control in CONTROL_NAMES.items():
-            if row[which]:
-                rows.append((f"points over {control}", *(_points(row[which][key]) for key in names)))
-    if not rows:
-        return None
-    header = ("by contact", "weakest quartile", "second", "third", "strongest quartile")
-    note = "Quartiles of each object's touches, sorted by the mean difference between gel image and no-contact frame."
-    return Table(header, tuple(rows), (note,))
 
 
 def reliability(entry: Entry) -> Table | None:

@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from retrieval.methods import CHANCE
 from retrieval.metrics.registry import METRICS
 from retrieval.model.posterior import FORMULA
 from retrieval.report.document import Table
@@ -116,29 +115,6 @@ def basis(summary: Summary) -> str:
     return f"{summary['queries']:,} queries of {summary['objects']} objects. Gallery: {summary['gallery']}."
 
 
-def everything(results: Results) -> Table:
-    """Return all measures of all methods with interval, chance, queries, objects, seeds and gallery."""
-    known = [key for name in results.methods for key in results.data["methods"][name].get("measures", {})]
-    keys = sorted(set(known), key=lambda key: known.index(key))
-    rows = [
-        (
-            method_label(name),
-            measure_label(key),
-            "; ".join(with_interval(found, place) for place in range(len(found["value"]))),
-            "; ".join(percent(chance) for chance in found["chance"]),
-            ", ".join(percent(values[0]) for values in found["by_seed"]),
-            f"{found['queries']:,}",
-            str(found["objects"]),
-            found["gallery"],
-        )
-        for key in keys
-        for name in results.methods
-        if (found := results.summary(name, key))
-    ]
-    header = ("method", "measure", "value [interval], %", "chance, %", "by seed, %", "queries", "objects", "gallery")
-    return _with_notes(Table(header, tuple(rows), words=frozenset({1, 7})))
-
-
 def comparisons(results: Results) -> Table:
     """Return the paired differences between methods on the same queries."""
     rows = [
@@ -185,19 +161,6 @@ def ceilings(results: Results) -> Table:
         real = (with_interval(results.summary("cca", key)) for key in keys)
         rows.insert(0, ("touch to photo", "the result of CCA", *real))
     header = ("ceiling", "description", *(f"{measure_label(key)}, %" for key in keys))
-    return _with_notes(Table(header, tuple(rows), words=frozenset({1})))
-
-
-def low_contact(results: Results) -> Table:
-    """Return the measures of low-contact touches and of all others, without chance."""
-    keys = ("pair_accuracy", "topn_k5", "topn_k10")
-    rows = [
-        (method_label(name), label, *(with_interval(parts[part].get(key)) for key in keys))
-        for name, parts in results.data["low_contact"]["methods"].items()
-        if name != CHANCE
-        for part, label in (("low_contact", "low-contact"), ("others", "others"))
-    ]
-    header = ("method", "touches", *(f"{measure_label(key)}, %" for key in keys))
     return _with_notes(Table(header, tuple(rows), words=frozenset({1})))
 
 
@@ -323,26 +286,3 @@ def split(results: Results) -> Table:
         (part, str(len(found[part])), ", ".join(sorted(found[part]))) for part in ("train", "validation", "test")
     )
     return Table(("part", "objects", "ids"), rows, words=frozenset({2}))
-
-
-def audit(found: Any) -> Table:
-    """Return the distances of test frames to training and validation frames, and to frames of the same object."""
-    points = [f"{100 * quantile:g} %" if quantile else "nearest" for quantile in found["quantiles"]]
-    rows = []
-    for kind, frames in found["frames"].items():
-        for key, label in (
-            ("to_train_validation", "to training and validation objects"),
-            ("within_object", "to its own object"),
-        ):
-            values = [f"{value:.2f}" for value in frames[key] or ()] or [MISSING_VALUE] * len(points)
-            counts = (
-                (f"{frames['near_copies']} of {frames['checked']:,}", f"{frames['test']:,}")
-                if key == "to_train_validation"
-                else ("", "")
-            )
-            rows.append((f"{kind}, {label}", *values, *counts))
-    return Table(
-        ("nearest frame of each test frame", *points, "copies of those checked", "test frames"),
-        tuple(rows),
-        (f"Quantiles of the distance: {found['unit']}.",),
-    )

@@ -1,4 +1,4 @@
-// Tables of a report: a click on a heading sorts; the filter field shows the rows that contain all its words.
+// Tables of a report: a click on a heading sorts.
 const number = (text) => parseFloat(text.replace(/^< /, "").replace("−", "-").replace(/,(?=\d{3})/g, ""));
 
 for (const table of document.querySelectorAll("table")) {
@@ -33,18 +33,4 @@ for (const table of document.querySelectorAll("table")) {
     if (isNaN(x) || isNaN(y)) return isNaN(x) - isNaN(y);
     return sign * (x - y);
   }
-
-  if (rows.length < 6) continue;
-  const field = document.createElement("input");
-  field.type = "search";
-  field.placeholder = `Filter ${rows.length} rows`;
-  field.setAttribute("aria-label", "Filter the rows of this table");
-  field.addEventListener("input", () => {
-    const words = field.value.toLowerCase().split(/\s+/).filter(Boolean);
-    for (const row of rows) {
-      const text = row.textContent.toLowerCase();
-      row.hidden = !words.every((word) => text.includes(word));
-    }
-  });
-  table.parentElement.before(field);
 }

@@ -32,7 +32,7 @@ from retrieval.data.dataset import (
 from retrieval.data.licences import LICENCES, DataLicence
 from retrieval.data.pairs import PairBatch, PairSampler
 from retrieval.errors import CheckpointError, JobInterrupted
-from retrieval.metrics.pairs import fit_calibration, pair_accuracy, pair_auc
+from retrieval.metrics.pairs import negative_log_likelihood, pair_accuracy, pair_auc
 from retrieval.model.checkpoint import (
     Checkpoint,
     load_checkpoint,
@@ -285,7 +285,7 @@ class Trainer:
         return {
             "validation_auc": pair_auc(logits, labels),
             "validation_pair_accuracy": pair_accuracy(logits, labels),
-            "validation_nll": fit_calibration(logits, labels).nll_before,
+            "validation_nll": negative_log_likelihood(logits, labels),
         }
 
     def _save_best(self, metrics: dict[str, float]) -> None:

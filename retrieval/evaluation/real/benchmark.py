@@ -13,9 +13,8 @@ from typing import Any
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import AnyRecording, Grasp, Split, data_digest, folder_of
 from retrieval.errors import BadInput
-from retrieval.evaluation.cache import cached_document, resumable, write_document
+from retrieval.evaluation.cache import resumable, write_document
 from retrieval.evaluation.experiment import Experiment
-from retrieval.evaluation.low_contact import gel_change
 from retrieval.evaluation.queries import draw_queries
 from retrieval.evaluation.real import PROTOCOLS, SCHEMA_VERSION
 from retrieval.evaluation.real.conditions import (
@@ -213,25 +212,6 @@ class _ProtocolRun:
     quiet: bool
 
     @cached_property
-    def _contact(self) -> dict[str, float] | None:
-        """Gel change of each grasp, grey levels; None without no-contact frames."""
-        grasps = self.all_facts.grasps
-        if any(len(grasp.backgrounds) != len(grasp.touches) for grasp in grasps):
-            return None
-        digest = data_digest(grasps)
-        # The result is stored, because computing it reads all touches.
-        return cached_document(self.cache / "contact" / f"{digest[:32]}.json", {"grasps": digest}, self._gel_changes)
-
-    def _gel_changes(self) -> dict[str, float]:
-        grasps = self.all_facts.grasps
-        found = {}
-        with Bar("compare with no-contact frames", len(grasps), "grasps", quiet=self.quiet) as bar:
-            for grasp in grasps:
-                found[grasp.grasp_id] = gel_change(grasp)
-                bar.advance()
-        return found
-
-    @cached_property
     def facts(self) -> RecordingFacts:
         """The recording with the grasps that are queries.
 
@@ -375,13 +355,12 @@ class _ProtocolRun:
             "measures": list(protocol.measures),
             "shown": [protocol.allows_own_photos, protocol.is_by_sequence, protocol.gallery_of(self.facts, split)],
             "line": condition.key,
-            "contact": self._contact is not None,
         }
         path = self.cache / "measures" / self.name / f"{condition.key}-{seed}-{number}.safetensors"
         if (stored := read_fold_measures(path, cache_key)) is not None:
             return stored
         method_scores = MethodScores(experiment.queries, experiment.run(condition.method, seed), seed)
-        measured = measure_fold(method_scores, protocol, self.facts, split, features.grasp_ids, self._contact)
+        measured = measure_fold(method_scores, protocol, self.facts, split, features.grasp_ids)
         write_fold_measures(path, measured, cache_key)
         shutil.rmtree(work)
         return measured

@@ -1,6 +1,5 @@
 """Measures of one fold: score each gallery of the protocol, then pool the galleries."""
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import compress
@@ -14,16 +13,14 @@ from numpy.typing import NDArray
 from retrieval.data.dataset import Split
 from retrieval.errors import BadInput
 from retrieval.evaluation.cache import CacheKey, read_cached, write_cached
-from retrieval.evaluation.calibrate import KWayTest, draw_k_way_tests, pair_rule, top1_confidences
-from retrieval.evaluation.example_grasps import ExampleGrasps
+from retrieval.evaluation.calibrate import KWayTest, draw_k_way_tests, pair_threshold, top1_confidences
+from retrieval.evaluation.example_grasps import example_queries
 from retrieval.evaluation.real.protocol import Protocol, RecordingFacts
 from retrieval.evaluation.scoring import MethodScores
 from retrieval.metrics.measure import Measure, pooled
 from retrieval.metrics.registry import MethodScoreTables
 from retrieval.metrics.table import ScoreTable
 from retrieval.model.posterior import Posterior
-
-QUARTILES = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,34 +61,12 @@ class ResamplingUnits:
         return cls(names, {name: names.index(unit) for name, unit in unit_of.items()})
 
 
-def quartile_name(measure: str, quartile: int) -> str:
-    """Return the name of a measure for one contact quartile, 1 to `QUARTILES`."""
-    return f"{measure}_contact{quartile}"
-
-
-def contact_quartiles(contact: NDArray[np.float64], owner: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the contact quartile of each touch within its object, 1 (weakest) to 4.
-
-    Quartiles are taken within each object, so that all quartiles contain the same objects.
-
-    Args:
-        contact: (Q,) gel change of each touch; ties stay in their order.
-        owner: (Q,) object of each touch.
-    """
-    found = np.empty(len(contact), np.int64)
-    for name in np.unique(owner):
-        rows = np.flatnonzero(owner == name)
-        found[rows[np.argsort(contact[rows], kind="stable")]] = 1 + np.arange(len(rows)) * QUARTILES // len(rows)
-    return found
-
-
 def measure_fold(
     method_scores: MethodScores,
     protocol: Protocol,
     facts: RecordingFacts,
     split: Split,
     grasp_ids: Sequence[str],
-    contact: Mapping[str, float] | None = None,
 ) -> FoldMeasures:
     """Measure one method in one fold.
 
@@ -101,7 +76,6 @@ def measure_fold(
         facts: The recording.
         split: The split of the fold.
         grasp_ids: Grasp ids of the feature rows.
-        contact: Gel change of each grasp. With it the main measure is also taken for each contact quartile.
 
     Raises:
         BadInput: The gallery is too small for the main measure.
@@ -112,7 +86,7 @@ def measure_fold(
         return table.with_own() if protocol.allows_own_photos else table
 
     validation = allowed(method_scores.touches("validation", "validation"))
-    rule = pair_rule(method_scores.predictions.best_params, validation, seed=method_scores.seed).rule
+    threshold = pair_threshold(method_scores.predictions.best_params, validation, seed=method_scores.seed).at
     whole = allowed(method_scores.touches("test", "test"))
     sets = {size: allowed(table) for size, table in method_scores.sets("test").items()}
     gallery_of = protocol.gallery_of(facts, split)
@@ -121,7 +95,6 @@ def measure_fold(
     queries: dict[str, list[Any]] = {"best": [], "worst": []}
     confidences: dict[str, list[NDArray[np.float64]]] = {}
     posterior = method_scores.predictions.best_params.get("posterior")
-    levels = np.array([contact[name] for name in test_ids[0]]) if contact else None
     for one in sorted(set(gallery_of.values())):
         mine = np.array([gallery_of.get(name) == one for name in objects])
         gallery = _of(whole, mine)
@@ -129,22 +102,14 @@ def measure_fold(
             list(compress(*pair))
             for pair in zip(test_ids, (mine[whole.touch_owner], mine[whole.photo_owner]), strict=True)
         )
-        for kind, some in ExampleGrasps(gallery, objects, *ids).examples(one_of_each=True).items():
+        for kind, some in example_queries(gallery, objects, *ids, one_of_each=True).items():
             queries[kind] += some
         tables = MethodScoreTables(
-            gallery, gallery, {size: _of(one, mine) for size, one in sets.items()}, rule, method_scores.seed
+            gallery, gallery, {size: _of(one, mine) for size, one in sets.items()}, threshold, method_scores.seed
         )
         for name, metric in protocol.measures.items():
             if (value := metric.compute(tables)) is not None:
                 found.setdefault(name, []).append(value)
-        if levels is not None:
-            quartiles = contact_quartiles(levels[mine[whole.touch_owner]], gallery.touch_owner)
-            for quartile in np.unique(quartiles):  # objects with few touches lack some quartiles
-                part = dataclasses.replace(
-                    tables, test=gallery.select(quartiles == quartile, np.arange(len(gallery.photo_owner)))
-                )
-                if (value := protocol.measures[protocol.main].compute(part)) is not None:
-                    found.setdefault(quartile_name(protocol.main, quartile), []).append(value)
         if posterior:
             confidences.setdefault("gallery", []).append(_top1_confidences(gallery, posterior, method_scores.seed))
     if posterior and protocol.galleries:

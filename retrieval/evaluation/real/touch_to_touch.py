@@ -25,7 +25,7 @@ from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, Split, data_digest
 from retrieval.data.images import encode_image, read_rgb
 from retrieval.errors import DatasetError
-from retrieval.evaluation.example_grasps import ExampleGrasps
+from retrieval.evaluation.example_grasps import example_queries
 from retrieval.evaluation.real.conditions import (
     CONTROLS,
     TowerEncoder,
@@ -304,7 +304,7 @@ def touch_to_touch_entry(
             first_row = first_row or (name, table)
     assert first_row is not None
     objects = sorted(set(sequences.objects))
-    examples = ExampleGrasps(first_row[1], objects, sequences.middle, sequences.middle).examples(one_of_each=True)
+    examples = example_queries(first_row[1], objects, sequences.middle, sequences.middle, one_of_each=True)
     return {
         "title": protocol.title,
         "rule": protocol.rule,

@@ -41,22 +41,15 @@ def one_of_each(folder):
     return (split_of(grasps).select(grasps, part)[0] for part in ("train", "validation", "test"))
 
 
-def brighter(picture, levels):
-    return np.clip(picture.astype(np.int16) + levels, 0, 255).astype(np.uint8)
-
-
 def test_a_clean_recording_is_reported_as_clean(recording):
     found = run_audit(recording)
     assert found["clean"]
     assert found["verdict"].startswith("No object, sequence or file is in two parts")
     assert (found["shared"], found["identical"]) == ([], {"count": 0, "examples": []})
-    assert found["objects"] == {"train": 5, "validation": 2, "test": 3}
-    assert found["grasps"] == {"train": 15, "validation": 6, "test": 9}
     assert list(found["frames"]) == ["photo", "touch a", "touch b"]
     for frames in found["frames"].values():
         assert (frames["test"], frames["train_validation"], frames["near_copies"]) == (9, 21, 0)
-        assert frames["to_train_validation"] == sorted(frames["to_train_validation"])
-        assert frames["to_train_validation"][0] > 0.1
+        assert frames["examples"] == []
     checked = [found["frames"][kind]["checked"] for kind in ("photo", "touch a", "touch b")]
     assert checked[0] >= 7
     counts = f"{checked[0]} of 9 (photo), {checked[1]} of 9 (touch a), {checked[2]} of 9 (touch b) test frames"
@@ -84,21 +77,7 @@ def test_a_copy_that_is_re_encoded_brighter_moved_or_flipped_is_found(recording,
     for kind in ("photo", "touch a", "touch b") if how in GENTLE else ("photo",):
         assert found["frames"][kind]["near_copies"] == 1
         assert f"1 of 9 test frames ({kind})" in found["verdict"]
-    nearest = found["frames"]["photo"]["nearest"][0]
-    assert (nearest["test"], nearest["train_validation"]) == (test.grasp_id, train.grasp_id)
-
-
-def test_digests_and_unsigned_differences_miss_a_copy(recording):
-    """Naive checks that fail: equal digests, and a difference of unsigned bytes."""
-    train, *_ = one_of_each(recording)
-    picture = cv2.imread(str(train.photo))
-    data = cv2.imencode(".jpg", brighter(picture, -1), [cv2.IMWRITE_JPEG_QUALITY, 95])[1]
-    copy = cv2.imdecode(data, cv2.IMREAD_COLOR)
-    assert copy.tobytes() != picture.tobytes()
-    naive = (copy - picture).astype(np.float64)  # uint8: -1 becomes 255
-    assert np.sqrt((naive**2).mean()) > 100
-    true = copy.astype(np.float64) - picture.astype(np.float64)
-    assert np.sqrt((true**2).mean()) < 3
+    assert found["frames"]["photo"]["examples"] == [[f"test: {test.grasp_id}", f"train: {train.grasp_id}"]]
 
 
 def test_a_copy_of_a_validation_frame_counts_too(recording):
@@ -122,8 +101,7 @@ def test_objects_outside_the_split_are_left_out(recording):
     grasps = load_grasps(recording)
     whole = split_of(grasps)
     found = run_audit(recording, Split(seed=0, train=whole.train[:2], validation=(), test=whole.test))
-    assert found["grasps"] == {"train": 6, "validation": 0, "test": 9}
-    assert found["frames"]["photo"]["train_validation"] == 6
+    assert (found["frames"]["photo"]["test"], found["frames"]["photo"]["train_validation"]) == (9, 6)
 
 
 def test_frames_of_one_side_only_are_not_compared(recording):
@@ -131,12 +109,8 @@ def test_frames_of_one_side_only_are_not_compared(recording):
     grasps = load_grasps(recording)
     names = tuple(sorted({grasp.object_id for grasp in grasps}))
     found = run_audit(recording, Split(seed=0, train=(), validation=(), test=names))
-    assert found["frames"]["photo"]["to_train_validation"] is None
-    assert found["frames"]["photo"]["nearest"] == []
     assert found["clean"]
     assert "near copies were not checked, as one side has no frames" in found["verdict"]
-    nothing = run_audit(recording, Split(seed=0, train=names, validation=(), test=()))["frames"]["photo"]
-    assert (nothing["test"], nothing["to_train_validation"], nothing["within_object"]) == (0, None, None)
 
 
 def test_a_damaged_image_is_named(recording):
@@ -144,10 +118,6 @@ def test_a_damaged_image_is_named(recording):
     train.photo.write_bytes(b"no picture")
     with pytest.raises(ImageError, match=train.photo.name):
         run_audit(recording)
-
-
-def test_two_runs_agree_to_the_last_digit(recording):
-    assert run_audit(recording) == run_audit(recording)
 
 
 def test_low_contact_touches_are_reported_as_unchecked(recording):
@@ -159,6 +129,6 @@ def test_low_contact_touches_are_reported_as_unchecked(recording):
         cv2.imwrite(str(grasp.touches[0]), noisy)
     found = run_audit(recording)
     frames = found["frames"]["touch a"]
-    assert (frames["checked"], frames["near_copies"], frames["nearest"]) == (0, 0, [])
+    assert (frames["checked"], frames["near_copies"]) == (0, 0)
     assert "0 of 9 (touch a)" in found["verdict"]
     assert "the other test frames have too little detail to recognise a copy" in found["verdict"]

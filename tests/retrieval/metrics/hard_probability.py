@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 from scipy.special import expit, log_expit, softmax
 
 from retrieval.evaluation.reject import galleries, statistic
-from retrieval.metrics.pairs import fit_calibration, reliability_bins
+from retrieval.metrics.pairs import fit_calibration, negative_log_likelihood, reliability_bins
 from retrieval.model.posterior import Posterior, ScoredTouches, fit_posterior
 from tests.hard_case import HardCase, error_of
 
@@ -52,7 +52,7 @@ def _sure_and_wrong() -> HardCase:
     logits, labels = np.array([-400.0, 400.0]), np.array([1, 0])
     p = 1 / (1 + np.exp(-logits))
     naive = float(-np.mean(labels * np.log(p) + (1 - labels) * np.log(1 - p)))
-    ours = fit_calibration(logits, labels).nll_before
+    ours = negative_log_likelihood(logits, labels)
     return HardCase(
         _LOGITS, "likelihood of logits wrong by 400", "400 nats", f"{naive}", f"{ours}", ours == 400, naive == 400
     )

@@ -1,17 +1,22 @@
 """Calibration of match logits and the two pair metrics: by hand, by grids and loops, and where logits are extreme."""
 
 import dataclasses
-import json
 import math
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.special import expit
 
 from retrieval.errors import BadInput, NumericalError
-from retrieval.metrics.pairs import SLOPE_BOUNDS, Calibration, fit_calibration, pair_accuracy, pair_auc
+from retrieval.metrics.pairs import (
+    SLOPE_BOUNDS,
+    Calibration,
+    fit_calibration,
+    negative_log_likelihood,
+    pair_accuracy,
+    pair_auc,
+)
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 
@@ -108,7 +113,6 @@ def test_one_pair_of_each_class_gives_its_smoothed_targets():
     fitted = fit_calibration([-1.0, 3.0], [0, 1])
     np.testing.assert_allclose(fitted.probability([-1.0, 3.0]), [1 / 3, 2 / 3], rtol=1e-9)
     assert fitted.slope == pytest.approx(2 * math.log(2) / 4)
-    assert (fitted.positives, fitted.negatives) == (1, 1)
 
 
 def test_separable_logits_have_a_finite_fit_although_the_plain_likelihood_has_none():
@@ -128,18 +132,17 @@ def test_rarer_true_pairs_do_not_shift_the_probability_because_the_odds_are_even
     logits, labels = overlapping(400)
     rare = np.concatenate([np.flatnonzero(labels == 0), np.flatnonzero(labels == 1)[:40]])
     even, few = fit_calibration(logits, labels), fit_calibration(logits[rare], labels[rare])
-    assert (few.positives, few.negatives) == (40, 200)
     # Naively, the log-odds at any logit would fall by log(5) = 1.6 with the fraction of true pairs.
     assert abs(few.log_odds(0.5) - even.log_odds(0.5)) < 0.5
 
 
 def test_the_fit_recovers_the_true_odds():
     """Two normal distributions at distance 1 with deviation 1: the log-odds of a logit z are z - 1/2."""
-    fitted = fit_calibration(*overlapping(100_000))
+    logits, labels = overlapping(100_000)
+    fitted = fit_calibration(logits, labels)
     assert fitted.slope == pytest.approx(1.0, abs=0.03)  # the standard error is about 0.01
     assert fitted.intercept == pytest.approx(-0.5, abs=0.03)
-    assert fitted.nll_after < fitted.nll_before
-    assert fitted.ece_after < 0.01 < fitted.ece_before
+    assert negative_log_likelihood(fitted.log_odds(logits), labels) < negative_log_likelihood(logits, labels)
 
 
 # Extreme logits --------------------------------------------------------------------------------------------
@@ -157,7 +160,6 @@ def test_the_fit_is_finite_within_bounds_and_preserves_the_order_at_any_scale(sc
     ranked = np.sort(logits)
     assert (np.diff(fitted.log_odds(ranked)) >= 0).all()
     assert (np.diff(fitted.probability(ranked)) >= 0).all()
-    json.dumps(fitted.to_dict(), allow_nan=False)
 
 
 @pytest.mark.parametrize("offset", [1e3, -1e5, 1e6])
@@ -188,7 +190,6 @@ def test_constant_logits_make_both_answers_equally_likely(value):
     fitted = fit_calibration([value] * 6, [0, 1, 0, 1, 1, 0])
     assert fitted.slope == SLOPE_BOUNDS[0]
     assert fitted.probability(value) == 0.5
-    assert fitted.nll_after == pytest.approx(math.log(2))
 
 
 def test_logits_with_wrong_information_get_the_smallest_slope_and_never_a_negative_one():
@@ -196,16 +197,6 @@ def test_logits_with_wrong_information_get_the_smallest_slope_and_never_a_negati
     fitted = fit_calibration(-logits, labels)
     assert fitted.slope == SLOPE_BOUNDS[0]
     assert fitted.probability(0.0) == pytest.approx(0.5, abs=0.01)
-
-
-def test_one_extreme_logit_flattens_the_slope_and_leaves_the_others_undecided():
-    """A smoothed target is never certain, so even a false pair with a very low logit adds loss by its slope."""
-    logits, labels = overlapping()
-    logits[0] = -1e30
-    fitted = fit_calibration(logits, labels)
-    assert fitted.slope == SLOPE_BOUNDS[0]
-    assert np.abs(fitted.probability(logits[1:]) - 0.5).max() < 0.02
-    assert fitted.probability(-1e30) == 0.0
 
 
 finite_logits = st.floats(-FLOAT32_MAX, FLOAT32_MAX, width=32)
@@ -220,72 +211,18 @@ def test_any_finite_logits_of_both_classes_can_be_calibrated(pairs, one, two):
     assert all(math.isfinite(value) for value in dataclasses.asdict(fitted).values())
     assert SLOPE_BOUNDS[0] <= fitted.slope <= SLOPE_BOUNDS[1]
     assert (np.diff(fitted.log_odds(np.sort(logits))) >= 0).all()
-    assert 0 <= fitted.ece_after <= 1
 
 
 # Use -------------------------------------------------------------------------------------------------------
 
 
-FITTED = Calibration(2.0, -0.5, 0.3, 10, 12, 0.7, 0.6, 0.2, 0.1)
+FITTED = Calibration(2.0, -0.5)
 
 
 def test_log_odds_and_probability_equal_the_formula():
     assert FITTED.log_odds(1.25) == 2.0
     assert FITTED.probability(1.25) == pytest.approx(1 / (1 + math.exp(-2)))
     np.testing.assert_array_equal(FITTED.log_odds([0.0, 1.0]), [-0.5, 1.5])
-
-
-def test_probabilities_saturate_without_a_warning_and_log_odds_do_not():
-    np.testing.assert_array_equal(FITTED.probability([-1e30, 1e30]), [0.0, 1.0])
-    logits = np.array([20.0, 21.0, 25.0])
-    assert len(np.unique(FITTED.probability(logits))) == 1  # ranking by these would tie
-    assert len(np.unique(FITTED.log_odds(logits))) == 3
-
-
-@pytest.mark.parametrize(
-    ("logits", "labels", "expected"),
-    [
-        ([-2.0, -1.0, 3.0, 4.0], [0, 0, 1, 1], 1.0),
-        ([0.0, 1.0, 2.0, 3.0], [0, 1, 0, 1], 0.75),
-        ([4.0, 3.0, 2.0, 1.0], [0, 0, 1, 1], 0.5),
-        ([1.0, 1.0, 1.0], [0, 1, 1], 0.5),
-        ([0.0, 1.0, 1.0, 2.0], [0, 0, 1, 1], 0.75),
-        ([1e16, 1e16 + 2], [0, 1], 1.0),
-        ([-1e30, 1e30], [0, 1], 1.0),
-    ],
-)
-def test_the_reject_threshold_has_the_largest_balanced_accuracy_of_all_thresholds(logits, labels, expected):
-    fitted = fit_calibration(logits, labels)
-    x, labels = fitted.log_odds(logits), np.array(labels)
-
-    def balanced_accuracy(threshold):
-        return (np.mean(x[labels == 1] >= threshold) + np.mean(x[labels == 0] < threshold)) / 2
-
-    best = max(map(balanced_accuracy, [*x, np.inf]))
-    assert balanced_accuracy(fitted.reject_log_odds) == best == expected
-
-
-def test_the_reject_threshold_is_midway_between_the_classes():
-    fitted = fit_calibration([-2.0, -1.0, 3.0, 4.0], [0, 0, 1, 1])
-    assert fitted.reject_log_odds == pytest.approx(float(fitted.log_odds(1.0)))
-
-
-def test_the_expected_calibration_error_equals_that_by_hand():
-    """Probabilities .1, .9, .95 in 15 bins: .1 in bin 1, .9 in bin 13, .95 in bin 14."""
-    logits = np.log([0.1 / 0.9, 0.9 / 0.1, 0.95 / 0.05])
-    fitted = fit_calibration(logits, [0, 1, 0])
-    assert fitted.ece_before == pytest.approx((0.1 + 0.1 + 0.95) / 3)
-
-
-def test_errors_cancel_within_a_bin_and_not_between_bins():
-    """Probability 0.7 twice, one true of two: off by 0.2 on average; pair by pair it would be 0.5."""
-    logit = math.log(0.7 / 0.3)
-    assert fit_calibration([logit, logit], [0, 1]).ece_before == pytest.approx(0.2)
-
-
-def test_certain_and_correct_is_an_error_of_zero_and_certain_and_wrong_of_one():
-    assert fit_calibration([-1e30, 1e30], [0, 1]).ece_before == 0.0
-    assert fit_calibration([1e30, -1e30], [0, 1]).ece_before == 1.0
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
@@ -335,20 +272,7 @@ def test_a_constant_scorer_has_exactly_an_auc_of_one_half(true, false):
     assert sum(below) / (true * false) == 1.0
 
 
-def test_the_auc_does_not_change_with_the_scale_although_probabilities_tie():
-    logits, labels = np.array([17.5, 18.0, 25.0, 40.0]) * 3, [0, 1, 0, 1]
-    assert pair_auc(logits, labels) == pair_auc(logits * 1e30, labels) == 0.75
-    assert pair_auc(expit(logits), labels) == 0.5  # naive: all are exactly 1
-
-
 def test_pair_accuracy_equals_that_by_hand_and_counts_zero_as_one_half():
     assert pair_accuracy([2.0, -1.0, 0.0, 3.0], [1, 1, 1, 0]) == (1 + 0 + 0.5 + 0) / 4
     assert pair_accuracy([0.0] * 4, [0, 1, 1, 1]) == 0.5
     assert pair_accuracy([-0.0, 1e-30, -1e-30, 1e30], [1, 1, 0, 1]) == 3.5 / 4
-
-
-def test_labels_may_be_booleans_and_logits_float32():
-    logits = np.array([-1.0, 2.0, 0.5], dtype=np.float32)
-    labels = np.array([False, True, True])
-    assert pair_auc(logits, labels) == 1.0
-    assert fit_calibration(logits, labels) == fit_calibration(logits.astype(float), labels.astype(int))

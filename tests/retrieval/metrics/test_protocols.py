@@ -6,15 +6,12 @@ import numpy as np
 import pytest
 
 from retrieval.errors import BadInput
-from retrieval.metrics.pairs import Calibration
 from retrieval.metrics.protocols import (
     average_precision,
     confusions,
     k_way,
     pair_accuracy,
     pair_auc,
-    paired,
-    per_object,
     recall,
     reciprocal_rank,
     true_ranks,
@@ -28,8 +25,6 @@ from retrieval.metrics.registry import (
     photos_metric_name,
 )
 from retrieval.metrics.table import ScoreTable, object_scores
-
-EVEN = Calibration(1.0, 0.0, 0.0, 1, 1, 0.0, 0.0, 0.0, 0.0)
 
 
 def full_gallery(table):
@@ -87,8 +82,7 @@ def values_of(measure):
 
 def test_pair_accuracy_equals_that_of_two_loops():
     table = uneven()
-    calibration = Calibration(2.0, -2.0, 0.0, 1, 1, 0.0, 0.0, 0.0, 0.0)  # exactly 0 at a score of 1
-    found = values_of(pair_accuracy(table, calibration))
+    found = values_of(pair_accuracy(table, 1.0))
     for row in range(14):
         true = np.mean([correctness(2 * table.scores[row, column] - 2) for column in mine_of(table, row)])
         false = np.mean(
@@ -102,14 +96,6 @@ def test_pair_accuracy_equals_that_of_two_loops():
 
 def correctness(log_odds):
     return 0.5 if log_odds == 0 else float(log_odds > 0)
-
-
-def test_pair_accuracy_equals_that_by_hand():
-    """Row 0 has photo 1 (correct) and, of objects 1 and 2, photos 2 (correct), 3 (half), 4 (wrong): (1 + 3/8) / 2."""
-    scores = np.full((5, 5), -1.0)
-    scores[0] = [-9, 2, -1, 0, 4]
-    found = pair_accuracy(table_of(scores, [0, 0, 1, 1, 2], own=np.eye(5)), EVEN)
-    assert found.values[0, 0] == (1 + (0.75 + 0) / 2) / 2
 
 
 def test_pair_auc_equals_that_of_two_loops():
@@ -128,7 +114,7 @@ def test_an_object_with_many_photos_is_a_rival_as_often_as_one_with_few():
     owner = [0, 0, 1] + [2] * 10
     table = table_of([[0, 5, 9, *[1] * 10]], [0], owner, own=[[1] + [0] * 12])
     assert pair_auc(table).values[0, 0] == pytest.approx(0.5)
-    assert pair_accuracy(table, Calibration(1, -3, 0, 1, 1, 0, 0, 0, 0)).values[0, 0] == pytest.approx((1 + 0.5) / 2)
+    assert pair_accuracy(table, 3.0).values[0, 0] == pytest.approx((1 + 0.5) / 2)
 
 
 # K-way -----------------------------------------------------------------------------------------------------
@@ -156,29 +142,6 @@ def test_k_way_curves_converge_to_those_over_every_draw(k, photos):
     for row in range(14):
         exact = k_way_by_enumeration(table, row, k, photos)
         np.testing.assert_allclose(found.values[row], exact, atol=0.065)  # five standard errors of 1,500 draws
-
-
-def test_k_way_is_exact_if_every_object_uses_all_its_photos():
-    table = uneven(values=2)
-    found = k_way(table, 3, photos=5, draws=1)
-    for row in range(14):
-        np.testing.assert_allclose(found.values[row], k_way_by_enumeration(table, row, 3, 5), atol=1e-12)
-
-
-def test_a_k_way_test_equals_that_by_hand():
-    """Of three rivals one scores higher: with two of them it takes part two times in three."""
-    scores = [[0, 5, 9, 1, 2]]
-    table = table_of(scores, [0], [0, 0, 1, 2, 3], own=[[1, 0, 0, 0, 0]])
-    np.testing.assert_allclose(k_way(table, 3).values, [[1 / 3, 1, 1]])
-    np.testing.assert_allclose(k_way(table, 4).values, [[0, 1, 1, 1]])
-
-
-def test_more_photos_help_a_scorer_with_independent_errors():
-    rng = np.random.default_rng(0)
-    owner = np.repeat(np.arange(12), 8)
-    table = table_of((owner[:, None] == owner) + rng.normal(size=(96, 96)), owner)
-    first, third = (k_way(table, 5, photos=photos).values[:, 0].mean() for photos in (1, 3))
-    assert third > first + 0.1
 
 
 def test_a_test_of_more_candidates_than_objects_is_refused():
@@ -225,22 +188,6 @@ def test_measures_of_the_full_gallery_equal_those_of_two_loops(transposed):
         assert ranks[row] == pytest.approx(expected["rank"], abs=0.2)
 
 
-def test_without_ties_the_full_gallery_has_one_order():
-    rng = np.random.default_rng(3)
-    table = uneven()
-    table = table_of(rng.permutation(196).reshape(14, 14), table.touch_owner)
-    found, shown = full_gallery(table), average_precision(table.with_own())
-    for row in range(14):
-        places = ranked_places(table, row, False, range(14))
-        assert found["mrr"].values[row, 0] == 1 / places[0]
-        assert found["recall_5"].values[row, 0] == (places[0] <= 5)
-        precisions = [count / place for count, place in enumerate(places, 1)]
-        assert found["map"].values[row, 0] == pytest.approx(np.mean(precisions), rel=1e-12)
-        places = ranked_places(table, row, True, range(14))
-        precisions = [count / place for count, place in enumerate(places, 1)]
-        assert shown.values[row, 0] == pytest.approx(np.mean(precisions), rel=1e-12)
-
-
 def test_with_the_own_photo_a_scorer_that_only_recognises_each_grasps_lighting_would_beat_chance():
     """Its own photo first, all else tied: chance without the own photo, more than twice chance with it."""
     blind = constant(objects=10, grasps=4)
@@ -252,54 +199,12 @@ def test_with_the_own_photo_a_scorer_that_only_recognises_each_grasps_lighting_w
     assert "left out" in left_out.gallery
 
 
-def paired_by_loops(table, k):
-    """Return the expected fraction of rows, and of columns, that find their partner within k places."""
-    found = []
-    for scores in (table.scores, table.scores.T):
-        hits = []
-        for row in range(len(scores)):
-            above = sum(scores[row] > scores[row, row])
-            tied = sum(scores[row] == scores[row, row])
-            hits.append(min(max((k - above) / tied, 0), 1))
-        found.append(hits)
-    return np.mean(found, axis=0)
-
-
-def test_a_paired_batch_equals_that_of_two_loops_in_both_directions():
-    table = uneven(values=4)
-    for k in (1, 5):
-        found = paired(table, k)
-        np.testing.assert_allclose(values_of(found), paired_by_loops(table, k), atol=1e-12)
-        assert found.chance[0] == k / 14
-
-
-def test_in_a_paired_batch_another_photo_of_the_object_is_wrong():
-    table = perfect()
-    assert values_of(paired(table, 1)).mean() == pytest.approx(1 / 4)
-    assert values_of(full_gallery(table)["recall_1"]).mean() == 1
-
-
-def test_the_order_of_photos_does_not_matter_in_a_paired_batch():
-    table = uneven()
-    order = np.random.default_rng(1).permutation(14)
-    for k in (1, 5):
-        np.testing.assert_allclose(paired(table, k).values, paired(table.select(np.arange(14), order), k).values)
-
-
-def test_a_paired_batch_needs_one_photo_for_each_touch():
-    table = uneven()
-    with pytest.raises(BadInput, match="one photo for each touch"):
-        paired(table.select(np.arange(13), np.arange(14)), 1)
-    with pytest.raises(BadInput, match="one photo for each touch"):
-        paired(table.with_own(), 1)
-
-
 # The table of metrics --------------------------------------------------------------------------------------
 
 
 def test_scores_that_allow_every_metric_get_every_metric():
     table = perfect(objects=100, grasps=21)
-    taken = compute(MethodScoreTables(table, table, dict.fromkeys(SET_SIZES, table), EVEN, seed=0))
+    taken = compute(MethodScoreTables(table, table, dict.fromkeys(SET_SIZES, table), 0.0, seed=0))
     assert list(taken) == list(METRICS)
     labels = [(metric.section, metric.column) for metric in METRICS.values()]
     assert len(set(labels)) == len(labels)
@@ -310,9 +215,9 @@ def test_a_metric_that_the_scores_do_not_allow_is_left_out():
     table = perfect(objects=4, grasps=4)
     shared = table.select(np.arange(16), np.arange(0, 16, 2))
     shared.own[np.arange(1, 16, 2), np.arange(8)] = True
-    taken = set(compute(MethodScoreTables(shared, shared, {}, EVEN, seed=0)))
+    taken = set(compute(MethodScoreTables(shared, shared, {}, 0.0, seed=0)))
     assert {"pair_accuracy", "recall_1", "photo_to_touch_map"} <= taken
-    left_out = {"topn_k5", "topn_k10", "topn_k100", "topn_k5_all_objects", "paired_top1", "paired_top5"}
+    left_out = {"topn_k5", "topn_k10", "topn_k100", "topn_k5_all_objects"}
     assert not taken & (left_out | set(map(grasps_metric_name, SET_SIZES)))
 
 
@@ -320,7 +225,7 @@ def test_a_number_of_photos_is_used_only_if_every_candidate_has_as_many_besides_
     table = perfect(objects=6, grasps=4)
     assert table.min_photos == 3
     assert table.with_own().min_photos == 4
-    taken = compute(MethodScoreTables(table, table, {}, EVEN, seed=0))
+    taken = compute(MethodScoreTables(table, table, {}, 0.0, seed=0))
     assert {photos_metric_name(1), photos_metric_name(2), photos_metric_name(3)} <= set(taken)
     assert photos_metric_name(5) not in taken
     fewer = table.select(np.arange(24), np.delete(np.arange(24), [4, 5]))
@@ -332,14 +237,13 @@ def test_a_number_of_photos_is_used_only_if_every_candidate_has_as_many_besides_
 
 def every_measure(table):
     return {
-        "pair_accuracy": pair_accuracy(table, EVEN),
+        "pair_accuracy": pair_accuracy(table, 0.0),
         "pair_auc": pair_auc(table),
         "k3": k_way(table, 3),
         "k4p3": k_way(table, 4, photos=3),
         **full_gallery(table),
         **{f"back_{name}": measure for name, measure in full_gallery(table.transposed()).items()},
         "objectfolder": average_precision(table.with_own()),
-        **{f"paired_top{k}": paired(table, k) for k in (1, 5)},
     }
 
 
@@ -352,10 +256,9 @@ def test_a_constant_scorer_is_exactly_at_chance_in_every_protocol(value):
         np.testing.assert_allclose(means.mean(0), measure.chance, atol=1e-12, err_msg=name)
 
 
-def test_a_perfect_scorer_is_right_in_every_protocol_but_the_paired_one():
+def test_a_perfect_scorer_is_right_in_every_protocol():
     for name, measure in every_measure(perfect()).items():
-        if not name.startswith("paired"):
-            np.testing.assert_allclose(measure.values, 1, atol=1e-12, err_msg=name)
+        np.testing.assert_allclose(measure.values, 1, atol=1e-12, err_msg=name)
 
 
 def test_only_the_order_of_scores_matters_at_any_scale():
@@ -382,12 +285,12 @@ def test_rows_without_another_photo_of_their_object_are_counted_and_neither_hidd
 
 
 def every_measure_of_few(table):
-    return {"accuracy": pair_accuracy(table, EVEN), "k2": k_way(table, 2), **full_gallery(table)}
+    return {"accuracy": pair_accuracy(table, 0.0), "k2": k_way(table, 2), **full_gallery(table)}
 
 
 def test_a_gallery_of_one_object_is_refused_where_rivals_are_needed():
     table = table_of(np.zeros((3, 3)), [0, 0, 0])
-    for protocol in (pair_auc, lambda table: pair_accuracy(table, EVEN)):
+    for protocol in (pair_auc, lambda table: pair_accuracy(table, 0.0)):
         with pytest.raises(BadInput, match="at least two objects"):
             protocol(table)
     with pytest.raises(BadInput, match="1 other candidates; got 0"):
@@ -406,16 +309,6 @@ def test_the_gallery_is_described_in_plain_words():
 
 
 # By object -------------------------------------------------------------------------------------------------
-
-
-def test_means_by_object_equal_those_of_a_loop():
-    table = uneven()
-    measure = k_way(table, 3)
-    for column in (0, 1):
-        found = per_object(measure, column)
-        assert list(found) == [3, 5, 8, 9]
-        for name, value in found.items():
-            assert value == pytest.approx(np.mean(measure.values[measure.owner == name, column]))
 
 
 def test_confusions_equal_those_of_a_loop():

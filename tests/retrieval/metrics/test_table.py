@@ -40,16 +40,6 @@ def test_an_empty_table_and_an_own_photo_of_another_object_are_refused():
         table_of(np.zeros((2, 2)), [0, 1], own=[[0, 1], [0, 0]])
 
 
-def test_a_selection_has_the_owners_and_own_photos_of_its_rows_and_columns():
-    table = uneven()
-    rows, columns = np.array([5, 2]), np.arange(14) % 2 == 0
-    part = table.select(rows, columns)
-    np.testing.assert_array_equal(part.scores, table.scores[np.ix_(rows, columns)])
-    np.testing.assert_array_equal(part.own, table.own[np.ix_(rows, columns)])
-    np.testing.assert_array_equal(part.touch_owner, table.touch_owner[rows])
-    np.testing.assert_array_equal(part.photo_owner, table.photo_owner[columns])
-
-
 def test_a_measure_needs_a_finite_value_for_each_query():
     with pytest.raises(BadInput, match=r"values of shape \(2, 1\)"):
         Measure(np.zeros((3, 1)), np.array([0, 1]), np.array([0.5]), "")
