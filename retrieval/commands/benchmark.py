@@ -1,6 +1,5 @@
 """`retrieve benchmark`: accuracy of the matcher on public real data, by protocols with controls."""
 
-import shlex
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated
@@ -97,7 +96,7 @@ def real(
         skipped = {name: missing[data_set] for name, data_set in data_set_of.items() if data_set in missing}
         if protocols or len(skipped) < len(requested):
             for name, reason in skipped.items():
-                say(f"{name} is skipped: {reason}. To run it: {_command_with_data(data, out, name, data_set_of[name])}")
+                say(f"{name} is skipped: {reason}")
         if len(skipped) == len(requested):
             raise BadInput(
                 f"{data} must contain data of at least one protocol; {'; '.join(dict.fromkeys(missing.values()))}"
@@ -171,12 +170,3 @@ def _parse_pairs(words: Iterable[str], option: str, value: str) -> Iterator[tupl
         if not equals or not name or "/" in name:
             raise BadInput(f"{option} must have the form NAME={value}, got {word!r}")
         yield name, chosen
-
-
-def _command_with_data(data: Path, out: Path, protocol: str, data_set: str) -> str:
-    """Return the command that runs a protocol once its data is in place."""
-    run = f"retrieve benchmark real {shlex.quote(str(data))} --out {shlex.quote(str(out))} --protocols {protocol}"
-    if data_set != "rct":
-        return run
-    target = shlex.quote(str(data / "rct"))
-    return f"retrieve import rct RCT --out {target} --option touch=... photo=... && {run}"

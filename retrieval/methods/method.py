@@ -120,12 +120,6 @@ class Method(ABC):
             sets: (S, G) rows of `touch_encodings`.
         """
         self._require_fitted()
-        if sets.ndim != 2 or sets.shape[1] < 1 or not np.issubdtype(sets.dtype, np.integer):
-            raise BadInput(f"sets of grasps must be integers of shape (S, G), G >= 1; got {sets.dtype} {sets.shape}")
-        if sets.size and (sets.min() < 0 or sets.max() >= len(touch_encodings)):
-            raise BadInput(
-                f"sets must index the {len(touch_encodings)} touch encodings; got {sets.min()}..{sets.max()}"
-            )
         return _checked_scores(
             self._score_sets(touch_encodings, photo_encodings, sets), len(sets), len(photo_encodings)
         )

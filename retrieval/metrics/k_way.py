@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from math import comb
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.special import betaincinv
 
-from retrieval.errors import BadInput, NumericalError
+from retrieval.errors import BadInput
 
 
-def k_way_accuracy(true_score: float, other_scores: ArrayLike, k: int) -> NDArray[np.float64]:
+def k_way_accuracies(higher: NDArray[np.int64], equal: NDArray[np.int64], others: int, k: int) -> NDArray[np.float64]:
     """Return the probability that the true photo ranks within the top 1..k, among k - 1 random others.
 
     The value is exact over all draws without replacement, so it does not depend on a seed. Of n others, b score higher
@@ -18,26 +18,17 @@ def k_way_accuracy(true_score: float, other_scores: ArrayLike, k: int) -> NDArra
     every rank is equally likely. A constant scorer gives 1/k, 2/k, ..., 1.
 
     Args:
-        true_score: Score of the true photo.
-        other_scores: Scores of the others, at least k - 1.
+        higher: (Q,) number of others that score higher than the true photo of each query.
+        equal: (Q,) number of others with an equal score.
+        others: Number of others, at least k - 1.
         k: Candidates of the test.
 
     Returns:
-        (k,) values that end at 1.
+        (Q, k) values that end at 1.
 
     Raises:
         BadInput: There are fewer than k - 1 others.
-        NumericalError: A score is not finite.
     """
-    others = np.asarray(other_scores, dtype=np.float64)
-    if not (np.isfinite(others).all() and np.isfinite(true_score)):
-        raise NumericalError("every score must be finite; one of a K-way test is not")
-    higher, equal = int((others > true_score).sum()), int((others == true_score).sum())
-    return np.ravel(k_way_accuracies(np.array([higher]), np.array([equal]), len(others), k))
-
-
-def k_way_accuracies(higher: NDArray[np.int64], equal: NDArray[np.int64], others: int, k: int) -> NDArray[np.float64]:
-    """Return `k_way_accuracy` (Q, k) of many queries, from the counts (Q,) of others that score higher and equal."""
     if k < 1 or others < k - 1:
         raise BadInput(f"a {k}-way test needs k >= 1 and {k - 1} other candidates; got {others}")
     cases, place = np.unique(np.stack([higher, equal], axis=1), axis=0, return_inverse=True)

@@ -49,15 +49,20 @@ class Metric:
 
     Attributes:
         label: Name in the report.
-        column: Heading in its own table.
-        section: Name of that table.
+        section: Name of its table.
         compute: Returns its values; None if these scores do not allow it.
+        short_label: Heading in its table, if shorter than the label.
     """
 
     label: str
-    column: str
     section: str
     compute: Callable[[MethodScoreTables], Measure | None]
+    short_label: str = ""
+
+    @property
+    def column(self) -> str:
+        """Heading in its table."""
+        return self.short_label or self.label
 
 
 def grasps_metric_name(count: int) -> str:
@@ -75,26 +80,29 @@ def k_way_measure(table: ScoreTable | None, k: int, seed: int, photos: int = 1) 
     return protocols.k_way(table, k, photos=photos, seed=seed) if table and len(table.objects) >= k else None
 
 
+def _top1_of(k: int, table: Callable[[MethodScoreTables], ScoreTable], words: str = "") -> Metric:
+    return Metric(f"{k}-way top-1 accuracy{words}", "main", lambda tables: k_way_measure(table(tables), k, tables.seed))
+
+
 def _grasps_metric(count: int) -> Metric:
     words = f"{count} grasp{'s' * (count > 1)}"
-    label = f"5-way top-1 accuracy, {words}, {PHOTOS_PER_CANDIDATE} photos"
     return Metric(
-        label,
-        words,
+        f"5-way top-1 accuracy, {words}, {PHOTOS_PER_CANDIDATE} photos",
         "grasps",
         lambda tables: k_way_measure(tables.sets.get(count), 5, tables.seed, PHOTOS_PER_CANDIDATE),
+        words,
     )
 
 
 def _photos_metric(count: int) -> Metric:
     words = f"{count} photos"
-    label = f"5-way top-1 accuracy, {words}"
-    return Metric(label, words, "photos", lambda tables: _if_enough_photos(tables, count))
-
-
-def _if_enough_photos(tables: MethodScoreTables, count: int) -> Measure | None:
-    """Return the 5-way measure; None if a candidate has too few photos: the mean of fewer scores varies more."""
-    return k_way_measure(tables.test, 5, tables.seed, count) if tables.test.min_photos >= count else None
+    return Metric(
+        f"5-way top-1 accuracy, {words}",
+        "photos",
+        # A candidate with fewer photos has a mean of fewer scores, which varies more.
+        lambda tables: k_way_measure(tables.test, 5, tables.seed, count) if tables.test.min_photos >= count else None,
+        words,
+    )
 
 
 TOUCH_TO_PHOTO, PHOTO_TO_TOUCH = "touch to photo", "photo to touch"
@@ -104,7 +112,7 @@ def _gallery_metrics(prefix: str, section: str, table: Callable[[MethodScoreTabl
     """Return the measures of the whole gallery in one direction."""
 
     def metric(column: str, compute: Callable[[ScoreTable], Measure]) -> Metric:
-        return Metric(f"{column}, {section}", column, section, lambda tables: compute(table(tables)))
+        return Metric(f"{column}, {section}", section, lambda tables: compute(table(tables)), column)
 
     return {
         **{f"{prefix}recall_{k}": metric(f"R@{k}", partial(protocols.recall, k=k)) for k in (1, 5, 10)},
@@ -116,50 +124,21 @@ def _gallery_metrics(prefix: str, section: str, table: Callable[[MethodScoreTabl
 METRICS: dict[str, Metric] = {
     "pair_accuracy": Metric(
         "pair accuracy",
-        "pair accuracy",
         "main",
         lambda tables: None if tables.threshold is None else protocols.pair_accuracy(tables.test, tables.threshold),
     ),
-    "pair_auc": Metric("pair AUC", "pair AUC", "main", lambda tables: protocols.pair_auc(tables.test)),
-    "topn_k5": Metric(
-        "5-way top-1 accuracy",
-        "5-way top-1 accuracy",
-        "main",
-        lambda tables: k_way_measure(tables.test, 5, tables.seed),
-    ),
-    "topn_k10": Metric(
-        "10-way top-1 accuracy",
-        "10-way top-1 accuracy",
-        "main",
-        lambda tables: k_way_measure(tables.test, 10, tables.seed),
-    ),
-    "topn_k100": Metric(
-        "100-way top-1 accuracy",
-        "100-way top-1 accuracy",
-        "main",
-        lambda tables: k_way_measure(tables.test, 100, tables.seed),
-    ),
-    "topn_k5_all_objects": Metric(
-        "5-way top-1 accuracy, all objects",
-        "5-way top-1 accuracy, all objects",
-        "main",
-        lambda tables: k_way_measure(tables.all_objects, 5, tables.seed),
-    ),
+    "pair_auc": Metric("pair AUC", "main", lambda tables: protocols.pair_auc(tables.test)),
+    **{f"topn_k{k}": _top1_of(k, lambda tables: tables.test) for k in (5, 10, 100)},
+    "topn_k5_all_objects": _top1_of(5, lambda tables: tables.all_objects, ", all objects"),
     **{grasps_metric_name(count): _grasps_metric(count) for count in SET_SIZES},
     **{photos_metric_name(count): _photos_metric(count) for count in PHOTO_COUNTS if count > 1},
     **_gallery_metrics("", TOUCH_TO_PHOTO, lambda tables: tables.test),
     **_gallery_metrics("photo_to_touch_", PHOTO_TO_TOUCH, lambda tables: tables.photos),
     "objectfolder_touch_to_photo": Metric(
-        "mAP, touch to photo",
-        "mAP, touch to photo",
-        "objectfolder",
-        lambda tables: protocols.average_precision(tables.test.with_own()),
+        "mAP, touch to photo", "objectfolder", lambda tables: protocols.average_precision(tables.test.with_own())
     ),
     "objectfolder_photo_to_touch": Metric(
-        "mAP, photo to touch",
-        "mAP, photo to touch",
-        "objectfolder",
-        lambda tables: protocols.average_precision(tables.photos.with_own()),
+        "mAP, photo to touch", "objectfolder", lambda tables: protocols.average_precision(tables.photos.with_own())
     ),
 }
 """Name in results.json -> metric, in the order of every table."""

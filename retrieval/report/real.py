@@ -20,10 +20,10 @@ from retrieval.report.results import (
     FEW_OBJECTS_NOTE,
     METHOD_LABELS,
     MISSING_VALUE,
-    few_objects_mark,
     file_name,
     method_label,
     percent,
+    points,
     read_results_file,
     with_interval,
 )
@@ -228,7 +228,7 @@ def controls(entry: Entry) -> Table:
 def differences(entry: Entry) -> Table:
     """Return the paired differences between each row and its controls."""
     rows = [
-        (_label(name, row), entry["labels"][key], control, _points(one), probability(one["p"]))
+        (_label(name, row), entry["labels"][key], control, points(one), probability(one["p"]))
         for name, row in entry["rows"].items()
         for which, control in CONTROL_NAMES.items()
         for key, one in (row[which] or {}).items()
@@ -241,16 +241,12 @@ def differences(entry: Entry) -> Table:
 def towers(entry: Entry) -> Table | None:
     """Return the paired differences between each tower and the first one; None unless towers are compared."""
     rows = [
-        (_label(name, row), entry["labels"][key], _points(one), probability(one["p"]))
+        (_label(name, row), entry["labels"][key], points(one), probability(one["p"]))
         for name, row in entry["rows"].items()
         for key, one in (row.get("tower_differences") or {}).items()
     ]
     header = ("tower", "measure", "points over the first tower, same representation", "p")
     return Table(header, tuple(rows), words=frozenset({1})) if rows else None
-
-
-def _points(one: Mapping[str, Any]) -> str:
-    return f"{100 * one['difference']:+.1f} [{100 * one['low']:+.1f}, {100 * one['high']:+.1f}]{few_objects_mark(one)}"
 
 
 def choices(entry: Entry) -> Table | None:
@@ -275,20 +271,11 @@ def _spread(summary: Mapping[str, Any]) -> list[str]:
 
 
 def reliability(entry: Entry) -> Table | None:
-    """Return the reliability of the top-1 probabilities; None if no row has probabilities."""
+    """Return the calibration errors of the top-1 probabilities; None if no row has probabilities."""
     rows = [
-        (
-            _label(name, row),
-            SEARCH_SPACES[searched],
-            f"{one['from']:.1f} to {one['to']:.1f}",
-            f"{one['confidence']:.3f}",
-            f"{one['accuracy']:.3f}",
-            f"{one['confidence'] - one['accuracy']:+.3f}",
-            f"{one['count']:,}",
-        )
+        (_label(name, row), SEARCH_SPACES[searched], percent(one["ece"]), f"{sum(b['count'] for b in one['bins']):,}")
         for name, row in entry["rows"].items()
-        for searched, bins in row["reliability"].items()
-        for one in bins
+        for searched, one in row["reliability"].items()
     ]
     if not rows:
         return None
@@ -296,8 +283,9 @@ def reliability(entry: Entry) -> Table | None:
         "Top-1 answers to one touch. The candidates are objects with one photo each, including the true object. "
         "The posterior is fitted on held-out training objects of each fold."
     )
-    header = ("method", "gallery", "confidence", "mean confidence", "accuracy", "difference", "answers")
-    return Table(header, tuple(rows), (note,), words=frozenset({1}))
+    return Table(
+        ("method", "gallery", "expected calibration error, %", "answers"), tuple(rows), (note,), frozenset({1})
+    )
 
 
 # Figure ------------------------------------------------------------------------------------------------

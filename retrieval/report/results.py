@@ -133,8 +133,17 @@ def with_interval(summary: Summary | None, place: int = 0) -> str:
     """Return value and interval in percent, as in "71.2 [65.0, 77.1]", with a mark if there are too few objects."""
     if summary is None or summary["value"][place] is None:
         return MISSING_VALUE
-    low, high = percent(summary["low"][place]), percent(summary["high"][place])
-    return f"{percent(summary['value'][place])} [{low}, {high}]{few_objects_mark(summary)}"
+    return interval(*(summary[key][place] for key in ("value", "low", "high"))) + few_objects_mark(summary)
+
+
+def interval(value: float, low: float, high: float) -> str:
+    """Return a value and its interval in percent, as in "71.2 [65.0, 77.1]"."""
+    return f"{percent(value)} [{percent(low)}, {percent(high)}]"
+
+
+def points(one: Mapping[str, Any]) -> str:
+    """Return a difference and its interval in percent points, with a mark if there are too few objects."""
+    return f"{100 * one['difference']:+.1f} [{100 * one['low']:+.1f}, {100 * one['high']:+.1f}]{few_objects_mark(one)}"
 
 
 def few_objects_mark(summary: Mapping[str, Any]) -> str:

@@ -14,11 +14,12 @@ from retrieval.report.results import (
     MISSING_VALUE,
     Results,
     Summary,
-    few_objects_mark,
     format_number,
+    interval,
     measure_label,
     method_label,
     percent,
+    points,
     with_interval,
 )
 
@@ -121,8 +122,7 @@ def comparisons(results: Results) -> Table:
         (
             f"{method_label(one['a'])} − {method_label(one['b'])}",
             measure_label(one["measure"]),
-            f"{100 * one['difference']:+.1f} [{100 * one['low']:+.1f}, {100 * one['high']:+.1f}]"
-            f"{few_objects_mark(one)}",
+            points(one),
             probability(one["p"]),
         )
         for one in results.data["comparisons"]
@@ -226,13 +226,9 @@ def verification(results: Results) -> Table:
 def _supported_rate(rate: Mapping[str, Any]) -> str:
     """Return a rate with its interval in percent, or the number of objects that it needs."""
     if rate["value"] is not None:
-        return _percent_interval(rate["value"], rate["low"], rate["high"])
+        return interval(rate["value"], rate["low"], rate["high"])
     needed = rate["objects_needed"]
     return "refused: no errors" if needed is None else f"refused: needs {needed:,} objects"
-
-
-def _percent_interval(value: float, low: float, high: float) -> str:
-    return f"{percent(value)} [{percent(low)}, {percent(high)}]"
 
 
 def _has_entry(results: Results, name: str, entry: str) -> bool:

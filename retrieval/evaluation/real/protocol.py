@@ -183,7 +183,6 @@ def topn_accuracy(k: int, *, grasps: int = 1, photos: int = 1, entries: str = "p
     return {
         name: Metric(
             label,
-            label,
             "real",
             lambda of: k_way_measure(of.test if grasps == 1 else of.sets.get(grasps), k, of.seed, photos),
         )

@@ -49,9 +49,9 @@ PERMUTED = "the objects of the sequences are permuted: the level of chance"
 Vectors = NDArray[np.float64]
 
 MEASURES = {
-    "recall_1": Metric("top-1", "top-1", "real", lambda of: protocols.recall(of.test, 1)),
-    "recall_5": Metric("R@5", "R@5", "real", lambda of: protocols.recall(of.test, 5)),
-    "map": Metric("mAP", "mAP", "real", lambda of: protocols.average_precision(of.test)),
+    "recall_1": Metric("top-1", "real", lambda of: protocols.recall(of.test, 1)),
+    "recall_5": Metric("R@5", "real", lambda of: protocols.recall(of.test, 5)),
+    "map": Metric("mAP", "real", lambda of: protocols.average_precision(of.test)),
 }
 """Measures of sequence-to-sequence retrieval; the first one decides."""
 

@@ -11,6 +11,7 @@ from retrieval.evaluation.real.protocol import Protocol
 from retrieval.metrics.intervals import LEVEL, compare, summarise
 from retrieval.metrics.k_way import clopper_pearson
 from retrieval.metrics.measure import Measure
+from retrieval.metrics.pairs import reliability_bins
 from retrieval.metrics.resampled_splits import compare_splits, summarise_splits
 
 RULE = (
@@ -25,7 +26,6 @@ CONTROL_NAMES = {
     "no_contact_differences": "the no-contact frame as input",
 }
 """Key of a row's paired differences -> name of the control."""
-CONFIDENCE_BINS = 10
 
 MeasuresBySeed = Sequence[Mapping[str, Measure]]
 
@@ -136,32 +136,16 @@ def _against(difference: Mapping[str, Any], control: str) -> str:
     return f"{points} against {control}, an interval that contains 0"
 
 
-def reliability_entry(confidences: Sequence[Mapping[str, NDArray[np.float64]]]) -> dict[str, list[dict[str, Any]]]:
-    """Return reliability bins of top-1 confidences, by gallery.
+def reliability_entry(confidences: Sequence[Mapping[str, NDArray[np.float64]]]) -> dict[str, Any]:
+    """Return the reliability of top-1 confidences (`reliability_bins`), by gallery.
 
     Args:
         confidences: For each fold and gallery (Q, 2): probability and accuracy of the top-1 answer.
-
-    Returns:
-        For each gallery a dictionary {"from", "to", "confidence", "accuracy", "count"} per non-empty bin of width 0.1.
     """
     names = dict.fromkeys(name for one in confidences for name in one)
-    return {name: _bins(np.concatenate([one[name] for one in confidences if name in one])) for name in names}
-
-
-def _bins(confidences: NDArray[np.float64]) -> list[dict[str, Any]]:
-    stated, right = confidences.T
-    which = np.minimum((stated * CONFIDENCE_BINS).astype(int), CONFIDENCE_BINS - 1)
-    return [
-        {
-            "from": place / CONFIDENCE_BINS,
-            "to": (place + 1) / CONFIDENCE_BINS,
-            "confidence": float(stated[which == place].mean()),
-            "accuracy": float(right[which == place].mean()),
-            "count": int((which == place).sum()),
-        }
-        for place in np.unique(which).tolist()
-    ]
+    return {
+        name: reliability_bins(*np.concatenate([one[name] for one in confidences if name in one]).T) for name in names
+    }
 
 
 def _correct_counts(by_seed: MeasuresBySeed, name: str | None) -> dict[str, Any] | None:

@@ -158,10 +158,8 @@ class QueryResult:
         try:
             matches = [_match(match, Path(document["index"]["catalogue"])) for match in document["results"]]
             query = {name: document["query"][name] for name in ("touches", "grasps")}
-            names = ("index", "timing_ms", "verdict", "none_probability", "posterior")
-            others = {name: document[name] for name in names}
-            others["more_grasps"] = document.get("more_grasps")  # old documents in a service's history lack it
-            return cls(**query, results=matches, **others)
+            names = ("index", "timing_ms", "verdict", "none_probability", "posterior", "more_grasps")
+            return cls(**query, results=matches, **{name: document[name] for name in names})
         except (KeyError, TypeError) as error:
             raise BadInput(f"this is not a document of `retrieve query --json`: {error!r}") from error
 

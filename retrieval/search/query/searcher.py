@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, NoReturn
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,6 @@ from retrieval.model.reference_calibration import REFERENCE_ROWS
 from retrieval.model.touch_reader import EncodedTouches, Stopwatch, TouchEncoder, TouchReader
 from retrieval.model.touches import AnyImage, AnyTouches, InputImage, parse_grasps
 from retrieval.search.query.answer import (
-    NONE_OF_THESE,
     Match,
     QueryResult,
     gel_classes,
@@ -32,10 +31,9 @@ from retrieval.search.query.answer import (
 from retrieval.search.query.objects import Objects
 from retrieval.search.query.opening import OpenShards, open_index, scorer_for, torch_encoder
 from retrieval.search.query.reference_touches import reference_summary
-from retrieval.search.query.shard import FolderShard, Shard, ShardQuery, ShardResult
+from retrieval.search.query.shard import FolderShard, RankedObject, Shard, ShardQuery, ShardResult
 from retrieval.search.query.verification import Verification, verify
 
-Floats = NDArray[np.float32]
 
 
 class Searcher:
@@ -263,44 +261,46 @@ class Searcher:
         clock = Stopwatch()
         codes = self.reader.encode(grasps, self.reader.no_contact_frames(background), clock)
         classes = gel_classes(self.gel_check, codes)
-        scored = []
+        found = []
         for span in spans:
             in_contact = (classes[span] == CONTACT) & (classes[span] != NOT_A_GEL).all()
             query = ShardQuery(codes.embeddings[span][in_contact], codes.partials[span][in_contact])
-            scored.append(self._score(query, top, candidates, none_prior, clock))
+            one = self.shard.search(query, top, candidates, self.posterior) if in_contact.any() else None
+            clock.add({stage: one.timing_ms[stage] if one else 0.0 for stage in ("candidates", "rerank")})
+            found.append(one)
         timing_ms = clock.finish(len(spans))
         return [
-            self._result(grasps[span], classes[span].tolist(), timing_ms, found, none_prior)
-            for span, found in zip(spans, scored, strict=True)
+            self._result(grasps[span], classes[span].tolist(), timing_ms, one, none_prior)
+            for span, one in zip(spans, found, strict=True)
         ]
-
-    def _score(
-        self, query: ShardQuery, top: int, candidates: int | None, none_prior: float, clock: Stopwatch
-    ) -> _ScoredQuery | None:
-        """Return the best objects and their probabilities; None without a grasp with contact."""
-        grasps = len(query.partials)
-        if not grasps:
-            clock.add({"candidates": 0.0, "rerank": 0.0})
-            return None
-        found = self.shard.search(query, top, candidates, self.posterior)
-        clock.add({stage: found.timing_ms[stage] for stage in ("candidates", "rerank")})
-        probabilities = None
-        if self.posterior is not None and found.mass is not None:
-            logits = [one.logit for one in found.best]
-            probabilities = self.posterior.probabilities_given(logits, found.mass, grasps, none_prior)
-        return _ScoredQuery(found, grasps, probabilities)
 
     def _result(
         self,
         grasps: Sequence[Sequence[InputImage]],
         classes: list[str],
         timing_ms: dict[str, float],
-        scored: _ScoredQuery | None,
+        found: ShardResult | None,
         none_prior: float,
     ) -> QueryResult:
-        info, probabilities = self.info, scored.probabilities if scored else None
-        verdict = verdict_of(classes, probabilities)
-        searched = scored.found.searched if scored else info.photos
+        """Return the answer; `found` is None without a grasp with contact."""
+        info, posterior, count = self.info, self.posterior, classes.count(CONTACT)
+        probabilities, formula, more_grasps = None, None, None
+        if found is not None and found.mass is not None and posterior is not None:
+            logits = [one.logit for one in found.best]
+            probabilities = posterior.probabilities_given(logits, found.mass, count, none_prior)
+            if not probabilities.is_match and is_clear(float(probabilities.objects_if_present[0])):
+                more_grasps = posterior.more_grasps(logits[0], found.mass.objects, count, none_prior)
+            references = reference_summary(info.about)
+            formula = {
+                **posterior.to_dict(),
+                "none_prior": none_prior,
+                "grasps": count,
+                "objects": info.objects,
+                "scored_objects": found.objects,
+                "unscored_probability": probabilities.unscored,
+                **({REFERENCE_ROWS: references} if references else {}),
+            }
+        searched = found.searched if found else info.photos
         sharding = {"shards": info.shards, "searched": searched / info.photos} if info.shards > 1 else {}
         return QueryResult(
             touches=[[image.name for image in grasp] for grasp in grasps],
@@ -311,7 +311,7 @@ class Searcher:
                 "kind": info.kind,
                 "photos": info.photos,
                 "objects": info.objects,
-                "scored": scored.found.photos if scored else 0,
+                "scored": found.photos if found else 0,
                 **sharding,
                 "encoder": self.encoder.name,
                 "catalogue": str(info.about["catalogue"]),
@@ -319,50 +319,18 @@ class Searcher:
                 "trained_on": self.checkpoint.provenance.get("source", "unknown"),
             },
             timing_ms=timing_ms,
-            verdict=verdict,
+            verdict=verdict_of(classes, probabilities),
             none_probability=probabilities.none if probabilities else None,
-            posterior=self._formula(scored, none_prior) if scored else None,
-            results=self._ranking(scored) if scored else [],
-            more_grasps=self._more_grasps(scored, none_prior) if verdict == NONE_OF_THESE and scored else None,
+            posterior=formula,
+            results=self._ranking(found.best, probabilities) if found else [],
+            more_grasps=more_grasps,
         )
 
-    def _more_grasps(self, scored: _ScoredQuery, none_prior: float) -> int | None:
-        """Return the number of further grasps until a match is expected; None if unclear or too many."""
-        mass, probabilities = scored.found.mass, scored.probabilities
-        if self.posterior is None or probabilities is None or mass is None:
-            return None
-        if not is_clear(float(probabilities.objects_if_present[0])):
-            return None
-        return self.posterior.more_grasps(scored.found.best[0].logit, mass.objects, scored.grasps, none_prior)
-
-    def _ranking(self, scored: _ScoredQuery) -> list[Match]:
-        ranking, base, probabilities = [], self.catalogue.absolute(), scored.probabilities
-        for rank, (logit, photo, reference) in enumerate(scored.found.best, start=1):
-            probability = None if probabilities is None else float(probabilities.objects[rank - 1])
-            if_present = None if probabilities is None else float(probabilities.objects_if_present[rank - 1])
-            fields = (rank, photo.object_id, logit, probability, photo.path, photo.metadata)
+    def _ranking(self, best: Sequence[RankedObject], probabilities: PosteriorProbabilities | None) -> list[Match]:
+        ranking, base = [], self.catalogue.absolute()
+        for place, (logit, photo, reference) in enumerate(best):
+            probability = None if probabilities is None else float(probabilities.objects[place])
+            if_present = None if probabilities is None else float(probabilities.objects_if_present[place])
+            fields = (place + 1, photo.object_id, logit, probability, photo.path, photo.metadata)
             ranking.append(Match(*fields, base / photo.path, reference, if_present))
         return ranking
-
-    def _formula(self, scored: _ScoredQuery, none_prior: float) -> dict[str, Any] | None:
-        """Return the formula of the probabilities, with the numbers of this query."""
-        if self.posterior is None or scored.probabilities is None:
-            return None
-        references = reference_summary(self.info.about)
-        return {
-            **self.posterior.to_dict(),
-            "none_prior": none_prior,
-            "grasps": scored.grasps,
-            "objects": self.info.objects,
-            "scored_objects": scored.found.objects,
-            "unscored_probability": scored.probabilities.unscored,
-            **({REFERENCE_ROWS: references} if references else {}),
-        }
-
-
-class _ScoredQuery(NamedTuple):
-    """The result for one object in the hand, its number of grasps with contact, and the probabilities."""
-
-    found: ShardResult
-    grasps: int
-    probabilities: PosteriorProbabilities | None

@@ -13,7 +13,7 @@ import torch
 from retrieval.commands.main import main
 from retrieval.data.dataset import Grasp, Split, load_grasps, make_split
 from retrieval.errors import BadInput, ConfigError, DatasetError, JobInterrupted
-from retrieval.evaluation.controls import CEILINGS, ceiling_experiments, score_control, thin_grasps
+from retrieval.evaluation.controls import CEILINGS, ceiling_experiments, score_control
 from retrieval.evaluation.evaluate import evaluate
 from retrieval.evaluation.experiment import Experiment, _permute_touches
 from retrieval.evaluation.queries import draw_queries
@@ -346,13 +346,6 @@ def test_objects_with_one_photo_have_no_photo_ceiling():
     features = Features(tuple("abcdef"), tuple("xxyyzz"), one, np.arange(3, dtype=np.float32).repeat(2)[:, None])
     experiment = Experiment(Path(), CONFIG, None, features, None, None, None, shuffled=False, quiet=True)
     assert set(ceiling_experiments(experiment)) == {"touch_to_touch"}
-
-
-def test_grasps_are_thinned_evenly(grasped):
-    grasps = load_grasps(grasped)
-    thinned = thin_grasps(grasps, 2)
-    assert [grasps.index(grasp) % 4 for grasp in thinned] == [0, 3] * 18
-    assert thin_grasps(grasps, 9) == grasps
 
 
 @pytest.fixture(scope="module")

@@ -9,11 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-import retrieval
 from retrieval.commands.main import main
 from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.data.images import read_rgb
-from retrieval.errors import BadInput, DatasetError
+from retrieval.errors import DatasetError
 from retrieval.evaluation.real.conditions import TowerEncoder
 from retrieval.evaluation.real.touch_to_touch import (
     Sequences,
@@ -118,12 +117,6 @@ def test_one_sequence_of_an_object_or_one_object_is_refused(counts, message):
         Sequences.of(grasps(counts))
 
 
-def test_a_sequence_never_finds_itself():
-    sequences = Sequences.of(grasps({"a": 2, "b": 2}))
-    scores = np.eye(4, dtype=np.float32)
-    assert protocols.recall(sequences.table(scores), 1).values.ravel().tolist() == [pytest.approx(1 / 3)] * 4
-
-
 # The common no-contact frame -------------------------------------------------------------------------------
 
 
@@ -157,13 +150,6 @@ def test_drift_that_identifies_the_object_is_removed_on_the_common_frame(tmp_pat
             made.append(Grasp(f"{number}-{video}", f"o{number}", f"{number}-{video}", path, (path,), (path,)))
     moved = with_common_frame(made, tmp_path / "common")
     assert {read_rgb(one.touches[0]).tobytes() for one in moved} == {read_rgb(made[0].touches[0]).tobytes()}
-
-
-def test_existing_images_are_reused(recording, tmp_path, monkeypatch):
-    own = load_grasps(recording / "recording")[:4]
-    with_common_frame(own, tmp_path / "common")
-    monkeypatch.setattr("retrieval.evaluation.real.touch_to_touch.write_atomically", None)
-    with_common_frame(own, tmp_path / "common")
 
 
 def test_frames_of_two_sizes_are_refused(recording, tmp_path):
@@ -215,12 +201,6 @@ def test_the_report_shows_touch_to_touch_results(out):
     assert (out / "figures" / "physiclear-best.jpg").is_file()
 
 
-def test_a_second_run_is_byte_identical(recording, out):
-    before = (out / "results.json").read_bytes()
-    assert benchmark(recording, out) == 0
-    assert (out / "results.json").read_bytes() == before
-
-
 def test_the_towers_of_other_configurations_are_rows_compared_with_the_first(recording, tmp_path):
     larger = tmp_path / "larger.toml"
     tiny = (resources.files("retrieval") / "configs" / "tiny.toml").read_text()
@@ -250,12 +230,6 @@ def test_a_tower_without_a_name_of_its_own_is_refused(recording, tmp_path, capsy
     assert message in capsys.readouterr().err
 
 
-def test_towers_without_a_protocol_that_compares_them_are_refused(tmp_path):
-    options = {"protocols": ["vt60-choices"], "towers": {"other": load_config("tiny")}}
-    with pytest.raises(BadInput, match="Only touch-to-touch protocols compare towers, got vt60-choices"):
-        retrieval.benchmark({}, tmp_path, **options)
-
-
 def test_cells_are_not_compared_since_a_part_is_pressed_at_any_place(recording, tmp_path):
     grasps = load_grasps(recording / "recording")
     config = load_config("small")
@@ -266,15 +240,3 @@ def test_cells_are_not_compared_since_a_part_is_pressed_at_any_place(recording, 
     assert towers.matcher.touch_tower.output_count > towers.matcher.touch_tower.feature_count
     encoder = _SequenceEncoder(Sequences.of(grasps), towers, grasps)
     assert encoder.vectors("difference", "touch").shape[1] == towers.matcher.touch_tower.feature_count
-
-
-@pytest.mark.slow
-def test_a_shipped_model_has_its_name_and_is_compared_with_the_frozen_towers(recording, out):
-    assert benchmark(recording, out, "--model", "shipped=shipped-one-finger") == 0
-    rows = json.loads((out / "results.json").read_text())["protocols"]["physiclear"]["rows"]
-    for representation in ("difference", "common-frame"):
-        mine, frozen = (rows[f"{name}-{representation}"] for name in ("shipped", "frozen"))
-        by_hand = mine["measures"]["map"]["value"][0] - frozen["measures"]["map"]["value"][0]
-        assert mine["tower_differences"]["map"]["difference"] == pytest.approx(by_hand)
-        assert mine["model"]
-    assert "points over the first tower" in (out / "report.md").read_text()

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from retrieval.methods import contrastive as module
-from retrieval.methods.contrastive import ContrastiveEmbedding, ObjectSampler, Projections, seeded_generator
+from retrieval.methods.contrastive import ContrastiveEmbedding, ObjectSampler, Projections
 from retrieval.methods.method import MethodSettings
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from retrieval.model.losses.contrastive import LOG_SCALE_MAX, contrastive_loss
@@ -45,15 +44,6 @@ def test_scores_are_scaled_cosines():
     assert 1 <= scale <= 100
 
 
-@pytest.mark.slow
-def test_the_best_parameters_are_among_the_candidates():
-    fitted = ContrastiveEmbedding(MethodSettings(CONFIG))
-    fitted.fit(TRAIN, VALIDATION)
-    assert (fitted.best_params["dropout"], fitted.best_params["weight_decay"]) in module.REGULARISATIONS
-    assert fitted.best_params["steps"] in (40, 80)
-    assert fitted.best_params["validation_auc"] > 0.7
-
-
 def test_the_scale_is_clamped_at_a_hundred_and_has_a_gradient_there():
     projections = Projections(3, 3, 2, 0.0)
     with torch.no_grad():
@@ -65,13 +55,6 @@ def test_the_scale_is_clamped_at_a_hundred_and_has_a_gradient_there():
         contrastive_loss(touch, photo, objects, objects, projections.log_scale), projections.log_scale
     )
     assert gradient.item() > 1  # a clamp of the forward value would have none
-
-
-def test_a_feature_vector_of_zeros_has_the_embedding_of_its_bias_and_no_nan():
-    projections = Projections(3, 3, 2, 0.0)
-    with torch.no_grad():
-        projections.touch.bias.zero_()
-    assert projections(torch.zeros(1, 3), projections.touch).tolist() == [[0.0, 0.0]]
 
 
 def test_a_fit_does_not_change_the_global_random_stream():
@@ -101,11 +84,3 @@ def test_a_batch_contains_an_object_once():
     drawn = draws([0, 1, 2, 3])
     assert sorted(drawn.distinct_objects(10).tolist()) == [0, 1, 2, 3]
     assert len(set(drawn.distinct_objects(2).tolist())) == 2
-
-
-def test_equal_seeds_draw_the_same():
-    with seeded_generator(4) as one:
-        first = torch.rand(3, generator=one), torch.rand(3)
-    with seeded_generator(4) as other:
-        second = torch.rand(3, generator=other), torch.rand(3)
-    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))

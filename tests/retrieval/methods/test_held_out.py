@@ -63,13 +63,3 @@ def test_objects_of_one_sequence_stay_together_although_they_are_of_two_kinds():
     parts = held_out_folds(features_of(KINDS), linked=[["a0", "b3"]])
     assert any({"a0", "b3"} <= set(part) for part in parts)
     assert sorted(name for fold in parts for name in fold) == NAMES
-
-
-def test_the_seed_changes_the_folds_of_named_kinds():
-    features, kind_of = features_of(KINDS), {name: name[0] for name in NAMES}
-    first = held_out_folds(features, kind_of)
-    assert held_out_folds(features, kind_of) == first != held_out_folds(features, kind_of, seed=1)
-
-
-def test_two_objects_give_two_folds_of_one():
-    assert held_out_folds(features_of([["a", "b"]])) == [("a",), ("b",)]

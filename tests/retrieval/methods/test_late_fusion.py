@@ -10,9 +10,8 @@ from retrieval.data.dataset import load_grasps, make_split
 from retrieval.errors import BadInput, JobInterrupted
 from retrieval.methods.late_fusion import LateFusion
 from retrieval.methods.method import MethodSettings
-from retrieval.methods.retrieve_rerank import RetrieveRerank, nearest_photos
+from retrieval.methods.retrieve_rerank import RetrieveRerank
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.model.encode import one_thread
 from retrieval.training.features import Features, encode_recording
 from retrieval.training.initial_weights import build_matcher
 from retrieval.training.state import state_path, unfinished_path
@@ -79,14 +78,6 @@ def test_scores_are_the_match_logits_of_every_pair(fitted, parts):
     np.testing.assert_allclose(fitted.score(*encodings(fitted, parts[2])), expected, rtol=1e-4, atol=1e-5)
 
 
-def test_a_set_of_grasps_scores_the_sum_of_its_logits(fitted, parts):
-    touch, photo = encodings(fitted, parts[2])
-    sets = np.array([[0, 1], [4, 2]])
-    single = fitted.score(touch, photo).astype(np.float64)
-    expected = np.array([single[0] + single[1], single[4] + single[2]])
-    np.testing.assert_allclose(fitted.score_sets(touch, photo, sets), expected, rtol=1e-5, atol=1e-6)
-
-
 def test_the_method_trains_the_same_model_as_the_command_line(recording, split, fitted, tmp_path):
     ours = load_checkpoint(fitted.settings.folder / "late_fusion-0.safetensors")
     theirs = train(recording, tmp_path / "m.safetensors", FROZEN, split=split, quiet=True)
@@ -94,15 +85,6 @@ def test_the_method_trains_the_same_model_as_the_command_line(recording, split, 
     for name, weight in theirs.matcher.state_dict().items():
         # The same steps, on features from batches of another size.
         torch.testing.assert_close(ours.matcher.state_dict()[name], weight, rtol=1e-3, atol=2e-4)
-
-
-def test_a_fit_stores_a_checkpoint_that_can_build_an_index(fitted, catalogue, tmp_path):
-    from retrieval.search.build.build_index import build_index
-
-    report = build_index(
-        catalogue, load_checkpoint(fitted.settings.folder / "late_fusion-0.safetensors"), tmp_path / "index"
-    )
-    assert report.to_dict()["photos"] == 24
 
 
 def test_a_finished_fit_is_not_trained_again(fitted, parts, monkeypatch):
@@ -168,26 +150,6 @@ def test_an_interrupted_fit_continues_and_ends_bit_for_bit_the_same(fitted, part
     path = tmp_path / "late_fusion-0.safetensors"
     assert path.read_bytes() == (fitted.settings.folder / path.name).read_bytes()
     assert not state_path(unfinished_path(path)).exists()
-
-
-def test_the_unfinished_state_of_another_fit_is_replaced(fitted, parts, tmp_path, monkeypatch):
-    stopped(parts, tmp_path, monkeypatch, with_training(FROZEN, learning_rate=1e-4))
-    assert fit(LateFusion, parts, tmp_path).best_params == fitted.best_params
-
-
-def test_a_fit_without_a_folder_stores_nothing_and_gives_the_same(fitted, parts):
-    unstored = fit(LateFusion, parts, None)
-    expected = fitted.score(*encodings(fitted, parts[2]))
-    np.testing.assert_array_equal(unstored.score(*encodings(unstored, parts[2])), expected)
-
-
-def test_different_seeds_give_different_fits(parts, tmp_path):
-    methods = [LateFusion(MethodSettings(FROZEN, seed=seed, folder=tmp_path)) for seed in (0, 1)]
-    for method in methods:
-        method.fit(*parts[:2])
-    first, second = (method.score(*encodings(method, parts[2])) for method in methods)
-    assert np.abs(first - second).max() > 1e-3
-    assert {path.name for path in tmp_path.glob("*.safetensors")} == {f"late_fusion-{n}.safetensors" for n in (0, 1)}
 
 
 @pytest.mark.parametrize("method", [LateFusion, RetrieveRerank])
@@ -259,28 +221,3 @@ def test_a_model_without_trained_embeddings_scores_every_photo(parts, tmp_path):
     assert method.best_params["reranked_fraction"] == 1.0
     late = fit(LateFusion, parts, tmp_path, with_training(FROZEN, weights={}))
     np.testing.assert_array_equal(method.score(*encodings(method, parts[2])), late.score(*encodings(late, parts[2])))
-
-
-def test_equally_near_photos_are_taken_by_row():
-    nearness = np.array([[0.5, 0.25, 0.5, 0.75], [0.25, 0.5, 0.25, 0.25]], dtype=np.float32)
-    assert nearest_photos(nearness, 2).tolist() == [0, 3]
-    assert nearest_photos(nearness[1:], 2).tolist() == [0, 1]
-
-
-def test_one_thread_limits_pytorch_to_one_thread_and_restores_the_number():
-    before = torch.get_num_threads()
-    with one_thread():
-        assert torch.get_num_threads() == 1
-    assert torch.get_num_threads() == before
-
-
-def test_a_matcher_of_several_views_is_fitted_on_the_features_of_all(recording, split, tmp_path):
-    config = dataclasses.replace(
-        FROZEN, preprocessing=dataclasses.replace(FROZEN.preprocessing, views=("whole", "zoom"))
-    )
-    torch.manual_seed(0)
-    features = encode_recording(load_grasps(recording), build_matcher(config), config, None, quiet=True)
-    both = tuple(features.of_objects(part) for part in (split.train, split.validation, split.test))
-    method = fit(LateFusion, both, tmp_path, config)
-    touches, photos = encodings(method, both[2])
-    assert method.score(touches, photos).shape == (len(both[2]), len(both[2]))

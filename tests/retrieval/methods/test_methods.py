@@ -18,7 +18,7 @@ from retrieval.methods.cca_towers import (
     tower_widths,
 )
 from retrieval.methods.method import Method, MethodSettings
-from retrieval.methods.selection import Validator, ranking_auc, validation_rows
+from retrieval.methods.selection import Validator, ranking_auc
 from retrieval.methods.standardise import Standardiser
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from retrieval.training.features import Features
@@ -144,17 +144,6 @@ def test_a_set_scores_the_sum_over_its_grasps(name):
     np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", LEARNS)
-def test_five_grasps_rank_better_than_one(name):
-    noisy = planted(6, 2, noise=6.0)
-    touch, photo = encodings(fitted(name), noisy)
-    rows = np.arange(len(TEST))
-    sets = rows[:, None] // 8 * 8 + (rows[:, None] + np.arange(5)) % 8
-    own = (sets[:, :, None] == rows).any(1)
-    single = ranking_auc(fitted(name).score(touch, photo), noisy.owner, noisy.owner, own)
-    assert ranking_auc(fitted(name).score_sets(touch, photo, sets), noisy.owner, noisy.owner, own) > single
-
-
 @every_method
 def test_a_method_must_be_fitted_before_use(name):
     method = METHODS.load(name)(MethodSettings(CONFIG))
@@ -196,18 +185,6 @@ def test_too_few_objects_and_objects_in_both_parts_are_refused():
         METHODS.load("chance")(MethodSettings(CONFIG)).fit(TRAIN, VALIDATION.select(np.arange(8)))
     with pytest.raises(BadInput, match="'object-0-00' is in both"):
         METHODS.load("chance")(MethodSettings(CONFIG)).fit(TRAIN, TRAIN)
-
-
-@pytest.mark.parametrize("sets", [np.array([0, 1]), np.zeros((2, 0), np.int64), np.array([[0.0]])])
-def test_sets_of_another_shape_are_refused(sets):
-    with pytest.raises(BadInput, match="shape"):
-        fitted("chance").score_sets(*encodings(fitted("chance")), sets)
-
-
-@pytest.mark.parametrize("row", [-1, len(TEST)])
-def test_sets_that_index_no_touch_are_refused(row):
-    with pytest.raises(BadInput, match="index the 48 touch encodings"):
-        fitted("chance").score_sets(*encodings(fitted("chance")), np.array([[0, row]]))
 
 
 def test_scores_of_a_method_that_are_not_finite_or_of_another_shape_are_refused():
@@ -253,14 +230,6 @@ def test_a_ranking_auc_of_scores_that_are_not_finite_is_refused(bad):
     scores[1, 2] = bad
     with pytest.raises(NumericalError, match="every score must be finite; touch 1 has"):
         ranking_auc(scores, np.array([0, 1]), np.array([0, 1, 1]), np.zeros((2, 3), dtype=bool))
-
-
-def test_every_object_has_equally_many_validation_rows():
-    features = planted(5, 3, each=40)
-    rows = validation_rows(features, max_rows=50)
-    assert np.bincount(features.owner[rows]).tolist() == [10] * 5
-    assert len(np.unique(rows)) == 50
-    assert np.bincount(features.owner[validation_rows(features, max_rows=3)]).tolist() == [2] * 5
 
 
 def test_features_are_standardised_by_the_training_grasps_and_constant_ones_dropped():
@@ -373,11 +342,6 @@ def test_a_reference_touch_after_a_photo_is_encoded_as_a_touch_and_weighted_on_v
     expected = weights[0] * plain.score(*encodings(plain)) + weights[1] * (touches @ references.T)
     found = method.score(method.encode_touch(test.touch), method.encode_photo(test.photo))
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-4)  # float32 sums of some hundred terms
-
-
-def test_touches_may_take_the_place_of_photos():
-    touches = replace(TRAIN, photo=TRAIN.touch.reshape(len(TRAIN), -1))
-    assert tower_widths(CONFIG, touches) == ([FEATURES, FEATURES], [FEATURES, FEATURES], 1)
 
 
 def test_concatenated_towers_accept_only_their_own_features():

@@ -12,7 +12,7 @@ from retrieval.errors import BadInput, DatasetError
 from retrieval.model.posterior import FORMULA
 from retrieval.report.document import Details, Document, Listing, Picture, Section, Table, Text, to_html, to_markdown
 from retrieval.report.evaluation import write_report
-from retrieval.report.results import capitalized, format_number, percent, shortened, with_interval
+from retrieval.report.results import format_number, percent, with_interval
 from retrieval.report.tables import probability
 from tests import synthetic
 from tests.pages import HtmlPage
@@ -166,15 +166,6 @@ def test_the_decision_is_shown_with_the_formula_and_by_number_of_grasps(report, 
     assert not any("threshold" in row for row in rows if row.startswith("| method | AUROC"))
 
 
-@pytest.mark.usefixtures("text_only")
-def test_single_grasps_have_no_table_by_grasps(report, tmp_path):
-    def change(results):
-        for method in results["methods"].values():
-            method["reject"]["by_grasps"].pop("3")
-
-    assert "by grasps in a query" not in remake(report, tmp_path, change=change)[1]
-
-
 def test_too_few_objects_for_a_posterior_are_reported(report, tmp_path):
     def change(results):
         for method in results["methods"].values():
@@ -240,29 +231,6 @@ def test_missing_measures_are_left_out(report, tmp_path):
     assert "## Comparison of methods" in text
 
 
-def test_a_recording_of_few_objects_has_no_accuracy_by_object(report, tmp_path):
-    """There are fewer test objects than candidates."""
-
-    def change(results):
-        for method in results["methods"].values():
-            method["per_object"] = {"test_candidates": {}, "all_candidates": {}}
-            method["measures"] = {"map": method["measures"]["map"]}
-
-    _, text, files = remake(report, tmp_path, change=change)
-    assert "## Accuracy by object" not in text
-    assert {path.name for path in files[2:]} >= {"overview.png", "reject.png"}
-
-
-def test_missing_values_are_dashes(report, tmp_path):
-    def change(results):
-        results["methods"]["cca"]["measures"].pop("pair_auc")
-        results["methods"]["cca"]["measures"]["topn_k5"] |= {key: [None] * 5 for key in ("value", "low", "high")}
-
-    rows = remake(report, tmp_path, change=change)[1].splitlines()
-    cca = next(row for row in rows if row.startswith("| CCA |")).split(" | ")
-    assert (cca[2], cca[3]) == ("–", "–")
-
-
 def test_unknown_methods_are_shown_under_their_names(report, tmp_path):
     def change(results):
         results["methods"]["brand/new_method"] = results["methods"]["cca"]
@@ -310,12 +278,6 @@ def test_without_the_recording_there_are_no_galleries(report, tmp_path):
     assert "The pictures need the recording" in page
 
 
-@pytest.mark.usefixtures("text_only")
-def test_two_reports_of_the_same_results_are_equal(report, tmp_path):
-    first = remake(report, tmp_path)[:2]
-    assert remake(report, tmp_path)[:2] == first
-
-
 @pytest.mark.parametrize("text", ["", "[1]", "{", '{"schema_version": 99}'])
 def test_unreadable_results_are_one_clear_error(tmp_path, text):
     (tmp_path / "results.json").write_text(text)
@@ -341,12 +303,6 @@ def test_numbers_are_written_for_readers():
     assert with_interval({"value": [0.5], "low": [0.4], "high": [0.625]}) == "50.0 [40.0, 62.5]"
     assert with_interval(None) == "–"
     assert [probability(p) for p in (0.0, 0.00012, 0.0512, 0.5)] == ["< 0.0001", "0.00012", "0.051", "0.50"]
-
-
-def test_a_long_name_keeps_both_ends():
-    assert shortened("abcdef", 6) == "abcdef"
-    assert shortened("abcdefgh", 5) == "ab…gh"
-    assert [capitalized("late fusion"), capitalized("CCA"), capitalized("")] == ["Late fusion", "CCA", ""]
 
 
 def test_markdown_and_html_have_the_same_content(tmp_path):

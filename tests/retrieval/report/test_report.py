@@ -120,13 +120,6 @@ def test_names_and_metadata_cannot_inject_markup(place, tmp_path):
     assert (SCRIPT.split("/")[-1] if place == "touch" else SCRIPT) in HtmlPage(page).text
 
 
-def test_a_quote_in_a_name_cannot_leave_its_attribute(tmp_path, touch):
-    shutil.copy(touch[0], tmp_path / "1.png")
-    page = HtmlPage(query_html(synthetic_results(('" onerror="alert(1)', 1.5, 0.8, "1.png", {})), tmp_path))
-    assert [set(image) for image in page.all("img")] == [{"class", "src", "alt"}]
-    assert page.all("img")[0]["alt"] == 'photo of " onerror="alert(1)'
-
-
 def test_metadata_of_any_json_kind_is_shown(tmp_path):
     metadata = {"n": 3, "none": None, "list": [SCRIPT, 1], "deep": {"a": {"b": SCRIPT}}, "": "empty key"}
     page = query_html(synthetic_results((*ONE[:4], metadata)), tmp_path)
@@ -212,16 +205,6 @@ def test_the_advice_for_an_object_with_reference_touches_requests_more():
     assert "More reference touches of mug would help." in dataclasses.replace(result, results=[match]).advice
 
 
-def test_a_document_without_advice_of_an_earlier_version_is_read():
-    """The history of a service may contain such documents."""
-    document = synthetic_results(ONE).to_dict()
-    for name in ("more_grasps", "advice"):
-        del document[name]
-    del document["results"][0]["probability_if_present"]
-    result = QueryResult.from_dict(document)
-    assert (result.top.object_id, result.top.probability_if_present, result.more_grasps) == ("mug", None, None)
-
-
 def answer_cards(page):
     """Return the cards that are marked as the answer."""
     return [tag for tag in page.all("div") if "first" in tag.get("class", "").split()]
@@ -286,18 +269,6 @@ def test_the_table_has_a_line_for_each_object(answer, stdout):
         assert f"{match.probability:.3f}" in line
         assert f"{match.probability_if_present:.3f}" in line
     assert f"{result.none_probability:.3f}" in next(line for line in out.splitlines() if "none of these" in line)
-
-
-def test_no_table_is_printed_without_a_ranking(capsys):
-    print_table(synthetic_results(verdict="no contact", none=None, posterior=None, grasps=["no contact"]))
-    assert capsys.readouterr().out == ""
-
-
-def test_a_model_without_calibration_has_no_line_for_none_of_these(capsys):
-    print_table(synthetic_results(("mug", 1.5, None, "1.jpg", {}), verdict="uncalibrated", none=None, posterior=None))
-    out = capsys.readouterr().out
-    assert "mug" in out
-    assert "none of these" not in out
 
 
 @pytest.mark.parametrize("name", ["[bold]mug[/bold]", "[/red]", ":smile:", "[link=x]y"])
