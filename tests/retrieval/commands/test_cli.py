@@ -15,7 +15,6 @@ import typer
 from indexes import KINDS
 from retrieval.commands.main import application, main
 from retrieval.commands.options import Command
-from retrieval.errors import BadInput
 from retrieval.frontier import APPROXIMATIONS
 from retrieval.methods import METHODS
 from retrieval.search import defaults
@@ -83,13 +82,6 @@ def test_the_exit_code_distinguishes_none_of_these_from_a_match(built, capsys):
     best = document["results"][0]
     last = f"match: {best['object_id']}, probability {best['probability']:.2f}; none of these: 0.00"
     assert output.err.splitlines()[-1] == last
-
-
-def test_a_prior_of_1_is_wrong_use(built, capsys):
-    assert main([*QUERY, "--none-prior=1"]) == 2
-    output = capsys.readouterr()
-    assert output.out == ""
-    assert 'the prior of "none of these" must be at least 0 and less than 1; got 1.0' in output.err
 
 
 def test_an_index_outside_the_folder_is_found_only_from_the_folder_where_it_was_built(
@@ -246,40 +238,6 @@ def test_the_command_line_rejects_numbers_out_of_range(words, command, option, t
     assert not list(tmp_path.iterdir())
 
 
-def test_the_test_above_finds_the_numeric_options():
-    assert {"serve --deadline", "query --top", "benchmark real --seeds"} <= {case.id for case in numeric_options()}
-    assert len(numeric_options()) > 30
-
-
-def test_naive_range_checks_accept_nan():
-    assert not float("nan") < 0
-    assert not float("nan") > 1
-
-
-@pytest.mark.parametrize("length", [501, 5000])
-def test_a_long_message_is_cut_in_its_middle_and_keeps_its_end(length, monkeypatch, capsys):
-    def fail(path):
-        raise BadInput("x" * length + "; do this")
-
-    monkeypatch.setattr(defaults, "find_index", fail)
-    assert main(["query", "--gelsight", "a.png"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert len(line) < 540
-    assert line.startswith("retrieve query: xxx")
-    assert line.endswith("x; do this")
-
-
-@pytest.mark.parametrize(
-    "words", [["import", "imagenet", "src", "--out", "o"], ["benchmark", "real", "empty", "--out", "report"]]
-)
-def test_an_error_with_a_long_list_is_one_line(words, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "empty").mkdir()
-    assert main(words) == 2
-    assert len(capsys.readouterr().err.splitlines()) == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["empty"]
-
-
 @pytest.mark.parametrize(
     "words",
     [
@@ -305,15 +263,6 @@ def test_an_index_is_not_written_among_the_photos(out, workplace, model, capsys)
     assert sorted(workplace.rglob("*")) == before
 
 
-def test_an_index_can_be_in_its_own_folder_in_the_catalogue(workplace, model, capsys, monkeypatch):
-    monkeypatch.chdir("catalog")
-    for photos in (24, 24):
-        assert main(["build-index", ".", "--model", str(model), "--json"]) == 0
-        assert json.loads(capsys.readouterr().out)["photos"] == photos
-    assert main(["build-index", ".", "--model", str(model), "--preview"]) == 2
-    assert "would become a photo of the catalogue" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("task", ["match", "relief", "grasp-success"])
 def test_a_checkpoint_with_another_suffix_is_refused_before_anything_is_read(task, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
@@ -328,12 +277,6 @@ def test_a_history_that_is_not_a_file_is_refused(make, built, capsys):
     assert main(["serve", "--index", "index", "--history", "history", "--port", "0"]) == 2
     last = capsys.readouterr().err.splitlines()[-1]
     assert re.search(r"history/history.sqlite must be the history of a service: is a (folder|pipe), not a", last)
-
-
-def test_a_history_whose_folder_is_a_file_is_refused(built, capsys):
-    assert main(["serve", "--index", "index", "--history", "a.png", "--port", "0"]) == 2
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert last.startswith("retrieve serve: the history must be a folder, but a.png is")
 
 
 WRONG_WORDS = {
@@ -410,45 +353,6 @@ def test_help_lists_the_choices(command, choices, capsys):
     assert set(choices) <= {word.strip("<>") for word in words}
 
 
-@pytest.mark.parametrize(
-    ("words", "completed"),
-    [
-        ("build", ["build-index"]),
-        ("rig ca", ["calibrate"]),
-        ("train rec --task g", ["grasp-success"]),
-        ("query --gelsight a.png b.png --to", ["--top"]),
-    ],
-)
-def test_a_shell_completes_commands_options_and_choices(words, completed):
-    variables = {"COMP_WORDS": f"retrieve {words}", "COMP_CWORD": str(len(words.split()))}
-    assert complete("complete_bash", **variables).split() == completed
-
-
-def test_the_script_for_a_shell_names_the_program():
-    assert "complete -o default -F _retrieve_completion retrieve" in complete("source_bash")
-
-
-def complete(request, **variables):
-    """Return the program's answer to a shell."""
-    environment = {**os.environ, "_RETRIEVE_COMPLETE": request, **variables}
-    done = subprocess.run(
-        [sys.executable, "-m", "retrieval"], env=environment, capture_output=True, text=True, timeout=60, check=False
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    return done.stdout
-
-
-@pytest.mark.parametrize("option", ["--show-completion", "--install-completion"])
-def test_completion_is_printed_and_installed_for_a_shell(option, tmp_path):
-    """typer detects the shell of the parent process unless this variable is set."""
-    environment = {**os.environ, "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1", "HOME": str(tmp_path)}
-    command = [sys.executable, "-m", "retrieval", option, "bash"]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 0, done.stderr
-    script = done.stdout if option == "--show-completion" else (tmp_path / ".bash_completions/retrieve.sh").read_text()
-    assert "complete -o default -F _retrieve_completion retrieve" in script
-
-
 def test_check_prints_licence_and_terms_or_that_none_is_stated(recording, tmp_path, capsys):
     shutil.copytree(recording, tmp_path / "r")
     path = tmp_path / "r" / "recording.json"
@@ -459,21 +363,6 @@ def test_check_prints_licence_and_terms_or_that_none_is_stated(recording, tmp_pa
     assert json.loads(output.out)["licence"]["licence"] == "CC BY 4.0"
     assert main(["check", str(recording)]) == 0
     assert "licence of the data: not stated" in capsys.readouterr().err.splitlines()
-
-
-def test_check_prints_which_grasps_have_depth_force_and_opening(recording, tmp_path, capsys):
-    shutil.copytree(recording, tmp_path / "r")
-    path = tmp_path / "r" / "metadata.jsonl"
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
-    for line in lines:
-        for key in ("force_n", "opening_mm", "depth_file_name"):
-            line.pop(key, None)
-    lines[0] |= {"force_n": 3.0, "depth_file_name": lines[0]["photo_file_name"]}
-    lines[1] |= {"force_n": 24.75}
-    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    main(["check", str(tmp_path / "r")])
-    expected = f"depth of 1 of {len(lines)} grasps, force of 2 (3 to 24.8 N), opening of 0"
-    assert f"recorded with the touches: {expected}" in capsys.readouterr().err.splitlines()
 
 
 def test_check_exits_with_1_if_it_finds_errors(recording, tmp_path, capsys):
@@ -538,20 +427,6 @@ def test_ctrl_c_while_collecting_prints_how_to_continue(workplace, capsys, monke
         "retrieve collect: stopped by Ctrl-C",
     ]
     monkeypatch.undo()
-
-
-def test_the_preview_of_the_current_folder_is_next_to_it(workplace, capsys, monkeypatch):
-    """Path(".") has no name to extend."""
-    Path("rec").mkdir()
-    monkeypatch.chdir("rec")
-    assert main(["collect", "--objects", "1", "--grasps", "1", "--out", ".", "--preview"]) == 0
-    assert Path("../rec-preview.png").is_file()
-
-
-def test_collecting_nothing_is_a_failure_that_names_the_log(workplace, capsys, monkeypatch):
-    monkeypatch.setattr("tests.fake_rig.FakeRig.object_ids", lambda self, count: ["wide-0"])
-    assert main(COLLECT) == 1
-    assert "no grasp was accepted; rec/attempts.jsonl lists the reasons" in capsys.readouterr().err
 
 
 def test_meshes_that_cannot_be_grasped_are_listed_and_the_others_are_collected(tmp_path, monkeypatch, capsys):
