@@ -72,7 +72,7 @@ def identify(
         say(f"index: {path} ({reason})")
     from retrieval.search.query.answer import EXIT_CODES
     from retrieval.search.query.searcher import Searcher
-    from retrieval.search.query.verification import VERIFY_EXIT_CODES, expected_object
+    from retrieval.search.query.verification import VERIFY_EXIT_CODES
     from robot.collection import CollectSettings, collect
     from robot.grasping.spread import SpreadPlanner
     from robot.rig import load_rig
@@ -80,7 +80,7 @@ def identify(
     with Searcher.open(path, model=model, verify=not no_verify) as searcher:
         run = _Run(searcher, out, expect, 0.01 if far is None else far, confidence, grasps)
         if expect is not None:  # refuse it before the rig moves
-            expected_object(searcher, expect, run.far)
+            searcher.expected_object(expect, run.far)
 
         def make_rig() -> "Rig":
             made = load_rig(rig, seed=seed)

@@ -17,7 +17,6 @@ from retrieval.errors import ImageError
 from retrieval.report.pages import jpeg, thumbnail
 from retrieval.search.query.neighbours import nearest_photos
 from retrieval.search.query.objects import ListedPhoto, listed_photo
-from retrieval.search.query.verification import calibration_of
 from retrieval.serve.documents import (
     CatalogueDocument,
     IndexDocument,
@@ -195,7 +194,7 @@ def index(parts: Parts) -> IndexDocument:
         candidates=measured.get("k"),
         sensors=sorted(parts.rig.sensors),
         can_grasp=parts.rig.grasp is not None,
-        can_verify=calibration_of(searcher) is not None,
+        can_verify=searcher.can_verify,
         stores_history=parts.history_writer is not None,
         trials=len(parts.trials.unseen(generation)) if parts.trials else 0,
         version=__version__,

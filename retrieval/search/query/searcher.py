@@ -14,12 +14,13 @@ from indexes.errors import UnsupportedFormat
 from indexes.store.generation import Generation
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint_info import CheckpointInfo
-from retrieval.model.fusion_scorer import CONTACT, NOT_A_GEL, FusionScorer
+from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL, FusionScorer
 from retrieval.model.onnx_encoder import find_export
 from retrieval.model.posterior import NONE_PRIOR, Posterior, PosteriorProbabilities, require_prior
 from retrieval.model.reference_calibration import REFERENCE_ROWS
 from retrieval.model.touch_reader import EncodedTouches, Stopwatch, TouchEncoder, TouchReader
 from retrieval.model.touches import AnyImage, AnyTouches, InputImage, parse_grasps
+from retrieval.model.verification import MAX_GRASPS, DecisionBounds
 from retrieval.search.query.answer import (
     Match,
     QueryResult,
@@ -32,7 +33,7 @@ from retrieval.search.query.objects import Objects
 from retrieval.search.query.opening import OpenShards, open_index, scorer_for, torch_encoder
 from retrieval.search.query.reference_touches import reference_summary
 from retrieval.search.query.shard import FolderShard, RankedObject, Shard, ShardQuery, ShardResult
-from retrieval.search.query.verification import Verification, verify
+from retrieval.search.query.verification import Verification
 
 
 
@@ -234,7 +235,43 @@ class Searcher:
             BadInput: The catalogue lacks the object, the rate is too small for the model's validation objects, or the
                 model has no error rates.
         """
-        return verify(self._snapshot(), touches, expect, far=far, background=background)
+        opened = self._snapshot()
+        number, bounds, posterior = opened.expected_object(expect, far)
+        grasps = parse_grasps(touches, opened.reader.fingers)
+        names = [[image.name for image in grasp] for grasp in grasps]
+        codes = opened.reader.encode(grasps, opened.reader.no_contact_frames(background), Stopwatch())
+        checked = gel_classes(opened.gel_check, codes)
+        partials, classes = codes.partials[checked == CONTACT][:MAX_GRASPS], checked.tolist()
+        if NOT_A_GEL in classes or not len(partials):
+            decision = NOT_A_GEL if NOT_A_GEL in classes else NO_CONTACT
+            return Verification(expect, decision, names, classes, [], None)
+        shard = opened.folder_shard
+        ratios = [
+            float(posterior.log_ratio(shard.object_logit(number, partials[:count], posterior), count))
+            for count in range(1, len(partials) + 1)
+        ]
+        return Verification(expect, bounds.decide(np.array(ratios)), names, classes, ratios, bounds)
+
+    @property
+    def can_verify(self) -> bool:
+        """Whether the model has error rates for verification, and the index the model's cells."""
+        has_cells = self.scorer.cell_dim == self.checkpoint.config.matcher.cell_dim
+        return self.checkpoint.verification is not None and has_cells and self.posterior is not None
+
+    def expected_object(self, expect: str, far: float) -> tuple[int, DecisionBounds, Posterior]:
+        """Return the number of the expected object, the bounds of the decision and the posterior; raise as `verify`."""
+        calibration, posterior = self.checkpoint.verification, self.posterior
+        if not self.can_verify or calibration is None or posterior is None:
+            raise BadInput(
+                f"{self.checkpoint.path} has no error rates for verification with this index: fit a model with at "
+                "least 20 objects of 5 grasps (`retrieve train`: validation objects), and build its index with its "
+                "cells"
+            )
+        bounds = calibration.bounds(far)
+        number = int(self.folder_shard.objects.numbers_of([expect])[0])
+        if number < 0:
+            raise BadInput(f"the catalogue of {self.index} has no object {expect!r}; give the name of its folder")
+        return number, bounds, posterior
 
     def _snapshot(self) -> Searcher:
         """Return a copy with references to all resources, so that `close` in another thread cannot break a query."""

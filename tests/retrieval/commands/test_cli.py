@@ -4,7 +4,6 @@ import json
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -322,15 +321,6 @@ def test_an_option_of_several_values_takes_the_words_up_to_the_next_option(monke
     assert (calls[2]["only"], calls[2]["quick"]) == (("closing", "contact"), True)
 
 
-def test_a_repeated_option_of_several_values_keeps_all_of_them(monkeypatch):
-    calls = []
-    monkeypatch.setattr(Command, "invoke", lambda self, context: calls.append(context.params))
-    towers = ["--towers", "a=adapt", "b=real", "--towers", "c=relief"]
-    assert main(["benchmark", "real", "data", "--out", "o", *towers, "--seeds", "1"]) == 0
-    assert calls[-1]["towers"] == ("a=adapt", "b=real", "c=relief")
-    assert calls[-1]["seeds"] == 1
-
-
 def test_the_package_runs_the_command_line():
     command = [sys.executable, "-m", "retrieval", "train", "--help"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
@@ -501,19 +491,3 @@ def test_closed_streams_do_not_stop_a_command_or_add_to_stdout(built):
     done = subprocess.run(f"{query} 2>&-", shell=True, capture_output=True, text=True, check=False)
     assert (done.returncode, len(json.loads(done.stdout)["results"])) == (0, 8)
     assert subprocess.run(f"{query} >&- 2>&-", shell=True, check=False).returncode == 0
-
-
-def test_ctrl_c_that_causes_another_error_is_reported_as_ctrl_c(monkeypatch, capsys):
-    """Interrupting the import of numpy.linalg causes a RecursionError."""
-
-    def interrupted(*_):
-        try:
-            signal.raise_signal(signal.SIGINT)
-        except KeyboardInterrupt:
-            raise RecursionError from None
-
-    before = signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr("retrieval.data.check.recording.check_recording", interrupted)
-    assert main(["check", "recording"]) == 1
-    assert capsys.readouterr().err == "retrieve check: stopped by Ctrl-C\n"
-    assert signal.getsignal(signal.SIGINT) is before

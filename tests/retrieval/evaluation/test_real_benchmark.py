@@ -10,9 +10,7 @@ import pytest
 from retrieval.commands.main import main
 from retrieval.evaluation.real import PROTOCOLS, vt60
 from retrieval.evaluation.real import benchmark as real_benchmark
-from retrieval.evaluation.real.fold_measures import FoldMeasures, read_fold_measures, write_fold_measures
 from retrieval.methods.method import Method
-from retrieval.metrics.measure import Measure
 from tests import real_data_sets
 from tests.data import touch_data
 
@@ -61,12 +59,6 @@ def test_trained_rows_have_a_low_pass_control_and_a_verdict(results):
         by_hand = row["measures"][entry["main"]]["value"][0] - row["low_pass"][entry["main"]]["value"][0]
         assert difference["difference"] == pytest.approx(by_hand)
         assert (chance["low_pass"], chance["verdict"]) == (None, None)
-
-
-def test_a_seed_tests_every_object_and_chance_is_that_of_the_gallery(results):
-    summary = results["protocols"]["vt60-random"]["rows"]["cca"]["measures"]["topn_k9"]
-    assert (summary["objects"], summary["queries"], len(summary["by_seed"])) == (18, 18 * 4, 2)
-    assert summary["chance"][0] == pytest.approx(1 / 9)
 
 
 def test_a_billet_gallery_has_the_places_of_one_billet_and_right_answers_are_counted(results):
@@ -181,25 +173,6 @@ def test_a_stopped_run_resumes(data, out, tmp_path, monkeypatch, capsys):
     assert benchmark(data, again, "--protocols", ",".join(PROTOCOL_NAMES)) == 0
     assert len(fitted) == 3
     assert (again / "results.json").read_bytes() == (out / "results.json").read_bytes()
-
-
-def test_cached_measures_with_another_key_or_damage_are_not_read(tmp_path):
-    path, cache_key = tmp_path / "measures.safetensors", {"seed": 0, "split": {"test": ("a", "b")}}
-    values, owner = np.array([[1.0], [0.5]]), np.array([0, 1])
-    measured = FoldMeasures({"k9": Measure(values, owner, np.array([0.1]), "nine")}, {"power": 1}, {"best": []}, {})
-    write_fold_measures(path, measured, cache_key)
-    stored = read_fold_measures(path, cache_key)
-    np.testing.assert_array_equal(stored.measures["k9"].values, values)
-    assert (stored.measures["k9"].gallery, stored.best_params, stored.examples) == ("nine", {"power": 1}, {"best": []})
-    assert read_fold_measures(path, cache_key | {"seed": 1}) is None
-    assert read_fold_measures(tmp_path / "none.safetensors", cache_key) is None
-    path.write_bytes(path.read_bytes()[:-9])
-    assert read_fold_measures(path, cache_key) is None
-
-
-def test_no_scores_and_no_fits_are_left_on_the_disk(out):
-    assert not list((out / "cache").rglob("predictions"))
-    assert not list((out / "cache" / "fits").iterdir())
 
 
 @pytest.mark.parametrize(

@@ -118,15 +118,6 @@ def test_a_choice_has_two_galleries_of_one_object_of_each_class():
             assert (len(members), len(set(members))) == (9, 9)
 
 
-def test_default_galleries_are_one_or_one_of_each_sequence():
-    split = folds("vt60-random")[0]
-    assert set(PROTOCOLS.load("vt60-random").gallery_of(RECORDINGS["vt60-random"], split).values()) == {""}
-    places = PROTOCOLS.load("billets-places")
-    assert set(places.gallery_of(RECORDINGS["billets-places"], folds("billets-places")[0]).values()) == {
-        f"welded{number}" for number in range(5)
-    }
-
-
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_folds_depend_on_the_seed(name):
     assert folds(name, 1) == folds(name, 1)
@@ -154,11 +145,6 @@ def test_a_fold_of_unseen_classes_tests_all_objects_of_three_classes():
         assert len(kinds) == 3
         assert len(split.test) == 12
         assert not kinds & {each.split("-")[0] for each in (*split.train, *split.validation)}
-
-
-def test_a_recording_without_classes_is_refused():
-    with pytest.raises(DatasetError, match="retrieve import vt60"):
-        PROTOCOLS.load("vt60-random").folds(facts(dict.fromkeys("ab")), 0)
 
 
 def test_a_test_billet_is_unseen_and_ground_billets_are_left_out():

@@ -105,28 +105,6 @@ def test_another_setting_or_other_features_are_trained_again(parts, tmp_path):
     assert fit(LateFusion, (moved, *parts[1:]), tmp_path).best_params != first.best_params
 
 
-LOSS = """
-import retrieval
-
-class Own(retrieval.Loss):
-    def forward(self, batch):
-        return batch.touch.embedding.square().mean()
-"""
-
-
-def test_after_an_edit_of_a_users_own_loss_the_method_is_trained_again(parts, tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(tmp_path)
-    module = tmp_path / "edited_loss.py"
-    module.write_text(LOSS)
-    config = FROZEN.using(losses={"contrastive": 1.0, "edited_loss:Own": 0.5})
-    trained, run = [], Trainer.run
-    monkeypatch.setattr(Trainer, "run", lambda trainer, quiet: trained.append(trainer.step) or run(trainer, quiet))
-    for text, times in ((LOSS, 1), (LOSS, 1), (LOSS + "# edited\n", 2), (LOSS + "# edited\n", 2)):
-        module.write_text(text)
-        fit(LateFusion, parts, tmp_path, config)
-        assert len(trained) == times
-
-
 def stopped(parts, folder, monkeypatch, config=FROZEN):
     """Interrupt a fit in its fourth step, after the state of the third is on disk."""
     loss = Trainer.loss
@@ -206,14 +184,6 @@ def test_reranking_orders_candidates_by_logit_and_the_rest_after_them_by_embeddi
         assert ranked == expected_order(logits[members].sum(0, dtype=np.float64), nearness[members], count)
     if grasps == 1:
         np.testing.assert_allclose(method.score(*encodings(method, every))[:4], scores, rtol=1e-4, atol=1e-5)
-
-
-def test_reranking_every_photo_equals_late_fusion(fitted, parts):
-    method = RetrieveRerank(fitted.settings, reranked_fraction=1.0)
-    method.fit(*parts[:2])
-    np.testing.assert_array_equal(
-        method.score(*encodings(method, parts[2])), fitted.score(*encodings(fitted, parts[2]))
-    )
 
 
 def test_a_model_without_trained_embeddings_scores_every_photo(parts, tmp_path):

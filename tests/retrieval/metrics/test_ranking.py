@@ -81,12 +81,6 @@ def test_ties_count_by_the_mean_over_every_order(items):
     assert found == pytest.approx(expected, rel=1e-12, abs=1e-14)
 
 
-def test_an_item_that_is_not_shown_takes_no_place():
-    assert measures([9, 8, 7, 6], [0, 1, 0, 1], [0, 0, 1, 1]) == measures([7, 6], [0, 1])
-    # An own photo that scores highest would otherwise count as found.
-    assert measures([9, 8, 7, 6], [1, 0, 0, 1], [0, 1, 1, 1])["mrr"] == pytest.approx(1 / 3)
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_score_that_is_not_finite_is_refused_and_its_row_named(bad):
     scores, relevant = np.zeros((2, 3)), np.array([[True, False, False]] * 2)

@@ -8,7 +8,7 @@ import shutil
 import pytest
 from PIL import Image
 
-from retrieval.errors import BadInput, DatasetError
+from retrieval.errors import BadInput
 from retrieval.model.posterior import FORMULA
 from retrieval.report.document import Details, Document, Listing, Picture, Section, Table, Text, to_html, to_markdown
 from retrieval.report.evaluation import write_report
@@ -283,13 +283,6 @@ def test_unreadable_results_are_one_clear_error(tmp_path, text):
     (tmp_path / "results.json").write_text(text)
     with pytest.raises(BadInput, match="retrieve evaluate"):
         write_report(tmp_path, None)
-
-
-def test_missing_results_and_a_missing_recording_are_clear_errors(report, tmp_path):
-    with pytest.raises(BadInput, match=r"results\.json"):
-        write_report(tmp_path, None)
-    with pytest.raises(DatasetError):
-        write_report(report[1], tmp_path / "nowhere")
 
 
 # Labels ----------------------------------------------------------------------------------------------
