@@ -6,7 +6,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from retrieval.commands.options import COUNT, FRACTION, SEED, Index, IndexModel, Json, NoVerify, announce_resume
+from retrieval.commands.options import (
+    COUNT,
+    FRACTION,
+    SEED,
+    Index,
+    IndexModel,
+    Json,
+    NoVerify,
+    announce_resume,
+    resolve_index,
+)
 from retrieval.console.files import require_output, text_bytes, write_output
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput, RetrievalError
@@ -65,11 +75,7 @@ def identify(
         if expect is not None:
             raise BadInput("--html shows a ranking, and --expect ranks nothing; leave one of them out")
         require_output(html, ".html")
-    from retrieval.search import defaults
-
-    path, reason = defaults.find_index(index)
-    if index is None:
-        say(f"index: {path} ({reason})")
+    path = resolve_index(index)
     from retrieval.search.query.answer import EXIT_CODES
     from retrieval.search.query.searcher import Searcher
     from retrieval.search.query.verification import VERIFY_EXIT_CODES

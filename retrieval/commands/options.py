@@ -193,6 +193,16 @@ def announce_resume(stored: str) -> Iterator[None]:
         raise
 
 
+def resolve_index(index: str | None) -> Path:
+    """Return the folder of the index, and print it if the user named none."""
+    from retrieval.search import defaults
+
+    path, reason = defaults.find_index(index)
+    if index is None:
+        say(f"index: {path} ({reason})")
+    return path
+
+
 def read_split(path: Path | None) -> "Split | None":
     """Read the split of objects from the file of `--split`; None without a file.
 

@@ -5,7 +5,17 @@ from typing import Annotated
 
 import typer
 
-from retrieval.commands.options import COUNT, FRACTION, Background, GelSight, Index, IndexModel, Json, NoVerify
+from retrieval.commands.options import (
+    COUNT,
+    FRACTION,
+    Background,
+    GelSight,
+    Index,
+    IndexModel,
+    Json,
+    NoVerify,
+    resolve_index,
+)
 from retrieval.console.files import require_output, text_bytes, write_output
 from retrieval.console.output import print_json, say
 
@@ -30,11 +40,7 @@ def query(
     no_verify: NoVerify = False,
 ) -> int:
     """Find the catalogue photo of the object in the hand."""
-    from retrieval.search import defaults
-
-    path, reason = defaults.find_index(index)
-    if index is None:
-        say(f"index: {path} ({reason})")
+    path = resolve_index(index)
     from retrieval.search.query.answer import EXIT_CODES, verdict_sentence
     from retrieval.search.query.searcher import Searcher
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from retrieval.commands.options import FRACTION, Background, GelSight, Index, IndexModel, Json, NoVerify
+from retrieval.commands.options import FRACTION, Background, GelSight, Index, IndexModel, Json, NoVerify, resolve_index
 from retrieval.console.output import print_json, say
 
 
@@ -24,11 +24,7 @@ def verify(
     no_verify: NoVerify = False,
 ) -> int:
     """Accept or reject the object in the hand as the expected one, at a stated false-accept rate."""
-    from retrieval.search import defaults
-
-    path, reason = defaults.find_index(index)
-    if index is None:
-        say(f"index: {path} ({reason})")
+    path = resolve_index(index)
     from retrieval.search.query.searcher import Searcher
     from retrieval.search.query.verification import VERIFY_EXIT_CODES
 
