@@ -11,7 +11,7 @@ from retrieval.frontier.clock import time_points
 from retrieval.frontier.pixels import SLACK
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, miss_rate_point, smallest_error
 from retrieval.frontier.sample import Sample
-from retrieval.methods.cca import Cca, canonical_correlations, component_counts, cosine, decompose, unit_rows
+from retrieval.methods.cca import Cca, canonical_correlations, cosine, decompose, unit_rows
 from retrieval.methods.method import MethodSettings
 
 Matrix = NDArray[np.float64]
@@ -139,7 +139,7 @@ def cca_components(sample: Sample) -> ApproximationResult:
     photo = views[1].standardise(test.photo) @ found.photo_weights * weights
     points, works = list[Tradeoff](), list[Callable[[], object]]()
     photos_tiled = np.tile(photo, (1 + sample.scale.photos // len(photo), 1))[: sample.scale.photos]
-    for count in sorted({*component_counts(SIZES, len(weights)), method.best_params["components"]}):
+    for count in sorted({*(min(size, len(weights)) for size in SIZES), method.best_params["components"]}):
         codes = unit_rows(touch[:, :count]), unit_rows(photo[:, :count])
         scores = cosine(*codes)
         np.fill_diagonal(scores, -np.inf)  # exclude the photo of the touch's own grasp
