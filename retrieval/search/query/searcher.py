@@ -8,7 +8,6 @@ from types import TracebackType
 from typing import NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 
 from indexes.errors import UnsupportedFormat
 from indexes.store.generation import Generation
@@ -34,7 +33,6 @@ from retrieval.search.query.opening import OpenShards, open_index, scorer_for, t
 from retrieval.search.query.reference_touches import reference_summary
 from retrieval.search.query.shard import FolderShard, RankedObject, Shard, ShardQuery, ShardResult
 from retrieval.search.query.verification import Verification
-
 
 
 class Searcher:
