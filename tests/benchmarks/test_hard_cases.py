@@ -125,12 +125,6 @@ def test_the_naive_fits_equal_ours_on_overlapping_pairs():
     assert probability.naive_slope(scores) == pytest.approx(fitted.slope, rel=2e-2)
 
 
-def test_the_naive_components_are_those_of_the_cross_covariance():
-    touch, photo = linear._views(300, 5)
-    first = np.linalg.svd((touch - touch.mean(0)).T @ (photo - photo.mean(0)))[0][:, 0]
-    assert abs(linear.naive_pls(touch, photo, 2)[:, 0] @ first) == pytest.approx(1, abs=1e-6)
-
-
 def test_the_naive_interval_is_the_t_interval_of_many_values():
     values = np.random.default_rng([9]).normal(0.5, 0.1, 400)
     low, high = ranking.naive_interval(values)
