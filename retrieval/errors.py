@@ -6,7 +6,7 @@ exits with `exit_code`; any other error is a bug.
     RetrievalError             the job ran and failed (exit code 1)
     +-- NumericalError         a value is NaN or infinite
     +-- TooManyUnreadable      more photos are unreadable than the user allows
-    +-- IncompleteSearch       shards did not answer, and too little of the catalogue was searched
+    +-- IncompleteSearch       a shard did not answer, so not all of the catalogue was searched
     +-- JobInterrupted         the user stopped the job; results so far are stored
     +-- BadInput               wrong use or bad input (exit code 2)
         +-- ImageError         a file is not a readable image
@@ -43,7 +43,7 @@ class TooManyUnreadable(RetrievalError):
 
 
 class IncompleteSearch(RetrievalError):
-    """Shards did not answer, and less of the catalogue was searched than the user requires."""
+    """A shard did not answer, so not all of the catalogue was searched."""
 
 
 class JobInterrupted(RetrievalError):

@@ -23,9 +23,8 @@ from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import default_device
 from retrieval.search.sharding.build_sharded import ShardBuild, ShardJob, ShardRunner, build_shard
 
-RELEASE_TIMEOUT_S, MAX_FAILURES = 60.0, 3
-"""Longest wait for a lost process to release its shard's lock, and largest number of failures without a finished shard
-in between."""
+RELEASE_TIMEOUT_S = 60.0
+"""Longest wait for a lost process to release its shard's lock."""
 
 
 class BuildWorkerPool(NamedTuple):
@@ -72,26 +71,19 @@ def ray_runner(cpus: int | None = None, workers: int | None = None) -> ShardRunn
     """
 
     def run(jobs: Sequence[ShardJob], checkpoint: Checkpoint) -> Iterator[ShardBuild]:
-        remaining, failures = {job.folder: job for job in jobs}, 0
         with ray_session(cpus) as ray:
             ray.data.DataContext.get_current().enable_progress_bars = False
-            while remaining:
-                try:
-                    for result in _results(ray, list(remaining.values()), checkpoint, workers):
-                        if isinstance(result, Exception):
-                            raise result
-                        del remaining[result.folder]
-                        failures = 0
-                        yield result
-                except (RetrievalError, IndexesError):
-                    raise
-                except Exception as error:  # Ray Data itself may fail when processes are lost
-                    failures += 1
-                    if failures > MAX_FAILURES:
-                        raise RetrievalError(
-                            f"Ray failed {failures} times without a finished shard ({type(error).__name__}: {error}); "
-                            "run the same command again to continue"
-                        ) from error
+            try:
+                for result in _results(ray, jobs, checkpoint, workers):
+                    if isinstance(result, Exception):
+                        raise result
+                    yield result
+            except (RetrievalError, IndexesError):
+                raise
+            except Exception as error:  # the exceptions of Ray have no common base
+                raise RetrievalError(
+                    f"Ray lost the build ({type(error).__name__}: {error}); run the same command again to continue"
+                ) from error
 
     return run
 

@@ -3,8 +3,7 @@
 The name of a deployment contains the digest of its shard. A new generation of a sharded index deploys only the shards
 that changed; old deployments are deleted when no client uses them.
 
-A shard that does not answer in time is left out. The result then states the searched fraction of the catalogue, and
-the evidence mass is extrapolated to the missing objects. If less than `min_share` was searched, the query fails.
+If a shard does not answer in time, the query fails: no result lacks a part of the catalogue.
 """
 
 import re
@@ -14,7 +13,7 @@ import time
 import weakref
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -52,27 +51,21 @@ class ReplicaSettings:
     """Settings of the replicas of shards.
 
     Attributes:
-        replicas: Smallest number of replicas of each shard.
-        max_replicas: Largest number when requests wait; None for `replicas`.
+        replicas: Number of replicas of each shard.
         cpus: CPUs that Ray reserves for each replica.
         max_ongoing_requests: Largest number of concurrent requests of a replica.
         wait_s: Longest wait for an answer, in seconds.
-        min_share: Smallest fraction of the catalogue that must be searched.
     """
 
     replicas: int = 1
-    max_replicas: int | None = None
     cpus: float = 0.5
     max_ongoing_requests: int = 4
     wait_s: float = 5.0
-    min_share: float = 1.0
 
     def __post_init__(self) -> None:
         """Check the values. Raises BadInput."""
-        if not 1 <= self.replicas <= (self.max_replicas or self.replicas):
-            raise BadInput(f"replicas must be from 1 to the maximum number of replicas; got {self.replicas}")
-        if not 0 < self.min_share <= 1:
-            raise BadInput(f"the minimum searched fraction must be above 0 and at most 1; got {self.min_share}")
+        if self.replicas < 1:
+            raise BadInput(f"replicas must be at least 1; got {self.replicas}")
         if not 0 < self.wait_s <= MAX_WAIT_S:
             raise BadInput(f"the wait for a shard must be above 0 and at most {MAX_WAIT_S} seconds; got {self.wait_s}")
 
@@ -117,40 +110,24 @@ class RayShardGroup:
         self.info, self.entries, self._handles, self._settings = info, list(entries), handles, settings
 
     def search(self, query: ShardQuery, top: int, candidates: int | None, posterior: Posterior | None) -> ShardResult:
-        """As `Shard.search`. Raises IncompleteSearch if less than `min_share` of the catalogue was searched."""
-        results, missing = self._call_shards("search", query, top, candidates, posterior)
-        searched = sum(entry.photos for entry in self.entries if entry not in missing)
-        if not results or searched < self._settings.min_share * self.info.photos:
-            raise self._unanswered_error(missing, searched)
-        found = merge_results(results, top)
-        if found.mass is not None:
-            found = replace(found, mass=found.mass.extrapolated(sum(entry.objects for entry in missing)))
-        return found
+        """As `Shard.search`. Raises IncompleteSearch if a shard does not answer."""
+        return merge_results(self._call_shards("search", query, top, candidates, posterior), top)
 
     def rows(self, ids: Sequence[str]) -> list[dict[str, Any] | None]:
-        """As `Shard.rows`. Raises IncompleteSearch if a photo may be in a shard that did not answer."""
-        results, missing = self._call_shards("rows", list(ids))
-        found: list[dict[str, Any] | None] = merge_rows(results) if results else [None for _ in ids]
-        if missing and None in found:
-            raise self._unanswered_error(missing, sum(entry.photos for entry in self.entries if entry not in missing))
-        return found
+        """As `Shard.rows`. Raises IncompleteSearch if a shard does not answer."""
+        return merge_rows(self._call_shards("rows", list(ids)))
 
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
         """As `Shard.page`. Raises IncompleteSearch if a shard does not answer."""
 
         def of_shard(entry: ShardEntry, offset: int, limit: int) -> Page:
-            results, missing = self._call_shards("page", list(words), object_id, offset, limit, entries=[entry])
-            if missing:
-                raise self._unanswered_error(missing, self.info.photos - entry.photos)
-            found: Page = results[0]
+            found: Page = self._call_shards("page", list(words), object_id, offset, limit, entries=[entry])[0]
             return found
 
         return merge_pages([partial(of_shard, entry) for entry in self.entries], offset, limit)
 
-    def _call_shards(
-        self, method: str, *arguments: Any, entries: Sequence[ShardEntry] | None = None
-    ) -> tuple[list[Any], list[ShardEntry]]:
-        """Call a method of some shards (None: all); return the results, and the shards without a result in time."""
+    def _call_shards(self, method: str, *arguments: Any, entries: Sequence[ShardEntry] | None = None) -> list[Any]:
+        """Return the results of a method of some shards (None: all)."""
         until = time.monotonic() + self._settings.wait_s
         called = self.entries if entries is None else entries
         waiting = [(entry, self._send(entry, method, arguments)) for entry in called]
@@ -158,12 +135,17 @@ class RayShardGroup:
         for entry, response in waiting:
             result = self._result(entry, response, method, arguments, until)
             if result is None:
-                missing.append(entry)
+                missing.append(entry.folder)
             elif isinstance(result, Exception):
                 raise result
             else:
                 results.append(result)
-        return results, missing
+        if missing:
+            raise IncompleteSearch(
+                f"no answer within {self._settings.wait_s:g} s from {', '.join(missing)}; try again, or raise "
+                "--shard-timeout"
+            )
+        return results
 
     def _send(self, entry: ShardEntry, method: str, arguments: Sequence[Any]) -> Any:
         return self._handles[entry.folder].call.remote(method, *arguments)
@@ -184,14 +166,6 @@ class RayShardGroup:
                     return None
                 time.sleep(RETRY_S)
                 response = self._send(entry, method, arguments)
-
-    def _unanswered_error(self, missing: Sequence[ShardEntry], photos: int) -> IncompleteSearch:
-        fraction = photos / self.info.photos
-        names = ", ".join(entry.folder for entry in missing)
-        return IncompleteSearch(
-            f"no answer within {self._settings.wait_s:g} s from {names}: only {fraction:.3f} of the catalogue could be "
-            f"searched, and {self._settings.min_share:g} is required; try again, or lower --min-share"
-        )
 
 
 class Deployments:
@@ -271,24 +245,15 @@ class Deployments:
         deployed = serve.status().applications
         entries = [entry for entry in manifest.shards if names[entry.folder] not in deployed]
         required, model = dict(manifest.fingerprint), str(stored.path.resolve())
-        scale: dict[str, Any] = {"num_replicas": settings.replicas}
-        if settings.max_replicas is not None and settings.max_replicas > settings.replicas:
-            scale = {
-                "autoscaling_config": {
-                    "min_replicas": settings.replicas,
-                    "max_replicas": settings.max_replicas,
-                    "target_ongoing_requests": max(1, settings.max_ongoing_requests // 2),
-                }
-            }
         deployment = serve.deployment(
             ShardReplica,
             name="shard",
+            num_replicas=settings.replicas,
             max_ongoing_requests=settings.max_ongoing_requests,
             ray_actor_options={"num_cpus": settings.cpus},
             health_check_period_s=2,
             health_check_timeout_s=10,
             graceful_shutdown_timeout_s=10,
-            **scale,
         )
         targets = [
             serve.RunTarget(

@@ -11,7 +11,6 @@ import typer
 
 from retrieval.commands.options import (
     COUNT,
-    FRACTION,
     SECONDS,
     WORKERS,
     Index,
@@ -80,24 +79,10 @@ def serve(
     replicas: Annotated[
         int | None, typer.Option(parser=WORKERS, help="with --cluster: processes per shard (default: 1)")
     ] = None,
-    max_replicas: Annotated[
-        int | None,
-        typer.Option(
-            parser=WORKERS, help="with --cluster: maximum processes per shard while requests wait (default: --replicas)"
-        ),
-    ] = None,
     shard_timeout: Annotated[
         float | None,
         typer.Option(
             metavar="SECONDS", parser=SECONDS, help="with --cluster: maximum time to wait for a shard (default: 5)"
-        ),
-    ] = None,
-    min_share: Annotated[
-        float | None,
-        typer.Option(
-            metavar="FRACTION",
-            parser=FRACTION,
-            help="with --cluster: fraction of the catalogue that must be searched for an answer (default: 1)",
         ),
     ] = None,
     open_page: Annotated[bool, typer.Option("--open-page", help="open the page in a browser")] = False,
@@ -115,12 +100,7 @@ def serve(
 
     if no_history:
         refuse_options("contradicts --no-history; give one of them", history=history)
-    cluster_options = {
-        "replicas": replicas,
-        "max_replicas": max_replicas,
-        "shard_timeout": shard_timeout,
-        "min_share": min_share,
-    }
+    cluster_options = {"replicas": replicas, "shard_timeout": shard_timeout}
     if not cluster:
         refuse_options("needs --cluster", **cluster_options)
     path, reason = defaults.find_index(index)

@@ -103,14 +103,6 @@ class EvidenceMass:
             top,
         )
 
-    def extrapolated(self, objects: int) -> "EvidenceMass":
-        """Return the evidence after adding `objects` objects, each with the mean likelihood of the present ones."""
-        if not objects:
-            return self
-        mean = float(np.logaddexp(self.scored, self.unscored)) - math.log(self.objects)
-        unscored = float(np.logaddexp(self.unscored, math.log(objects) + mean))
-        return EvidenceMass(self.scored, unscored, self.objects + objects, self.top)
-
 
 @dataclass(frozen=True)
 class Posterior:

@@ -104,12 +104,6 @@ def test_a_failed_import_is_one_clear_error(place):
         make().name_of(place)
 
 
-def test_an_error_names_a_broken_package(tmp_path, monkeypatch):
-    plugins.install(tmp_path, monkeypatch, shapes={"broken": "no_such_package:Thing"})
-    with pytest.raises(LookupError, match="shape 'broken' cannot be imported: No module named 'no_such_package'"):
-        make().load("broken")
-
-
 def test_a_registry_without_a_base_contains_functions():
     registry = make({}, base=None)
     assert registry.resolve("json:dumps") is json.dumps

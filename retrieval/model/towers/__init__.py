@@ -21,7 +21,6 @@ TOWERS: "Registry[type[Tower]]" = Registry(
     {
         "mobilenet_v2": "retrieval.model.towers.mobilenet:MobileNetV2",
         "resnet18": "retrieval.model.towers.resnet:ResNet18",
-        "resnet34": "retrieval.model.towers.resnet:ResNet34",
         "resnet50": "retrieval.model.towers.resnet:ResNet50",
         "small": "retrieval.model.towers.small:SmallTower",
     },
@@ -32,7 +31,6 @@ FAMILIES: "Registry[type[TowerFamily]]" = Registry(
     "family of towers",
     "tower_families",
     {
-        "timm": "retrieval.model.towers.timm_models:TimmTower",
         "transformers": "retrieval.model.towers.transformers_models:TransformersTower",
     },
     error=ConfigError,

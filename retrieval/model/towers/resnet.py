@@ -1,4 +1,4 @@
-"""ResNet-18, -34 and -50 (He et al., CVPR 2016), with the key names of torchvision's checkpoints.
+"""ResNet-18 and -50 (He et al., CVPR 2016), with the key names of torchvision's checkpoints.
 
 The bottleneck strides in its 3 x 3 convolution ("v1.5"), as the published ImageNet weights do.
 """
@@ -114,13 +114,6 @@ class ResNet18(ResNet):
 
     block, depths = BasicBlock, (2, 2, 2, 2)
     url = "https://download.pytorch.org/models/resnet18-f37072fd.pth"
-
-
-class ResNet34(ResNet):
-    """ResNet-34: 512 pooled features."""
-
-    block, depths = BasicBlock, (3, 4, 6, 3)
-    url = "https://download.pytorch.org/models/resnet34-b627a593.pth"
 
 
 class ResNet50(ResNet):

@@ -335,8 +335,7 @@ class Searcher:
                 "unscored_probability": probabilities.unscored,
                 **({REFERENCE_ROWS: references} if references else {}),
             }
-        searched = found.searched if found else info.photos
-        sharding = {"shards": info.shards, "searched": searched / info.photos} if info.shards > 1 else {}
+        sharding = {"shards": info.shards} if info.shards > 1 else {}
         return QueryResult(
             touches=[[image.name for image in grasp] for grasp in grasps],
             grasps=classes,

@@ -62,7 +62,6 @@ class ShardResult:
         objects: Number of scored objects.
         best: The best objects, ordered by (-logit, name), at most the requested number.
         mass: Evidence mass of all objects; None if the model is not calibrated.
-        searched: Number of photos that could be candidates: all photos, unless a shard did not answer.
         timing_ms: Milliseconds by stage; of several shards, those of the slowest.
     """
 
@@ -70,7 +69,6 @@ class ShardResult:
     objects: int
     best: list[RankedObject]
     mass: EvidenceMass | None
-    searched: int
     timing_ms: Mapping[str, float]
 
 
@@ -191,7 +189,7 @@ class FolderShard:
         best = [
             self._ranked_object(objects, place, query.partials) for place in self.objects.best(objects, top).tolist()
         ]
-        return ShardResult(photos, len(objects.numbers), best, mass, self.generation.count, clock.finish(1))
+        return ShardResult(photos, len(objects.numbers), best, mass, clock.finish(1))
 
     def object_logit(self, number: int, partials: Floats, posterior: Posterior) -> float:
         """Return the logit of an object for grasps, by all its photos and reference touches.
@@ -370,7 +368,6 @@ def merge_results(results: Sequence[ShardResult], top: int) -> ShardResult:
         sum(result.objects for result in results),
         best[:top],
         EvidenceMass.merged(masses) if masses else None,
-        sum(result.searched for result in results),
         {stage: max(result.timing_ms.get(stage, 0.0) for result in results) for stage in stages},
     )
 

@@ -4,7 +4,6 @@ One Ray serves all tests of this file: two CPUs, a small object store, 127.0.0.1
 simulate lost and hanging machines.
 """
 
-import math
 import os
 import shutil
 import signal
@@ -12,7 +11,6 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import suppress
 from importlib.util import find_spec
 
 import httpx
@@ -29,7 +27,7 @@ from retrieval.search.build.build_index import build_index
 from retrieval.search.query.searcher import Searcher
 from retrieval.search.sharding.build_sharded import build_sharded
 from tests import ray_processes, reference_model, serving, synthetic
-from tests.waiting import first_line, run_process, wait_until
+from tests.waiting import first_line, run_process
 
 pytestmark = [
     pytest.mark.slow,
@@ -88,19 +86,7 @@ def test_results_equal_those_of_the_folder(count, served, searcher, grasps):
         assert names(ours) == names(theirs)
         assert numbers(ours) == pytest.approx(numbers(theirs), abs=1e-5)
         assert (ours.verdict, ours.posterior["scored_objects"]) == (theirs.verdict, 8)
-        assert (ours.index["shards"], ours.index["searched"]) == (4, 1.0)
-
-
-def test_photos_are_found_and_listed_in_all_shards(served, searcher):
-    rows = list(searcher.generation.rows)
-    ids = [row["id"] for row in rows[::7]] + ["absent"]
-    assert served.shard.rows(ids) == [*rows[::7], None]
-    pages = [served.shard.page([], None, offset, 7) for offset in range(0, 24, 7)]
-    assert {page.total for page in pages} == {24}
-    assert sorted(row["id"] for page in pages for row in page.rows) == sorted(row["id"] for row in rows)
-    name = rows[0]["object_id"]
-    assert served.shard.page([], name, 0, 10).total == 3
-    assert served.shard.page([name], None, 0, 2).rows == [row for row in rows if row["object_id"] == name][:2]
+        assert ours.index["shards"] == 4
 
 
 def test_reference_touches_give_the_results_of_the_folder(ray, catalogue_with_touches, touches, tmp_path):
@@ -161,7 +147,7 @@ def test_closing_deployments_does_not_affect_others(ray, cluster, served, grasps
         time.sleep(0.1)
     assert len(before) == 8
     assert len(ray.serve.status().applications) == 4
-    assert served.query(grasps[0]).index["searched"] == 1.0
+    assert served.query(grasps[0]).results
 
 
 HOLDING = """
@@ -191,7 +177,7 @@ def test_shards_of_a_killed_process_are_deleted_by_the_next(ray, cluster, served
         time.sleep(0.5)
     assert not orphans & set(ray.serve.status().applications)
     assert before <= set(ray.serve.status().applications)
-    assert served.query(grasps[0]).index["searched"] == 1.0
+    assert served.query(grasps[0]).results
 
 
 # Faults ---------------------------------------------------------------------------------------------------------------
@@ -202,9 +188,7 @@ def test_a_killed_shard_is_restarted_and_every_result_is_complete(served, grasps
     for turn in range(20):
         process = ray_processes.processes_named(SHARD)[turn % len(ray_processes.processes_named(SHARD))]
         os.kill(process, signal.SIGKILL)
-        answer = served.query(grasps[0])
-        assert names(answer) == expected
-        assert answer.index["searched"] == 1.0
+        assert names(served.query(grasps[0])) == expected
 
 
 @pytest.fixture
@@ -226,37 +210,16 @@ def stopped():
 
 
 def test_a_shard_that_hangs_is_reported(ray, cluster, grasps, stopped):
-    whole = deployments(ray, wait_s=2.0)
-    part = deployments(ray, wait_s=2.0, min_share=0.1)
-    strict, lenient = Searcher.open(cluster, shards=whole.open), Searcher.open(cluster, shards=part.open)
-    expected = strict.query(grasps[0], top=8)
+    searcher = Searcher.open(cluster, shards=deployments(ray, wait_s=2.0).open)
+    assert searcher.query(grasps[0]).results
     stopped()
-    with pytest.raises(
-        IncompleteSearch, match=r"no answer within 2 s from shard-0\d-of-04: only 0\.\d+ of the catalogue"
-    ):
-        strict.query(grasps[0])
-    found = []
-
-    def answered():  # on a busy machine the other shards may be late too
-        with suppress(IncompleteSearch):
-            found.append(lenient.query(grasps[0], top=8))
-        return found
-
-    wait_until(answered, 60)
-    [answer] = found
-    if answer.index["searched"] == 1.0:  # Ray has replaced it already
-        return
-    assert 0.1 <= answer.index["searched"] < 1
-    searched = [match for match in expected.results if match.object_id in {one.object_id for one in answer.results}]
-    assert [match.object_id for match in searched] == [match.object_id for match in answer.results]
-    shown = math.fsum(match.probability for match in answer.results)
-    assert answer.posterior["unscored_probability"] > 0
-    assert answer.none_probability + shown + answer.posterior["unscored_probability"] == pytest.approx(1, abs=1e-9)
+    with pytest.raises(IncompleteSearch, match=r"no answer within 2 s from shard-0\d-of-04"):
+        searcher.query(grasps[0])
 
 
 @pytest.mark.parametrize(
     "field",
-    [{"replicas": 0}, {"replicas": 3, "max_replicas": 2}, {"min_share": 0.0}, {"min_share": 1.5}, {"wait_s": 0.0}],
+    [{"replicas": 0}, {"wait_s": 0.0}],
 )
 def test_invalid_settings_raise(field):
     from retrieval.cluster.serving import ReplicaSettings
@@ -274,7 +237,7 @@ def test_a_new_generation_is_used_during_running_queries(ray, catalogue, cluster
     def run_queries():
         while not stop.is_set():
             answer = current[0].query(grasps[0], top=1)
-            reports.append((answer.index["generation"], answer.index["photos"], answer.index["searched"]))
+            reports.append((answer.index["generation"], answer.index["photos"]))
 
     thread = threading.Thread(target=run_queries)
     thread.start()
@@ -291,39 +254,8 @@ def test_a_new_generation_is_used_during_running_queries(ray, catalogue, cluster
     finally:
         stop.set()
         thread.join(300)
-    assert set(reports) == {("sharded-000001", 24, 1.0), ("sharded-000002", 25, 1.0)}
+    assert set(reports) == {("sharded-000001", 24), ("sharded-000002", 25)}
     assert reports == sorted(reports)
-
-
-def test_replicas_grow_while_requests_wait(ray, cluster, grasps, served):
-    grown = deployments(ray, wait_s=120.0, max_replicas=2, max_ongoing_requests=2)
-    expected, stop, found = names(served.query(grasps[0])), threading.Event(), set()
-    with Searcher.open(cluster, shards=grown.open) as searcher:
-        own = [name for name in ray.serve.status().applications if name.endswith(grown._owner_id)]
-
-        def run_queries():
-            while not stop.is_set():
-                found.add(tuple(names(searcher.query(grasps[0]))))
-
-        def replicas():
-            applications = ray.serve.status().applications
-            return sum(sum(applications[name].deployments["shard"].replica_states.values()) for name in own)
-
-        threads = [threading.Thread(target=run_queries) for _ in range(12)]
-        try:
-            assert replicas() == 4
-            for thread in threads:
-                thread.start()
-            deadline = time.monotonic() + 240
-            while replicas() <= 4 and time.monotonic() < deadline:
-                time.sleep(0.2)
-            assert 4 < replicas() <= 8
-        finally:
-            stop.set()
-            for thread in threads:
-                thread.join(300)
-    grown.close()
-    assert found == {tuple(expected)}
 
 
 ENDING = """
@@ -333,7 +265,7 @@ from retrieval.cluster.serving import Deployments, ReplicaSettings
 from retrieval.cluster.session import ray_session
 from retrieval.search.query.searcher import Searcher
 with ray_session(2) as ray:
-    served = Deployments(ray, ReplicaSettings(cpus=0.1, wait_s=240.0, max_replicas=2))
+    served = Deployments(ray, ReplicaSettings(cpus=0.1, wait_s=240.0))
     with Searcher.open(sys.argv[1], shards=served.open) as searcher, ThreadPoolExecutor(12) as threads:
         print(set(threads.map(lambda _: str(searcher.shard.rows(["nothing"])), range(12))), flush=True)
     served.close()
@@ -343,7 +275,7 @@ print(ray.is_initialized())
 
 
 def test_after_closing_nothing_calls_ray_or_starts_it_again(cluster):
-    """With autoscaling, a thread reports the number of waiting requests to Ray every ten seconds."""
+    """A handle that stays open may report the number of waiting requests to Ray every ten seconds."""
     command = [sys.executable, "-W", "ignore", "-c", ENDING, str(cluster)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert done.stdout.splitlines() == ["{'[None]'}", "False"], done.stderr
@@ -441,7 +373,7 @@ def test_the_service_on_a_cluster_gives_the_results_of_the_folder_and_restarts_a
             answer = client.query(touch)
             assert names(answer) == names(expected)
             assert numbers(answer) == pytest.approx(numbers(expected), abs=1e-5)
-            assert (answer.index["shards"], answer.index["searched"]) == (4, 1.0)
+            assert answer.index["shards"] == 4
             found = httpx.get(f"{address}/v1/catalogue", params={"limit": 500}).json()
             assert {item["id"] for item in found["items"]} == {row["id"] for row in searcher.generation.rows}
             assert httpx.get(f"{address}/v1/photos/{answer.top.photo}").status_code == 200

@@ -466,7 +466,6 @@ def test_training_a_gate_refuses_options_of_matchers(option, workplace, capsys):
     [
         (["collect", "--out", "r", "--dry-run", "--preview"], "--preview has no effect with --dry-run"),
         (["serve", "--index", "i", "--replicas", "2"], "--replicas needs --cluster"),
-        (["serve", "--index", "i", "--min-share", "0"], "--min-share needs --cluster"),
         (["serve", "--index", "i", "--no-history", "--history", "h"], "--history contradicts --no-history"),
         (["build-index", "catalog/", "--max-unreadable", "0.1"], "give --shards too"),
         (["build-index", "catalog/", "--cluster"], "give --shards too"),

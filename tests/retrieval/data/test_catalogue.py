@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from retrieval.data import catalogue as module
-from retrieval.data.catalogue import CataloguePhoto, PhotoTable, decode_photo, list_catalogue, read_photo
+from retrieval.data.catalogue import decode_photo, list_catalogue, read_photo
 from retrieval.data.folder_walk import SkippedPhoto
 from retrieval.data.naming import Naming
 from retrieval.errors import DatasetError
@@ -89,15 +89,6 @@ def test_a_missing_folder_a_file_and_an_empty_folder_give_different_errors(tmp_p
         DatasetError, match=r"only 1 other file\(s\) such as b\.txt; a\.gif: \.gif pictures are not read"
     ):
         list_catalogue(fill(tmp_path / "wrong", "a.gif", "b.txt"))
-
-
-def test_a_folder_that_cannot_be_listed_is_an_error(tmp_path, monkeypatch):
-    def refuse(path):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(module.os, "scandir", refuse)
-    with pytest.raises(DatasetError, match=r"cannot list .*Permission denied"):
-        list_catalogue(fill(tmp_path, "mug/1.png"))
 
 
 def test_a_naming_names_objects_and_skips_photos_that_do_not_fit(tmp_path):
@@ -184,17 +175,6 @@ def test_a_photos_own_metadata_takes_precedence_over_its_objects(tmp_path):
     assert catalogue.notes == ()
 
 
-def test_a_photo_table_returns_the_photos_it_was_made_of():
-    photos = [
-        CataloguePhoto("a/1.png", "a"),
-        CataloguePhoto("a/2.png", "a", {"price": 5}),
-        CataloguePhoto("b.png", "b"),
-    ]
-    table = PhotoTable.of(photos)
-    assert (list(table), len(table), table[-1], list(table[1:])) == (photos, 3, photos[2], photos[1:])
-    assert (table.paths, table.objects) == (("a/1.png", "a/2.png", "b.png"), ("a", "a", "b"))
-
-
 def test_metadata_goes_to_objects_by_the_same_naming(tmp_path):
     fill(tmp_path, "mug_0.png", "mug_1.png")
     write_metadata(
@@ -275,11 +255,3 @@ def test_broken_files_are_left_out_with_the_reason_and_the_rest_is_read(tmp_path
     assert skipped["d.png"] == "no such file"
     assert skipped["e.png"].startswith("cannot be read: is a pipe, a device or a socket, not a regular file")
     assert len(results) == 6
-
-
-def test_reading_one_photo_opens_no_other(tmp_path, monkeypatch):
-    calls, read_bytes = [], module.read_bytes
-    monkeypatch.setattr(module, "read_bytes", lambda path: calls.append(path) or read_bytes(path))
-    catalogue = list_catalogue(fill(tmp_path, *(f"{number:04}.png" for number in range(50))))
-    read_photo(catalogue, catalogue.photos[3])
-    assert calls == [tmp_path / "0003.png"]

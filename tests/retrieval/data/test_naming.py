@@ -1,10 +1,8 @@
 """Objects derived from photo paths (`build-index --objects-from`), and warnings about suspicious names."""
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from retrieval.data.naming import Naming, count_summary, naming_warnings
+from retrieval.data.naming import Naming, naming_warnings
 from retrieval.errors import BadInput
 
 BY_RULE = {
@@ -75,16 +73,6 @@ def test_an_invalid_rule_is_refused_with_the_valid_forms(rule, message):
     assert "{split}/{object}/{photo}" in str(raised.value)
 
 
-@given(rule=st.text("{}object/_.a(", max_size=20), path=st.text("object/_.a1(", min_size=1, max_size=20))
-def test_any_text_is_a_rule_or_refused_and_an_object_is_part_of_the_path(rule, path):
-    try:
-        naming = Naming(rule)
-    except BadInput:
-        return
-    name = naming.object_of(path)
-    assert name is None or (name and name in path and "/" not in name)
-
-
 # Warnings --------------------------------------------------------------------------------------------------
 
 
@@ -118,7 +106,3 @@ def test_plausible_names_give_no_warning():
     assert naming_warnings({"slab-knurl-20000-00010": 3, "cone-ribs-20000-00015": 3}, Naming()) == []
     # The rule stem has already removed the last number of mug_1_5.jpg.
     assert naming_warnings({"mug_1": 2, "mug_2": 2}, Naming("stem")) == []
-
-
-def test_the_count_summary_has_minimum_median_and_maximum():
-    assert count_summary([4, 1, 1, 2]) == {"min": 1, "median": 1.5, "max": 4}

@@ -77,14 +77,6 @@ def test_an_embedding_at_the_end_of_partial_activations_has_its_own_scale():
     assert PartialStatistics.of(partials)(partials)[:, 2].abs().max() < 1e-3
 
 
-def test_partial_activations_are_centred_by_unit_and_scaled_by_one_number():
-    partials = torch.tensor([[0.0, 10.0], [2.0, 14.0]])
-    spread = PartialStatistics.of(partials)
-    assert spread.mean.tolist() == [1.0, 12.0]
-    scale = (((0 - 6.5) ** 2 + (10 - 6.5) ** 2 + (2 - 6.5) ** 2 + (14 - 6.5) ** 2) / 4) ** 0.5
-    torch.testing.assert_close(spread(partials), (partials - torch.tensor([1.0, 12.0])) / scale)
-
-
 def test_constant_partial_activations_stay_finite_where_a_plain_division_gives_nan():
     partials = torch.full((3, 2), 5.0)
     assert (partials - partials.mean(0)).div(partials.std(correction=0)).isnan().all()

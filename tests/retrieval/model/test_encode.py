@@ -13,15 +13,12 @@ from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.config import MatcherConfig
 from retrieval.model.encode import (
     encode_photos,
-    encode_touches,
     for_inference,
     photo_features,
     to_batch,
-    touch_batch,
-    touch_features,
 )
 from retrieval.model.fusion import Matcher
-from retrieval.model.towers import OUTPUTS, TOWERS
+from retrieval.model.towers import TOWERS
 from retrieval.search.defaults import shipped_model
 
 SIDE = 48
@@ -59,14 +56,6 @@ def test_folded_towers_are_as_close_to_float64_as_the_plain_ones(tower):
     assert error <= 1e-3
 
 
-@pytest.mark.parametrize("output", OUTPUTS)
-def test_every_output_of_a_tower_and_a_touch_of_two_fingers_stay_the_same(output):
-    matcher, touches = matcher_with_statistics("resnet18", output), [images(2, seed) for seed in (2, 3)]
-    with torch.inference_mode():
-        plain = matcher.touch_features(touch_batch(touches))
-    torch.testing.assert_close(touch_features(matcher, touches), plain, rtol=1e-4, atol=1e-4 * float(plain.abs().max()))
-
-
 @torch.inference_mode()
 def test_the_shipped_model_gives_the_partial_activations_and_embeddings_of_its_plain_towers():
     matcher = load_checkpoint(shipped_model()).matcher
@@ -85,13 +74,6 @@ def smooth_pictures():
     axis = np.linspace(0, 6, 224, dtype=np.float32)
     waves = [np.sin(k * axis)[:, None] * np.cos((k + 1) * axis)[None] for k in range(1, 5)]
     return [np.stack([wave, wave.T, wave**2], axis=2) / 2 + 0.5 for wave in waves]
-
-
-@pytest.mark.parametrize("tower", sorted(TOWERS))
-def test_no_batch_normalisation_is_left_in_a_tower_for_inference(tower):
-    fast = for_inference(matcher_with_statistics(tower, "pooled"))
-    for name in ("touch_tower", "photo_tower"):
-        assert not [part for part in fast.get_submodule(name).modules() if isinstance(part, nn.BatchNorm2d)]
 
 
 def test_encoding_leaves_the_matcher_unchanged():
@@ -148,18 +130,6 @@ def test_changed_weights_are_used_in_the_next_encoding(change):
         expected = matcher.photo_features(to_batch(images(2)))
     torch.testing.assert_close(photo_features(matcher, images(2)), expected, rtol=1e-5, atol=1e-5)
     assert not torch.equal(before, expected)
-
-
-def test_a_changed_head_or_candidate_encoder_is_used_at_once():
-    matcher = matcher_with_statistics("small", "pooled")
-    before = encode_touches(matcher, [images(2)])
-    with torch.no_grad():
-        matcher.head.touch_partial.bias += 1
-    torch.testing.assert_close(encode_touches(matcher, [images(2)]).partial, before.partial + 1)
-    matcher.candidate_encoder = None
-    with torch.inference_mode():
-        expected = matcher.touch_encoding(touch_features(matcher, [images(2)])).embedding
-    assert torch.equal(encode_touches(matcher, [images(2)]).embedding, expected)
 
 
 def test_a_tower_in_training_mode_is_not_folded_because_its_normalisation_depends_on_the_batch():

@@ -66,8 +66,7 @@ def export_random_matcher(path, config, seed=0, *, gel_head=False):
     return checkpoint.matcher, OnnxEncoder(path.with_suffix(".onnx"), checkpoint.digest)
 
 
-LARGE = ("resnet34", "resnet50")
-MAKES = [{"tower": tower, "tower_output": "stages"} for tower in sorted(TOWERS) if tower not in LARGE]
+MAKES = [{"tower": tower, "tower_output": "stages"} for tower in sorted(TOWERS) if tower != "resnet50"]
 MAKES += [{"tower_output": name} for name in OUTPUTS]
 MAKES += [{"fingers": 1}, {"standardise": False}, {"candidate_width": 0}]
 MAKES += [{"tower_output": "stages", "cell_dim": 4, "touch_cells": 2, "cosine": True, "projection_hidden": 12}]

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from retrieval.errors import NumericalError
 from retrieval.model.fusion_scorer import CELL_BLOCK, FusionScorer
-from retrieval.model.stored_partials import StoredPartials, as_float32, stored_layout, to_stored
+from retrieval.model.stored_partials import StoredPartials, as_float32, to_stored
 
 
 def random_scorer(hidden, seed=0):
@@ -48,31 +47,6 @@ def test_a_float16_that_is_not_finite_stays_so_although_shifted_bits_would_make_
     naive = (values.view(np.int16).astype(np.int32) << 13 & 0x0FFFE000).view(np.float32) * np.float32(2.0**112)
     assert np.isfinite(naive).all()
     np.testing.assert_array_equal(as_float32(values), values.astype(np.float32))
-
-
-def test_partial_activations_may_be_a_view_or_of_another_type():
-    stored = np.random.default_rng(0).normal(size=(6, 8)).astype(np.float16)
-    assert np.array_equal(as_float32(stored[::2, 1:]), stored[::2, 1:].astype(np.float32))
-    assert np.array_equal(as_float32(stored.astype(np.float64)), stored.astype(np.float32))
-
-
-def test_scoring_changes_neither_the_partial_activations_nor_the_touch():
-    scorer, rng = random_scorer(4), np.random.default_rng(2)
-    touches, photos = (rng.normal(size=(3, 4)).astype(np.float32) for _ in range(2))
-    before = touches.copy(), photos.copy()
-    scorer.logits(touches, photos)
-    assert np.array_equal(touches, before[0])
-    assert np.array_equal(photos, before[1])
-
-
-@pytest.mark.parametrize("dtype", [np.float16, np.float32])
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_a_partial_activation_that_is_not_finite_is_named_by_its_row(bad, dtype):
-    photos = np.zeros((9, 4), dtype=dtype)
-    photos[7, 2] = bad
-    ones = FusionScorer(*(np.ones(shape, np.float32) for shape in ((4, 4), 4, 4, 1)))
-    with pytest.raises(NumericalError, match="photo row 7 has"):
-        ones.logits(np.zeros((1, 4), np.float32), photos, np.array([1, 7, 8]))
 
 
 def cell_score(touch_cells, photo_cells):
@@ -135,9 +109,3 @@ def test_a_logit_from_stored_cells_is_wrong_by_at_most_the_rounding_of_its_cells
     bound = 2 * 3 * np.sqrt(8) * 0.5 / 127 + 1e-4
     stored = StoredPartials(to_stored(partials, 6))
     assert np.abs(scorer.logits(touches, stored) - scorer.logits(touches, exact)).max() <= bound
-
-
-def test_the_layout_of_an_index_lists_cells_only_if_there_are_some():
-    assert stored_layout(6, 6) == {"partials": (np.dtype(np.float16), (6,))}
-    assert stored_layout(6, 14)["cells"] == (np.dtype(np.int8), (8,))
-    assert list(to_stored(np.zeros((2, 6), np.float32), 6)) == ["partials"]

@@ -74,17 +74,6 @@ def test_cells_are_the_means_of_the_map_row_by_row():
     torch.testing.assert_close(cells[2], maps[0, :, 2:, :2].mean((1, 2)))
 
 
-@pytest.mark.parametrize("name", ["small", "mobilenet_v2"])
-def test_cells_do_not_change_the_features_before_them(name):
-    torch.manual_seed(0)
-    tower, images = build_tower(name, "stages").eval(), torch.rand(2, 3, 64, 64)
-    with torch.inference_mode():
-        plain = tower(images)
-        divided = tower.divide(4)(images)
-    assert divided.shape == (2, tower.output_count)
-    assert torch.equal(divided[:, : tower.feature_count], plain)
-
-
 def test_a_tower_without_cells_is_refused_by_name():
     with pytest.raises(ConfigError, match="has no cells"):
         build_tower("resnet18", "stages").divide(4)
@@ -118,13 +107,6 @@ def test_partial_activations_without_cells_give_the_logit_without_late_interacti
             plain.photo_encoding(plain.photo_features(images[1])).partial,
         )
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
-
-
-def test_late_interaction_is_trained_by_the_logit(matcher, images):
-    logits = matcher(images[0], images[1][:3])
-    logits.sum().backward()
-    assert all(parameter.grad.abs().sum() > 0 for parameter in matcher.touch_cells.parameters())
-    assert matcher.photo_cells.network[0].weight.grad.abs().sum() > 0
 
 
 def test_the_pooled_listwise_loss_is_that_of_the_matcher_without_cells_and_trains_no_cell(matcher, images):

@@ -1,7 +1,6 @@
 """Calibration of reference touches, by hand."""
 
 import dataclasses
-import json
 import math
 
 import numpy as np
@@ -15,7 +14,6 @@ from retrieval.model.reference_calibration import (
     ReferenceCalibration,
     fit_reference_calibration,
     reference_similarity,
-    unit_embeddings,
 )
 from tests.reference_model import REFERENCE_CALIBRATION
 
@@ -36,20 +34,6 @@ def test_several_references_are_averaged_as_likelihoods():
         for part, got in zip(parts, row, strict=True):
             mean = sum(math.exp(SHARPNESS * float(cosines[grasp, place])) for place in part) / len(part)
             assert got == pytest.approx(math.log(mean) / SHARPNESS, abs=1e-6)
-
-
-def test_embeddings_are_columns_of_partial_activations_at_norm_one():
-    partials = np.float16([[9, 9, 3, 4, 7], [9, 9, 0, -2, 7]])
-    np.testing.assert_allclose(unit_embeddings(partials, slice(2, 4)), [[0.6, 0.8], [0, -1]], atol=1e-6)
-    assert unit_embeddings(partials, slice(4, 4)).shape == (2, 0)
-
-
-def test_a_calibration_is_stored_and_read_again():
-    assert (
-        ReferenceCalibration.from_dict(json.loads(json.dumps(REFERENCE_CALIBRATION.to_dict()))) == REFERENCE_CALIBRATION
-    )
-    bare = dataclasses.replace(REFERENCE_CALIBRATION, weight=None, with_photos=None)
-    assert ReferenceCalibration.from_dict(bare.to_dict()) == bare
 
 
 @pytest.mark.parametrize(

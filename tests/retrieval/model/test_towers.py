@@ -17,9 +17,7 @@ from retrieval.model.towers.weights import initialise_tower, load_tower_state, r
 from tests.data import touch_data
 
 # ResNet-18 and -50 cover both kinds of block.
-every_tower = pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name == "resnet34" else ()) for name in sorted(TOWERS)]
-)
+every_tower = pytest.mark.parametrize("name", sorted(TOWERS))
 
 
 def transformers_resnet(name):
@@ -27,7 +25,6 @@ def transformers_resnet(name):
 
     kinds = {
         "resnet18": ("basic", [2, 2, 2, 2], [64, 128, 256, 512]),
-        "resnet34": ("basic", [3, 4, 6, 3], [64, 128, 256, 512]),
         "resnet50": ("bottleneck", [3, 4, 6, 3], [256, 512, 1024, 2048]),
     }
     kind, depths, widths = kinds[name]
@@ -55,9 +52,7 @@ def weights_in_order_of_use(model, images):
     return met
 
 
-@pytest.mark.parametrize(
-    "name", ["resnet18", pytest.param("resnet34", marks=pytest.mark.slow), "resnet50", "mobilenet_v2"]
-)
+@pytest.mark.parametrize("name", ["resnet18", "resnet50", "mobilenet_v2"])
 def test_a_tower_computes_the_same_as_an_independent_implementation_with_the_same_weights(name):
     torch.manual_seed(3)
     other = (transformers_mobilenet() if name == "mobilenet_v2" else transformers_resnet(name)).eval()
@@ -82,21 +77,6 @@ def test_a_tower_computes_the_same_as_an_independent_implementation_with_the_sam
     assert not waiting
     with torch.inference_mode():
         torch.testing.assert_close(tower(images), other(normalised).logits, rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("name", "parameters", "pooled"),
-    [
-        ("resnet18", 11_689_512, 512),
-        pytest.param("resnet34", 21_797_672, 512, marks=pytest.mark.slow),
-        ("resnet50", 25_557_032, 2048),
-        ("mobilenet_v2", 3_504_872, 1280),
-    ],
-)
-def test_a_tower_has_the_published_number_of_parameters(name, parameters, pooled):
-    assert sum(value.numel() for value in build_tower(name, "classes").parameters()) == parameters
-    assert build_tower(name, "classes").feature_count == 1000
-    assert build_tower(name).feature_count == pooled
 
 
 PUBLISHED = {
@@ -149,15 +129,6 @@ def test_unknown_towers_and_outputs_are_refused_with_the_known_ones():
         build_tower("small", "logits")
 
 
-def test_weights_come_back_from_a_file(tmp_path):
-    torch.manual_seed(1)
-    source = build_tower("resnet18", "classes")
-    torch.save(source.state_dict(), tmp_path / "weights.pth")
-    target = build_tower("resnet18")
-    initialise_tower(target, str(tmp_path / "weights.pth"))
-    assert torch.equal(target.conv1.weight, source.conv1.weight)
-
-
 def test_a_tower_loads_a_file_of_its_weights_and_refuses_unknown_ones(tmp_path):
     torch.save(Plain("pooled").state_dict(), tmp_path / "weights.pth")
     target = Plain("pooled")
@@ -205,14 +176,6 @@ def test_an_initial_weight_that_is_not_finite_is_refused_and_named(value):
     with pytest.raises(CheckpointError, match=r"r\.pth contains a NaN or infinite weight in layer1\.0\.conv1\.weight"):
         load_tower_state(tower, state, "r.pth")
     assert all(bool(torch.isfinite(weight).all()) for weight in tower.state_dict().values())
-
-
-@pytest.mark.parametrize("content", [b"", b"not a checkpoint", b"PK\x03\x04broken zip"])
-def test_damaged_weight_files_are_one_clear_error(tmp_path, content):
-    path = tmp_path / "weights.pth"
-    path.write_bytes(content)
-    with pytest.raises(CheckpointError, match=r"weights\.pth is not a readable state dict \(\w+\)$"):
-        read_state(path)
 
 
 class Payload:
@@ -263,31 +226,11 @@ def test_real_imagenet_weights_load_in_their_older_key_layout():
     assert features.max() <= 6
 
 
-@every_tower
-def test_stages_are_mean_deviation_and_maximum_of_maps_of_any_image(name):
-    torch.manual_seed(0)
-    tower = build_tower(name, "stages").eval()
-    with torch.inference_mode():
-        features = tower(torch.rand(2, 3, 64, 96))
-    assert features.shape == (2, tower.feature_count)
-    assert torch.isfinite(features).all()
-
-
 def test_stage_statistics_are_those_of_each_map_concatenated():
     first = torch.tensor([[[[0.0, 2.0], [4.0, 6.0]]]])  # mean 3, deviation sqrt(5), maximum 6
     second = torch.full((1, 1, 1, 3), 7.0)  # constant
     expected = torch.tensor([[3.0, 5**0.5, 6.0, 7.0, 0.0, 7.0]])
     torch.testing.assert_close(stage_statistics([first, second]), expected)
-
-
-def test_published_weights_load_into_stages_without_their_last_layers(tmp_path):
-    torch.manual_seed(1)
-    source = build_tower("mobilenet_v2", "classes")
-    torch.save(source.state_dict(), tmp_path / "weights.pth")
-    tower = build_tower("mobilenet_v2", "stages")
-    initialise_tower(tower, str(tmp_path / "weights.pth"))
-    assert not any(key.startswith("features.18") for key in tower.state_dict())
-    torch.testing.assert_close(tower.features[17].conv[2].weight, source.features[17].conv[2].weight)
 
 
 FIRST = {

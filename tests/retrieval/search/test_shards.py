@@ -113,7 +113,7 @@ def test_rows_are_found_in_every_shard(divided, searcher):
 
 def test_a_result_has_the_number_of_shards_and_folder_attributes_raise(divided, searcher, touch, cluster):
     index = divided.query(touch).index
-    assert (index["shards"], index["searched"]) == (len(read_sharded_manifest(cluster).shards), 1.0)
+    assert index["shards"] == len(read_sharded_manifest(cluster).shards)
     assert "shards" not in searcher.query(touch).index
     with pytest.raises(BadInput, match="is a sharded index, but one index folder is required"):
         _ = divided.generation
@@ -124,13 +124,13 @@ def test_a_result_has_the_number_of_shards_and_folder_attributes_raise(divided, 
 
 def scored(*objects, mass=None, photos=10):
     best = [RankedObject(logit, ListedPhoto(name, f"{name}/1.jpg", {})) for name, logit in objects]
-    return ShardResult(photos, len(best), best, mass, photos, {"candidates": 1.0, "rerank": photos / 10})
+    return ShardResult(photos, len(best), best, mass, {"candidates": 1.0, "rerank": photos / 10})
 
 
 def test_merged_objects_are_ordered_by_logit_then_by_name():
     found = merge_results([scored(("tin", 2.0), ("cup", 1.0)), scored(("mug", 2.0), ("jar", 0.5), photos=30)], top=3)
     assert [one.photo.object_id for one in found.best] == ["mug", "tin", "cup"]
-    assert (found.photos, found.objects, found.searched) == (40, 4, 40)
+    assert (found.photos, found.objects) == (40, 4)
     assert found.timing_ms == {"candidates": 1.0, "rerank": 3.0}
 
 
@@ -142,14 +142,6 @@ def test_masses_of_parts_give_the_probabilities_of_the_whole():
     terms = [0.4, *(0.6 / 4 * math.exp(2 * logit - 1.5) for logit in [*logits, math.log(3)])]
     expected = [term / math.fsum(terms) for term in terms]
     assert [probabilities.none, *probabilities.objects, probabilities.unscored] == pytest.approx(expected, abs=1e-12)
-
-
-def test_unknown_objects_have_the_average_mass_of_the_others():
-    mass = STEEP.mass([0.0, math.log(3)], unscored=1, sample=[math.log(2)]).extrapolated(6)
-    assert mass.objects == 9
-    assert math.exp(mass.scored + mass.top) == pytest.approx(1 + 9)
-    assert math.exp(mass.unscored + mass.top) == pytest.approx(4 + 6 * (1 + 9 + 4) / 3)
-    assert STEEP.mass([1.0]).extrapolated(0) == STEEP.mass([1.0])
 
 
 # Building -------------------------------------------------------------------------------------------------------------
