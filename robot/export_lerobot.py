@@ -2,7 +2,7 @@
 
 Written with pyarrow and PyAV according to the source of lerobot 0.4.4; lerobot itself is not needed.
 
-    meta/info.json                                    features, counts, paths; splits as ranges of episodes
+    meta/info.json                                    features, counts, paths
     meta/stats.json                                   min, max, mean, std and count of each feature
     meta/tasks.parquet                                a task for each object: its object_id
     meta/episodes/chunk-000/file-000.parquet          an episode for each grasp, with its recorded fields
@@ -16,12 +16,10 @@ error is 0.86 grey levels, at most 1.2. Only the current grasp is in memory.
 """
 
 import contextlib
-import itertools
 import json
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -35,9 +33,6 @@ from robot.importers.episodes import MOMENT_SUFFIXES, Picture
 from robot.importers.importing import Progress, import_extra, picture_bytes
 from robot.recording.folder import RecordedGrasp, Recording
 from robot.storage import decode_picture, storage_errors
-
-Parts = Mapping[str, Sequence[str]]
-"""A split: train, validation, test -> object ids."""
 
 FPS = 1
 """Nominal, because steps have no fixed rate; readers require an integer."""
@@ -53,40 +48,24 @@ _FACTS = ("source", "sensor", "rig", "licence", "terms", "citation", "background
 _WHAT = "LeRobot's format"
 
 
-@dataclass(frozen=True)
-class RecordingExport:
-    """Result of an export.
-
-    Attributes:
-        grasps: Number of written grasps.
-        notes: Remarks for the user.
-    """
-
-    grasps: int
-    notes: tuple[str, ...] = ()
-
-
-def export_lerobot(
-    recording: Recording, out: Path, *, parts: Parts | None = None, progress: Progress | None = None
-) -> RecordingExport:
+def export_lerobot(recording: Recording, out: Path, progress: Progress | None = None) -> tuple[str, ...]:
     """Write a LeRobot data set, version 3.
 
     Args:
         recording: The recording.
         out: New or empty folder; after an error it does not exist.
-        parts: Split of the objects; None for all in the training part.
         progress: Called with (done, total) after each grasp.
 
+    Returns:
+        Remarks for the user.
+
     Raises:
-        RecordingError: A picture is damaged, grasps differ in their fingers, `out` is not empty, or the split is
-            invalid.
+        RecordingError: A picture is damaged, grasps differ in their fingers, or `out` is not empty.
         ImporterError: pyarrow or av is missing.
         StorageError: The folder cannot be written.
     """
     import_extra("pyarrow", _WHAT), import_extra("av", _WHAT)
-    by_part, notes = _grasps_by_part(recording, parts)
-    grasps = [grasp for part in by_part.values() for grasp in part]
-    steps = _EpisodeSteps(recording, grasps)
+    grasps, steps = recording.grasps, _EpisodeSteps(recording)
     tasks = {name: number for number, name in enumerate(dict.fromkeys(grasp.object_id for grasp in grasps))}
     with _new_folder(out) as folder:
         stats = {name: _Stats() for name in (*_STEP_COLUMNS, *map(_key, steps.sizes))}
@@ -98,8 +77,8 @@ def export_lerobot(
                         progress(episode + 1, len(grasps))
         _write_tasks(folder / "meta" / "tasks.parquet", tasks)
         _write_json(folder / "meta" / "stats.json", {name: values.to_dict() for name, values in stats.items()})
-        _write_json(folder / "meta" / "info.json", _info(recording, steps, len(tasks), by_part))
-    return RecordingExport(len(grasps), (*notes, *steps.remarks()))
+        _write_json(folder / "meta" / "info.json", _info(recording, steps, len(tasks)))
+    return steps.remarks()
 
 
 @contextlib.contextmanager
@@ -115,26 +94,6 @@ def _new_folder(out: Path) -> Iterator[Path]:
             os.replace(part, out)
 
 
-def _grasps_by_part(recording: Recording, parts: Parts | None) -> tuple[dict[str, list[RecordedGrasp]], list[str]]:
-    """Return the grasps by part of the split (None: all in `train`), and remarks."""
-    if parts is None:
-        return {"train": list(recording.grasps)}, []
-    part_of: dict[str, str] = {}
-    for part, objects in parts.items():
-        for object_id in objects:
-            if part_of.setdefault(object_id, part) != part:
-                raise RecordingError(f"the split has {object_id} in two parts; each object must be in one part")
-    found: dict[str, list[RecordedGrasp]] = {part: [] for part in parts}
-    for grasp in recording.grasps:
-        if grasp.object_id in part_of:
-            found[part_of[grasp.object_id]].append(grasp)
-    exported = {part: grasps for part, grasps in found.items() if grasps}
-    if not exported:
-        raise RecordingError("the split contains no object of the recording")
-    left_out = len(recording.grasps) - sum(map(len, exported.values()))
-    return exported, [f"left out {left_out} grasp(s) of objects that are not in the split"] if left_out else []
-
-
 # Steps -----------------------------------------------------------------------------------------------------
 
 
@@ -146,9 +105,9 @@ class _EpisodeSteps:
         sizes: (height, width) of `photo`, `touch_a`, ...
     """
 
-    def __init__(self, recording: Recording, grasps: Sequence[RecordedGrasp]) -> None:
+    def __init__(self, recording: Recording) -> None:
         """Read the first grasp; raise RecordingError if there is none, or grasps differ in their fingers."""
-        if not grasps:
+        if not (grasps := recording.grasps):
             raise RecordingError(f"{recording.folder} must contain grasps, but contains none")
         self._folder = recording.folder
         self._fingers = sorted(grasps[0].touches)
@@ -193,7 +152,7 @@ class _EpisodeSteps:
         }
         return {"photo": [_read_picture(self._folder / files["photo"])] * len(self.moments), **touches}
 
-    def remarks(self) -> list[str]:
+    def remarks(self) -> tuple[str, ...]:
         """Return remarks on moments that are left out and on pictures that were resized so far."""
         left_out = [
             f"the frames {moment} the touch are left out because some grasps do not have them"
@@ -204,7 +163,7 @@ class _EpisodeSteps:
             f"{self.sizes[name][0]} with black borders"
             for name, count in self._resized.items()
         ]
-        return [*left_out, *resized]
+        return (*left_out, *resized)
 
 
 def _read_picture(path: Path) -> Picture:
@@ -389,11 +348,8 @@ def _write_json(path: Path, value: Any) -> None:
     path.write_text(json.dumps(value, indent=4) + "\n", "utf-8")
 
 
-def _info(
-    recording: Recording, steps: _EpisodeSteps, tasks: int, by_part: Mapping[str, Sequence[RecordedGrasp]]
-) -> dict[str, Any]:
-    ends = list(itertools.accumulate(map(len, by_part.values())))
-    episodes = ends[-1]
+def _info(recording: Recording, steps: _EpisodeSteps, tasks: int) -> dict[str, Any]:
+    episodes = len(recording.grasps)
     return {
         "codebase_version": "v3.0",
         "robot_type": None,
@@ -404,7 +360,7 @@ def _info(
         "data_files_size_in_mb": 100,
         "video_files_size_in_mb": 200,
         "fps": FPS,
-        "splits": {part: f"{end - len(by_part[part])}:{end}" for part, end in zip(by_part, ends, strict=True)},
+        "splits": {"train": f"0:{episodes}"},
         "data_path": _DATA,
         "video_path": _VIDEO,
         "features": {_key(camera): _video_feature(size) for camera, size in steps.sizes.items()}

@@ -30,7 +30,6 @@ from robot.importers.episodes import Episode, Picture, Step
 from robot.importers.importing import (
     NOT_STATED,
     DataSet,
-    DataSetMetadata,
     Item,
     Progress,
     Skip,
@@ -98,7 +97,6 @@ def import_lerobot(
         out,
         total=total,
         progress=progress,
-        metadata=DataSetMetadata({}, source.splits()),
     )
 
 
@@ -115,7 +113,6 @@ class _Info(msgspec.Struct):
     data_path: str = _DATA_PATH
     video_path: str = _VIDEO_PATH
     robot_type: str | None = None
-    splits: dict[str, Any] = {}
     recording: dict[str, Any] = {}
 
 
@@ -161,21 +158,6 @@ class _LeRobotSource:
         texts = {key: facts[key] for key in keys if isinstance(facts.get(key), str)}
         own_terms = {"terms": ""} if "licence" in texts else {}
         return {"sensor": ", ".join(self.touch)} | own_terms | texts
-
-    def splits(self) -> dict[str, dict[str, list[str]]]:
-        """Return the split of info.json ("0:80" for each part) if it has several parts."""
-        found = {part: re.fullmatch(r"(\d{1,9}):(\d{1,9})", str(text)) for part, text in self._info.splits.items()}
-        ranges = {part: range(int(match[1]), int(match[2])) for part, match in found.items() if match}
-        if len(ranges) < 2:
-            return {}
-        objects = [_object(row) for row in self.episodes(("object_id", "tasks"))]
-        return {
-            "published": {
-                part: sorted({objects[episode] for episode in episodes if episode < len(objects)})
-                for part, episodes in ranges.items()
-                if len(episodes) <= len(objects)
-            }
-        }
 
     # Episodes ----------------------------------------------------------------------------------------------
 

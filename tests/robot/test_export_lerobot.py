@@ -18,7 +18,6 @@ av = pytest.importorskip("av")
 parquet = pytest.importorskip("pyarrow.parquet")
 
 RNG = np.random.default_rng(0)
-SPLIT = {"train": ("object 0",), "validation": (), "test": ("object 2",)}
 
 
 def smooth(height, width):
@@ -69,10 +68,9 @@ def test_an_export_appears_when_it_is_complete_and_reports_progress(source, tmp_
     def progress(done, total):
         calls.append((done, total, any(out.iterdir())))
 
-    result = export_lerobot(source, out, progress=progress)
+    notes = export_lerobot(source, out, progress)
     assert calls == [(done, 6, False) for done in range(1, 7)]
-    assert result.grasps == 6
-    assert result.notes == (
+    assert notes == (
         "the frames after the touch are left out because some grasps do not have them",
         "photo: 1 grasp(s) had another size and were resized to 40 x 30 with black borders",
     )
@@ -84,7 +82,7 @@ def test_a_stopped_export_leaves_nothing(source, tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        export_lerobot(source, tmp_path / "out", progress=stop)
+        export_lerobot(source, tmp_path / "out", stop)
     assert not list(tmp_path.iterdir())
 
 
@@ -96,13 +94,6 @@ def test_an_error_names_a_damaged_picture_and_nothing_is_written(source, tmp_pat
     with pytest.raises(RecordingError, match=rf"{path.name} is missing, damaged or cut off; run `retrieve check`"):
         export_lerobot(recording, tmp_path / "out")
     assert {path.name for path in tmp_path.iterdir()} == {"r"}
-
-
-def test_a_split_with_an_object_in_two_parts_or_with_other_objects_is_refused(source, tmp_path):
-    with pytest.raises(RecordingError, match="has object 0 in two parts"):
-        export_lerobot(source, tmp_path / "out", parts={"train": ["object 0"], "test": ["object 0"]})
-    with pytest.raises(RecordingError, match="contains no object of the recording"):
-        export_lerobot(source, tmp_path / "out", parts={"train": ["mug"]})
 
 
 def test_an_error_names_the_extra_if_a_package_is_missing(source, tmp_path, monkeypatch):
@@ -134,10 +125,9 @@ def frames_of(path):
 def test_pyarrow_and_av_open_a_lerobot_data_set(source, tmp_path, monkeypatch):
     monkeypatch.setattr("robot.export_lerobot.EPISODES_A_FILE", 4)
     out = tmp_path / "out"
-    export_lerobot(source, out, parts={"train": ["object 0", "object 1"], "test": ["object 2"]})
+    export_lerobot(source, out)
     info = json.loads((out / "meta/info.json").read_text())
     assert (info["codebase_version"], info["total_episodes"], info["total_frames"], info["fps"]) == ("v3.0", 6, 12, 1)
-    assert info["splits"] == {"train": "0:4", "test": "4:6"}
     steps = rows(out.glob("data/*/*.parquet"))
     assert [row["index"] for row in steps] == list(range(12))
     assert [row["moment"] for row in steps] == [0, 1] * 6
@@ -189,8 +179,7 @@ def test_a_photo_of_another_size_is_scaled_into_the_middle_of_black(source, tmp_
 
 def test_an_export_can_be_imported_again(source, tmp_path, monkeypatch):
     monkeypatch.setattr("robot.export_lerobot.EPISODES_A_FILE", 4)
-    parts = {"train": ["object 0", "object 1"], "validation": [], "test": ["object 2"]}
-    export_lerobot(source, tmp_path / "exported", parts=parts)
+    export_lerobot(source, tmp_path / "exported")
     again = import_lerobot(tmp_path / "exported", tmp_path / "back")
     plain = ("grasp_id", "object_id", "sequence_id", "grasped", "force_n", "pose")
     assert len(again.grasps) == len(source.grasps)
@@ -199,21 +188,16 @@ def test_an_export_can_be_imported_again(source, tmp_path, monkeypatch):
         assert grasp.images().keys() == {"photo", *(f"touch_{at}" for at in ("a", "a_before", "b", "b_before"))}
         for column in ("touch_a", "touch_b_before"):
             assert rms(picture(again, grasp, column), picture(source, old, column)) < 3
-    split = json.loads((tmp_path / "back/splits/published.json").read_text())
-    assert {part: split[part] for part in parts} == parts
     for key in ("source", "sensor", "licence", "terms"):
         assert again.info[key] == source.info[key]
 
 
-def test_the_command_writes_reports_left_out_grasps_and_refuses_a_second_run(source, tmp_path, capsys):
+def test_the_command_writes_reports_and_refuses_a_second_run(source, tmp_path, capsys):
     options = ["export-recording", str(source.folder), "--out", str(tmp_path / "out")]
-    (tmp_path / "split.json").write_text(
-        json.dumps({"seed": 0, **{part: list(objects) for part, objects in SPLIT.items()}})
-    )
-    assert main([*options, "--split", str(tmp_path / "split.json")]) == 0
+    assert main(options) == 0
     output = capsys.readouterr()
     assert output.out == ""
-    assert "left out 2 grasp(s)" in output.err
-    assert f"{tmp_path / 'out'}: 4 grasps" in output.err
+    assert "resized to 40 x 30" in output.err
+    assert f"{tmp_path / 'out'}: 6 grasps" in output.err
     assert main(options) == 2
     assert "must be a new or an empty folder" in capsys.readouterr().err
