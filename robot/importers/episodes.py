@@ -7,7 +7,7 @@ of strongest contact so far stay in memory.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import cached_property, partial
+from functools import cache, partial
 from string import ascii_lowercase
 
 import numpy as np
@@ -25,49 +25,31 @@ MOMENT_SUFFIXES = {"before": "_before", "during": "", "after": "_after"}
 """Suffix of the columns of each moment."""
 
 
-class Episode:
-    """The pictures of one episode, read on first use of any of them."""
+def episode_images(steps: Callable[[], Iterable[Step]], fingers: int, labels: Sequence[str] | None = None) -> Images:
+    """Return the images of an episode's grasp by column, each as a function that reads it.
 
-    def __init__(self, steps: Callable[[], Iterable[Step]], fingers: int, moments: Sequence[str] | None = None) -> None:
-        """Store how to read the episode; nothing is read yet.
+    The episode is read once, on first use of any image. These functions raise ImporterError for an episode without a
+    usable touch.
 
-        Args:
-            steps: Reads the steps in order of time.
-            fingers: Gel images per step.
-            moments: Label of each step, or None without labels.
-        """
-        self._steps, self._fingers, self._moments = steps, fingers, moments
+    Args:
+        steps: Reads the steps in order of time.
+        fingers: Gel images per step.
+        labels: Moment of each step; None without labels.
+    """
+    moments = labels or ("before", "during")
 
-    def images(self) -> Images:
-        """Return the images of the grasp by column, each as a function that reads it.
+    @cache
+    def read() -> dict[str, Picture]:
+        found = _labelled_steps(iter(steps()), moments) if labels else _peak_contact_steps(iter(steps()))
+        touches = {
+            f"touch_{finger}{MOMENT_SUFFIXES[moment]}": touch
+            for moment, (_, gels) in found.items()
+            for finger, touch in zip(ascii_lowercase, gels, strict=False)
+        }
+        return {"photo": next(iter(found.values()))[0], **touches}
 
-        These functions raise ImporterError for an episode without a usable touch.
-        """
-        moments = self._moments or ("before", "during")
-        columns = [
-            f"touch_{finger}{MOMENT_SUFFIXES[moment]}"
-            for finger in ascii_lowercase[: self._fingers]
-            for moment in moments
-        ]
-        return {column: partial(self._picture, column) for column in ("photo", *columns)}
-
-    def _picture(self, column: str) -> Picture:
-        return self._pictures[column]
-
-    @cached_property
-    def _pictures(self) -> dict[str, Picture]:
-        return dict(self._read())
-
-    def _read(self) -> Iterator[tuple[str, Picture]]:
-        steps = iter(self._steps())
-        found = _labelled_steps(steps, self._moments) if self._moments else _peak_contact_steps(steps)
-        photo = None
-        for moment, (camera, touches) in found.items():
-            photo = camera if photo is None else photo
-            for finger, touch in zip(ascii_lowercase, touches, strict=False):
-                yield f"touch_{finger}{MOMENT_SUFFIXES[moment]}", touch
-        assert photo is not None
-        yield "photo", photo
+    columns = [f"touch_{finger}{MOMENT_SUFFIXES[moment]}" for finger in ascii_lowercase[:fingers] for moment in moments]
+    return {column: partial(lambda name: read()[name], column) for column in ("photo", *columns)}
 
 
 def _labelled_steps(steps: Iterator[Step], moments: Sequence[str]) -> dict[str, Step]:

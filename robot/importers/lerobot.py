@@ -26,7 +26,7 @@ import msgspec
 import numpy as np
 
 from robot.errors import ImporterError
-from robot.importers.episodes import Episode, Picture, Step
+from robot.importers.episodes import Picture, Step, episode_images
 from robot.importers.importing import (
     NOT_STATED,
     DataSet,
@@ -196,8 +196,8 @@ class _LeRobotSource:
             fields = {key: row[key] for key in _FIELDS if row.get(key) is not None}
             sequence = row.get("sequence_id") or f"episode-{number}"
             moments = self._moments if row["length"] == len(self._moments or ()) else None
-            pictures = Episode(partial(self._steps, row), len(self.touch), moments)
-            yield Item(name, _object(row), pictures.images(), {"sequence_id": str(sequence), **fields})
+            images = episode_images(partial(self._steps, row), len(self.touch), moments)
+            yield Item(name, _object(row), images, {"sequence_id": str(sequence), **fields})
 
     # Pictures ----------------------------------------------------------------------------------------------
 

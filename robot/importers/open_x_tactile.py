@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robot.errors import ImporterError
-from robot.importers.episodes import Episode, Step
+from robot.importers.episodes import Step, episode_images
 from robot.importers.importing import NOT_STATED, DataSet, Item, Progress, import_extra, import_items, safe_name
 from robot.recording.folder import Recording
 
@@ -130,8 +130,8 @@ class _Task:
         """Yield one grasp for each episode."""
         for episode, (start, end) in enumerate(zip([0, *self.ends], self.ends, strict=False)):
             name = safe_name(self.name, f"{episode:06d}")
-            pictures = Episode(partial(self._steps, start, end), self.fingers)
-            yield Item(name, self.name, pictures.images(), {"sequence_id": f"{self.name}-{episode:06d}"})
+            images = episode_images(partial(self._steps, start, end), self.fingers)
+            yield Item(name, self.name, images, {"sequence_id": f"{self.name}-{episode:06d}"})
 
     def _steps(self, start: int, end: int) -> Iterator[Step]:
         for step in range(start, end):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from robot.errors import ImporterError
-from robot.importers.episodes import Episode
+from robot.importers.episodes import episode_images
 from robot.importers.lerobot import import_lerobot
 from tests.miniatures import encoded, pixels
 
@@ -153,10 +153,10 @@ def steps(count, pressed):
 
 
 def test_steps_of_a_long_episode_are_read_one_by_one():
-    episode = Episode(lambda: steps(500, 321), 1, None)
+    episode = episode_images(lambda: steps(500, 321), 1)
     tracemalloc.start()
     try:
-        images = {column: source() for column, source in episode.images().items()}
+        images = {column: source() for column, source in episode.items()}
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -166,7 +166,7 @@ def test_steps_of_a_long_episode_are_read_one_by_one():
 
 
 def test_labelled_moments_define_the_columns():
-    images = Episode(lambda: steps(3, 0), 1, ["before", "during", "after"]).images()
+    images = episode_images(lambda: steps(3, 0), 1, ["before", "during", "after"])
     assert sorted(images) == ["photo", "touch_a", "touch_a_after", "touch_a_before"]
     assert [images[column]()[0, 0, 0] for column in ("touch_a_before", "touch_a", "touch_a_after")] == [200, 101, 102]
 
@@ -180,6 +180,6 @@ def test_labelled_moments_define_the_columns():
     ],
 )
 def test_an_episode_without_a_touch_is_an_error(count, moments, message):
-    images = Episode(lambda: steps(count, 9), 1, moments).images()
+    images = episode_images(lambda: steps(count, 9), 1, moments)
     with pytest.raises(ImporterError, match=message):
         images["photo"]()
