@@ -16,7 +16,6 @@ import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -73,31 +72,37 @@ def import_objectfolder(src: Path, out: Path, progress: Progress | None = None) 
         raise DATA_SET.mismatch_error(src, "it is not a folder")
     is_pack = (src / "vision").is_dir() and (src / "touch").is_dir()
     if is_pack:
-        objects = [(folder.name, folder, src / "vision" / folder.name) for folder in subfolders(src / "touch")]
+        folders = [(folder.name, folder, src / "vision" / folder.name) for folder in subfolders(src / "touch")]
     else:
-        objects = [(folder.name, folder / "tactile", folder / "visual") for folder in subfolders(src)]
-    objects = [(name, touch, photo) for name, touch, photo in objects if name.isdecimal() and touch.is_dir()]
-    examples = [touch for _, touch, _ in objects for _, touch in islice(numbered_files(touch, _PICTURE), 1)]
-    if not examples:
+        folders = [(folder.name, folder / "tactile", folder / "visual") for folder in subfolders(src)]
+    objects = {
+        name: (touches, numbered_files(vision, _PICTURE))
+        for name, touch, vision in folders
+        if name.isdecimal() and (touches := numbered_files(touch, _PICTURE))
+    }
+    if not objects:
         is_raw = any((folder / "tactile_data").is_dir() for folder in subfolders(src))
         raise DATA_SET.mismatch_error(
             src, "it contains raw videos without photos" if is_raw else "it contains no touch of that kind"
         )
     facts = DATA_SET
-    if _width(examples[0]) == _SIMULATED_WIDTH:
+    if _width(next(iter(objects.values()))[0][0][1]) == _SIMULATED_WIDTH:
         facts = replace(facts, sensor=_SIMULATED, licence="CC BY 4.0", terms=_SIMULATED_TERMS)
     names = _names(src / _NAMES)
     metadata = DataSetMetadata(
-        {name: names.get(name, {}) for name, _, _ in objects}, _split(src / "split.json") if is_pack else {}
+        {name: names.get(name, {}) for name in objects}, _split(src / "split.json") if is_pack else {}
     )
-    total = sum(len(numbered_files(touch, _PICTURE)) for _, touch, _ in objects)
+    total = sum(len(touches) for touches, _ in objects.values())
     return import_items(facts, _items(objects), out, total=total, progress=progress, metadata=metadata)
 
 
-def _items(objects: Sequence[tuple[str, Path, Path]]) -> Iterator[Item | Skip]:
-    for name, touch, vision in objects:
-        photos = {match[1]: path for match, path in numbered_files(vision, _PICTURE)}
-        for number, (match, path) in enumerate(numbered_files(touch, _PICTURE)):
+_Files = list[tuple[re.Match[str], Path]]
+
+
+def _items(objects: Mapping[str, tuple[_Files, _Files]]) -> Iterator[Item | Skip]:
+    for name, (touches, pictures) in objects.items():
+        photos = {match[1]: path for match, path in pictures}
+        for number, (match, path) in enumerate(touches):
             if not photos:
                 yield Skip("its object has no photo", safe_name(name, match[1]))
                 continue
