@@ -129,27 +129,3 @@ def test_a_full_disk_leaves_complete_lines(tmp_path):
         log._file = file
         log.append(MISSED)
     assert read_attempts(tmp_path, GRASPS) == list(ALL[:3])
-
-
-def test_a_missing_log_has_no_attempts(tmp_path):
-    assert read_attempts(tmp_path, GRASPS) == []
-
-
-# Acceptance -------------------------------------------------------------------------------------------------
-
-
-def test_attempts_are_counted_by_object():
-    mug, cup = tally(ALL).values()
-    assert (mug.object_id, mug.attempts, mug.accepted) == ("mug", 3, 1)
-    assert mug.outcomes == {"held": 1, "no_plan": 1, "missed": 1}
-    assert (cup.attempts, cup.accepted) == (1, 1)
-
-
-def test_the_table_has_a_line_for_each_object_and_marks_missing_grasps():
-    assert acceptance_table(list(tally(ALL).values()), grasps_target=1).splitlines() == [
-        "object     accepted  of  held  missed  slipped  no_plan",
-        "mug               1   3     1       1        0        1",
-        "cup, blue         1   1     0       0        1        0",
-        "all               2   4     1       1        1        1",
-    ]
-    assert acceptance_table(list(tally(ALL).values()), grasps_target=2).count("gave up") == 2
