@@ -33,7 +33,6 @@ from retrieval.model.checkpoint_info import (
 )
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
-from retrieval.model.fusion_scorer import GelCheck
 from retrieval.model.gel_head import GelHead
 from retrieval.model.posterior import Posterior
 from retrieval.model.reference_calibration import ReferenceCalibration
@@ -42,16 +41,6 @@ from retrieval.version import __version__
 
 _QUERIES = "queries.touch_partials"
 _GEL_HEAD = "gel_head."
-_DTYPES = {
-    torch.float16,
-    torch.bfloat16,
-    torch.float32,
-    torch.float64,
-    torch.int32,
-    torch.int64,
-    torch.bool,
-    torch.uint8,
-}
 
 
 @dataclass(frozen=True)
@@ -115,16 +104,10 @@ def save_checkpoint(
     *,
     split: Split | None,
     provenance: Mapping[str, Any],
-    posterior: Posterior | None = None,
-    gel_check: GelCheck | None = None,
-    verification: VerificationCalibration | None = None,
-    queries: NDArray[np.float16] | None = None,
-    references: ReferenceCalibration | None = None,
-    pooled_posterior: Posterior | None = None,
-    pooled_references: ReferenceCalibration | None = None,
     float16: bool = False,
+    **calibrations: Any,
 ) -> None:
-    """Write `path` and its model card (the same name with .md) atomically.
+    """Write `path` and its model card, as `store_checkpoint`.
 
     Args:
         path: A name that ends in .safetensors.
@@ -132,36 +115,41 @@ def save_checkpoint(
         config: Its settings.
         split: Its training, validation and test objects.
         provenance: Source, step, seed, data digest, licences of the data and metrics of the training.
-        posterior: Calibration of its logits.
-        gel_check: Thresholds of its gel head.
-        verification: Error rates of verifications with its logits.
-        queries: (Q, partial) partial activations of validation touches.
-        references: Calibration of reference touches.
-        pooled_posterior: Calibration of the logits without late interaction; stored only if the model has cells.
-        pooled_references: As `references`, of the same logits.
+        float16: As for `store_checkpoint`.
+        **calibrations: Further fields of `Checkpoint`, such as `posterior`; None for those left out.
+
+    Raises:
+        CheckpointError: The file cannot be written, or a weight exceeds float16.
+    """
+    calibrations = {"gel_check": None, "verification": None, **calibrations}
+    made = Checkpoint(path, "", config, dict(provenance), matcher=matcher, split=split, **calibrations)
+    store_checkpoint(made, path, float16=float16)
+
+
+def store_checkpoint(checkpoint: Checkpoint, path: Path, *, float16: bool = False) -> None:
+    """Write a checkpoint and its model card (the same name with .md) atomically.
+
+    Args:
+        checkpoint: The checkpoint; the calibrations without late interaction are stored only if the model has cells.
+        path: A name that ends in .safetensors.
         float16: Store weights as float16, which halves the file. Loading converts them to float32.
 
     Raises:
         CheckpointError: The file cannot be written, or a weight exceeds float16.
     """
     require_writable(path)
-    header = {
-        "config": config.to_dict(),
-        "split": split.to_dict() if split else None,
-        "posterior": posterior.to_dict() if posterior else None,
-        "gel_check": gel_check.to_dict() if gel_check else None,
-        "verification": verification.to_dict() if verification else None,
-        "references": references.to_dict() if references else None,
-        "provenance": dict(provenance),
-    }
-    if config.matcher.cell_dim:
-        header["pooled_posterior"] = pooled_posterior.to_dict() if pooled_posterior else None
-        header["pooled_references"] = pooled_references.to_dict() if pooled_references else None
-    state = matcher.state_dict()
+    parts = ["split", "posterior", "gel_check", "verification", "references"]
+    if checkpoint.config.matcher.cell_dim:
+        parts += ["pooled_posterior", "pooled_references"]
+    header: dict[str, Any] = {"config": checkpoint.config.to_dict(), "provenance": dict(checkpoint.provenance)}
+    for name in parts:
+        part = getattr(checkpoint, name)
+        header[name] = part.to_dict() if part else None
+    state = checkpoint.matcher.state_dict()
     if float16:
         state = as_float16(state, path)
-    if queries is not None:
-        state[_QUERIES] = torch.from_numpy(queries)
+    if checkpoint.queries is not None:
+        state[_QUERIES] = torch.from_numpy(checkpoint.queries)
     write_tensors(path, state, header)
     write_atomically(sibling_file(path, ".md"), _model_card(path.name, header).encode())
 
@@ -172,19 +160,6 @@ def as_float16(state: Mapping[str, Tensor], path: Path) -> dict[str, Tensor]:
     if over := [name for name, tensor in half.items() if not bool(torch.isfinite(tensor).all())]:
         raise CheckpointError(f"{path}: {over[0]} exceeds 65504, the limit of float16; store it as float32")
     return half
-
-
-CHECKPOINT_FIELDS = (
-    *("split", "provenance", "posterior", "gel_check", "verification", "queries", "references"),
-    *("pooled_posterior", "pooled_references"),
-)
-"""Fields of a checkpoint that are stored in addition to matcher and configuration."""
-
-
-def store_checkpoint(checkpoint: Checkpoint, path: Path, *, float16: bool = False) -> None:
-    """Write a loaded checkpoint to `path`, as `save_checkpoint` does."""
-    fields = {name: getattr(checkpoint, name) for name in CHECKPOINT_FIELDS}
-    save_checkpoint(path, checkpoint.matcher, checkpoint.config, **fields, float16=float16)
 
 
 def require_writable(path: Path) -> None:
@@ -228,8 +203,14 @@ def load_checkpoint(path: str | Path, *, info: CheckpointInfo | None = None) -> 
     info = info or checkpoint_info(path, header)
     try:
         split = None if header["split"] is None else Split.from_dict(header["split"])
-        posterior, references = _calibration(header, "posterior", "references")
-        pooled_posterior, pooled_references = _calibration(header, "pooled_posterior", "pooled_references")
+        posterior, pooled_posterior = (
+            None if header.get(name) is None else Posterior.from_dict(header[name])
+            for name in ("posterior", "pooled_posterior")
+        )
+        references, pooled_references = (
+            None if header.get(name) is None else ReferenceCalibration.from_dict(header[name])
+            for name in ("references", "pooled_references")
+        )
         queries = state.pop(_QUERIES, None)
         partial = info.config.matcher.touch_partial_width
         if queries is not None and (queries.dtype != torch.float16 or queries.shape[1:] != (partial,)):
@@ -259,17 +240,6 @@ def load_checkpoint(path: str | Path, *, info: CheckpointInfo | None = None) -> 
         references,
         pooled_posterior,
         pooled_references,
-    )
-
-
-def _calibration(
-    header: Mapping[str, Any], posterior: str, references: str
-) -> tuple[Posterior | None, ReferenceCalibration | None]:
-    """Return the calibration under these keys of a header. Raises BadInput if it is damaged."""
-    found, touches = header.get(posterior), header.get(references)
-    return (
-        None if found is None else Posterior.from_dict(found),
-        None if touches is None else ReferenceCalibration.from_dict(touches),
     )
 
 
@@ -318,7 +288,7 @@ def read_tensors(path: Path, *, check: bool = True) -> tuple[dict[str, Tensor], 
         check: Verify the checksum, and that every weight is finite.
 
     Raises:
-        CheckpointError: The file is missing or damaged, or has a data type that checkpoints do not use.
+        CheckpointError: The file is missing or damaged.
     """
     header = read_header(path)
     try:
@@ -326,9 +296,6 @@ def read_tensors(path: Path, *, check: bool = True) -> tuple[dict[str, Tensor], 
             state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError, MemoryError) as error:
         raise unreadable(path, error) from error
-    for name, tensor in state.items():
-        if tensor.dtype not in _DTYPES:
-            raise CheckpointError(f"{path}: {name} is {tensor.dtype}, a data type that checkpoints never contain")
     checksum = header.pop("sha256", None)
     if check and checksum != tensors_digest(state, json.dumps(header)):
         raise CheckpointError(f"{path} is damaged: its checksum does not match; restore the file or train again")

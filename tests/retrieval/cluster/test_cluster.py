@@ -21,12 +21,11 @@ import retrieval
 from indexes.store.folder import IndexStore
 from indexes.store.sharded import read_sharded_manifest
 from retrieval.data.catalogue import list_catalogue
-from retrieval.errors import BadInput, IncompleteSearch, TooManyUnreadable
+from retrieval.errors import BadInput, IncompleteSearch
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search.build.build_index import build_index
 from retrieval.search.query.searcher import Searcher
 from retrieval.search.sharding.build_sharded import build_sharded
-from tests import ray_processes, reference_model, serving, synthetic
+from tests import ray_processes, serving, synthetic
 from tests.waiting import first_line, run_process
 
 pytestmark = [
@@ -89,24 +88,6 @@ def test_results_equal_those_of_the_folder(count, served, searcher, grasps):
         assert ours.index["shards"] == 4
 
 
-def test_reference_touches_give_the_results_of_the_folder(ray, catalogue_with_touches, touches, tmp_path):
-    model = reference_model.write_reference_model(tmp_path / "model.safetensors")
-    build_index(catalogue_with_touches, model, tmp_path / "index", quiet=True)
-    build_sharded(catalogue_with_touches, model, tmp_path / "cluster", 2, quiet=True)
-    with (
-        Searcher.open(tmp_path / "cluster", shards=deployments(ray, wait_s=120.0).open) as ours,
-        Searcher.open(tmp_path / "index") as theirs,
-    ):
-        for name in reference_model.NAMES[:3]:
-            mine, whole = (one.query(touches[name][2], top=8) for one in (ours, theirs))
-            assert names(mine) == names(whole)
-            assert numbers(mine) == pytest.approx(numbers(whole), abs=1e-5)
-            for one, other in zip(mine.results, whole.results, strict=True):
-                assert (one.reference and one.reference.touch) == (other.reference and other.reference.touch)
-        gel = f"{reference_model.NAMES[0]}/touch_1_b.png"
-        assert ours.shard.rows([gel, "absent"]) == theirs.shard.rows([gel, "absent"])
-
-
 def test_everything_listens_only_on_this_machine(served, touch):
     served.query(touch)
     found = ray_processes.listening_addresses()
@@ -134,20 +115,6 @@ def test_a_shard_uses_one_blas_thread(cluster):
     output = subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout.split()
     assert output
     assert set(output) == {"1"}
-
-
-def test_closing_deployments_does_not_affect_others(ray, cluster, served, grasps):
-    other = deployments(ray, wait_s=120.0)
-    searcher = Searcher.open(cluster, shards=other.open)
-    assert names(searcher.query(grasps[0])) == names(served.query(grasps[0]))
-    before = set(ray.serve.status().applications)
-    other.close()
-    deadline = time.monotonic() + 60
-    while len(before & set(ray.serve.status().applications)) > 4 and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert len(before) == 8
-    assert len(ray.serve.status().applications) == 4
-    assert served.query(grasps[0]).results
 
 
 HOLDING = """
@@ -309,16 +276,6 @@ def test_shards_built_by_ray_equal_those_built_in_process(ray, catalogue, cluste
         np.testing.assert_allclose(
             np.frombuffer(partial, np.float16), np.frombuffer(theirs[name], np.float16), atol=2e-3
         )
-
-
-def test_an_error_of_a_remote_build_is_raised_as_a_clear_error(ray, catalogue, model, tmp_path):
-    from retrieval.cluster.building import ray_runner
-
-    shutil.copytree(catalogue, tmp_path / "catalog")
-    for photo in list((tmp_path / "catalog").glob("*/2.jpg"))[:4]:
-        photo.write_bytes(b"not an image")
-    with pytest.raises(TooManyUnreadable, match="4 of 24 photos cannot be read"):
-        build_sharded(tmp_path / "catalog", load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=ray_runner())
 
 
 @pytest.fixture

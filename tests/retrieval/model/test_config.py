@@ -111,11 +111,6 @@ def test_a_file_that_is_not_toml_is_named(tmp_path, content):
 # Refused values --------------------------------------------------------------------------------------------
 
 
-def test_an_unknown_table_is_refused_with_the_known_ones():
-    with pytest.raises(ConfigError, match="it has no setting 'model'; known settings: matcher, preproc"):
-        Config.from_dict({"model": {}})
-
-
 @pytest.mark.parametrize("table", TABLES)
 def test_an_unknown_key_is_refused_with_the_known_ones(table):
     known = ", ".join(sorted({*TABLES[table], *(["workers"] if table == "training" else [])}))
@@ -180,14 +175,6 @@ def test_a_checkpoint_is_usable_without_the_loss_that_trained_it():
         "triplet": 1.0,
     }
     assert Config.from_dict(config.to_dict()) == config
-
-
-def test_a_file_names_a_weight_after_its_loss():
-    config = Config.from_dict({"training": {"listwise_weight": 1}})
-    assert config.training.weights == {"contrastive": 0.0, "listwise": 1.0, "pooled_listwise": 0.0}
-    table = config.to_dict()["training"]
-    assert (table["contrastive_weight"], table["listwise_weight"]) == (0.0, 1.0)
-    assert "weights" not in table
 
 
 def test_the_held_out_fractions_must_leave_objects_to_train_on():

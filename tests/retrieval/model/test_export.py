@@ -102,15 +102,6 @@ def test_the_gel_head_is_exported_too(fingers, tmp_path):
             np.testing.assert_allclose(ours.encode(touches).readings, expected, atol=1e-5)
 
 
-def test_the_torch_encoder_gives_the_same_as_encode_touches(model):
-    matcher = load_checkpoint(model).matcher
-    touches = touches_of(2, 2, 32)
-    partial, embedding, *_ = TorchEncoder(matcher).encode(touches)
-    encoding = encode_touches(matcher, touches)
-    assert np.array_equal(partial, encoding.partial.numpy())
-    assert np.array_equal(embedding, encoding.embedding.numpy())
-
-
 # In a query ------------------------------------------------------------------------------------------------------
 
 
@@ -137,22 +128,6 @@ def test_with_an_export_a_query_runs_with_torch_blocked(model_copy, index, touch
     document = json.loads(done.stdout)
     assert document["index"]["encoder"] == "onnx"
     assert len(document["results"]) == 8
-
-
-def test_with_an_export_a_query_in_a_small_index_imports_no_faiss_and_nothing_for_plots_or_training(
-    model_copy, index, touch
-):
-    export(load_checkpoint(model_copy))
-    unused = ["torch", "faiss", "scipy", "sklearn", "matplotlib", "onnx", "robot", "jinja2", "typer", "rich"]
-    code = f"""
-import sys
-import retrieval
-with retrieval.open({str(index)!r}) as searcher:
-    searcher.query({[str(path) for path in touch]!r}, candidates=2)
-print([name for name in {unused!r} if name in sys.modules])
-"""
-    done = run_blocked(code, ())
-    assert (done.stdout.strip(), done.stderr) == ("[]", "")
 
 
 def test_a_stale_export_is_not_used_and_a_warning_is_logged(model_copy, index, touch, catalogue, tmp_path, caplog):

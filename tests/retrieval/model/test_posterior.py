@@ -124,18 +124,6 @@ def test_after_the_further_grasps_and_no_fewer_the_best_object_is_more_likely_th
     assert posterior.more_grasps(logit, 3, grasps, prior) == (matches[0] if matches else None)
 
 
-def test_dependent_grasps_weigh_less_than_independent_ones():
-    alike, apart = Posterior(2.0, 0.0, dependence=1.0), Posterior(2.0, 0.0, dependence=0.0)
-    assert [alike.weight(grasps) for grasps in (1, 2, 4)] == [2.0, 1.0, 0.5]  # the sum of four becomes their mean
-    assert [apart.weight(grasps) for grasps in (1, 2, 4)] == [2.0, 2.0, 2.0]
-    assert Posterior(2.0, 0.0, dependence=0.5).weight(3) == 1.0
-
-
-def test_an_object_with_one_photo_has_its_match_logit():
-    logits = Posterior(0.37, 1.0, 0.4).object_logits([1.25, -3.5], np.array([0, 1]), np.array([1, 1]), grasps=3)
-    assert logits == pytest.approx([1.25, -3.5], abs=1e-12)
-
-
 def test_an_objects_logit_averages_the_likelihoods_of_its_photos():
     posterior = Posterior(0.8, 0.3, 0.5)
     scores, owner, counts = np.array([2.0, -1.0, 0.5, 3.0]), np.array([0, 1, 0, 1]), np.array([2, 3])
@@ -227,12 +215,6 @@ def test_two_objects_are_too_few_to_fit_on():
     owner = np.array([0, 1])
     with pytest.raises(BadInput, match="at least three objects"):
         fit_posterior(ScoredTouches(np.eye(2), owner, owner, np.zeros((2, 2), dtype=bool)))
-
-
-def test_touches_without_another_photo_of_their_object_are_refused():
-    owner = np.arange(3)
-    with pytest.raises(BadInput, match="another photo of their object; got 3 objects and 0 such touches"):
-        fit_posterior(ScoredTouches(np.eye(3), owner, owner, np.ones((3, 3), dtype=bool)))
 
 
 @pytest.mark.parametrize(
