@@ -94,13 +94,6 @@ def test_the_camera_gets_the_frame_rate_and_the_pictures_have_the_requested_size
     assert device.values[cv2.CAP_PROP_FPS] == 15.0
 
 
-def test_without_a_size_the_camera_reports_that_of_its_pictures(make):
-    camera = make(FakeVideoDevice(size=(64, 48)), sensor="uvc")
-    assert (camera.width, camera.height) == (None, None)
-    with camera:
-        assert (camera.width, camera.height) == (64, 48)
-
-
 def test_async_read_returns_each_frame_once_and_read_latest_again(make):
     device = FakeVideoDevice()
     with make(device, sensor="uvc") as camera:
@@ -109,13 +102,6 @@ def test_async_read_returns_each_frame_once_and_read_latest_again(make):
         device.frozen = True
         for _ in range(2):
             wait_until(lambda: np.array_equal(camera.read_latest(600_000), device.picture(device.pictures)[..., ::-1]))
-
-
-def test_read_waits_for_a_frame_that_is_newer_than_the_call(make):
-    device = FakeVideoDevice(fps=20)
-    with make(device, sensor="uvc") as camera:
-        before = device.pictures
-        assert camera.read()[0, 0, 2] > before  # blue is the number of the picture
 
 
 def read_on(read, **limit):
@@ -166,11 +152,6 @@ def test_a_camera_that_cannot_be_opened_is_a_connection_error(make):
     with pytest.raises(ConnectionError, match=r"usb-Fake.* cannot be opened; is it used by another program"):
         camera.connect()
     assert not camera.is_connected
-
-
-def test_a_setting_that_the_camera_refuses_is_logged(make, caplog):
-    with make(FakeVideoDevice(stubborn=[cv2.CAP_PROP_FPS]), sensor="uvc", fps=60):
-        assert "refused the setting fps: requested 60, has 15" in caplog.text
 
 
 def test_wrong_settings_are_refused_without_the_device(make):

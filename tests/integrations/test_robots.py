@@ -211,26 +211,12 @@ def test_a_ur_arm_moves_at_the_requested_speed_and_reports_the_pose_of_the_rigs_
     assert fake.pose[:3] == pytest.approx([0.53, 0.06, 0.2])  # origin + pose, and the tool above the fingertips
 
 
-def test_two_motions_of_a_ur_arm_follow_each_other(ur):
-    _, arm = ur
-    moves_and_reports(arm, Pose(30.0, -40.0, 100.0, 0.5), 150.0)
-    moves_and_reports(arm, Pose(-30.0, 40.0, 200.0, 0.0), 50.0)
-
-
 def test_a_ur_arm_is_stopped_after_a_protective_stop(ur):
     fake, arm = ur
     fake.is_stopped = True
     with pytest.raises(DeviceError, match=r"move_to of ur_arm:URArm failed: the robot stopped itself; unlock it"):
         arm.move_to(Pose(0.0, 0.0, 100.0, 0.0), 100.0)
     assert fake.calls[-1] == "stopL"
-
-
-def test_a_ur_arm_does_not_move_to_a_pose_outside_its_safety_limits(ur):
-    fake, arm = ur
-    fake.reachable = False
-    with pytest.raises(DeviceError, match="cannot reach"):
-        arm.move_to(Pose(0.0, 0.0, 100.0, 0.0), 100.0)
-    assert "moveL" not in str(fake.calls)
 
 
 @pytest.mark.parametrize("yaw_rad", [-2.0, 0.0, 1.5])

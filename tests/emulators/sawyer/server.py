@@ -1,6 +1,6 @@
-"""A rosbridge server with an emulated arm: a real websocket, the robot's topics and IK service, and faults.
+"""A rosbridge server with an emulated arm: a real websocket, the robot's topics and IK service.
 
-    python -m tests.emulators.sawyer.server --port 9090 [--faults 0.02 --seed 0]
+    python -m tests.emulators.sawyer.server --port 9090
 
 It does not use the driver's code for messages, so tests check that code independently.
 """
@@ -12,10 +12,9 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from tests.emulators.faults import FaultInjector
 from tests.emulators.interrupts import until_interrupted
 from tests.emulators.sawyer.arm import SawyerModel, forward, inverse
 
@@ -23,19 +22,7 @@ JOINT_NAMES = [f"right_j{number}" for number in range(7)]
 LIMB = "/robot/limb/right/"
 IK_SERVICE = "/ExternalTools/right/PositionKinematicsNode/IKService"
 TIP = "right_hand"
-
-MESSAGE_FAULTS = ("dropped", "duplicated", "corrupted")
-REPLY_FAULTS = (*MESSAGE_FAULTS, "delayed", "wrong_id", "ik_failed", "disconnected")
-
-
-class MessageFaults(FaultInjector):
-    """Faults of messages.
-
-    A message is dropped, duplicated or corrupted (truncated). A reply of a service can also be delayed, have a
-    wrong_id, be ik_failed, or be replaced by a disconnected connection. A command can be command_dropped.
-    """
-
-    KINDS = (*REPLY_FAULTS, "command_dropped")
+RATE_HZ = 100.0
 
 
 class RosbridgeClient:
@@ -63,25 +50,18 @@ class EmulatedSawyer:
     Attributes:
         silent: Topics that are not sent.
         refuse_ik: Number of IK calls to refuse.
-        reply_delay_s: Delay of replies.
         commands: Received joint commands as (time_s, positions), newest last.
     """
 
-    def __init__(
-        self, *, model: SawyerModel | None = None, faults: MessageFaults | None = None, rate_hz: float = 100.0
-    ) -> None:
+    def __init__(self, *, model: SawyerModel | None = None) -> None:
         self.model = model or SawyerModel()
-        self.faults = faults or MessageFaults()
-        self.rate_hz = rate_hz
         self.silent: set[str] = set()
         self.refuse_ik = 0
-        self.reply_delay_s = 0.0
         self.commands: deque[tuple[float, list[float]]] = deque(maxlen=5000)
         self.calls = 0
         self._lock = threading.RLock()
         self._clients: set[RosbridgeClient] = set()
         self._latched: dict[str, Mapping[str, Any]] = {}
-        self._later: list[tuple[float, RosbridgeClient, str]] = []
         self._ended = threading.Event()
         self._now = time.monotonic()
 
@@ -118,14 +98,10 @@ class EmulatedSawyer:
 
     def run(self) -> None:
         """Move the arm and publish its state until `end` is called."""
-        while not self._ended.wait(1.0 / self.rate_hz):
+        while not self._ended.wait(1.0 / RATE_HZ):
             with self._lock:
                 self._advance()
                 self._publish_all()
-                due = [reply for reply in self._later if reply[0] <= self._now]
-                self._later = [reply for reply in self._later if reply[0] > self._now]
-            for _, client, text in due:
-                client.send(text)
 
     def end(self) -> None:
         """Stop `run`."""
@@ -142,7 +118,7 @@ class EmulatedSawyer:
             if clients and topic not in self.silent:
                 text = json.dumps({"op": "publish", "topic": topic, "msg": make()})
                 for client in clients:
-                    self._send(client, text, MESSAGE_FAULTS)
+                    client.send(text)
 
     def _topics(self) -> Mapping[str, Callable[[], Mapping[str, Any]]]:
         return {
@@ -228,33 +204,16 @@ class EmulatedSawyer:
             raise ValueError(f"only position mode, 1, is emulated, got {message['mode']}")
         positions = dict(zip(message["names"], message["position"], strict=True))
         target = [float(positions[name]) for name in JOINT_NAMES]
-        if self.faults.draw(["command_dropped"]) is None:
-            self._advance()
-            self.model.command(target)
-            self.commands.append((self._now, target))
+        self._advance()
+        self.model.command(target)
+        self.commands.append((self._now, target))
 
     def _call_service(self, client: RosbridgeClient, operation: Mapping[str, Any]) -> None:
         self.calls += 1
         exists = operation["service"] == IK_SERVICE
         values = self._solve(operation["args"]) if exists else f"Service {operation['service']} does not exist"
         reply = {"op": "service_response", "service": operation["service"], "values": values, "result": exists}
-        self._reply(client, reply | {"id": operation.get("id")})
-
-    def _reply(self, client: RosbridgeClient, reply: dict[str, Any]) -> None:
-        fault = self.faults.draw(REPLY_FAULTS)
-        if fault == "disconnected":
-            client.drop()
-            return
-        if fault == "wrong_id":
-            reply["id"] = f"not-{reply['id']}"
-        if fault == "ik_failed" and isinstance(reply["values"], dict):
-            reply["values"] = {"joints": [{"name": [], "position": []}], "result_type": [-1]}
-        delay_s = self.reply_delay_s + (0.3 if fault == "delayed" else 0.0)
-        for text in _damaged(json.dumps(reply), fault):
-            if delay_s:
-                self._later.append((time.monotonic() + delay_s, client, text))
-            else:
-                client.send(text)
+        client.send(json.dumps(reply | {"id": operation.get("id")}))
 
     def _solve(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Return joint positions for each pose and seed; result_type -1: no solution, -3: the tip does not exist."""
@@ -283,15 +242,6 @@ class EmulatedSawyer:
         seed = arguments["seed_angles"][index]
         positions = dict(zip(seed["name"], seed["position"], strict=True))
         return [float(positions[name]) for name in JOINT_NAMES]
-
-    def _send(self, client: RosbridgeClient, text: str, possible: Sequence[str]) -> None:
-        for part in _damaged(text, self.faults.draw(possible)):
-            client.send(part)
-
-
-def _damaged(text: str, fault: str | None) -> list[str]:
-    """Return the texts that replace a message."""
-    return {"dropped": [], "duplicated": [text, text], "corrupted": [text[: len(text) // 2]]}.get(fault or "", [text])
 
 
 def _header() -> dict[str, Any]:
@@ -324,16 +274,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--host", default="127.0.0.1")
     parser.add_argument("--port", type=int, default=9090)
-    parser.add_argument("--faults", type=float, default=0.0, help="fraction of operations with a fault")
-    parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    emulator = EmulatedSawyer(faults=MessageFaults(options.faults, seed=options.seed))
-    with until_interrupted(), serve(emulator, options.host, options.port) as url:
+    with until_interrupted(), serve(EmulatedSawyer(), options.host, options.port) as url:
         print(f"emulated arm behind rosbridge at {url}; press Ctrl-C to stop", flush=True)
         threading.Event().wait()
-    for kind, count in sorted(emulator.faults.counts.items()):
-        if count:
-            print(f"{kind}: {count}")
 
 
 if __name__ == "__main__":

@@ -3,11 +3,12 @@
 A line is a stream: a late packet delays all packets behind it, and the order never changes.
 """
 
+import random
+import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from robot.drivers.wsg50.codec import Packet, WireError, encode
-from tests.emulators.faults import FaultInjector
 
 
 @dataclass(frozen=True)
@@ -18,20 +19,28 @@ class Piece:
     pause_s: float = 0.0
 
 
-class LineFaults(FaultInjector):
-    """Damages packets. `delay_s` is the delay of a delayed packet, and the pause within a split one."""
+class LineFaults:
+    """Damages a fraction `rate` of the packets, with uniformly drawn `kinds`; `counts` counts them. Thread-safe.
+
+    `delay_s` is the delay of a delayed packet, and the pause within a split one.
+    """
 
     KINDS = ("dropped", "duplicated", "corrupted", "delayed", "split", "wrong id", "disconnect")
 
     def __init__(
         self, rate: float = 0.0, kinds: Sequence[str] | None = None, *, seed: int = 0, delay_s: float = 0.05
     ) -> None:
-        super().__init__(rate, kinds, seed=seed)
-        self.delay_s = delay_s
+        self.rate, self.kinds, self.delay_s = rate, tuple(kinds or self.KINDS), delay_s
+        self.counts = dict.fromkeys(self.kinds, 0)
+        self._random, self._lock = random.Random(seed), threading.Lock()
 
     def on(self, packet: Packet) -> Iterator[Piece]:
         """Yield the pieces of a packet on the line."""
-        kind, data = self.draw(self.KINDS), encode(packet)
+        kind, data = None, encode(packet)
+        with self._lock:
+            if self._random.random() < self.rate:
+                kind = self._random.choice(self.kinds)
+                self.counts[kind] += 1
         yield from self._damaged(kind, packet, data) if kind else [Piece(data)]
 
     def _damaged(self, kind: str, packet: Packet, data: bytes) -> Iterator[Piece]:

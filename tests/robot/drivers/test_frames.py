@@ -85,14 +85,6 @@ def test_the_newest_frame_is_returned_and_the_newest_few_are_buffered(script, ma
     assert [reader.near(time_s).time_s for time_s in (0.0, 3.2, 4.4, 4.6, 99.0)] == [3.0, 3.0, 4.0, 5.0, 6.0]
 
 
-def test_frames_of_the_warm_up_are_dropped(script, make):
-    script.show(0.1, 0.9, 1.0)
-    reader = make(ReaderSettings(warmup_s=1.0, timeout_s=5.0))
-    reader.start()
-    assert reader.near(0.0).time_s == 1.0
-    assert reader.frame_count == 3
-
-
 def test_a_camera_without_frames_raises_after_the_timeout(script, make):
     reader = make(ReaderSettings(warmup_s=0.0, timeout_s=0.02))
     with pytest.raises(DeviceError, match=r"eye returned no picture within 0\.02 s: no frame arrived"):
@@ -206,18 +198,6 @@ def test_a_frozen_stream_is_stale_long_before_it_is_opened_again(script, make):
     assert gel.reader.lost_count == 0
 
 
-def test_a_stream_frozen_for_long_is_lost_with_this_reason(script, make):
-    reader = make(ReaderSettings(warmup_s=0.0, timeout_s=0.05, frozen_s=2.0), backoff_s=(ENOUGH_S, ENOUGH_S))
-    script.show(0.0, 1.0, 2.0, picture=7)
-    reader.start()
-    wait_for_frames(reader, 3)
-    assert reader.lost_count == 0
-    script.show(2.1, picture=7)
-    wait_until(lambda: reader.lost_count)
-    with pytest.raises(DeviceError, match=r"frozen: the same picture for 2\.1 s"):
-        reader.newest()
-
-
 def test_closing_ends_the_thread_and_closes_the_camera_also_twice_and_before_starting(script, make):
     make().close()
     script.show(1.0)
@@ -229,16 +209,6 @@ def test_closing_ends_the_thread_and_closes_the_camera_also_twice_and_before_sta
     reader.close()
     assert not own_threads()
     assert script.closed == script.opened == 1
-
-
-def test_closing_ends_a_thread_that_waits_to_reopen_its_camera(script, make):
-    script.show(1.0)
-    reader = make(ReaderSettings(warmup_s=0.0), backoff_s=(100.0, 100.0))
-    reader.start()
-    script.items.put(DeviceError("gone"))
-    wait_until(lambda: reader.lost_count)
-    reader.close()
-    assert not own_threads()
 
 
 def test_closing_raises_if_the_driver_blocks_and_the_camera_is_closed_later(script, make, monkeypatch):

@@ -64,12 +64,6 @@ def test_a_camera_named_by_a_number_is_refused_with_the_names_of_those_connected
         OpencvTactile(finger="a", device=device)
 
 
-@pytest.mark.parametrize("device", ["", "video0", "usb-Maker_Gel-video-index0"])
-def test_a_camera_that_is_not_named_by_an_absolute_path_is_refused(dev, device):
-    with pytest.raises(RobotConfigError, match=f"named by its absolute path, got '{device}'"):
-        OpencvTactile(finger="a", device=device, allow_index=True)
-
-
 def test_without_stable_names_the_message_names_allow_index(dev):
     with pytest.raises(RobotConfigError, match="set allow_index = true"):
         OpencvTactile(finger="a", device="0")
@@ -159,12 +153,6 @@ def test_settings_that_the_camera_refuses_are_reported_with_the_actual_values(pl
         assert gel.settings()["fps"] == 15.0
 
 
-def test_by_default_only_automatic_exposure_and_white_balance_are_written(plug):
-    camera = FakeVideoDevice()
-    with OpencvTactile(finger="a", device=plug(camera), **QUICK):
-        assert camera.written == [(cv2.CAP_PROP_AUTO_EXPOSURE, 1), (cv2.CAP_PROP_AUTO_WB, 0)]
-
-
 def test_the_zoom_control_of_a_digit_sets_its_brightness(plug):
     camera = FakeVideoDevice()
     with Digit(finger="a", device=plug(camera), led=[15, 2, 1], **QUICK) as gel:
@@ -251,16 +239,6 @@ def test_pictures_without_three_colours_are_a_device_error_with_the_remedy(plug,
         make(finger="a", device=plug(camera), **QUICK).connect()
 
 
-def test_numbers_that_are_not_finite_never_reach_the_settings(plug):
-    camera = FakeVideoDevice()
-    for number, value in ((cv2.CAP_PROP_GAIN, math.nan), (cv2.CAP_PROP_FPS, math.inf), (cv2.CAP_PROP_FOURCC, 1e300)):
-        camera.values[number] = value
-    with OpencvTactile(finger="a", device=plug(camera), gain=None, **QUICK) as gel:
-        found = gel.settings()
-    assert (found["gain"], found["fps"]) == (None, None)
-    json.dumps(found, allow_nan=False)
-
-
 def test_the_time_of_a_picture_is_that_at_which_its_buffer_was_filled(plug):
     camera = FakeVideoDevice(stamps=True)
     stream = CaptureStream(plug(camera), CaptureSettings(), lambda: 1e6)
@@ -315,17 +293,6 @@ def test_a_camera_reconnected_under_another_number_gets_its_settings_again(plug)
         assert gel.refused == {"fps": "requested 30, has 15"}
     assert not first.open_captures
     assert not second.open_captures
-
-
-def test_a_disconnected_camera_is_an_error_also_in_recovery(plug, dev):
-    camera = FakeVideoDevice()
-    with OpencvTactile(finger="a", device=plug(camera), warmup_s=0.0, timeout_s=0.3) as gel:
-        camera.dead = True
-        (dev / "video0").unlink()
-        with pytest.raises(DeviceError, match="does not exist; is the camera plugged in"):
-            gel.recover()
-        with pytest.raises(DeviceError, match="does not exist; is the camera plugged in"):
-            gel.read()
 
 
 def test_a_frozen_camera_is_an_error(plug):

@@ -237,19 +237,17 @@ def test_a_missing_package_is_a_device_error_that_names_the_extra(monkeypatch):
 
 @pytest.mark.parametrize("by", STARTED, ids=STARTED_IDS)
 def test_the_emulator_runs_as_a_process_and_ends_with_ctrl_c(by):
-    command = [sys.executable, "-m", "tests.emulators.sawyer.server", "--port", "0", "--faults", "1"]
+    command = [sys.executable, "-m", "tests.emulators.sawyer.server", "--port", "0"]
     with run_process([*by, *command]) as process:
         url = next(word for word in first_line(process).split() if word.startswith("ws://")).rstrip(";")
         link = RosbridgeLink(url, timeout_s=60.0)
         link.open()
         link.subscribe("/robot/joint_states", "sensor_msgs/JointState")
-        with contextlib.suppress(DeviceError):  # every message may be damaged
-            link.wait_for("/robot/joint_states", timeout_s=1.0)
+        link.wait_for("/robot/joint_states")
         link.close()
         process.send_signal(signal.SIGINT)
-        counts, _ = process.communicate(timeout=60)
+        process.communicate(timeout=60)
     assert process.returncode == 0
-    assert "corrupted: " in counts or "duplicated: " in counts
 
 
 def test_the_module_can_be_imported_without_optional_packages():

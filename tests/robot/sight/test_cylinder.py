@@ -5,7 +5,6 @@ of noise at 0.9 m, with and without 10 % of outliers. The fit's standard error m
 """
 
 import math
-import time
 
 import numpy as np
 import pytest
@@ -83,19 +82,6 @@ def test_the_naive_fit_fails_on_the_same_pictures():
     assert wild[2] > 33 + 50  # and outliers blow the radius up
 
 
-def test_the_fit_is_deterministic():
-    image = view(UprightCylinder(33, 120, X, Y), **NOISY)
-    assert fit_cylinder(image, views.camera_pose()) == fit_cylinder(image, views.camera_pose())
-
-
-def test_an_error_of_the_extrinsics_moves_the_fit_as_much():
-    image, moved = view(UprightCylinder(33, 120, X, Y)), views.camera_pose()
-    moved[:2, 3] += (8.0, -5.0)
-    fit = fit_cylinder(image, moved)
-    assert math.hypot(fit.x_mm - X - 8, fit.y_mm - Y + 5) < 1.0
-    assert fit.notes == ()
-
-
 # Other shapes ------------------------------------------------------------------------------------------------
 
 BOXES = {
@@ -147,14 +133,6 @@ def test_a_ball_is_round():
     for fit in fits(DepthBall(35, X, Y)):
         assert off_centre(fit) < 3.0
         assert fit.is_round
-
-
-def test_too_few_points_on_the_side_give_the_enclosing_circle_and_a_note():
-    for fit in fits(UprightCylinder(25, 8, X, Y)):
-        assert fit.method == "enclosing circle"
-        assert off_centre(fit) < 4.0
-        assert fit.radius_mm == pytest.approx(25, abs=3)
-        assert "points on its side: the smallest circle" in fit.notes[0]
 
 
 def test_a_short_arc_gives_no_circle_and_a_large_error():
@@ -252,24 +230,6 @@ def test_a_table_at_another_height_than_calibrated_is_found_and_noted():
     assert fit.height_mm == pytest.approx(120, abs=2)
 
 
-def test_a_table_that_is_hardly_visible_is_taken_from_the_calibration():
-    image, pose = view(UprightCylinder(60, 150, X, Y)), views.camera_pose()
-    rays = Rays.from_image(image, pose)
-    height = image.depth_m * 1000 * rays.along(np.array([0.0, 0.0, 1.0])) + pose[2, 3]
-    depth = np.where(height < 45, np.nan, image.depth_m).astype(np.float32)
-    fit = fit_cylinder(RGBD(image.colour, depth, image.intrinsics, 0.0), pose)
-    assert fit.notes[0].startswith("too little of the table is visible: z = 0")
-    assert off_centre(fit) < 1.0
-
-
-def test_a_fit_takes_milliseconds():
-    """The loose bound detects only a slowdown of 50 times; the benchmark `cylinder` prints the time."""
-    image, pose = view(UprightCylinder(33, 120, X, Y), **NOISY), views.camera_pose()
-    start = time.process_time()
-    fit_cylinder(image, pose)
-    assert time.process_time() - start < 1.0
-
-
 # Width -------------------------------------------------------------------------------------------------------
 
 
@@ -301,8 +261,3 @@ def test_fingers_that_pass_between_the_corners_meet_the_end_of_a_box():
     fit = CylinderFit(0, 0, 100, 10, 1, "box", (10.0, 75.0))
     assert fit.width_mm(0.0, 25.0) == pytest.approx(20.0)
     assert fit.width_mm(0.2, 25.0) == pytest.approx(25.4736, abs=1e-3)
-
-
-def test_a_round_object_has_the_same_width_in_all_directions():
-    fit = CylinderFit(0, 0, 100, 30, 1, "circle", (30.0, 30.0))
-    assert {fit.width_mm(yaw, 25.0) for yaw in (0.0, 1.0, 2.0)} == {60.0}
