@@ -48,8 +48,10 @@ class ManualArm(Arm):
 
     def _move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
         """Ask for the pose; raise RobotConfigError without a terminal."""
-        if self._at is not None and is_near(self._at, pose):
-            return self._at
+        if self._at is not None:
+            turn = math.remainder(pose.yaw_rad - self._at.yaw_rad, math.tau)
+            if math.dist(self._at.as_tuple()[:3], pose.as_tuple()[:3]) <= NEAR_MM and abs(turn) <= NEAR_RAD:
+                return self._at
         self._at = None
         try:
             self._ask(describe_pose(pose))
@@ -62,12 +64,6 @@ class ManualArm(Arm):
         if self._at is None:
             raise DeviceError(f"{self.name}: the pose is unknown before the first motion; call move_to first")
         return self._at
-
-
-def is_near(here: Pose, there: Pose) -> bool:
-    """Return whether two poses are equal to a person: within 1 mm and 1 degree."""
-    turn = math.remainder(there.yaw_rad - here.yaw_rad, math.tau)
-    return math.dist(here.as_tuple()[:3], there.as_tuple()[:3]) <= NEAR_MM and abs(turn) <= NEAR_RAD
 
 
 def describe_pose(pose: Pose) -> str:

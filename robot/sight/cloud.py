@@ -112,14 +112,9 @@ def find_table(depth_mm: Depth, rays: Rays) -> TablePlane:
     off = near[:, 2] - _heights(plane, near)
     noise = 1.4826 * float(np.median(np.abs(off))) / max(abs(_steepness(rays)), 0.1)
     a, b, c = map(float, plane)
-    return TablePlane(a, b, c, max(noise, 0.3), _table_notes(a, b, c))
-
-
-def _table_notes(a: float, b: float, c: float) -> tuple[str, ...]:
     slope = float(np.degrees(np.arctan(np.hypot(a, b))))
-    if abs(c) < 15.0 and slope < 2.0:
-        return ()
-    return (f"the camera measures a table {c:.0f} mm high and {slope:.1f} degrees steep: calibrate the camera again",)
+    note = f"the camera measures a table {c:.0f} mm high and {slope:.1f} degrees steep: calibrate the camera again"
+    return TablePlane(a, b, c, max(noise, 0.3), (note,) if abs(c) >= 15.0 or slope >= 2.0 else ())
 
 
 def _steepness(rays: Rays) -> float:

@@ -175,7 +175,9 @@ def _fit(object_points: ObjectPoints, rays: Rays) -> CylinderFit:
     lying = (fit_lying_cylinder(points, box, along, eye) for along in (True, False))
     candidates = [
         _upright_candidate(points, top, noise, rays, box),
-        _box_candidate(points, box, top, noise),
+        _Candidate(box, "box", _CRUDE_MM)
+        if (np.abs(points[:, 2] - top) < 2 * noise).mean() > _MIN_TOP_FRACTION
+        else _Candidate(box, "box", _GUESS_MM, note="its top is not visible, so the place of its far side is a guess"),
         *(_Candidate(solid, "lying", _CRUDE_MM) for solid in lying if solid is not None),
     ]
     best = min(candidates, key=lambda candidate: candidate.solid.misfit(points, noise, rays.pose[:3, 3]))
@@ -183,7 +185,7 @@ def _fit(object_points: ObjectPoints, rays: Rays) -> CylinderFit:
         best = _enclosing_candidate(points, top, "no simple solid fits the visible points", _ROUGH_MM)
     if object_points.is_cut_off and best.arc_deg < _MIN_CUT_OFF_ARC_DEG:
         raise PlanError("the object touches the border of the picture, and its visible part is too small to locate it")
-    return _to_fit(best, points, noise, _notes(object_points, best, points, noise))
+    return _to_fit(object_points, best, points, noise)
 
 
 def _loss(solid: Solid, points: Array, noise: float) -> float:
@@ -191,17 +193,15 @@ def _loss(solid: Solid, points: Array, noise: float) -> float:
     return float((np.minimum(solid.distance(points) / (OUTLIER_CUT * noise), 1.0) ** 2).mean())
 
 
-def _box_candidate(points: Array, box: Cuboid, top: float, noise: float) -> _Candidate:
-    """Return the box as a candidate; without a visible top, its far side is a guess."""
-    if (np.abs(points[:, 2] - top) < 2 * noise).mean() > _MIN_TOP_FRACTION:
-        return _Candidate(box, "box", _CRUDE_MM)
-    return _Candidate(box, "box", _GUESS_MM, note="its top is not visible, so the place of its far side is a guess")
-
-
-def _to_fit(best: _Candidate, points: Array, noise: float, notes: tuple[str, ...]) -> CylinderFit:
+def _to_fit(object_points: ObjectPoints, best: _Candidate, points: Array, noise: float) -> CylinderFit:
     """Convert the candidate to an upright cylinder with the footprint of its solid."""
     solid = best.solid
     residual_mm = OUTLIER_CUT * noise * math.sqrt(_loss(solid, points, noise))
+    notes = [*object_points.table.notes, best.note]
+    if object_points.is_cut_off:
+        notes.append("it touches the border of the picture: a part of it is not visible")
+    if (solid.distance(points) > OUTLIER_CUT * noise).mean() > _MAX_OUTLIER_FRACTION:
+        notes.append("it is not a simple solid: many points lie off the fitted surface")
     return CylinderFit(
         solid.x,
         solid.y,
@@ -213,17 +213,8 @@ def _to_fit(best: _Candidate, points: Array, noise: float, notes: tuple[str, ...
         solid.yaw_rad,
         len(points),
         best.arc_deg,
-        notes,
+        tuple(note for note in notes if note),
     )
-
-
-def _notes(object_points: ObjectPoints, best: _Candidate, points: Array, noise: float) -> tuple[str, ...]:
-    notes = [*object_points.table.notes, best.note]
-    if object_points.is_cut_off:
-        notes.append("it touches the border of the picture: a part of it is not visible")
-    if (best.solid.distance(points) > OUTLIER_CUT * noise).mean() > _MAX_OUTLIER_FRACTION:
-        notes.append("it is not a simple solid: many points lie off the fitted surface")
-    return tuple(note for note in notes if note)
 
 
 def _top(points: Array, noise: float) -> float:

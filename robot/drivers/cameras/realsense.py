@@ -55,23 +55,16 @@ class RealSense(VendorCamera):
             found = [str(each.get_info(rs.camera_info.serial_number)) for each in rs.context().query_devices()]
             serial = found[self._choose_camera(self._options.serial, found)]
             pipeline = rs.pipeline()
-            profile = pipeline.start(self._config(rs, serial))
+            config, size = rs.config(), (self._options.width, self._options.height)
+            config.enable_device(serial)
+            config.enable_stream(rs.stream.depth, *size, rs.format.z16, self._options.fps)
+            config.enable_stream(rs.stream.color, *size, rs.format.rgb8, self._options.fps)
+            profile = pipeline.start(config)
             self._pipeline = pipeline  # now `_close` stops it
             self._align = rs.align(rs.stream.color)
             self._read_parameters(rs, profile, serial)
             for _ in range(self._options.warmup_frames):
                 self._wait()
-
-    def _config(self, rs: Any, serial: str) -> Any:
-        config = rs.config()
-        config.enable_device(serial)
-        config.enable_stream(
-            rs.stream.depth, self._options.width, self._options.height, rs.format.z16, self._options.fps
-        )
-        config.enable_stream(
-            rs.stream.color, self._options.width, self._options.height, rs.format.rgb8, self._options.fps
-        )
-        return config
 
     def _read_parameters(self, rs: Any, profile: Any, serial: str) -> None:
         """Read the depth scale, the intrinsics and the distortion."""

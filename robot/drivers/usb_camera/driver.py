@@ -14,7 +14,13 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.devices import Camera, Clock, Device, TactileSensor
-from robot.drivers.usb_camera.stream import CaptureReader, CaptureSettings, UsbCameraSettings
+from robot.drivers.usb_camera.stream import (
+    CaptureSettings,
+    CaptureStream,
+    FrameReader,
+    UsbCameraSettings,
+    stable_path,
+)
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import RGBD, Frame
 from robot.settings import bounded
@@ -24,24 +30,39 @@ _MAX_PX = 20_000
 
 
 class UsbDevice(Device):
-    """The common part of the devices behind a USB camera: the reader of its stream."""
+    """The common part of the devices behind a USB camera: its stream."""
 
-    _reader: CaptureReader
     _options: UsbCameraSettings
+    _path: str
+    _reader: FrameReader | None = None
+    _camera: dict[str, Any] = {}  # noqa: RUF012
+
+    def _open_stream(self) -> CaptureStream:
+        """Open the camera, then write and read back its settings; the reader calls this after each loss too."""
+        stream = CaptureStream(self._path, self._options, self.clock)
+        self.refused.clear()
+        self.refused.update(stream.refused)
+        self._camera = {"device": self._options.device, **stream.settings}
+        return stream
 
     def _connect(self) -> None:
-        self._reader = CaptureReader(self, self._options)
+        self._reader = FrameReader(self.name, self._open_stream, self._options, clock=self.clock)
         self._reader.start()
 
     def _close(self) -> None:
-        self._reader.close()
+        self._connected_reader.close()
 
     def _settings(self) -> dict[str, Any]:
         """Return the camera's settings of the last opening of its stream."""
-        return dict(self._reader.camera)
+        return dict(self._camera)
 
     def _recover(self) -> None:
-        self._reader.recover()
+        self._connected_reader.recover()
+
+    @property
+    def _connected_reader(self) -> FrameReader:
+        assert self._reader is not None, "the base class refuses calls before connecting"
+        return self._reader
 
 
 # Gels --------------------------------------------------------------------------------------------------------
@@ -104,7 +125,7 @@ class OpencvTactile(UsbDevice, TactileSensor):
             led=options.led or preset.led,
             crop=options.crop or self.CROP,
         )
-        self._reader = CaptureReader(self, self._options)
+        self._path = stable_path(options.device, options.allow_index)
         self._picture_px: list[int] = []
 
     def read_after(self, time_s: float, timeout_s: float) -> Frame:
@@ -113,7 +134,7 @@ class OpencvTactile(UsbDevice, TactileSensor):
         Unlike `read`, it waits for a lost stream no longer than this. With `timeout_s` 0 it does not wait at all.
         """
         with self._use("cannot be read"):
-            return self._picture(self._reader.after(time_s, timeout_s))
+            return self._picture(self._connected_reader.after(time_s, timeout_s))
 
     def _connect(self) -> None:
         super()._connect()
@@ -124,10 +145,10 @@ class OpencvTactile(UsbDevice, TactileSensor):
         return {**super()._settings(), "picture_px": self._picture_px}
 
     def _read(self) -> Frame:
-        return self._picture(self._reader.newest())
+        return self._picture(self._connected_reader.newest())
 
     def _read_near(self, time_s: float) -> Frame:
-        return self._picture(self._reader.near(time_s))
+        return self._picture(self._connected_reader.near(time_s))
 
     def _picture(self, frame: Frame) -> Frame:
         """Rotate, crop, then convert to RGB. The conversion is last, because it is faster with fewer pixels."""
@@ -215,10 +236,10 @@ class UvcCamera(UsbDevice, Camera):
         """Check the settings without using the device; raise RobotConfigError for one out of range."""
         super().__init__("usb camera", extrinsics, clock=clock)
         self._options = UvcSettings(**settings)
-        self._reader = CaptureReader(self, self._options)
+        self._path = stable_path(self._options.device, self._options.allow_index)
 
     def _read(self, depth: bool) -> RGBD:
-        frame = self._reader.newest()
+        frame = self._connected_reader.newest()
         colour = to_rgb(frame.pixels)
         if self._options.upside_down:
             colour = np.ascontiguousarray(colour[::-1, ::-1])

@@ -28,7 +28,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from robot.devices import Clock, Device
+from robot.devices import Clock
 from robot.drivers import discover
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import Frame
@@ -208,8 +208,10 @@ class CaptureStream:
         """Return the next frame, (H, W, 3) uint8 BGR; raise DeviceError if the stream has ended."""
         while True:
             with self._errors():
-                grabbed = self._capture.grab()
-                time_s = self._time()
+                grabbed, time_s = self._capture.grab(), self.clock()
+                stamp_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+                if _STAMP_S[0] <= time_s - stamp_s <= _STAMP_S[1]:  # it is on the rig's clock
+                    time_s = stamp_s
                 complete, pixels = self._capture.retrieve() if grabbed else (False, None)
             if complete and pixels is not None and pixels.size:
                 self._damaged = 0
@@ -222,12 +224,6 @@ class CaptureStream:
         """Release the camera; a second call does nothing."""
         with contextlib.suppress(cv2.error):
             self._capture.release()
-
-    def _time(self) -> float:
-        """Return the picture's own time stamp if it is on the rig's clock, else the current time."""
-        now = self.clock()
-        stamp = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-        return stamp if _STAMP_S[0] <= now - stamp <= _STAMP_S[1] else now
 
     def _write(self, settings: CaptureSettings) -> dict[str, Any]:
         requested = settings.requested()
@@ -364,9 +360,10 @@ class FrameReader:
         """Return the buffered frame nearest to `time_s`, on a tie the newer one; raise DeviceError without frames."""
         return min(self._wait(self.settings.timeout_s), key=lambda frame: (abs(frame.time_s - time_s), -frame.time_s))
 
-    def reopen_now(self) -> None:
-        """Open a lost stream again without further delay."""
+    def recover(self) -> None:
+        """Open a lost stream without further delay and wait for a frame."""
         self._reopen.set()
+        self.after(self.clock())
 
     def close(self) -> None:
         """Stop the thread, which closes the stream; raise DeviceError if the camera's driver blocks it."""
@@ -404,7 +401,13 @@ class FrameReader:
                 self._store(stream.next())
                 delay = shortest
             except Exception as error:  # the thread must survive, and readers get the reason
-                self._handle_failure(stream, error, delay)
+                with self._changed:
+                    self._frames.clear()
+                    self._last_error = str(error) or type(error).__name__
+                    self.lost_count += 1
+                log.warning("%s: %s; reopening in %.2g s (loss %d)", self.name, error, delay, self.lost_count)
+                if stream is not None:
+                    stream.close()
                 stream = None
                 self._reopen.wait(delay)
                 self._reopen.clear()
@@ -424,41 +427,3 @@ class FrameReader:
             if frame.time_s >= self._warm_s:
                 self._frames.append(frame)
                 self._changed.notify_all()
-
-    def _handle_failure(self, stream: "CaptureStream | None", error: Exception, delay: float) -> None:
-        with self._changed:
-            self._frames.clear()
-            self._last_error = str(error) or type(error).__name__
-            self.lost_count += 1
-        log.warning("%s: %s; reopening in %.2g s (loss %d)", self.name, self._last_error, delay, self.lost_count)
-        if stream is not None:
-            stream.close()
-
-
-class CaptureReader(FrameReader):
-    """Frame reader of one camera.
-
-    Attributes:
-        camera: Settings read back at the last opening of the stream.
-        refused: The owner's dictionary of refused settings, updated at each opening.
-    """
-
-    def __init__(self, owner: Device, requested: UsbCameraSettings) -> None:
-        """Check the path without opening it; raise RobotConfigError if `device` is not a stable name."""
-        super().__init__(owner.name, self._open_camera, requested, clock=owner.clock)
-        self.requested, self.refused = requested, owner.refused
-        self._path = stable_path(requested.device, requested.allow_index)
-        self.camera: dict[str, Any] = {}
-
-    def _open_camera(self) -> CaptureStream:
-        """Open the camera, then write and read back its settings; the thread calls this after each loss too."""
-        stream = CaptureStream(self._path, self.requested, self.clock)
-        self.refused.clear()
-        self.refused.update(stream.refused)
-        self.camera = {"device": self.requested.device, **stream.settings}
-        return stream
-
-    def recover(self) -> None:
-        """Open a lost stream without further delay and wait for a frame."""
-        self.reopen_now()
-        self.after(self.clock())

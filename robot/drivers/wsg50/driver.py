@@ -398,7 +398,7 @@ class WSG50(Gripper):
                 break
             if now > deadline:
                 raise DeviceError(f"the gripper did not end {command_name(packet.id)} in time and still moves")
-        link.require_sync()
+        link.needs_sync = True
         self._stop_updates()
         return status
 

@@ -64,6 +64,7 @@ class Link:
     Attributes:
         updates: For each updating command, its last parameters and their time of arrival (s, time.monotonic).
         has_echoed: Whether a gripper has answered over the open port.
+        needs_sync: Whether the next command must synchronise first.
     """
 
     def __init__(self, name: str, *, baud: int = 115200, stop_bits: int = 1, timeout_s: float = 1.0) -> None:
@@ -73,7 +74,7 @@ class Link:
         self._port: Any = None
         self._buffer = bytearray()
         self._last_byte_s = 0.0
-        self._needs_sync = True
+        self.needs_sync = True
         self._tokens = itertools.count(int.from_bytes(os.urandom(6), "little"))
 
     @property
@@ -104,7 +105,7 @@ class Link:
             raise LinkLost(f"the gripper's port {self.name} cannot be opened: {_first_line(error)}") from error
         self._buffer.clear()
         self.updates.clear()
-        self._needs_sync = True
+        self.needs_sync = True
 
     def close(self) -> None:
         """Close the port if it is open; never raises."""
@@ -138,15 +139,15 @@ class Link:
             except (NoReply, WireError):
                 if not left:
                     raise
-                self._needs_sync = True
+                self.needs_sync = True
         raise AssertionError("the loop returns or raises")
 
     def begin(self, packet: Packet) -> None:
         """Send a command whose replies `poll` returns; synchronise first if necessary."""
         self.pump(0.0)
-        if self._needs_sync:
+        if self.needs_sync:
             self.sync()
-        self._needs_sync = True
+        self.needs_sync = True
         self._write(encode(packet))
 
     def poll(self, command_id: int, timeout_s: float) -> Status | None:
@@ -159,7 +160,7 @@ class Link:
             self._write(encode(packet))
             self._result(packet.id)
         finally:
-            self._needs_sync = True
+            self.needs_sync = True
 
     def sync(self) -> None:
         """Synchronise: have the gripper echo a fresh token, and drop all packets before it."""
@@ -170,7 +171,7 @@ class Link:
             self._write(encode(Packet(CommandId.LOOP, token)))
             echo = Packet(CommandId.LOOP, bytes(2) + token)
             if any(packet == echo for packet in self._packets(self.timeout_s)):
-                self._needs_sync, self.has_echoed = False, True
+                self.needs_sync, self.has_echoed = False, True
                 return
         raise NoEcho(f"the gripper at {self.name} did not answer within {self.timeout_s:g} s; is it on and connected?")
 
@@ -178,21 +179,17 @@ class Link:
         """Complete a packet whose damaged length would swallow the next command; call it before a repetition."""
         self._write(_PADDING)
 
-    def require_sync(self) -> None:
-        """Make the next command synchronise first."""
-        self._needs_sync = True
-
     def pump(self, seconds: float) -> None:
         """Process the packets that arrive within `seconds`; 0: those that have arrived."""
         for packet in self._packets(seconds):
-            self._needs_sync |= packet.id not in codec.UPDATING
+            self.needs_sync |= packet.id not in codec.UPDATING
 
     def _result(self, command_id: int) -> bytes:
         """Return the parameters of the final reply to the last command."""
         for status, parameters in self._replies(command_id, self.timeout_s):
             if status is Status.CMD_PENDING:
                 continue
-            self._needs_sync = False
+            self.needs_sync = False
             if status is Status.CHECKSUM_ERROR:
                 raise NoReply(f"the gripper received {command_name(command_id)} damaged (CHECKSUM_ERROR)")
             if status is not Status.SUCCESS:

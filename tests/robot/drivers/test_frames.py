@@ -146,7 +146,7 @@ def test_a_lost_stream_can_be_opened_again_without_delay(script, make):
     script.items.put(DeviceError("gone"))
     wait_until(lambda: reader.lost_count)
     script.show(2.0)
-    reader.reopen_now()
+    reader._reopen.set()
     assert reader.newest().time_s == 2.0
 
 
