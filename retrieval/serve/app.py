@@ -5,11 +5,9 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import anyio.to_thread
 from fastapi import FastAPI
-from pydantic import BaseModel
 from starlette.staticfiles import StaticFiles
 from threadpoolctl import threadpool_limits
 
@@ -19,13 +17,12 @@ from retrieval.serve.decoders import Decoders
 from retrieval.serve.generations import Generations
 from retrieval.serve.history_writer import HistoryWriter, Recorder
 from retrieval.serve.metrics import Metrics
-from retrieval.serve.queries import VerifyBody
 from retrieval.serve.queue import Queue
 from retrieval.serve.security import Guard
 from retrieval.serve.service import LiveRig, Service
 from retrieval.serve.settings import ServiceSettings
 from retrieval.serve.trials import Trials
-from retrieval.serve.uploads import BatchBody, BodyLimit, QueryBody
+from retrieval.serve.uploads import BodyLimit
 from retrieval.version import __version__
 
 THREADS = 4
@@ -36,8 +33,6 @@ MAX_FRAMES = 8
 """Maximum number of pending requests for single sensor pictures, in addition to streams."""
 _CLOSING_S = 1.0
 """Time for each queue to close; work that hangs is abandoned."""
-_BODIES: tuple[type[BaseModel], ...] = (QueryBody, BatchBody, VerifyBody, errors.ProblemDocument)
-"""Models that the OpenAPI document lacks, because the routes parse their bodies themselves."""
 
 
 def create_app(
@@ -86,14 +81,13 @@ def create_app(
         docs_url=None,  # the default page loads scripts from other hosts
         redoc_url=None,
         lifespan=_lifespan,
-        separate_input_output_schemas=False,
+        responses=errors.PROBLEM_RESPONSES,
     )
     app.state.service = parts
     errors.install_handlers(app)
     for module in (queries, catalogue, live, history, human_baseline, health):
         app.include_router(module.router)
     app.mount("/", StaticFiles(directory=Path(__file__).parent / "page", html=True))
-    app.openapi = lambda: _document(app)  # type: ignore[method-assign]
     app.add_middleware(BodyLimit, seconds=settings.body_s)
     app.add_middleware(Guard, settings=settings, metrics=metrics)
     return app
@@ -123,24 +117,3 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         await asyncio.gather(*(asyncio.to_thread(queue.close, _CLOSING_S) for queue in queues))
         if parts.history_writer:
             await asyncio.to_thread(parts.history_writer.close)
-
-
-def _document(app: FastAPI) -> dict[str, Any]:
-    """Return the OpenAPI document, including the bodies that the routes parse themselves."""
-    if app.openapi_schema is None:
-        document = FastAPI.openapi(app)
-        schemas = document.setdefault("components", {}).setdefault("schemas", {})
-        for model in _BODIES:
-            schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
-            schemas |= schema.pop("$defs", {})
-            schemas[model.__name__] = schema
-        for name in ("HTTPValidationError", "ValidationError"):  # the service returns problem documents instead
-            schemas.pop(name, None)
-        for path in document["paths"].values():
-            for operation in path.values():
-                if "application/json" in operation["responses"].get("422", {}).get("content", {}):
-                    operation["responses"] |= {
-                        str(status): response for status, response in errors.problem_responses("bad-input").items()
-                    }
-        app.openapi_schema = document
-    return app.openapi_schema

@@ -24,7 +24,7 @@ from retrieval.serve.documents import (
     NearPhotosDocument,
     PhotoDocument,
 )
-from retrieval.serve.errors import HttpProblem, problem_responses
+from retrieval.serve.errors import HttpProblem
 from retrieval.serve.generations import ServedGeneration
 from retrieval.serve.history_writer import as_png_or_jpeg
 from retrieval.serve.service import Parts
@@ -67,7 +67,7 @@ Search = Annotated[
 ObjectFilter = Annotated[str | None, Query(max_length=1000, alias="object", description="Only photos of this object.")]
 
 
-@router.get("/v1/catalogue", responses=problem_responses("bad-input", "not-ready"))
+@router.get("/v1/catalogue")
 def catalogue(
     parts: Parts, offset: Offset = 0, limit: Limit = 100, search: Search = "", name: ObjectFilter = None
 ) -> CatalogueDocument:
@@ -89,7 +89,9 @@ def _document(photo: ListedPhoto) -> PhotoDocument:
 
 
 @router.get(
-    "/v1/photos/{photo:path}", response_class=Response, responses={**IMAGE_RESPONSES, **problem_responses("unknown")}
+    "/v1/photos/{photo:path}",
+    response_class=Response,
+    responses=IMAGE_RESPONSES,
 )
 def photo(request: Request, photo: str, parts: Parts) -> Response:
     """Return the file of a photo or of a reference gel image; formats that browsers lack are converted to JPEG."""
@@ -107,7 +109,7 @@ def photo(request: Request, photo: str, parts: Parts) -> Response:
 @router.get(
     "/v1/thumbnails/{photo:path}",
     response_class=Response,
-    responses={**IMAGE_RESPONSES, **problem_responses("unknown")},
+    responses=IMAGE_RESPONSES,
 )
 def get_thumbnail(
     request: Request,
@@ -162,7 +164,7 @@ def image_response(data: bytes, headers: Mapping[str, str] | None = None) -> Res
     return Response(data, media_type=kind, headers=headers)
 
 
-@router.get("/v1/nearest/{photo:path}", responses=problem_responses("unknown", "bad-input"))
+@router.get("/v1/nearest/{photo:path}")
 def nearest(photo: str, parts: Parts, count: Annotated[int, Query(ge=1, le=100)] = 12) -> NearPhotosDocument:
     """Return visually similar photos, by the model's embeddings."""
     generation = parts.generations.current
@@ -174,7 +176,7 @@ def nearest(photo: str, parts: Parts, count: Annotated[int, Query(ge=1, le=100)]
     return NearPhotosDocument(generation=generation.name, photo=photo, items=items)
 
 
-@router.get("/v1/index", responses=problem_responses("not-ready"))
+@router.get("/v1/index")
 def index(parts: Parts) -> IndexDocument:
     """Return a description of the index, its model and the service."""
     generation = parts.generations.current

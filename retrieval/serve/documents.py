@@ -11,43 +11,6 @@ from pydantic import BaseModel, Field
 from retrieval.model.verification import DecisionBounds
 from retrieval.search.query.answer import NearestReference
 
-EXAMPLE: dict[str, Any] = {
-    "query": {
-        "touches": [["grasp 1, finger a (48120 bytes)", "grasp 1, finger b (47903 bytes)"]],
-        "grasps": ["contact"],
-    },
-    "index": {
-        "path": "index",
-        "generation": "gen-000007",
-        "kind": "flat",
-        "photos": 60,
-        "objects": 20,
-        "scored": 60,
-        "encoder": "onnx",
-        "catalogue": "/data/catalog",
-        "model": "/data/model.safetensors",
-        "trained_on": "simulated rig",
-    },
-    "timing_ms": {"decode": 2.1, "encode": 14.0, "candidates": 0.1, "rerank": 0.6, "total": 17.0},
-    "verdict": "match",
-    "none_probability": 0.02,
-    "unlisted_probability": 0.02,
-    "more_grasps": None,
-    "advice": None,
-    "posterior": {"none_prior": 0.5, "grasps": 1, "objects": 20, "scored_objects": 20, "unscored_probability": 0.0},
-    "results": [
-        {
-            "rank": 1,
-            "object_id": "mug",
-            "logit": 3.2,
-            "probability": 0.96,
-            "probability_if_present": 0.98,
-            "photo": "mug/1.jpg",
-            "metadata": {"material": "glazed clay"},
-        }
-    ],
-}
-
 
 class MatchDocument(BaseModel):
     """One object of a ranking, with the id of its best photo.
@@ -73,8 +36,6 @@ class QueryDocument(BaseModel):
     grasps after which the verdict is expected to be "match"; null for other verdicts than "none of these", and if more
     grasps do not help. advice: a sentence on how to get a clearer answer.
     """
-
-    model_config = {"json_schema_extra": {"examples": [EXAMPLE]}}
 
     query: dict[str, Any]
     index: dict[str, Any]

@@ -87,6 +87,15 @@ class HttpProblem(HTTPException):
         return DocumentResponse(document, status, {"cache-control": "no-store", **(self.headers or {})}, MEDIA_TYPE)
 
 
+PROBLEM_RESPONSES: dict[int | str, dict[str, Any]] = {
+    "default": {
+        "description": "A problem document (RFC 9457).",
+        "content": {MEDIA_TYPE: {"schema": ProblemDocument.model_json_schema()}},
+    }
+}
+"""OpenAPI description of all errors of a route."""
+
+
 def problem_of(error: Exception) -> HttpProblem:
     """Return the problem document for an exception."""
     match error:
@@ -125,14 +134,3 @@ def install_handlers(app: FastAPI) -> None:
 
     for kind in (HttpProblem, RetrievalError, IndexesError, RequestValidationError, ClientDisconnect, HTTPException):
         app.add_exception_handler(kind, answer)
-
-
-def problem_responses(*kinds: str) -> dict[int | str, dict[str, Any]]:
-    """Return the OpenAPI `responses` of a route for these kinds and the kinds that every route may return."""
-    found: dict[int | str, dict[str, Any]] = {}
-    for kind in (*kinds, "malformed", "no-token", "refused", "wrong-host", "failed"):
-        status, title = KINDS[kind]
-        descriptions = [title, *([found[status]["description"]] if status in found else [])]
-        schema = {"$ref": "#/components/schemas/ProblemDocument"}
-        found[status] = {"description": "; ".join(descriptions), "content": {MEDIA_TYPE: {"schema": schema}}}
-    return found

@@ -3,7 +3,7 @@
 from fastapi import APIRouter, Response
 from pydantic import BaseModel, Field
 
-from retrieval.serve.errors import HttpProblem, problem_responses
+from retrieval.serve.errors import HttpProblem
 from retrieval.serve.security import COOKIE, same_token
 from retrieval.serve.service import Parts
 from retrieval.serve.uploads import RequestBody
@@ -23,7 +23,7 @@ async def healthz() -> Health:
     return Health(status="ok")
 
 
-@router.get("/readyz", responses=problem_responses("not-ready"))
+@router.get("/readyz")
 async def ready(parts: Parts) -> Health:
     """Return "ok" and the generation if an index is open and the service is not shutting down."""
     if parts.stopping.is_set():
@@ -43,7 +43,7 @@ class SessionBody(RequestBody):
     token: str = Field(max_length=1000)
 
 
-@router.post("/v1/session", status_code=204, responses=problem_responses("bad-input", "too-large", "too-slow"))
+@router.post("/v1/session", status_code=204)
 async def session(body: SessionBody, parts: Parts) -> Response:
     """Store the token in a cookie that scripts cannot read.
 

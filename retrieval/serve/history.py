@@ -14,7 +14,7 @@ from retrieval.search.query.answer import MATCH, NONE_OF_THESE, UNCALIBRATED
 from retrieval.search.query.objects import listed_photo
 from retrieval.serve.catalogue import IMAGE_RESPONSES, image_response
 from retrieval.serve.documents import QueryDocument
-from retrieval.serve.errors import HttpProblem, problem_responses
+from retrieval.serve.errors import HttpProblem
 from retrieval.serve.generations import ServedGeneration
 from retrieval.serve.service import HistoryWriter, Parts, Service
 from retrieval.serve.store import NONE, OBJECT, RIGHT, StoredQuery
@@ -117,7 +117,7 @@ def _item(stored: StoredQuery) -> dict[str, Any]:
     }
 
 
-@router.get("/v1/history", responses=problem_responses("unknown", "bad-input"))
+@router.get("/v1/history")
 def history(
     parts: Parts,
     offset: Annotated[int, Query(ge=0, le=2**31)] = 0,
@@ -136,7 +136,7 @@ def history(
 
 
 # Fields that the original answer lacks, such as a reference touch, stay absent.
-@router.get("/v1/history/{name}", responses=problem_responses("unknown"), response_model_exclude_unset=True)
+@router.get("/v1/history/{name}", response_model_exclude_unset=True)
 def entry(name: str, parts: Parts) -> HistoryEntry:
     """Return a query with its whole answer."""
     stored = _entry(parts, name)
@@ -146,7 +146,7 @@ def entry(name: str, parts: Parts) -> HistoryEntry:
 @router.get(
     "/v1/history/{name}/touches/{grasp}/{finger}",
     response_class=Response,
-    responses={**IMAGE_RESPONSES, **problem_responses("unknown")},
+    responses=IMAGE_RESPONSES,
 )
 def touch(name: str, grasp: int, finger: str, parts: Parts) -> Response:
     """Return a gel image of a query; formats that browsers lack are converted to PNG.
@@ -162,7 +162,7 @@ def touch(name: str, grasp: int, finger: str, parts: Parts) -> Response:
 # Feedback -------------------------------------------------------------------------------------------------------------
 
 
-@router.post("/v1/feedback", status_code=201, responses=problem_responses("unknown", "bad-input", "conflict"))
+@router.post("/v1/feedback", status_code=201)
 def post_feedback(body: FeedbackBody, parts: Parts, response: Response) -> FeedbackDocument:
     """Store whether an answer is right.
 

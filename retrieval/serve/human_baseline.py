@@ -12,7 +12,7 @@ from starlette.concurrency import run_in_threadpool
 
 from retrieval.data.images import read_bytes
 from retrieval.serve.catalogue import IMAGE_RESPONSES, image_response
-from retrieval.serve.errors import HttpProblem, problem_responses
+from retrieval.serve.errors import HttpProblem
 from retrieval.serve.service import HistoryWriter, Parts, Service
 from retrieval.serve.store import HistoryStore, TrialChoice, TrialRun, new_id
 from retrieval.serve.trials import CHOICES, Trial, TrialAccuracy, Trials, trial_accuracies
@@ -116,7 +116,7 @@ def _trial(parts: Service, run: TrialRun, number: int) -> Trial:
     return _require_trials(parts)[0].trial(parts.generations.current, run.seed, number)
 
 
-@router.get("/v1/trials", responses=problem_responses("unknown"))
+@router.get("/v1/trials")
 def trials(parts: Parts) -> TrialsDocument:
     """Return the number of unseen objects, and all series of the recording."""
     known, store = _require_trials(parts)
@@ -128,7 +128,7 @@ def trials(parts: Parts) -> TrialsDocument:
     )
 
 
-@router.post("/v1/trials", status_code=201, responses=problem_responses("unknown", "bad-input"))
+@router.post("/v1/trials", status_code=201)
 def begin_run(body: RunBody, parts: Parts) -> RunDocument:
     """Begin a series of trials."""
     known, store = _require_trials(parts)
@@ -139,13 +139,13 @@ def begin_run(body: RunBody, parts: Parts) -> RunDocument:
     return _document(run, store)
 
 
-@router.get("/v1/trials/{name}", responses=problem_responses("unknown"))
+@router.get("/v1/trials/{name}")
 def get_run(name: str, parts: Parts) -> RunDocument:
     """Return a series with the accuracy of the person and of the model in the same trials."""
     return _document(_run(parts, name), _require_trials(parts)[1])
 
 
-@router.get("/v1/trials/{name}/{number}", responses=problem_responses("unknown", "bad-input"))
+@router.get("/v1/trials/{name}/{number}")
 def trial(name: str, number: Number, parts: Parts) -> TrialDocument:
     """Return a trial; the right photo is included only after the trial is done."""
     run = _run(parts, name)
@@ -160,7 +160,7 @@ def trial(name: str, number: Number, parts: Parts) -> TrialDocument:
     )
 
 
-@router.post("/v1/trials/{name}/{number}", responses=problem_responses("unknown", "bad-input", "conflict", "busy"))
+@router.post("/v1/trials/{name}/{number}")
 async def choose(body: ChoiceBody, request: Request, name: str, number: Number, parts: Parts) -> TrialDocument:
     """Store the choice of a trial, once; the response contains the right photo and the model's choice."""
     known, store = _require_trials(parts)
@@ -175,7 +175,7 @@ async def choose(body: ChoiceBody, request: Request, name: str, number: Number, 
 @router.get(
     "/v1/trials/{name}/{number}/touches/{finger}",
     response_class=Response,
-    responses={**IMAGE_RESPONSES, **problem_responses("unknown")},
+    responses=IMAGE_RESPONSES,
 )
 def touch(name: str, number: Number, finger: str, parts: Parts) -> Response:
     """Return a gel image of the trial's grasp."""
@@ -189,7 +189,7 @@ def touch(name: str, number: Number, finger: str, parts: Parts) -> Response:
 @router.get(
     "/v1/trials/{name}/{number}/photos/{place}",
     response_class=Response,
-    responses={**IMAGE_RESPONSES, **problem_responses("unknown")},
+    responses=IMAGE_RESPONSES,
 )
 def photo(name: str, number: Number, place: Annotated[int, InPath(ge=1, le=CHOICES)], parts: Parts) -> Response:
     """Return one of the trial's photos, counted from 1."""

@@ -10,7 +10,7 @@ from fastapi.responses import StreamingResponse
 
 from retrieval.search.query.objects import listed_photo
 from retrieval.serve.documents import GraspDocument
-from retrieval.serve.errors import HttpProblem, problem_responses
+from retrieval.serve.errors import HttpProblem
 from retrieval.serve.generations import ServedGeneration
 from retrieval.serve.service import Parts, Service
 
@@ -22,7 +22,7 @@ ObjectParameter = Annotated[str | None, Query(max_length=1000, alias="object", d
 Rate = Annotated[float, Query(gt=0, le=30, description="Maximum pictures per second.")]
 
 
-@router.post("/v1/grasp", responses=problem_responses("unknown", "bad-input", "failed", "busy", "late", "not-ready"))
+@router.post("/v1/grasp")
 async def grasp(request: Request, parts: Parts, name: ObjectParameter = None) -> GraspDocument:
     """Grasp one of the catalogue's objects: the named one, else a random one.
 
@@ -61,7 +61,6 @@ def _object_ids(generation: ServedGeneration, name: str | None) -> list[str]:
     response_class=Response,
     responses={
         200: {"content": {"image/jpeg": {}}, "description": "The picture."},
-        **problem_responses("unknown", "failed", "busy", "late"),
     },
 )
 async def frame(name: str, request: Request, parts: Parts) -> Response:
@@ -74,7 +73,6 @@ async def frame(name: str, request: Request, parts: Parts) -> Response:
     response_class=StreamingResponse,
     responses={
         200: {"content": {"multipart/x-mixed-replace": {}}, "description": "Endless stream of pictures (MJPEG)."},
-        **problem_responses("unknown", "failed", "busy", "late"),
     },
 )
 async def stream(name: str, request: Request, parts: Parts, rate: Rate = 10.0) -> StreamingResponse:

@@ -4,7 +4,7 @@ from fastapi import APIRouter, Request
 from pydantic import Field
 
 from retrieval.serve.documents import BatchDocument, QueryDocument, VerificationDocument
-from retrieval.serve.errors import DocumentResponse, problem_responses
+from retrieval.serve.errors import DocumentResponse
 from retrieval.serve.service import Parts
 from retrieval.serve.uploads import (
     QUERY_BODY,
@@ -20,15 +20,11 @@ from retrieval.serve.uploads import (
 )
 
 router = APIRouter(tags=["queries"])
-_PROBLEMS = problem_responses(
-    "bad-input", "bad-image", "too-large", "too-slow", "unsupported-type", "busy", "late", "not-ready"
-)
 
 
 @router.post(
     "/v1/query",
     response_model=QueryDocument,
-    responses=_PROBLEMS,
     openapi_extra={"requestBody": QUERY_BODY},
     summary="Which object is in the hand?",
 )
@@ -43,7 +39,7 @@ async def query(request: Request, parts: Parts) -> DocumentResponse:
     return DocumentResponse(result.to_dict(), headers={"x-query-id": query_id} if query_id else None)
 
 
-@router.post("/v1/query/batch", response_model=BatchDocument, responses=_PROBLEMS, openapi_extra=json_body("BatchBody"))
+@router.post("/v1/query/batch", response_model=BatchDocument, openapi_extra=json_body(BatchBody))
 async def query_batch(request: Request, parts: Parts) -> DocumentResponse:
     """Return one answer for each of several objects, in their order; their touches are encoded together."""
     parts.queue.require_capacity()
@@ -72,8 +68,7 @@ class VerifyBody(RequestBody):
 @router.post(
     "/v1/verify",
     response_model=VerificationDocument,
-    responses=_PROBLEMS,
-    openapi_extra=json_body("VerifyBody"),
+    openapi_extra=json_body(VerifyBody),
     summary="Is the expected object in the hand?",
 )
 async def verify(request: Request, parts: Parts) -> DocumentResponse:

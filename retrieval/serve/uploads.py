@@ -165,7 +165,7 @@ class BatchBody(Options):
 QUERY_BODY = {
     "required": True,
     "content": {
-        "application/json": {"schema": {"$ref": "#/components/schemas/QueryBody"}},
+        "application/json": {"schema": QueryBody.model_json_schema()},
         "multipart/form-data": {
             "schema": {
                 "type": "object",
@@ -186,10 +186,10 @@ QUERY_BODY = {
 """OpenAPI description of a query's body; FastAPI cannot describe two content types of one route."""
 
 
-def json_body(model: str) -> dict[str, Any]:
-    """Return the OpenAPI description of a JSON body with the schema `model`, which `retrieval.serve.app` adds."""
-    schema = {"$ref": f"#/components/schemas/{model}"}
-    return {"requestBody": {"required": True, "content": {"application/json": {"schema": schema}}}}
+def json_body(model: type[BaseModel]) -> dict[str, Any]:
+    """Return the OpenAPI description of a JSON body that the route parses itself, with `read_json`."""
+    content = {"application/json": {"schema": model.model_json_schema()}}
+    return {"requestBody": {"required": True, "content": content}}
 
 
 @dataclass(eq=False)
