@@ -3,8 +3,7 @@
 The index maps an id to its file. No text of a request becomes part of a file path.
 """
 
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
@@ -38,18 +37,6 @@ IMAGE_RESPONSES: dict[int | str, dict[str, Any]] = {
 }
 MAX_PHOTO_PX = 4096
 """Maximum longer side, in pixels, of a photo that is converted to JPEG."""
-
-
-def photo_of(generation: ServedGeneration, photo: str) -> ListedPhoto:
-    """Return the photo with this id.
-
-    Raises:
-        HttpProblem: The index has no such photo.
-    """
-    row = _row(generation, photo)
-    if row.get("touch"):
-        raise HttpProblem("unknown", f"{photo!r} is a gel image of a reference touch, not a photo.")
-    return listed_photo(row)
 
 
 def _row(generation: ServedGeneration, photo: str) -> dict[str, object]:
@@ -88,29 +75,13 @@ def _document(photo: ListedPhoto) -> PhotoDocument:
     return PhotoDocument(id=photo.path, object_id=photo.object_id, metadata=photo.metadata)
 
 
-@router.get(
-    "/v1/photos/{photo:path}",
-    response_class=Response,
-    responses=IMAGE_RESPONSES,
-)
+@router.get("/v1/photos/{photo:path}", response_class=Response, responses=IMAGE_RESPONSES)
 def photo(request: Request, photo: str, parts: Parts) -> Response:
     """Return the file of a photo or of a reference gel image; formats that browsers lack are converted to JPEG."""
-
-    def read(path: Path, _: dict[str, object]) -> bytes | None:
-        data = read_bytes(path)
-        if data.startswith(tuple(BROWSER_IMAGE_TYPES)):
-            return data
-        image = thumbnail(path, MAX_PHOTO_PX)
-        return None if image is None else jpeg(image)
-
-    return _catalogue_image_response(request, parts, photo, "whole", read)
+    return _catalogue_image(request, parts, photo, None)
 
 
-@router.get(
-    "/v1/thumbnails/{photo:path}",
-    response_class=Response,
-    responses=IMAGE_RESPONSES,
-)
+@router.get("/v1/thumbnails/{photo:path}", response_class=Response, responses=IMAGE_RESPONSES)
 def get_thumbnail(
     request: Request,
     photo: str,
@@ -118,11 +89,25 @@ def get_thumbnail(
     px: Annotated[int, Query(ge=32, le=1024, description="Pixels of the longer side.")] = 320,
 ) -> Response:
     """Return a photo, or a gel image of a reference touch, as a small JPEG."""
+    return _catalogue_image(request, parts, photo, px)
 
-    def read(path: Path, row: dict[str, object]) -> bytes:
-        return _thumbnail(path, str(row.get("digest")), px)
 
-    return _catalogue_image_response(request, parts, photo, str(px), read)
+def _catalogue_image(request: Request, parts: Parts, photo: str, px: int | None) -> Response:
+    """Return the photo's file, or a JPEG with `px` pixels on its longer side; 304 if the client has it."""
+    generation = parts.generations.current
+    row = _row(generation, photo)
+    headers = {"etag": f'"{row["digest"]}-{px}"', "cache-control": "private, no-cache"}
+    if request.headers.get("if-none-match") == headers["etag"]:
+        return Response(status_code=304, headers=headers)
+    path = generation.searcher.catalogue / listed_photo(row).path
+    try:
+        data = read_bytes(path) if px is None else b""
+        if not data.startswith(tuple(BROWSER_IMAGE_TYPES)):
+            data = _thumbnail(path, str(row["digest"]), px or MAX_PHOTO_PX)
+    except ImageError as error:
+        detail = f"The photo {photo!r} cannot be read any more. Run `retrieve build-index` again."
+        raise HttpProblem("unknown", detail) from error
+    return image_response(data, headers)
 
 
 @lru_cache(512)
@@ -132,25 +117,6 @@ def _thumbnail(path: Path, digest: str, px: int) -> bytes:
     if image is None:
         raise ImageError(str(path), "unreadable")
     return jpeg(image)
-
-
-def _catalogue_image_response(
-    request: Request, parts: Parts, photo: str, size: str, read: Callable[[Path, dict[str, object]], bytes | None]
-) -> Response:
-    """Return the image that `read` makes of the photo's file, or 304 if the client has it; None means unreadable."""
-    generation = parts.generations.current
-    row = _row(generation, photo)
-    headers = {"etag": f'"{row.get("digest")}-{size}"', "cache-control": "private, no-cache"}
-    if row.get("digest") and request.headers.get("if-none-match") == headers["etag"]:
-        return Response(status_code=304, headers=headers)
-    listed = listed_photo(row)
-    data = None
-    with suppress(ImageError):
-        data = read(generation.searcher.catalogue / listed.path, row)
-    if data is None:
-        detail = f"The photo {listed.path!r} cannot be read any more. Run `retrieve build-index` again."
-        raise HttpProblem("unknown", detail)
-    return image_response(data, headers)
 
 
 def image_response(data: bytes, headers: Mapping[str, str] | None = None) -> Response:
@@ -168,7 +134,8 @@ def image_response(data: bytes, headers: Mapping[str, str] | None = None) -> Res
 def nearest(photo: str, parts: Parts, count: Annotated[int, Query(ge=1, le=100)] = 12) -> NearPhotosDocument:
     """Return visually similar photos, by the model's embeddings."""
     generation = parts.generations.current
-    photo_of(generation, photo)  # raises if the photo is missing
+    if _row(generation, photo).get("touch"):
+        raise HttpProblem("unknown", f"{photo!r} is a gel image of a reference touch, not a photo.")
     items = [
         NearPhoto(**_document(near.photo).model_dump(), score=near.score)
         for near in nearest_photos(generation.searcher, photo, count)

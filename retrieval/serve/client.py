@@ -1,7 +1,6 @@
 """Client of the service: `Searcher.query` for an index on another machine."""
 
 import base64
-import io
 import os
 import time
 from collections.abc import Sequence
@@ -12,7 +11,7 @@ from urllib.parse import quote
 import numpy as np
 from PIL import Image
 
-from retrieval.data.images import read_bytes
+from retrieval.data.images import encode_image, read_bytes
 from retrieval.errors import BadInput, ImageError, RetrievalError
 from retrieval.model.gel_images import GelImage
 from retrieval.model.touches import AnyImage, AnyTouches, InputImage, parse_grasps
@@ -23,7 +22,6 @@ try:
 except ImportError as missing:
     raise BadInput("A client needs httpx. Run: pip install 'touch-retrieval[serve]'") from missing
 
-_PNG_MODES = frozenset({"1", "L", "LA", "P", "RGB", "RGBA"})
 _BAD_INPUT_KINDS = frozenset(
     {"malformed", "bad-input", "too-large", "unsupported-type", "unknown", "conflict", "no-token"}
 )
@@ -193,18 +191,7 @@ def _file(source: InputImage) -> bytes:
     image = source.image
     if isinstance(image, bytes | bytearray | memoryview):
         return bytes(image)
-    if isinstance(image, Image.Image) and image.mode in _PNG_MODES:
-        return _png(image, source.name)
     if isinstance(image, Image.Image | np.ndarray):
-        return _png(Image.fromarray(np.rint(255 * source.read()).astype(np.uint8)), source.name)
+        return encode_image(np.rint(255 * source.read()).astype(np.uint8))
     assert not isinstance(image, GelImage), "only the service reads gel images in advance"
     return read_bytes(os.fspath(image))
-
-
-def _png(image: Image.Image, name: str) -> bytes:
-    file = io.BytesIO()
-    try:
-        image.save(file, "PNG", compress_level=1, exif=image.getexif())
-    except OSError as error:  # Pillow reads lazily: the source file is damaged
-        raise ImageError(name, f"damaged or truncated: {error}") from error
-    return file.getvalue()

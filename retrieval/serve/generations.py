@@ -19,7 +19,7 @@ from retrieval.serve.settings import ServiceSettings
 
 log = logging.getLogger(__name__)
 _RETRY_S = 10.0
-"""Time after which a generation that failed to open is reported again."""
+"""Time after which a generation that failed to open is tried again."""
 
 
 class ServedGeneration:
@@ -93,19 +93,16 @@ class Generations:
         If a generation cannot be opened, the failure is logged, again every `_RETRY_S`, and the previous generation
         continues to answer.
         """
-        failed: str | None = None
-        retry_at = 0.0
+        pause_s = self._settings.poll_s
         while True:
-            await asyncio.sleep(self._settings.poll_s)
-            now, name = asyncio.get_running_loop().time(), ""  # "": the manifest cannot be read
+            await asyncio.sleep(pause_s)
+            pause_s = self._settings.poll_s
             try:
                 name = (await asyncio.to_thread(manifest_of, self._settings.index)).generation
-                if name != self.current.name and (name != failed or now >= retry_at):
+                if name != self.current.name:
                     await asyncio.to_thread(self.open)
                     log.warning("Generation %s is now served.", self.current.name)
             except Exception as error:
-                if name == failed and now < retry_at:
-                    continue
-                failed, retry_at = name, now + _RETRY_S
+                pause_s = _RETRY_S
                 self._metrics.reload_failures.inc()
                 log.warning("A new generation cannot be opened; %s is still served: %s", self.current.name, error)

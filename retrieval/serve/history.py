@@ -143,11 +143,7 @@ def entry(name: str, parts: Parts) -> HistoryEntry:
     return HistoryEntry(**_item(stored), answer=QueryDocument(**stored.answer))
 
 
-@router.get(
-    "/v1/history/{name}/touches/{grasp}/{finger}",
-    response_class=Response,
-    responses=IMAGE_RESPONSES,
-)
+@router.get("/v1/history/{name}/touches/{grasp}/{finger}", response_class=Response, responses=IMAGE_RESPONSES)
 def touch(name: str, grasp: int, finger: str, parts: Parts) -> Response:
     """Return a gel image of a query; formats that browsers lack are converted to PNG.
 

@@ -15,7 +15,7 @@ from retrieval.serve.catalogue import IMAGE_RESPONSES, image_response
 from retrieval.serve.errors import HttpProblem
 from retrieval.serve.service import HistoryWriter, Parts, Service
 from retrieval.serve.store import HistoryStore, TrialChoice, TrialRun, new_id
-from retrieval.serve.trials import CHOICES, Trial, TrialAccuracy, Trials, trial_accuracies
+from retrieval.serve.trials import CHOICES, Trial, TrialAccuracy, Trials, trial_accuracy
 from retrieval.serve.uploads import RequestBody
 
 router = APIRouter(tags=["human baseline"])
@@ -89,15 +89,14 @@ def _require_trials(parts: Service) -> tuple[Trials, HistoryStore]:
 
 def _document(run: TrialRun, store: HistoryStore) -> RunDocument:
     choices = store.choices(run.id)
-    human_baseline, model = trial_accuracies(choices)
     remaining = set(range(1, run.count + 1)) - {one.number for one in choices}
     return RunDocument(
         **vars(run),
         choices=CHOICES,
         completed=len(choices),
         next=min(remaining, default=None),
-        human_baseline=human_baseline,
-        model=model,
+        human_baseline=trial_accuracy([one.choice == one.truth for one in choices]),
+        model=trial_accuracy([one.model == one.truth for one in choices]),
         chance=1 / CHOICES,
     )
 
@@ -172,11 +171,7 @@ async def choose(body: ChoiceBody, request: Request, name: str, number: Number, 
     return await run_in_threadpool(trial, name, number, parts)
 
 
-@router.get(
-    "/v1/trials/{name}/{number}/touches/{finger}",
-    response_class=Response,
-    responses=IMAGE_RESPONSES,
-)
+@router.get("/v1/trials/{name}/{number}/touches/{finger}", response_class=Response, responses=IMAGE_RESPONSES)
 def touch(name: str, number: Number, finger: str, parts: Parts) -> Response:
     """Return a gel image of the trial's grasp."""
     files = _trial(parts, _run(parts, name), number).grasp.touches
@@ -186,11 +181,7 @@ def touch(name: str, number: Number, finger: str, parts: Parts) -> Response:
     return image_response(read_bytes(files[place]))
 
 
-@router.get(
-    "/v1/trials/{name}/{number}/photos/{place}",
-    response_class=Response,
-    responses=IMAGE_RESPONSES,
-)
+@router.get("/v1/trials/{name}/{number}/photos/{place}", response_class=Response, responses=IMAGE_RESPONSES)
 def photo(name: str, number: Number, place: Annotated[int, InPath(ge=1, le=CHOICES)], parts: Parts) -> Response:
     """Return one of the trial's photos, counted from 1."""
     return image_response(read_bytes(_trial(parts, _run(parts, name), number).photos[place - 1]))

@@ -1,7 +1,5 @@
 """Prometheus metrics of the service, for /metrics."""
 
-from collections.abc import Mapping
-
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
 from retrieval.search.query.answer import QueryResult
@@ -32,7 +30,6 @@ class Metrics:
             "retrieve_dropped", "Requests that were not processed, by reason", ["reason"], registry=self.registry
         )
         self.responses = Counter("retrieve_responses", "Responses by status", ["status"], registry=self.registry)
-        self.problems = Counter("retrieve_problems", "Problem documents by kind", ["kind"], registry=self.registry)
         self.reloads = Counter("retrieve_reloads", "Generations opened", registry=self.registry)
         self.reload_failures = Counter(
             "retrieve_reload_failures", "Generations that could not be opened", registry=self.registry
@@ -45,12 +42,10 @@ class Metrics:
         )
         self.generation = Gauge("retrieve_generation", "1 for the served generation", ["name"], registry=self.registry)
 
-    def count_answer(self, results: Mapping[str, float] | QueryResult) -> None:
-        """Count a verdict and the stages of its query, or only stages, in milliseconds by name."""
-        if isinstance(results, QueryResult):
-            self.verdicts.labels(results.verdict).inc()
-            results = results.timing_ms
-        for stage, ms in results.items():
+    def count_answer(self, result: QueryResult) -> None:
+        """Count the verdict and the stages of a query."""
+        self.verdicts.labels(result.verdict).inc()
+        for stage, ms in result.timing_ms.items():
             self.stages.labels(stage).observe(ms / 1e3)
 
     def set_generation(self, generation: str) -> None:

@@ -13,8 +13,8 @@ from retrieval.serve.uploads import (
     Grasps,
     ParsedQuery,
     RequestBody,
+    RequestPictures,
     json_body,
-    pictures_of,
     read_json,
     read_query,
 )
@@ -32,7 +32,14 @@ async def query(request: Request, parts: Parts) -> DocumentResponse:
     """Return the document of `retrieve query --json` for one or several grasps of one object."""
     parts.queue.require_capacity()
     parsed_query = await read_query(request, parts.generations.current.fingers)
-    result = await parts.queue.answer(parsed_query, request)
+    result = await parts.queue.submit(
+        lambda generation: generation.searcher.query(parsed_query.pictures.images[0], **parsed_query.keywords),
+        request,
+        parsed_query.options.deadline_ms,
+        parsed_query.pictures,
+        parsed_query,
+    )
+    parts.metrics.count_answer(result)
     query_id = None
     if parts.history_writer is not None:
         query_id = await parts.history_writer.add_query(parsed_query.pictures, result)
@@ -44,7 +51,7 @@ async def query_batch(request: Request, parts: Parts) -> DocumentResponse:
     """Return one answer for each of several objects, in their order; their touches are encoded together."""
     parts.queue.require_capacity()
     body = await read_json(request, BatchBody)
-    parsed_query = ParsedQuery(pictures_of(body.objects, body.background, is_batch=True), body)
+    parsed_query = ParsedQuery(RequestPictures(body.objects, body.background, is_batch=True), body)
     results = await parts.queue.submit(
         lambda generation: generation.searcher.query_many(parsed_query.pictures.images, **parsed_query.keywords),
         request,
@@ -75,7 +82,7 @@ async def verify(request: Request, parts: Parts) -> DocumentResponse:
     """Return the document of `retrieve verify --json`."""
     parts.queue.require_capacity()
     body = await read_json(request, VerifyBody)
-    pictures = pictures_of([body.touches], body.background)
+    pictures = RequestPictures([body.touches], body.background)
     found = await parts.queue.submit(
         lambda generation: generation.searcher.verify(
             pictures.images[0], body.expect, far=body.far, background=pictures.frames

@@ -16,7 +16,6 @@ from typing import Any, TypeVar
 
 from starlette.requests import Request
 
-from retrieval.search.query.answer import QueryResult
 from retrieval.serve.decoders import Decoders
 from retrieval.serve.errors import HttpProblem
 from retrieval.serve.generations import Generations, ServedGeneration
@@ -90,30 +89,6 @@ class Queue:
                 f"{self.in_flight} requests are in flight already. Try again.",
                 {"retry-after": "1", "connection": "close"},
             )
-
-    async def answer(self, parsed_query: ParsedQuery, request: Request) -> QueryResult:
-        """Answer a query.
-
-        Args:
-            parsed_query: The query.
-            request: Its request, to notice that the client disconnects.
-
-        Returns:
-            The answer.
-
-        Raises:
-            HttpProblem: The queue is full, the client disconnects or the deadline passes.
-            RetrievalError: The errors of `Searcher.query`.
-        """
-        result = await self.submit(
-            lambda generation: generation.searcher.query(parsed_query.pictures.images[0], **parsed_query.keywords),
-            request,
-            parsed_query.options.deadline_ms,
-            parsed_query.pictures,
-            parsed_query,
-        )
-        self._metrics.count_answer(result)
-        return result
 
     async def submit(
         self,

@@ -6,8 +6,8 @@ objects. The seed of a series determines its trials, so they need not be stored.
 """
 
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,6 @@ from retrieval.errors import BadInput
 from retrieval.metrics.k_way import binomial_interval
 from retrieval.search.embeddings import embed_photos
 from retrieval.serve.generations import ServedGeneration
-from retrieval.serve.store import TrialChoice
 
 CHOICES = 10
 
@@ -51,18 +50,12 @@ class TrialAccuracy:
     high: float | None
 
 
-def trial_accuracy(right: int, trials: int) -> TrialAccuracy:
-    """Return the accuracy and its confidence interval for `right` of `trials` right choices."""
-    if not trials:
+def trial_accuracy(right: Sequence[bool]) -> TrialAccuracy:
+    """Return the accuracy of choices and its confidence interval."""
+    if not right:
         return TrialAccuracy(0, 0, None, None, None)
-    low, high = binomial_interval(right, trials)
-    return TrialAccuracy(right, trials, right / trials, low, high)
-
-
-def trial_accuracies(choices: list[TrialChoice]) -> tuple[TrialAccuracy, TrialAccuracy]:
-    """Return the accuracy of the person, and of the model in the same trials."""
-    right = [sum(one.choice == one.truth for one in choices), sum(one.model == one.truth for one in choices)]
-    return trial_accuracy(right[0], len(choices)), trial_accuracy(right[1], len(choices))
+    low, high = binomial_interval(sum(right), len(right))
+    return TrialAccuracy(sum(right), len(right), sum(right) / len(right), low, high)
 
 
 class Trials:
@@ -78,13 +71,9 @@ class Trials:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._grasps = load_grasps(folder)
-
-    @cached_property
-    def _by_object(self) -> dict[str, list[Grasp]]:
-        found: dict[str, list[Grasp]] = defaultdict(list)
+        self._by_object: dict[str, list[Grasp]] = defaultdict(list)
         for grasp in self._grasps:
-            found[grasp.object_id].append(grasp)
-        return found
+            self._by_object[grasp.object_id].append(grasp)
 
     def unseen(self, generation: ServedGeneration) -> list[str]:
         """Return the objects that the model was neither trained nor calibrated on, sorted."""
@@ -99,9 +88,6 @@ class Trials:
             generation: The generation whose model is compared.
             seed: Seed of the series.
             number: Number of the trial, counted from 1.
-
-        Returns:
-            The trial.
 
         Raises:
             BadInput: The recording has too few unseen objects, or another number of fingers than the model.

@@ -202,6 +202,9 @@ class RequestPictures:
         is_batch: Whether messages name the object.
         images: The decoded `files`.
         frames: The decoded `background`.
+
+    Raises:
+        HttpProblem: There are more than `MAX_PICTURES`.
     """
 
     files: Sequence[Sequence[Sequence[bytes]]]
@@ -209,6 +212,11 @@ class RequestPictures:
     is_batch: bool = False
     images: list[list[list[GelImage]]] = field(default_factory=list)
     frames: list[GelImage] | None = None
+
+    def __post_init__(self) -> None:
+        """Count the pictures."""
+        if (count := len(self.named_files())) > MAX_PICTURES:
+            raise HttpProblem("bad-input", f"A request may have at most {MAX_PICTURES} pictures, got {count}.")
 
     def named_files(self) -> list[tuple[str, bytes]]:
         """Return each file with its name for messages and answers."""
@@ -218,8 +226,9 @@ class RequestPictures:
             for number, grasp in enumerate(grasps, start=1)
             for place, data in enumerate(grasp)
         ]
-        found += [(f"background of finger {_letter(place)}", data) for place, data in enumerate(self.background or ())]
-        return found
+        return found + [
+            (f"background of finger {_letter(place)}", data) for place, data in enumerate(self.background or ())
+        ]
 
     def set_images(self, images: Iterator[GelImage]) -> None:
         """Set the decoded images, in the order of `named_files`."""
@@ -246,28 +255,6 @@ class ParsedQuery:
         return background and {**self.keywords, "background": None} == {**other.keywords, "background": None}
 
 
-def pictures_of(
-    objects: Sequence[Sequence[Sequence[bytes]]], background: Sequence[bytes] | None, is_batch: bool = False
-) -> RequestPictures:
-    """Return the pictures of a request.
-
-    Args:
-        objects: One file for each finger of each grasp of each object.
-        background: One no-contact frame for each finger; None without them.
-        is_batch: Whether messages name the object.
-
-    Returns:
-        The pictures, not decoded.
-
-    Raises:
-        HttpProblem: There are more than `MAX_PICTURES`.
-    """
-    count = sum(len(grasp) for grasps in objects for grasp in grasps) + len(background or ())
-    if count > MAX_PICTURES:
-        raise HttpProblem("bad-input", f"A request may have at most {MAX_PICTURES} pictures, got {count}.")
-    return RequestPictures(objects, background, is_batch)
-
-
 async def read_query(request: Request, fingers: int) -> ParsedQuery:
     """Return the query in a request's body; `fingers` is the number of gel images of one grasp.
 
@@ -277,7 +264,7 @@ async def read_query(request: Request, fingers: int) -> ParsedQuery:
     if _content_type(request) == "multipart/form-data":
         return await _read_form(request, fingers)
     body = await read_json(request, QueryBody)
-    return ParsedQuery(pictures_of([body.touches], body.background), body)
+    return ParsedQuery(RequestPictures([body.touches], body.background), body)
 
 
 async def read_json(request: Request, model: type[Body]) -> Body:
@@ -349,7 +336,7 @@ async def _read_form(request: Request, fingers: int) -> ParsedQuery:
     touches = [images[start : start + fingers] for start in range(0, len(images), fingers)]
     if len(touches) > MAX_GRASPS:
         raise HttpProblem("bad-input", f"A query may have at most {MAX_GRASPS} grasps, got {len(touches)}.")
-    return ParsedQuery(pictures_of([touches], files["background"] or None), options)
+    return ParsedQuery(RequestPictures([touches], files["background"] or None), options)
 
 
 def _letter(place: int) -> str:
