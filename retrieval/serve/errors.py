@@ -33,7 +33,6 @@ KINDS: Mapping[str, tuple[int, str]] = {
     "bad-input": (422, "The input cannot be used"),
     "bad-image": (422, "An image cannot be read"),
     "busy": (429, "The service is at capacity"),
-    "too-large-headers": (431, "The headers of the request are too large"),
     "failed": (500, "The service failed"),
     "not-ready": (503, "The service is not ready"),
     "late": (504, "The deadline passed"),

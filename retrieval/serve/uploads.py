@@ -26,10 +26,8 @@ PICTURE_PATHS = frozenset({"/v1/query", "/v1/query/batch", "/v1/verify"})
 """Routes whose bodies contain pictures: up to `MAX_BODY_BYTES`. All others: up to `MAX_SMALL_BODY_BYTES`."""
 LARGE_BYTES = 1_000_000
 """Size in bytes above which a body is treated as large."""
-MAX_LARGE_BODIES = 2
-"""Maximum number of concurrent large bodies."""
-MAX_SMALL_BODIES_BYTES = 20_000_000
-"""Maximum total size of all concurrent small bodies."""
+MAX_HELD_BYTES, MAX_HELD_BYTES_FOR_LARGE = 60_000_000, 40_000_000
+"""Maximum total size of the bodies in memory, and the size above which no large body may grow."""
 MAX_JSON_VALUES = 2_000
 """Maximum number of JSON values of a body. A body with `MAX_PICTURES` pictures, each in its own lists, and with all
 options has fewer than 800 values."""
@@ -38,7 +36,6 @@ MAX_FIELDS, MAX_FIELD_BYTES = 8, 1024
 Body = TypeVar("Body", bound=BaseModel)
 MAX_GRASPS, MAX_OBJECTS = 32, 32
 _CLOSE = {"connection": "close"}  # the rest of the body is not read
-_CLOSE_AND_RETRY = _CLOSE | {"retry-after": "1"}
 
 
 class BodyLimit:
@@ -49,12 +46,11 @@ class BodyLimit:
         seconds: Time limit for a body to arrive.
 
     Attributes:
-        held_bytes: Total size of the small bodies in memory.
-        large_bodies: Number of large bodies in memory.
+        held_bytes: Total size of the bodies in memory.
     """
 
     def __init__(self, app: ASGIApp, seconds: float) -> None:
-        self.app, self.seconds, self.held_bytes, self.large_bodies = app, seconds, 0, 0
+        self.app, self.seconds, self.held_bytes = app, seconds, 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on; refuse its body if it is too large or too slow (ASGI)."""
@@ -66,11 +62,10 @@ class BodyLimit:
         if announced.isdecimal() and int(announced[:20]) > max_bytes:
             await too_large(max_bytes).response()(scope, receive, send)
             return
-        deadline, received, held_bytes = asyncio.get_running_loop().time() + self.seconds, 0, 0
-        whole = is_large = False
+        deadline, received, whole = asyncio.get_running_loop().time() + self.seconds, 0, False
 
         async def limited() -> Message:
-            nonlocal received, held_bytes, whole, is_large
+            nonlocal received, whole
             if whole:  # the next message is the disconnect
                 return await receive()
             try:
@@ -80,25 +75,20 @@ class BodyLimit:
                 raise HttpProblem("too-slow", f"The body must arrive within {self.seconds:g} s.", _CLOSE) from None
             size = len(message.get("body", b""))
             received += size
+            self.held_bytes += size
             if received > max_bytes:
                 raise too_large(max_bytes)
-            if received <= LARGE_BYTES:
-                held_bytes, self.held_bytes = received, self.held_bytes + size
-                if self.held_bytes > MAX_SMALL_BODIES_BYTES:
-                    raise HttpProblem("busy", "Too many requests are arriving. Try again.", _CLOSE_AND_RETRY)
-            elif not is_large:
-                if self.large_bodies >= MAX_LARGE_BODIES:
-                    raise HttpProblem("busy", "Too many large requests are arriving. Try again.", _CLOSE_AND_RETRY)
-                is_large, self.large_bodies = True, self.large_bodies + 1
-                held_bytes, self.held_bytes = 0, self.held_bytes - held_bytes
+            if self.held_bytes > (MAX_HELD_BYTES if received <= LARGE_BYTES else MAX_HELD_BYTES_FOR_LARGE):
+                raise HttpProblem(
+                    "busy", "Too many large requests are arriving. Try again.", _CLOSE | {"retry-after": "1"}
+                )
             whole = not message.get("more_body", False)
             return message
 
         try:
             await self.app(scope, limited, send)
         finally:
-            self.large_bodies -= is_large
-            self.held_bytes -= held_bytes
+            self.held_bytes -= received
 
 
 def too_large(max_bytes: int) -> HttpProblem:

@@ -9,7 +9,6 @@ import httpx
 import pytest
 
 from retrieval.data.dataset import load_grasps
-from retrieval.serve.store import HistoryStore
 from tests.serving import command, with_history
 
 
@@ -61,19 +60,3 @@ def feedback_info(folder):
 
     info = read_info(folder / "recording")
     return {key: info[key] for key in ("source", "sensor")}
-
-
-def test_a_database_of_a_killed_writer_is_complete(tmp_path, searcher, touch):
-    """A copy of the files of the open database equals the state after a kill."""
-    import shutil
-
-    store = HistoryStore(tmp_path / "a" / "history.sqlite", 10, 2**30)
-    store.add_query("1", [[path.read_bytes() for path in touch]], None, searcher.query(touch))
-    store.add_feedback("1", "object", "mug", b"photo")
-    shutil.copytree(tmp_path / "a", tmp_path / "b")
-    copy = HistoryStore(tmp_path / "b" / "history.sqlite", 10, 2**30)
-    assert copy.recordable() == [("1", "mug")]
-    assert copy.pictures("1")[1, "a"] == touch[0].read_bytes()
-    assert copy.photo("1") == b"photo"
-    copy.close()
-    store.close()

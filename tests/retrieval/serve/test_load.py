@@ -3,8 +3,6 @@
 import shutil
 import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -188,27 +186,16 @@ def test_a_broken_generation_leaves_the_previous_one_served(grown, body):
         assert post_query(url, body).json()["index"]["generation"] == "gen-000002"
 
 
-@pytest.mark.slow
-def test_a_missing_index_is_reported_at_the_start(tmp_path):
-    line = [sys.executable, "-m", "retrieval", "serve", "--index", str(tmp_path), "--port", "0", "--no-history"]
-    done = subprocess.run(line, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 2
-    assert done.stderr.splitlines()[-1].startswith(f"retrieve serve: {tmp_path}: there is no index here")
-
-
 # The end -------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("sign", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
 def test_requests_in_flight_at_the_end_signal_are_answered(index, body, sign, tmp_path):
     with (
-        command("--index", index, "--port", "0", "--queue", "40", "--history", tmp_path / "store") as (
-            process,
-            url,
-            _,
-        ),
+        command("--index", index, "--port", "0", "--queue", "40", "--history", tmp_path / "store") as found,
         ThreadPoolExecutor(12) as client_threads,
     ):
+        process, url, _ = found
         post_query(url, body)
         connected = threading.Semaphore(0)
 
@@ -229,11 +216,11 @@ def test_requests_in_flight_at_the_end_signal_are_answered(index, body, sign, tm
             connected.acquire(timeout=30)
         in_flight = value(url, "retrieve_requests_in_flight")
         process.send_signal(sign)
-        found = [one.result(timeout=60) for one in answers]
+        received = [one.result(timeout=60) for one in answers]
         assert process.wait(60) == 0
         assert in_flight <= 12
-        assert [data.split(b" ", 2)[1] for data in found] == [b"200"] * 12
-        assert all(data.endswith(b"}") for data in found)
+        assert [data.split(b" ", 2)[1] for data in received] == [b"200"] * 12
+        assert all(data.endswith(b"}") for data in received)
 
 
 def test_a_stream_ends_when_the_service_does(index):

@@ -89,13 +89,6 @@ def test_pictures_are_removed_completed_and_their_fingers_swapped(opened, files)
     assert opened.locator(".grasp").count() == 0
 
 
-def test_files_other_than_pictures_are_refused_before_they_are_sent(opened, tmp_path):
-    (tmp_path / "notes.txt").write_text("no picture")
-    choose(opened, "Choose gel images", [tmp_path / "notes.txt"])
-    opened.get_by_text("notes.txt is not a picture.").wait_for()
-    assert opened.locator(".grasp").count() == 0
-
-
 def test_objects_that_are_not_shown_share_one_bar(opened, files):
     opened.get_by_text("Options").click()
     opened.get_by_label("Objects to show").fill("3")
@@ -144,22 +137,6 @@ def test_probabilities_if_present_and_the_advice_of_the_service_are_shown(opened
     shown = opened.locator(".photo.object .if-present").all_inner_texts()
     assert shown[:2] == ["62.5\u00a0% if present", "31.3\u00a0% if present"]
     assert len(shown) == len(document["results"])
-
-
-def test_the_probability_of_unlisted_objects_is_that_of_the_service(opened, files, searcher):
-    document = searcher.query(files[:2], top=3).to_dict() | {"unlisted_probability": 0.4375}
-    show_answer(document, opened, files)
-    assert opened.locator(".photo.rest .p").inner_text() == "43.8\u00a0%"
-
-
-def test_similar_photos_open_their_objects(opened, files):
-    ask(opened, files[:2])
-    opened.locator(".photo.object button").first.click()
-    similar = opened.locator(".similar-photos li button").first
-    similar.wait_for()
-    name = similar.inner_text()
-    similar.click()
-    opened.get_by_role("dialog", name=name).wait_for()
 
 
 def test_metadata_of_an_object_are_searched_and_shown(browser, catalogue, model, tmp_path):

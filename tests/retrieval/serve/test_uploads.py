@@ -7,7 +7,7 @@ import time
 import httpx
 import pytest
 
-from retrieval.serve.uploads import MAX_LARGE_BODIES, MAX_SMALL_BODIES_BYTES, PICTURE_PATHS
+from retrieval.serve.uploads import MAX_HELD_BYTES, MAX_HELD_BYTES_FOR_LARGE, PICTURE_PATHS
 from tests.hostile_pictures import png_file
 from tests.serving import listening, problem, service
 
@@ -33,14 +33,11 @@ def test_a_picture_of_more_than_20_million_pixels_is_refused_by_its_header(clien
     "image",
     [
         b"",
-        b"\x00" * 1000,
         b"GIF89a" + b"\x00" * 100,
         png_file(64, 64, samples=b"\x00" * 10),
         png_file(64, 64)[:40],
-        b"<svg/>",
-        b"\xff\xd8\xff",
     ],
-    ids=["empty", "zeros", "gif", "too few samples", "cut off", "svg", "jpeg's first bytes"],
+    ids=["empty", "gif", "too few samples", "cut off"],
 )
 def test_incomplete_pictures_are_refused_with_their_place(client, image):
     good = png_file(8, 8, samples=b"\x00" * 8 * 25)
@@ -210,16 +207,13 @@ def test_a_slow_body_is_refused_and_a_partial_body_is_harmless(url):
 def test_concurrent_bodies_have_a_common_limit_and_large_ones_leave_room_for_others(index):
     with service(index) as client:
         limit = next(each for each in middlewares(client.app) if type(each).__name__ == "BodyLimit")
-        small, large_bodies = {"touches": [["aGk="]]}, {"touches": [["aGkk" * 300_000]]}
-        limit.held_bytes = MAX_SMALL_BODIES_BYTES
-        assert "Too many requests" in problem(client.post("/v1/query", json=small), 429, "busy")
-        assert limit.held_bytes == MAX_SMALL_BODIES_BYTES
-        limit.held_bytes, limit.large_bodies = 0, MAX_LARGE_BODIES
-        assert "Too many large requests" in problem(client.post("/v1/query", json=large_bodies), 429, "busy")
-        problem(client.post("/v1/query", json=small), 422, "bad-image")
-        limit.large_bodies = MAX_LARGE_BODIES - 1
-        problem(client.post("/v1/query", json=large_bodies), 422, "bad-image")
-        assert (limit.held_bytes, limit.large_bodies) == (0, MAX_LARGE_BODIES - 1)
+        small, large = {"touches": [["aGk="]]}, {"touches": [["aGkk" * 300_000]]}
+        for held, refused in ((MAX_HELD_BYTES, (small, large)), (MAX_HELD_BYTES_FOR_LARGE, (large,)), (0, ())):
+            limit.held_bytes = held
+            for body in (small, large):
+                response = client.post("/v1/query", json=body)
+                problem(response, *((429, "busy") if body in refused else (422, "bad-image")))
+            assert limit.held_bytes == held
 
 
 def middlewares(app):
