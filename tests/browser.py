@@ -1,19 +1,13 @@
 """A real browser for the page: Debian's Chromium, driven by playwright, with the service in this process."""
 
 import shutil
-import signal
-import threading
 from contextlib import contextmanager
 
 import pytest
-import uvicorn
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Error, sync_playwright
 
-from retrieval.serve.app import create_app
-from retrieval.serve.server import Server
-from retrieval.serve.settings import ServiceSettings
-from tests.waiting import wait_until
+from tests.serving import listening
 
 NAMES = ("chromium", "chromium-browser", "google-chrome-stable", "google-chrome")
 CAMERA = ("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream")
@@ -41,18 +35,8 @@ def chromium():
 @contextmanager
 def address(index, *parts, **settings):
     """Serve an index on a free port; yield the address. parts: further arguments of `create_app`."""
-    app = create_app(ServiceSettings(index=index, **settings), *parts)
-    ports = []
-    config = uvicorn.Config(app, port=0, log_level="warning", access_log=False, ws="none", timeout_graceful_shutdown=2)
-    server = Server(config, app.state.service, ports.append)
-    thread = threading.Thread(target=server.run, daemon=True)
-    thread.start()
-    try:
-        wait_until(lambda: ports or not thread.is_alive(), 120.0)
-        yield f"http://127.0.0.1:{ports[0]}/"
-    finally:
-        server.handle_exit(signal.SIGTERM, None)
-        thread.join(60)
+    with listening(index, *parts, **settings) as (url, _):
+        yield f"{url}/"
 
 
 @contextmanager

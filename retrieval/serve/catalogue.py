@@ -1,4 +1,4 @@
-"""Routes of the catalogue: pages of photos, search, similar photos, images, thumbnails, and the index.
+"""Routes of the catalogue: pages of photos, search, similar photos, images, and the index.
 
 The index maps an id to its file. No text of a request becomes part of a file path.
 """
@@ -76,24 +76,16 @@ def _document(photo: ListedPhoto) -> PhotoDocument:
 
 
 @router.get("/v1/photos/{photo:path}", response_class=Response, responses=IMAGE_RESPONSES)
-def photo(request: Request, photo: str, parts: Parts) -> Response:
-    """Return the file of a photo or of a reference gel image; formats that browsers lack are converted to JPEG."""
-    return _catalogue_image(request, parts, photo, None)
-
-
-@router.get("/v1/thumbnails/{photo:path}", response_class=Response, responses=IMAGE_RESPONSES)
-def get_thumbnail(
+def photo(
     request: Request,
     photo: str,
     parts: Parts,
-    px: Annotated[int, Query(ge=32, le=1024, description="Pixels of the longer side.")] = 320,
+    px: Annotated[int | None, Query(ge=32, le=1024, description="Pixels of the longer side of a small JPEG.")] = None,
 ) -> Response:
-    """Return a photo, or a gel image of a reference touch, as a small JPEG."""
-    return _catalogue_image(request, parts, photo, px)
+    """Return a photo or a reference gel image: its file, or a small JPEG if `px` is given.
 
-
-def _catalogue_image(request: Request, parts: Parts, photo: str, px: int | None) -> Response:
-    """Return the photo's file, or a JPEG with `px` pixels on its longer side; 304 if the client has it."""
+    Formats that browsers lack are converted to JPEG.
+    """
     generation = parts.generations.current
     row = _row(generation, photo)
     headers = {"etag": f'"{row["digest"]}-{px}"', "cache-control": "private, no-cache"}

@@ -109,7 +109,7 @@ def many(opened):
 
     picture = synthetic._jpeg(synthetic.draw_background(1))
     opened.route("**/v1/catalogue*", listed)
-    opened.route("**/v1/thumbnails/**", lambda route: route.fulfill(content_type="image/jpeg", body=picture))
+    opened.route("**/v1/photos/**", lambda route: route.fulfill(content_type="image/jpeg", body=picture))
     return opened, offsets
 
 

@@ -30,7 +30,7 @@ def test_the_reference_gel_images_of_an_answer_are_served(index, catalogue_with_
         best = {match["object_id"]: match for match in found["results"]}[NAMES[1]]
         assert best["reference"]["touch"] == [f"{NAMES[1]}/touch_1_{finger}.png" for finger in "ab"]
         for path in best["reference"]["touch"]:
-            whole, small = client.get(f"/v1/photos/{path}"), client.get(f"/v1/thumbnails/{path}?px=64")
+            whole, small = client.get(f"/v1/photos/{path}"), client.get(f"/v1/photos/{path}?px=64")
             assert whole.content == (catalogue_with_touches / path).read_bytes()
             assert max(Image.open(io.BytesIO(small.content)).size) == 64
             assert client.get(f"/v1/photos/{path}", headers={"if-none-match": whole.headers["etag"]}).status_code == 304

@@ -71,7 +71,7 @@ function decoded(text) {
 }
 
 export const photoURL = (id) => `/v1/photos/${encodedPath(id)}`;
-export const thumbnailURL = (id, px = 480) => `/v1/thumbnails/${encodedPath(id)}?px=${px}`;
+export const thumbnailURL = (id, px = 480) => `${photoURL(id)}?px=${px}`;
 export const streamURL = (name, rate = 10) => `/v1/sensors/${encodeURIComponent(name)}/stream?rate=${rate}`;
 
 export const index = () => json("/v1/index");
