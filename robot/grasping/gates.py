@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.errors import RobotConfigError, RobotError
+from robot.settings import TypedSettings, bounded
 from robot.storage import decode_picture
 
 Picture = npt.NDArray[np.uint8]
@@ -81,7 +82,7 @@ def difference(frame: Picture, before: Picture) -> npt.NDArray[np.float32]:
 
 
 @dataclass(frozen=True)
-class ContactAreaGate:
+class ContactAreaGate(TypedSettings):
     """A gate that accepts a grasp when the gel of any finger (or of all) changed its colour over a large enough area.
 
     It compares the frame after the lift, if recorded, with the no-contact frame, because after a slip the gel has
@@ -95,19 +96,10 @@ class ContactAreaGate:
         every_finger: Whether every finger's gel must have changed.
     """
 
-    noise_levels: float = 8.0
-    least_share: float = 0.01
-    blur_px: int = 5
+    noise_levels: float = bounded(0.1, 254, 8.0)
+    least_share: float = bounded(1e-6, 1, 0.01)
+    blur_px: int = bounded(1, 1000, 5)
     every_finger: bool = False
-
-    def __post_init__(self) -> None:
-        """Raise RobotConfigError for a setting out of range."""
-        if not 0 < self.noise_levels < 255:
-            raise RobotConfigError(f"noise_levels must be between 0 and 255, got {self.noise_levels}")
-        if not 0 < self.least_share <= 1:
-            raise RobotConfigError(f"least_share must be above 0 and at most 1, got {self.least_share}")
-        if self.blur_px < 1:
-            raise RobotConfigError(f"blur_px must be at least 1, got {self.blur_px}")
 
     def __call__(self, touches: Mapping[str, GraspFrames]) -> bool:
         """Return whether the grasp is accepted; raise RobotConfigError if a no-contact frame is missing."""
