@@ -236,6 +236,8 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
 
     def _start(self, expected: dict[str, Any]) -> None:
         """Create recording.json unless it exists, and truncate metadata.jsonl after its last complete line."""
+        for left in self.folder.glob(f".{INFO_FILE}.*.tmp"):  # by a killed writer; this one has locked the folder
+            left.unlink()
         if not (self.folder / INFO_FILE).exists():
             write_atomically(self.folder / INFO_FILE, _encode_info(expected))
         self.info = read_info(self.folder)

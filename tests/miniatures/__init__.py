@@ -11,19 +11,19 @@ import numpy as np
 
 
 def picture(path: Path, seed: int, size: tuple[int, int] = (12, 16), **changes: Any) -> Path:
-    """Write a synthetic picture of size (H, W) for a seed. `grey`: one channel; `noise`: independent pixels."""
+    """Write a synthetic picture of size (H, W) for a seed. `grey`: one channel."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(encoded(path.suffix, seed, size, **changes))
     return path
 
 
-def encoded(suffix: str, seed: int, size: tuple[int, int] = (12, 16), grey: bool = False, noise: bool = False) -> bytes:
+def encoded(suffix: str, seed: int, size: tuple[int, int] = (12, 16), grey: bool = False) -> bytes:
     """Return the content of such a file."""
-    image = pixels(seed, size, noise)
+    image = pixels(seed, size)
     return bytes(cv2.imencode(suffix, image[..., 0] if grey else image)[1].tobytes())
 
 
-def pixels(seed: int, size: tuple[int, int] = (12, 16), noise: bool = False) -> Any:
-    """Return (H, W, 3) uint8, smooth or noise."""
-    small = np.random.default_rng(seed).integers(0, 256, (*(size if noise else (3, 4)), 3), dtype=np.uint8)
+def pixels(seed: int, size: tuple[int, int] = (12, 16)) -> Any:
+    """Return (H, W, 3) uint8, smooth."""
+    small = np.random.default_rng(seed).integers(0, 256, (3, 4, 3), dtype=np.uint8)
     return cv2.resize(small, size[::-1], interpolation=cv2.INTER_LINEAR)
