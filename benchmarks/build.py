@@ -23,7 +23,7 @@ from retrieval.model.config import Config
 from retrieval.model.encode import batches, encode_photos, one_thread
 from retrieval.model.photo_encoder import fastest_photo_encoder
 from retrieval.search.build.build_index import build_index
-from retrieval.search.build.embed import BATCH, MIN_PHOTOS_TO_TUNE, map_ahead
+from retrieval.search.build.codes import BATCH, MIN_PHOTOS_TO_TUNE, map_ahead
 from retrieval.search.defaults import shipped_model
 from tests import synthetic
 

@@ -35,7 +35,7 @@ def step(name, function):
     ms[name] = 1e3 * (time.perf_counter() - start)
     return value
 ours = ("retrieval.commands.main", "retrieval.search.query.searcher")
-for name in ("numpy", "PIL.Image", *ours, backend, "indexes.kinds.flat"):
+for name in ("numpy", "PIL.Image", *ours, backend, "indexes.kinds.faiss_index"):
     step("import " + name, lambda: import_module(name))
 from pathlib import Path
 import retrieval.search.query.opening as opening

@@ -13,6 +13,7 @@ from PIL import Image
 
 from benchmarks.common import REPETITIONS, ResultLine, as_text, duration, in_turns, matcher_of
 from indexes.store.folder import IndexStore
+from indexes.store.rows import Row
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from retrieval.model.checkpoint_info import fingerprint, read_scorer
 from retrieval.model.config import Config
@@ -129,13 +130,10 @@ def write_index(out: Path, checkpoint: Checkpoint, photos: int) -> None:
     embeddings /= np.linalg.norm(embeddings, axis=1, keepdims=True)
     names = [f"object-{number // 3:06d}/{number % 3}.jpg" for number in range(photos)]
     IndexStore(out).write(
-        [
-            {"id": name, "object_id": name.split("/")[0], "path": name, "digest": f"{number:064x}", "metadata": {}}
-            for number, name in enumerate(names)
-        ],
+        [Row(name, name.split("/")[0], f"{number:064x}") for number, name in enumerate(names)],
         embeddings,
         to_stored(partials, matcher.pooled_width),
-        {"calibration": Posterior().to_dict()},
+        documents={"calibration": Posterior().to_dict()},
         fingerprint=fingerprint(checkpoint),
         about={"catalogue": str(out), "checkpoint": str(checkpoint.path), "candidates": {"k": CANDIDATES}},
     )

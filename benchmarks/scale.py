@@ -18,7 +18,6 @@ The cost model, for h = hidden, d = embedding_dim, k candidates, L = 4 sqrt(N) l
     rescoring    2 d k                  4 d k, in random places       k
     rerank       2 h^2 k                2 h k, in random places       k
     build        rows: constant each; lists: 2 d L 64 L training for each of 10 rounds + 2 d L N     N, N^3/2
-    add F        2 d N hashing of existing photos, and N + F rows     N
 
 So with k = c N candidates, and search by lists, exhaustive search takes at most 1 / c times as long.
 
@@ -35,7 +34,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -43,13 +41,17 @@ import numpy as np
 import torch
 
 from benchmarks.common import duration
+from indexes import load_kind
 from indexes.errors import ParameterError
+from indexes.kinds.faiss_index import FLAT, FaissIndex
+from indexes.kinds.vector_index import VectorIndex
 from indexes.store.folder import IndexStore
-from indexes.store.generation import Generation
+from indexes.store.generation import Arrays, Generation, GenerationContent
 from indexes.store.manifest import FileChecksum
-from indexes.store.tables import Block
+from indexes.store.rows import Row
 from retrieval.commands.main import main as retrieve
 from retrieval.data.dataset import load_grasps
+from retrieval.frontier.kinds import STRUCTURES
 from retrieval.metrics.k_way import binomial_interval
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.fusion import scorer_of
@@ -57,11 +59,11 @@ from retrieval.model.fusion_scorer import FusionScorer
 from retrieval.search.defaults import shipped_model
 from retrieval.training.features import encode_recording
 
-KINDS = ("flat", "ivf_sq8", "ivf_pq", "hnsw")
+KINDS = {"flat": (), **STRUCTURES}
+"""Kinds, and the search setting of each with its values."""
 BLOCK = 8192
 MAX_CANDIDATES = 16_000
 TARGET, MARGIN = 0.99, 4
-ADDED = 1000
 TIMED = 40
 QUERIES, HELD_OUT = 200, 1000
 """Touches that choose the number of candidates, and others that evaluate it."""
@@ -124,16 +126,15 @@ class BlendedPhotos:
             return scaled / np.linalg.norm(scaled, axis=1, keepdims=True)
         return getattr(self.checkpoint.matcher.candidate_encoder, modality)(torch.from_numpy(partials)).numpy()
 
-    def blocks(self, start: int, stop: int, seed: int) -> Iterator[Block]:
-        """Yield photos `start` to `stop` - 1 of a catalogue, block by block."""
+    def blocks(self, start: int, stop: int, seed: int) -> Iterator[Arrays]:
+        """Yield arrays of photos `start` to `stop` - 1 of a catalogue, block by block."""
         rng = np.random.default_rng([seed, start])
         for first in range(start, stop, BLOCK):
             count = min(BLOCK, stop - first)
             one, other = rng.integers(len(self.photos), size=(2, count))
             weight = rng.uniform(0.5, 1, size=(count, 1)).astype(np.float32)
             partials = weight * self.photos[one] + (1 - weight) * self.photos[other]
-            rows = [_row(number) for number in range(first, first + count)]
-            yield Block(rows, self.embeddings(partials, "photo"), {"partials": partials.astype(np.float16)})
+            yield {"embeddings": self.embeddings(partials, "photo"), "partials": partials.astype(np.float16)}
 
 
 def blended_photos(model: Path, recording: Path, features: Path | None, by: str = "candidate_encoder") -> BlendedPhotos:
@@ -167,43 +168,43 @@ def measure(crowd: BlendedPhotos, photos: int, kinds: Sequence[str], folder: Pat
     touches = np.concatenate([crowd.touches[:chosen], crowd.held_out[:evaluated]])
     exhaustive_top1, size.figures["exhaustive_s"] = _top1(crowd.scorer, touches, partials)
     for kind in kinds:
-        start = time.perf_counter()
-        options = {
-            "fingerprint": {},
-            "kind": kind,
-            "threads": torch.get_num_threads(),
-            "parent": generation,
-            "self_check": 64,
-        }
+        name = kind.format(lists=1 << max(0, round(np.log2(np.sqrt(photos)))))
         try:
-            indexed = store.write_blocks(rows_of(generation), **options)
-        except ParameterError as error:  # too few vectors for codes
+            load_kind(name).require(name, photos, generation.manifest.dim)
+        except ParameterError as error:  # too few vectors
             size.kinds[kind] = {"refused": str(error)}
             continue
-        figures = {"structure_s": time.perf_counter() - start} | opened(folder) | on_disk(indexed)
+        start = time.perf_counter()
+        FaissIndex.build(generation.embeddings, name, threads=torch.get_num_threads())
+        figures = {"structure_s": time.perf_counter() - start}
+        indexed = store.write_content(
+            GenerationContent(rows_of(photos), blocks_of(generation), {}, name, threads=torch.get_num_threads())
+        )
+        figures |= opened(folder) | on_disk(indexed)
         size.kinds[kind] = figures | _operating_point(crowd, indexed, touches, exhaustive_top1, chosen)
-        size.kinds[kind] |= _growth(crowd, store, indexed, size.photos)
         point = size.kinds[kind]
         point["gain"] = size.figures["exhaustive_s"] / (point["search_s"] + point["rerank_s"])
     return size
 
 
-def rows_of(generation: Generation) -> Iterator[Block]:
-    """Return the rows of a generation, for a new one to take over."""
-    return (Block(generation.rows[start : start + BLOCK]) for start in range(0, generation.count, BLOCK))
+def blocks_of(generation: Generation) -> Iterator[Arrays]:
+    """Yield the arrays of a generation in blocks, for a new one."""
+    arrays = {"embeddings": generation.embeddings, **generation.arrays}
+    for start in range(0, generation.count, BLOCK):
+        yield {name: array[start : start + BLOCK] for name, array in arrays.items()}
 
 
-def _row(number: int) -> dict[str, Any]:
-    name = f"o{number // 3:07d}"
-    path = f"{name}/{number % 3}.jpg"
-    return {"id": path, "object_id": name, "path": path, "digest": f"{number:064x}", "metadata": {}}
+def rows_of(photos: int) -> list[Row]:
+    """Return rows of this many photos, three of each object."""
+    names = [(f"o{number // 3:07d}", f"{number % 3}.jpg") for number in range(photos)]
+    return [Row(f"{name}/{photo}", name, f"{number:064x}") for number, (name, photo) in enumerate(names)]
 
 
 def _build(crowd: BlendedPhotos, store: IndexStore, size: Size) -> Generation:
     """Stream the catalogue to disk; the time for drawing it is not measured."""
     drawing_s, peak_mb, before = 0.0, 0.0, anonymous_mb()
 
-    def blocks() -> Iterator[Block]:
+    def blocks() -> Iterator[Arrays]:
         nonlocal drawing_s, peak_mb
         source = crowd.blocks(0, size.photos, 0)
         while True:
@@ -216,7 +217,7 @@ def _build(crowd: BlendedPhotos, store: IndexStore, size: Size) -> Generation:
             peak_mb = max(peak_mb, anonymous_mb() - before)
 
     start = time.perf_counter()
-    generation = store.write_blocks(blocks(), fingerprint={}, kind="flat", self_check=64)
+    generation = store.write_content(GenerationContent(rows_of(size.photos), blocks(), {}))
     size.figures |= {"build_s": time.perf_counter() - start - drawing_s, "build_mb": peak_mb}
     return generation
 
@@ -241,19 +242,19 @@ def _operating_point(
     queries, partials, points = crowd.embeddings(touches, "touch"), made.arrays["partials"], []
     timed, built = range(min(TIMED, len(touches))), made.index
     needed = _needed(made, queries, exhaustive_top1)
-    for index in built.search_variants():
+    for index in _variants(built):
         made.index = index
         k = _candidates(made, queries[:choosing], exhaustive_top1[:choosing])
         contained = np.array(
-            [top1 in made.search(query[None], k)[0][0] for query, top1 in zip(queries, exhaustive_top1, strict=True)]
+            [top1 in made.search(query[None], k)[1][0] for query, top1 in zip(queries, exhaustive_top1, strict=True)]
         )
         evaluated = contained[choosing:]
         search = _median(lambda n, k=k: made.search(queries[n : n + 1], k), timed)
-        found = [made.search(queries[n : n + 1], k)[0][0] for n in timed]
+        found = [made.index.candidates(queries[n : n + 1], k)[0] for n in timed]
         rerank = _median(lambda n, found=found: crowd.scorer.logits(touches[n : n + 1], partials, found[n]), timed)
         low, high = binomial_interval(int(evaluated.sum()), len(evaluated))
         point = {"k": k, "recall": float(evaluated.mean()), "low": low, "high": high}
-        point |= {"search_s": search, "rerank_s": rerank, "settings": index.settings()}
+        point |= {"search_s": search, "rerank_s": rerank, "kind": index.kind}
         points.append((float(contained[:choosing].mean()), point))
     made.index = built
     for _, point in points:
@@ -264,6 +265,17 @@ def _operating_point(
     return max(points, key=lambda each: each[0])[1]
 
 
+def _variants(index: VectorIndex) -> Iterator[VectorIndex]:
+    """Yield the index with each of its search settings."""
+    if index.kind == FLAT or not isinstance(index, FaissIndex):
+        yield index
+        return
+    family = index.kind[:3] + index.kind[-3:]
+    setting, values = next(one for pattern, one in STRUCTURES.items() if pattern[:3] + pattern[-3:] == family)
+    for value in values:
+        yield index.with_settings(f"{setting}={value}")
+
+
 def _candidates(made: Generation, queries: np.ndarray, exhaustive_top1: np.ndarray) -> int:
     """Return `MARGIN` times the number of candidates that these touches need."""
     return min(MARGIN * _needed(made, queries, exhaustive_top1), MAX_CANDIDATES, made.count)
@@ -272,25 +284,10 @@ def _candidates(made: Generation, queries: np.ndarray, exhaustive_top1: np.ndarr
 def _needed(made: Generation, queries: np.ndarray, exhaustive_top1: np.ndarray) -> int:
     """Return the least number of candidates that contain the target fraction of exhaustive top-1s, up to a limit."""
     limit = min(MAX_CANDIDATES, made.count)
-    found = (made.search(query[None], limit)[0][0] for query in queries)
+    found = (made.search(query[None], limit)[1][0] for query in queries)
     places = [np.flatnonzero(rows == top1) for rows, top1 in zip(found, exhaustive_top1, strict=True)]
     needed = np.sort([int(place[0]) + 1 if len(place) else limit for place in places])
     return int(needed[int(np.ceil(TARGET * len(needed))) - 1])
-
-
-def _growth(crowd: BlendedPhotos, store: IndexStore, made: Generation, photos: int) -> dict[str, float]:
-    """Return the seconds for adding `ADDED` photos."""
-    added = list(crowd.blocks(photos, photos + ADDED, 1))
-    options = {
-        "fingerprint": {},
-        "kind": made.manifest.kind,
-        "threads": made.index.threads,
-        "parent": made,
-        "self_check": 64,
-    }
-    start = time.perf_counter()
-    store.write_blocks(chain(rows_of(made), added), **options)
-    return {"add_s": time.perf_counter() - start}
 
 
 def opened(folder: Path) -> dict[str, float]:
@@ -336,12 +333,11 @@ def lines(size: Size) -> Iterator[str]:
             continue
         times = {name: duration(value) for name, value in p.items() if name.endswith("_s")}
         yield (
-            f"  {kind} {p['settings']}: {p['gain']:.3g} times faster than scoring all, exhaustive top-1 found "
+            f"  {p['kind']}: {p['gain']:.3g} times faster than scoring all, exhaustive top-1 found "
             f"{p['recall']:.1%} ({p['low']:.1%} to {p['high']:.1%}) among {p['k']} ({p['needed']} for 99 % of all); "
             f"search {times['search_s']}, rerank {times['rerank_s']}; structure built in {times['structure_s']}, "
             f"{p['structure_mb']:.0f} of {p['disk_mb']:.0f} MB on disk, {p['memory_mb']:.0f} MB in memory, "
-            f"opened in {times['open_s']}; "
-            f"{ADDED} added in {times['add_s']}"
+            f"opened in {times['open_s']}"
         )
 
 

@@ -1,16 +1,17 @@
 """Vector indexes over unit vectors, and the index folder that stores one on disk.
 
-This package imports only numpy; FAISS is imported when one of its kinds is used.
+This package imports only numpy; FAISS is imported when it is used.
 
     indexes.store.folder          `IndexStore`, the folder of generations
     indexes.kinds.vector_index    `VectorIndex`, the base class of every kind of index
+    indexes.kinds.faiss_index     exact search and the kinds of FAISS
     indexes.kinds.measure         recall compared with exact search
     indexes.errors                every error
 
 >>> import indexes, numpy
 >>> axes = numpy.eye(3, dtype=numpy.float32)
->>> scores, slots = indexes.load_kind("exact").build(axes).search(axes[:1], 2)
->>> int(slots[0, 0]), float(scores[0, 0])
+>>> scores, rows = indexes.build(axes).search(axes[:1], 2)
+>>> int(rows[0, 0]), float(scores[0, 0])
 (0, 1.0)
 """
 
@@ -24,42 +25,58 @@ from indexes.errors import ParameterError
 if TYPE_CHECKING:
     from indexes.errors import IndexesError as IndexesError
     from indexes.kinds.measure import recall_against_exact as recall_against_exact
+    from indexes.kinds.vector_index import Floats
     from indexes.kinds.vector_index import VectorIndex as VectorIndex
     from indexes.store.folder import IndexStore as IndexStore
     from indexes.store.generation import Generation as Generation
+    from indexes.store.rows import Row as Row
 
 KINDS: "Registry[type[VectorIndex]]" = Registry(
     "kind of index",
     "indexes",
-    {
-        "exact": "indexes.kinds.exact:ExactIndex",
-        "flat": "indexes.kinds.flat:FlatIndex",
-        "ivf_flat": "indexes.kinds.ivf:IVFFlatIndex",
-        "ivf_sq8": "indexes.kinds.ivf:IVFSQ8Index",
-        "ivf_pq": "indexes.kinds.ivf:IVFPQIndex",
-        "hnsw": "indexes.kinds.hnsw:HNSWIndex",
-    },
+    {"flat": "indexes.kinds.faiss_index:FaissIndex"},
     error=ParameterError,
     base="indexes.kinds.vector_index:VectorIndex",
 )
-"""Names of the kinds of index, the fastest to build first. The class of a kind describes it (`indexes.VectorIndex`)."""
+"""Kinds of index by name: exact search ("flat"), and the classes of other packages. Other names are those of FAISS."""
+
+
+def kind_name(kind: "str | type[VectorIndex]") -> str:
+    """Return the name of a kind: "flat", a factory string of FAISS, `module:Class`, or a class of your own.
+
+    Raises:
+        ParameterError: The class is unusable.
+    """
+    return KINDS.name_of(kind) if not isinstance(kind, str) or ":" in kind or kind in KINDS.names() else kind
 
 
 def load_kind(name: str) -> "type[VectorIndex]":
-    """Return the class of the kind `name`. Raises `ParameterError` for an unknown name, and lists the known names.
+    """Return the class of the kind `name`. Raises `ParameterError` if the class is unusable.
 
-    >>> indexes.load_kind("flat").exact, indexes.load_kind("hnsw").exact
-    (True, False)
-    >>> indexes.load_kind("octree")
-    Traceback (most recent call last):
-    indexes.errors.ParameterError: kind of index must be one of exact, flat, ivf_flat, ...; got 'octree'. Give ...
+    >>> indexes.load_kind("flat") is indexes.load_kind("IVF1024,SQ8;nprobe=32")
+    True
     """
-    kind = KINDS.load(name)
-    if kind.kind != name:
-        raise ParameterError(
-            f"the index {kind.__module__}:{kind.__qualname__} must have kind = {name!r}, got {kind.kind!r}"
-        )
-    return kind
+    return KINDS.load(name if ":" in name or name in KINDS.names() else "flat")
+
+
+def build(vectors: "Floats", kind: "str | type[VectorIndex]" = "flat", *, threads: int | None = None) -> "VectorIndex":
+    """Build an index of vectors in memory.
+
+    Args:
+        vectors: Unit vectors (N, d) float32, N >= 1.
+        kind: "flat", a factory string of FAISS with search settings after a semicolon, or your own class.
+        threads: Number of threads; None for the library's own setting.
+
+    Raises:
+        VectorError: A vector is invalid, or there is none.
+        ParameterError: The kind is unknown or needs more vectors.
+
+    >>> indexes.build(vectors, "octree")
+    Traceback (most recent call last):
+    indexes.errors.ParameterError: the kind of index must be flat, a factory string of FAISS ... 'octree' ...
+    """
+    name = kind_name(kind)
+    return load_kind(name).build(vectors, name, threads=threads)
 
 
 def open(folder: str | Path, *, verify: bool = True) -> "Generation":
@@ -85,12 +102,13 @@ _MODULES = {
     "Generation": "store.generation",
     "IndexStore": "store.folder",
     "IndexesError": "errors",
+    "Row": "store.rows",
     "VectorIndex": "kinds.vector_index",
     "recall_against_exact": "kinds.measure",
 }
 """Public name -> its module in this package, imported on first use."""
 
-__all__ = ["KINDS", "load_kind", "open", *_MODULES]
+__all__ = ["KINDS", "build", "kind_name", "load_kind", "open", *_MODULES]
 
 if not TYPE_CHECKING:  # with it, a type checker would accept every attribute
 

@@ -12,12 +12,9 @@ A message contains the requirement, the value and the remedy. Each class has the
     +-- UnsupportedFormat         the index has a newer or older format than this software supports
     +-- LockedIndex               another writer is writing the index
     +-- JobFailed                 the job ran and failed (exit code 1)
-        +-- SelfRetrievalFailed   a search for the vector of a row does not find the row
         +-- WriteFailed           a file could not be written
         +-- EngineError           the vector library failed
 """
-
-from collections.abc import Sequence
 
 AGAIN = "run `retrieve build-index` again"
 
@@ -83,14 +80,6 @@ class JobFailed(IndexesError):
     """The job ran and failed."""
 
     exit_code = 1
-
-
-class SelfRetrievalFailed(JobFailed):
-    """Searches for the vectors of some rows do not find these rows. `ids` lists them."""
-
-    def __init__(self, message: str, ids: Sequence[str]) -> None:
-        super().__init__(message)
-        self.ids = list(ids)
 
 
 class WriteFailed(JobFailed):

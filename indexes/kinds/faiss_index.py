@@ -1,21 +1,23 @@
-"""Base class of the FAISS kinds: FAISS finds the candidates, `indexes.kinds.scores` scores and orders them."""
+"""FAISS: exact search, or the structure of a FAISS factory string."""
 
-import math
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import copy
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, Self
 
 import numpy as np
 
-from indexes.errors import CorruptIndex, EngineError
-from indexes.kinds.checks import check_slots
-from indexes.kinds.scores import Doubles, Floats, Mask, Slots, error_bound, grid_scores, scan, to_grid, top_k
-from indexes.kinds.vector_index import VectorIndex
+from indexes.errors import AGAIN, CorruptIndex, EngineError, ParameterError
+from indexes.kinds.vector_index import Floats, RowNumbers, VectorIndex
 
-FETCH_FACTOR = 4
-"""Growth of the number of candidates from one round to the next."""
-
+FLAT = "flat"
+"""The kind that searches exactly."""
+POINTS_PER_CENTRE = 39
+"""Smallest number of training vectors of each centre that FAISS accepts without a warning."""
+MAX_NUMPY_SCORES = 1 << 14
+"""Largest number of scores of an exact search by numpy. It takes less than a millisecond, the import of FAISS 25."""
 ADDED_ROWS = 1 << 16
 """Vectors passed to FAISS at once."""
 
@@ -37,143 +39,117 @@ def faiss_call(doing: str, threads: int | None) -> Iterator[None]:
     try:
         yield
     except (RuntimeError, AssertionError, ValueError, TypeError, MemoryError) as error:
-        raise EngineError(f"FAISS failed while {doing}: {error or type(error).__name__}") from error
+        raise EngineError(f"FAISS failed while {doing}: {_reason(error)}") from error
     finally:
         faiss.omp_set_num_threads(before)
 
 
 class FaissIndex(VectorIndex):
-    """A kind whose candidates come from FAISS.
+    """Search by FAISS.
 
-    The search runs in rounds. FAISS returns some candidates, which are then scored and ordered exactly. A query is
-    complete when k live candidates are found and, for an exact kind, no other slot can reach the score of the last
-    one. Incomplete queries fetch `FETCH_FACTOR` times more. When a round would fetch everything, all vectors are
-    scanned instead.
+    The kind is "flat", exact search, which scans the vectors in place. Or it is a factory string of FAISS, perhaps with
+    search settings after a semicolon, such as "IVF1024,SQ8;nprobe=32" or "HNSW32;efSearch=64".
+
+    >>> index = indexes.build(vectors, "HNSW16;efSearch=32")
+    >>> index.exact, index.search(vectors[:1], 3)[1].shape
+    (False, (1, 3))
     """
-
-    structure_type: ClassVar[str]
-    """Name of the FAISS class."""
-    build_threads: ClassVar[int | None] = None
-    """Number of threads of a build if the caller gives none."""
 
     _structure: Any = None
 
-    def _make(self) -> Any:
-        """Return an empty, untrained structure for the resolved parameters."""
-        raise NotImplementedError
+    @property
+    def exact(self) -> bool:
+        """Whether the kind is "flat"."""
+        return self.kind == FLAT
 
-    def _candidates(self, queries: Floats, fetch: int, effort: int) -> tuple[Floats, Slots]:
-        """Return the structure's own scores and slots (Q, fetch), best first, padded with -1.
+    @classmethod
+    def require(cls, kind: str, count: int, dim: int) -> None:
+        """Raise `ParameterError` unless FAISS knows this kind and can train it on `count` vectors of size `dim`."""
+        if kind == FLAT:
+            return
+        structure = _empty(kind, dim)
+        faiss = load_faiss()
+        lists = faiss.try_extract_index_ivf(structure)
+        inner = structure if lists is None else faiss.downcast_index(lists)
+        centres = max(0 if lists is None else lists.nlist, 2**inner.pq.nbits if hasattr(inner, "pq") else 0)
+        if count < centres * POINTS_PER_CENTRE:
+            raise ParameterError(
+                f"the kind {kind} needs at least {centres * POINTS_PER_CENTRE} photos to train {centres} centres; got "
+                f"{count}. Use the kind flat, or one with fewer centres"
+            )
 
-        Args:
-            queries: Unit vectors (Q, d).
-            fetch: Number of candidates for each query.
-            effort: Factor of the search breadth: 1 in the first round, larger in later ones.
-        """
-        raise NotImplementedError
-
-    def _training(self) -> Floats:
-        """Return the vectors to train the structure on."""
-        return np.ascontiguousarray(self._vectors)
-
-    def _first_fetch(self, k: int) -> int:
-        """Return the number of candidates of the first round if every slot is live."""
-        return k
-
-    def _search(self, queries: Floats, k: int, live: Mask | None) -> tuple[Floats, Slots]:
-        scores = np.empty((len(queries), k), dtype=np.float32)
-        slots = np.empty((len(queries), k), dtype=np.int64)
-        dilution = 1.0 if live is None else self.count / np.count_nonzero(live)
-        fetch, effort = math.ceil(self._first_fetch(k) * dilution), 1
-        pending = np.arange(len(queries))
-        while pending.size and fetch < self.count:
-            rough, found = self._rough_candidates(queries[pending], fetch, effort)
-            gridded, incomplete = to_grid(queries[pending]), []
-            for place, query in enumerate(pending):
-                named = found[place][found[place] >= 0]
-                named = named if live is None else named[live[named]]
-                ranked, ordered = top_k(grid_scores(gridded[place], to_grid(self._vectors[named])), named, k)
-                reach = float(rough[place].min()) + error_bound(self.dim)
-                if len(ranked) == k and (not self.exact or float(ranked[-1]) > reach):
-                    scores[query], slots[query] = ranked, ordered
-                else:
-                    incomplete.append(query)
-            pending = np.array(incomplete, dtype=np.int64)
-            fetch, effort = fetch * FETCH_FACTOR, effort * FETCH_FACTOR
-        if pending.size:
-            scores[pending], slots[pending] = scan(self._vectors, queries[pending], k, live)
-        return scores, slots
-
-    def _candidate_slots(self, query: Floats, k: int, live: Mask | None) -> Slots:
-        """Return the slots of the first round if they suffice.
-
-        An exact kind scores only those slots again that rounding may have put on the wrong side of rank k; usually
-        there are none.
-        """
-        dilution = 1.0 if live is None else self.count / np.count_nonzero(live)
-        fetch = math.ceil(self._first_fetch(k) * dilution)
-        if fetch < self.count:
-            rough, found = (row[0] for row in self._rough_candidates(query, fetch, 1))
-            usable = found >= 0 if live is None else (found >= 0) & live[found]
-            scores: Floats = rough[usable]
-            slots: Slots = found[usable]
-            if len(slots) >= k and not self.exact:
-                return slots
-            if len(slots) > k:
-                last, off = float(scores[k - 1]), 2 * error_bound(self.dim)
-                if float(scores[k]) < last - off:
-                    return slots[:k]
-                exact: Doubles = scores.astype(np.float64)  # adding the bound must not round
-                above = exact > last + off
-                sure, near = slots[above], slots[~above & (exact >= last - off)]
-                if rough[-1] < last - off:
-                    gridded = to_grid(query[0])
-                    more = top_k(grid_scores(gridded, to_grid(self._vectors[near])), near, k - len(sure))[1]
-                    return np.concatenate([sure, more])
-        return super()._candidate_slots(query, k, live)
-
-    def _rough_candidates(self, queries: Floats, fetch: int, effort: int) -> tuple[Floats, Slots]:
-        """Return FAISS's scores and slots (Q, n) of the best `fetch` candidates, padded with -1."""
-        with faiss_call("searching", 1 if len(queries) == 1 else self.threads):
-            rough, found = self._candidates(queries, fetch, effort)
-        return rough, check_slots(found, self.count, minimum=-1)
-
-    def _build_threads(self) -> int | None:
-        return self.build_threads if self.threads is None else self.threads
+    def with_settings(self, settings: str) -> Self:
+        """Return an index with a copy of the structure and other search settings, such as "nprobe=16"."""
+        other = copy(self)
+        other.kind = f"{self.kind.partition(';')[0]};{settings}"
+        other._structure = load_faiss().clone_index(self._structure)
+        load_faiss().ParameterSpace().set_index_parameters(other._structure, settings)
+        return other
 
     def _build(self) -> None:
-        with faiss_call(f"building {self.kind}", self._build_threads()):
-            self._structure = self._make()
+        if self.exact:
+            return
+        self._structure = _empty(self.kind, self.dim)
+        # The graph of more threads would depend on their timing.
+        threads = 1 if hasattr(self._structure, "hnsw") else self.threads
+        with faiss_call(f"building {self.kind}", threads):
             if not self._structure.is_trained:
-                self._structure.train(self._training())
-        self._add_missing()
+                self._structure.train(self.vectors)
+            for start in range(0, self.count, ADDED_ROWS):
+                self._structure.add(self.vectors[start : start + ADDED_ROWS])
 
-    def _extend_structure(self) -> None:
-        if self._structure.ntotal < self.count:
-            with faiss_call(f"copying {self.kind}", None):
-                self._structure = load_faiss().clone_index(self._structure)  # a copy of this index may use it too
-            self._add_missing()
+    def _search(self, queries: Floats, k: int) -> tuple[Floats, RowNumbers]:
+        if self.exact and len(queries) * self.count <= MAX_NUMPY_SCORES:
+            scores: Floats = queries @ self.vectors.T
+            rows: RowNumbers = np.argsort(-scores, axis=1, kind="stable")[:, :k]
+            return np.take_along_axis(scores, rows, axis=1), rows
+        with faiss_call("searching", 1 if len(queries) == 1 else self.threads):
+            if self.exact:
+                faiss = load_faiss()
+                scores, rows = faiss.knn(queries, self.vectors, k, faiss.METRIC_INNER_PRODUCT)
+            else:
+                scores, rows = self._structure.search(queries, k)
+        return scores, rows
 
-    def _add_missing(self) -> None:
-        """Add the vectors that the structure lacks."""
-        with faiss_call(f"adding to {self.kind}", self._build_threads()):
-            for start in range(self._structure.ntotal, self.count, ADDED_ROWS):
-                self._structure.add(np.ascontiguousarray(self._vectors[start : start + ADDED_ROWS]))
-
-    def _write(self, path: Path) -> None:
+    def _write(self, path: Path) -> bool:
+        if self._structure is None:
+            return False
         with faiss_call(f"writing {path}", None):
             load_faiss().write_index(self._structure, str(path))
+        return True
 
     def _read(self, path: Path) -> None:
+        if self.exact:
+            return
         faiss = load_faiss()
         try:
-            structure = faiss.read_index(str(path))
+            self._structure = faiss.read_index(str(path))
         except Exception as error:
-            raise CorruptIndex(f"{path}: FAISS cannot read it; build the index again ({error})") from error
-        got = (type(structure).__name__, structure.ntotal, structure.d, structure.metric_type)
-        must = (self.structure_type, self.count, self.dim, faiss.METRIC_INNER_PRODUCT)
+            raise CorruptIndex(f"{path}: FAISS cannot read it; {AGAIN} ({_reason(error)})") from error
+        got = (self._structure.ntotal, self._structure.d, self._structure.metric_type)
+        must = (self.count, self.dim, faiss.METRIC_INNER_PRODUCT)
         if got != must:
-            raise CorruptIndex(
-                f"{path}: the structure must have (type, count, size, metric) {must}, got {got}; build the index again"
-            )
-        self._structure = structure
+            raise CorruptIndex(f"{path}: must have (vectors, size, metric) {must}, got {got}; {AGAIN}")
+
+
+def _empty(kind: str, dim: int) -> Any:
+    """Return an empty, untrained structure. Raises `ParameterError` if FAISS does not know the kind."""
+    faiss = load_faiss()
+    factory, _, settings = kind.partition(";")
+    try:
+        if re.search(r"HNSW[01](?!\d)", factory):  # FAISS would end the process
+            raise ValueError("a graph needs at least 2 neighbours")
+        structure = faiss.index_factory(dim, factory, faiss.METRIC_INNER_PRODUCT)
+        if settings:
+            faiss.ParameterSpace().set_index_parameters(structure, settings)
+    except (RuntimeError, ValueError, MemoryError) as error:
+        raise ParameterError(
+            f"the kind of index must be flat, a factory string of FAISS such as IVF1024,SQ8;nprobe=32 or "
+            f"HNSW32;efSearch=64, or module:Class for your own; got {kind!r} ({_reason(error)})"
+        ) from error
+    return structure
+
+
+def _reason(error: BaseException) -> str:
+    """Return the last part of FAISS's message, without the place in its source."""
+    return str(error).rpartition(": ")[2].strip() or type(error).__name__

@@ -3,8 +3,7 @@
 import fcntl
 import os
 import stat
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -74,14 +73,3 @@ def _open_lock_file(path: Path) -> int:
     """Open a lock file, created if missing; links are refused and pipes do not block. Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     return os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
-
-
-@contextmanager
-def exclusive_lock(path: Path) -> Iterator[None]:
-    """Wait for a lock file, and hold its lock during the block, among all processes. Raises OSError."""
-    descriptor = _open_lock_file(path)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)

@@ -14,7 +14,7 @@ from _touch_retrieval.documents import typed
 from _touch_retrieval.files import durable_file, encoded, file_digest, open_regular, read_json
 from indexes.errors import AGAIN, CorruptIndex, RowError, UnsupportedFormat
 
-FORMAT = 5
+FORMAT = 6
 NAME = "manifest.json"
 MAX_BYTES = 4 * 2**20
 """Largest manifest. With the names and digests of 4096 shards it has 1 MiB."""
@@ -23,16 +23,6 @@ T = TypeVar("T")
 Count = Annotated[int, Meta(ge=0, lt=10**9)]
 Word = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]*\Z")]
 FileName = Annotated[str, Meta(pattern=r"^[a-z0-9_]+\.(json|jsonl|npy|faiss)\Z")]
-
-
-@dataclass(frozen=True)
-class Counts:
-    """Numbers of rows, slots (distinct vectors), tombstones (slots without a row) and slots at the last training."""
-
-    rows: Count
-    slots: Count
-    tombstones: Count
-    built_slots: Count
 
 
 @dataclass(frozen=True)
@@ -45,22 +35,34 @@ class FileChecksum:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Fields of the file, in its order. `requested` is the parameters before None was filled in."""
+    """Fields of the file, in its order.
+
+    Attributes:
+        generation: Name of the generation, such as gen-000007.
+        created: Time of the build.
+        software: Version of the software.
+        fingerprint: Origin of the vectors.
+        about: Further entries.
+        dim: Number of components of a vector.
+        kind: Kind of index.
+        recall: Measured recall and time of the kind.
+        photos: Number of rows.
+        objects: Number of objects.
+        arrays: Names of the per-row arrays.
+        documents: Names of the documents.
+        files: Size and SHA-256 of every other file.
+    """
 
     generation: str
-    parent: str | None
     created: str
     software: str
     fingerprint: dict[str, str]
     about: dict[str, Any]
     dim: Count
-    metric: str
     kind: str
-    parameters: dict[str, Any]
-    requested: dict[str, Any]
-    seed: int
     recall: dict[str, Any]
-    counts: Counts
+    photos: Count
+    objects: Count
     arrays: list[Word]
     documents: list[Word]
     files: dict[FileName, FileChecksum]
@@ -77,11 +79,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 
 def read_manifest(folder: Path) -> Manifest:
     """Return the manifest of a generation's folder. Raises `CorruptIndex` or `UnsupportedFormat`."""
-    manifest = read_document(folder / NAME, FORMAT, Manifest)
-    names = [*manifest.arrays, *manifest.documents]
-    if len(set(names)) < len(names):
-        raise CorruptIndex(f"{folder / NAME}: arrays and documents must have distinct names, got {names}; {AGAIN}")
-    return manifest
+    return read_document(folder / NAME, FORMAT, Manifest)
 
 
 def encode_document(content: Any, version: int) -> bytes:

@@ -12,6 +12,7 @@ Opening a sharded index reads only this file. Its length depends on the number o
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from hashlib import blake2b
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,7 +24,6 @@ from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from indexes.store.manifest import NAME as GENERATION_MANIFEST
 from indexes.store.manifest import encode_document, read_document
-from indexes.store.rows import key_of
 
 NAME, FORMAT = "SHARDS.json", 2
 SHARD_FOLDER = re.compile(r"shard-(\d{2,})-of-(\d{2,})")
@@ -90,7 +90,8 @@ def shard_number(object_id: str, shards: int) -> int:
         object_id: The object.
         shards: Number of shards.
     """
-    return int.from_bytes(key_of(object_id)[8:], "little") % shards
+    digest = blake2b(object_id.encode("utf-8", "surrogatepass"), digest_size=16).digest()
+    return int.from_bytes(digest[8:], "little") % shards
 
 
 def shard_folder(number: int, of: int) -> str:
@@ -108,17 +109,16 @@ def generation_number(name: str) -> int:
     return int(name.rpartition("-")[2])
 
 
-def shard_entry(index: Path, folder: str, generation: Generation, objects: int) -> ShardEntry:
+def shard_entry(index: Path, folder: str, generation: Generation) -> ShardEntry:
     """Return the manifest entry of a written shard.
 
     Args:
         index: Folder of the sharded index.
         folder: Folder of the shard in it.
         generation: Generation of the shard.
-        objects: Number of its objects.
     """
     digest = file_digest(index / folder / generation.name / GENERATION_MANIFEST)
-    return ShardEntry(folder, generation.name, digest, generation.count, objects)
+    return ShardEntry(folder, generation.name, digest, generation.count, generation.manifest.objects)
 
 
 def write_sharded_manifest(folder: Path, manifest: ShardedManifest) -> None:

@@ -27,6 +27,7 @@ from retrieval.console.output import say
 from retrieval.errors import BadInput, IncompleteSearch, RetrievalError
 from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_checkpoint_info
 from retrieval.model.posterior import Posterior
+from retrieval.search.query.objects import ListedPhoto
 from retrieval.search.query.opening import folder_shard, sharded_index_info
 from retrieval.search.query.shard import (
     IndexInfo,
@@ -34,8 +35,8 @@ from retrieval.search.query.shard import (
     ShardQuery,
     ShardResult,
     merge_pages,
+    merge_photos,
     merge_results,
-    merge_rows,
 )
 
 OWNERS = "touch-retrieval"
@@ -113,9 +114,9 @@ class RayShardGroup:
         """As `Shard.search`. Raises IncompleteSearch if a shard does not answer."""
         return merge_results(self._call_shards("search", query, top, candidates, posterior), top)
 
-    def rows(self, ids: Sequence[str]) -> list[dict[str, Any] | None]:
-        """As `Shard.rows`. Raises IncompleteSearch if a shard does not answer."""
-        return merge_rows(self._call_shards("rows", list(ids)))
+    def photos(self, paths: Sequence[str]) -> list[ListedPhoto | None]:
+        """As `Shard.photos`. Raises IncompleteSearch if a shard does not answer."""
+        return merge_photos(self._call_shards("photos", list(paths)))
 
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
         """As `Shard.page`. Raises IncompleteSearch if a shard does not answer."""

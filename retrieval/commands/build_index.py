@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from indexes import KINDS
-from retrieval.commands.options import COUNT, FRACTION, Json, Model, NumberParser, announce_resume
+from retrieval.commands.options import COUNT, FRACTION, Json, Model, announce_resume
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput, RetrievalError
 
@@ -36,26 +35,12 @@ def build_index(
     model: Model = None,
     out: Annotated[Path, typer.Option(help="index folder")] = Path("index"),
     kind: Annotated[
-        str | None,
+        str,
         typer.Option(
-            help=f"kind of the candidate index: {', '.join(KINDS)} (default: flat, exact search with FAISS; with "
-            "--min-recall or --max-ms a faster kind if needed)"
+            help="kind of the candidate index: flat, exact search; a factory string of FAISS with search settings "
+            "after a semicolon, such as 'IVF1024,SQ8;nprobe=32' or 'HNSW32;efSearch=64'; or module:Class"
         ),
-    ] = None,
-    min_recall: Annotated[
-        float | None,
-        typer.Option(
-            parser=FRACTION,
-            help="fraction of touches whose candidates must contain the exhaustive top-1 (default: 0.99)",
-        ),
-    ] = None,
-    max_ms: Annotated[
-        float | None,
-        typer.Option(
-            parser=NumberParser(float, 0, 86_400_000),
-            help="maximum time of one search in milliseconds: candidate search and reranking",
-        ),
-    ] = None,
+    ] = "flat",
     cells: Annotated[
         bool | None,
         typer.Option(
@@ -88,13 +73,6 @@ def build_index(
             "--cluster", help="build shards in parallel on the Ray cluster at RAY_ADDRESS, else on Ray on this machine"
         ),
     ] = False,
-    verify: Annotated[
-        bool,
-        typer.Option(
-            "--verify",
-            help="read every photo, even if its size, times and inode did not change",
-        ),
-    ] = False,
     json: Json = False,
 ) -> None:
     """Make a folder of photos searchable."""
@@ -111,14 +89,7 @@ def build_index(
     path, reason = defaults.find_model(model, out)
     say(f"model: {path} ({reason})")
     checkpoint = load_checkpoint(path)
-    options: dict[str, Any] = {
-        "objects_from": objects_from,
-        "kind": kind,
-        "min_recall": min_recall,
-        "max_ms": max_ms,
-        "cells": cells,
-        "verify": verify,
-    }
+    options: dict[str, Any] = {"objects_from": objects_from, "kind": kind, "cells": cells}
     run = None
     if cluster:
         from retrieval.cluster.building import ray_runner
@@ -189,5 +160,5 @@ def _write_views(sheet: Path, catalogue: Path, index: Path, report: "BuildReport
     first = IndexStore(index / report.shards[0]["folder"] if report.shards else index)
     rows = first.open(verify=False).rows
     chosen = sorted({number * len(rows) // PREVIEW_PHOTOS for number in range(PREVIEW_PHOTOS)})
-    write_views([catalogue / rows[row]["path"] for row in chosen], checkpoint.config.preprocessing, sheet)
+    write_views([catalogue / rows[row].path for row in chosen], checkpoint.config.preprocessing, sheet)
     say(f"views: {len(chosen)} photos in {sheet}")

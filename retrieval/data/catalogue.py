@@ -19,7 +19,6 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Self, overload
 
 from _touch_retrieval.files import parse_json, read_regular
-from indexes.store.stat_cache import FolderCache
 from retrieval.data.catalogue_touches import CatalogueTouch, group_touches, touch_name
 from retrieval.data.folder_walk import FolderWalk, SkippedPhoto
 from retrieval.data.images import EXTENSIONS, decode_rgb, read_bytes
@@ -153,15 +152,12 @@ class PhotoBytes:
     digest: str
 
 
-def list_catalogue(
-    folder: str | Path, naming: Naming | None = None, folder_cache: FolderCache | None = None
-) -> Catalogue:
+def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogue:
     """List the photos and touches below `folder`, sorted by path.
 
     Args:
         folder: The catalogue folder.
         naming: Rule that names the object of each photo; None for the rule "folder".
-        folder_cache: Names that earlier builds listed in unchanged folders; this call updates it.
 
     Raises:
         DatasetError: The folder does not exist, contains no photo or touch, or only ones that do not fit the
@@ -171,7 +167,7 @@ def list_catalogue(
     if not root.is_dir():
         what = "is a file" if root.exists() else "does not exist"
         raise DatasetError(f"a catalogue must be a folder of photos, but {root} {what}: {_LAYOUT}")
-    walk = FolderWalk(Path(os.path.realpath(root)), folder_cache)
+    walk = FolderWalk(Path(os.path.realpath(root)))
     walk.walk(str(root), "")
     path = root / METADATA_FILE
     try:

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
 
-from indexes.store.stat_cache import FolderCache
 from retrieval.data.text import is_utf8
 from retrieval.errors import DatasetError
 
@@ -24,14 +23,12 @@ class FolderWalk:
 
     Attributes:
         root: The folder.
-        folder_cache: Names that earlier builds listed in unchanged folders.
         names: Files found so far, as posix paths relative to `root`.
         skipped: Files and folders that cannot be used.
         link_targets: Folders that links have led to.
     """
 
     root: Path
-    folder_cache: FolderCache | None = None
     names: list[str] = field(default_factory=list)
     skipped: list[SkippedPhoto] = field(default_factory=list)
     link_targets: set[Path] = field(default_factory=set)
@@ -45,15 +42,10 @@ class FolderWalk:
         Raises:
             DatasetError: The folder cannot be listed.
         """
-        status = None if self.folder_cache is None else self.folder_cache.status(folder)  # read before the entries
-        if self.folder_cache is not None and (known := self.folder_cache.names(prefix, status)) is not None:
-            self.names += [prefix + name for name in known]
-            return
         try:
             entries = sorted(os.scandir(folder), key=attrgetter("name"))
         except OSError as error:
             raise DatasetError(f"cannot list the catalogue folder {folder}: {error.strerror}") from error
-        first, plain = len(self.names), True
         for entry in entries:
             name = entry.name
             if name.startswith("."):
@@ -61,21 +53,17 @@ class FolderWalk:
             path = prefix + name
             if not path.isascii() and not is_utf8(path):
                 self.skipped.append(skipped_non_utf8(path))
-                plain = False
                 continue
             try:
                 is_folder = entry.is_dir()
             except OSError:  # a link that leads to itself
                 is_folder = False
-            plain &= not is_folder and not entry.is_symlink()
             if not is_folder:
                 self.names.append(path)
             elif entry.is_symlink():
                 self._follow(entry.path, path)
             else:
                 self.walk(entry.path, path + "/")
-        if self.folder_cache is not None and plain:
-            self.folder_cache.note(prefix, status, [path[len(prefix) :] for path in self.names[first:]])
 
     def _follow(self, link: str, path: str) -> None:
         target = Path(os.path.realpath(link))

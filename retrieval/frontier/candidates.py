@@ -8,13 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from indexes import load_kind
+import indexes
 from indexes.kinds.vector_index import VectorIndex
 from retrieval.frontier.clock import time_points
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, miss_rate_point
 from retrieval.frontier.sample import Array, Sample
-from retrieval.search.build.measuring import EXHAUSTIVE_LIMIT, SHORT_LADDER, candidate_steps
-from retrieval.search.build.operating import TARGET
+from retrieval.search.build.candidates import EXHAUSTIVE_LIMIT, TARGET, candidate_steps
+
+FEW = (10, 25, 50, 100, 250)
+"""Numbers of candidates below the first one that `build-index` tries."""
 
 TOLERANCE = 100 * (1 - TARGET)
 """Default tolerance of `build-index`: percent of exhaustive top-1 photos that the candidates may miss."""
@@ -39,8 +41,8 @@ def _missed_top1_panel(sample: Sample) -> Panel:
     count, default = len(photos.partials), default_k(sample)
     for name, embeddings in photos.embeddings.items():
         found = ranks(sample.queries[name], embeddings, sample.exhaustive_top1)
-        index = load_kind("flat").build(embeddings, threads=1)
-        for k in (*SHORT_LADDER[::-1], *candidate_steps(count)[:-1]):
+        index = indexes.build(embeddings, threads=1)
+        for k in (*FEW, *candidate_steps(count)[:-1]):
             points.append(miss_rate_point(name, f"k = {k:,}", found >= k, k == default and is_used(sample, name)))
             works.append(_query_work(sample, index, sample.queries, name, photos.partials, k))
     points.append(miss_rate_point("no candidates", "all", sample.exhaustive_top1 < 0, default == count))
@@ -112,8 +114,8 @@ def _lost_top1_panel(sample: Sample) -> Panel:
     table = np.array([sample.logits(touch_partial, partials) for touch_partial in queries["partial"]])
     whole = _wrong(sample, table, rows)
     for name in (name for name in queries if name != "partial"):
-        index = load_kind("flat").build(sample.real_photo_codes[name], threads=1)
-        for k in (k for k in (1, 2, 5, *SHORT_LADDER[::-1], *candidate_steps(count)) if k < count):
+        index = indexes.build(sample.real_photo_codes[name], threads=1)
+        for k in (k for k in (1, 2, 5, *FEW, *candidate_steps(count)) if k < count):
             logits = _candidate_logits(table, index.search(queries[name], k)[1])
             points.append(miss_rate_point(name, f"k = {k:,}", _wrong(sample, logits, rows) & ~whole))
             works.append(_query_work(sample, index, queries, name, partials, k))
@@ -124,10 +126,10 @@ def _lost_top1_panel(sample: Sample) -> Panel:
     return _panel(f"lost correct top-1 answers, {count} photos of {objects} unseen objects", points, len(rows))
 
 
-def _candidate_logits(table: Array, slots: NDArray[np.int64]) -> Array:
+def _candidate_logits(table: Array, rows: NDArray[np.int64]) -> Array:
     """Return logits (Q, N) of the candidates (Q, k); -inf for the others."""
     logits = np.full(table.shape, -np.inf, dtype=np.float32)
-    np.put_along_axis(logits, slots, np.take_along_axis(table, slots, 1), 1)
+    np.put_along_axis(logits, rows, np.take_along_axis(table, rows, 1), 1)
     return logits
 
 

@@ -5,8 +5,10 @@ from itertools import cycle
 
 import numpy as np
 
-from indexes import KINDS, load_kind
+import indexes
 from indexes.errors import ParameterError
+from indexes.kinds.faiss_index import FaissIndex
+from indexes.kinds.measure import recall_against_exact
 from indexes.kinds.vector_index import VectorIndex
 from retrieval.console.progress import Bar
 from retrieval.frontier.candidates import default_k, is_used
@@ -17,7 +19,14 @@ from retrieval.frontier.sample import Array, Sample
 NEIGHBOURS = 10
 TOLERANCE = 1.0
 DEFAULT = "flat"
-"""Kind that `build-index` uses unless exact search exceeds a given time budget."""
+"""Kind that `build-index` uses unless `--kind` names another one."""
+STRUCTURES = {
+    "IVF{lists},Flat": ("nprobe", (1, 4, 16, 64)),
+    "IVF{lists},SQ8": ("nprobe", (1, 4, 16, 64)),
+    "IVF{lists},PQ16": ("nprobe", (4, 16, 64)),
+    "HNSW32": ("efSearch", (16, 64, 256, 1024)),
+}
+"""Factory strings of FAISS, with the search setting that trades time for recall and its values, the fastest first."""
 TimedPoint = tuple[Tradeoff, Callable[[], object]]
 
 
@@ -28,16 +37,15 @@ def index_kinds(sample: Sample) -> ApproximationResult:
         return ApproximationResult("Kind of index", "", skipped="this model has no trained embeddings")
     embeddings, queries = sample.catalogue.embeddings[used[0]], sample.queries[used[0]]
     k = min(default_k(sample), len(embeddings) // 4)
-    truth = load_kind("flat").build(embeddings, threads=1).search(queries, NEIGHBOURS)[0]
     near, far = list[TimedPoint](), list[TimedPoint]()
-    made = list(_structures(sample, embeddings))
-    with Bar("kinds of index", len(made), "settings", quiet=sample.quiet) as bar:
-        for series, setting, index in made:
+    settings = sum(len(values) for _, values in STRUCTURES.values())
+    with Bar("kinds of index", 1 + settings, "settings", quiet=sample.quiet) as bar:
+        for series, setting, index in _indexes(embeddings, sample.scale.quick):
             is_default = series == DEFAULT
-            if _is_comparable(setting, k):
-                lost = ~(index.search(queries, k)[1] == sample.exhaustive_top1[:, None]).any(1)
-                far.append((miss_rate_point(series, setting, lost, is_default), _query_work(index, queries, k)))
-            lacking = 100 * float(np.mean(index.search(queries, NEIGHBOURS)[0] < truth[:, -1:]))
+            rows = index.search(queries, k)[1]
+            lost = ~(rows == sample.exhaustive_top1[:, None]).any(1)
+            far.append((miss_rate_point(series, setting, lost, is_default), _query_work(index, queries, k)))
+            lacking = 100 * (1 - recall_against_exact(index, queries, NEIGHBOURS))
             near.append(
                 (Tradeoff(series, setting, lacking, is_default=is_default), _query_work(index, queries, NEIGHBOURS))
             )
@@ -47,8 +55,8 @@ def index_kinds(sample: Sample) -> ApproximationResult:
         "Kind of index",
         f"Search over {len(embeddings):,} blended photos by the {used[0]}. An answer needs the exhaustive top-1 of the "
         "fusion head among the candidates. The usual measure of such indexes is another one: recall of nearest "
-        "neighbours. Exact search is the default unless `build-index` gets a bound for recall or time: it needs no "
-        "training, and its recall does not depend on the catalogue.",
+        "neighbours. Exact search is the default: it needs no training, and its recall does not depend on the "
+        "catalogue. `build-index --kind` takes the name and the setting of a point, such as HNSW32;efSearch=64.",
         (
             _panel(
                 f"missed exhaustive top-1, k = {k:,} candidates", k, "every photo reranked", 100 / len(queries), of_top1
@@ -71,37 +79,18 @@ def _panel(title: str, k: int, reference: str, resolution: float, points: tuple[
     return Panel(title, time, unit, reference, TOLERANCE, points, resolution)
 
 
-def _structures(sample: Sample, embeddings: Array) -> Iterator[tuple[str, str, VectorIndex]]:
-    """Yield (series, setting, index) of every kind; search settings of one index do not rebuild it."""
-    for kind in KINDS:
-        if kind == "exact":  # the reference of the others
-            continue
-        for name, built in _build_variants(kind, embeddings, sample.scale.quick):
-            ladder = list(built.search_variants())
-            for index in ladder[::4] if sample.scale.quick else ladder:
-                with_settings = built.search_ladder and built.search_ladder[0]
-                yield name, f"{with_settings} = {index.settings()[with_settings]}" if with_settings else "", index
-
-
-def _build_variants(kind: str, embeddings: Array, quick: bool) -> Iterator[tuple[str, VectorIndex]]:
-    """Yield (series, index) of a kind, with each value of its `build_ladder` that fits these embeddings."""
-    made = load_kind(kind)
-    if made.build_ladder is None:
-        yield kind, made.build(embeddings)
-        return
-    setting, values = made.build_ladder
-    for value in values[:1] if quick else values:
+def _indexes(embeddings: Array, quick: bool) -> Iterator[tuple[str, str, VectorIndex]]:
+    """Yield (series, setting, index) of every kind that these embeddings can train."""
+    lists = 1 << max(0, round(np.log2(np.sqrt(len(embeddings)))))  # near the square root, a power of two
+    yield DEFAULT, "", indexes.build(embeddings, DEFAULT, threads=1)
+    for pattern, (setting, values) in STRUCTURES.items():
+        kind = pattern.format(lists=lists)
         try:
-            index = made.build(embeddings, made.parameters_from({setting: value}))
-        except ParameterError:  # the code size does not divide the vector
+            built = FaissIndex.build(embeddings, kind)
+        except ParameterError:  # too few vectors, or the code does not divide their size
             continue
-        yield f"{kind}, {setting} = {value}", index
-
-
-def _is_comparable(setting: str, k: int) -> bool:
-    """Return whether the setting can return k candidates: a graph needs a search breadth of at least k."""
-    name, _, value = setting.partition(" = ")
-    return name != "ef_search" or int(value) >= k
+        for value in values[:1] if quick else values:
+            yield kind, f"{setting} = {value}", built.with_settings(f"{setting}={value}")
 
 
 def _query_work(index: VectorIndex, queries: Array, k: int) -> Callable[[], object]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 PARTIALS, CELLS = "partials", "cells"
 """Names of the two arrays of an index."""
 _LARGEST = 127
+_BLOCK_ROWS = 8192
 Layout = dict[str, tuple[np.dtype[Any], tuple[int, ...]]]
 
 
@@ -55,6 +56,15 @@ def to_stored(partials: NDArray[np.float32], pooled_width: int) -> dict[str, NDA
     if partials.shape[1] > pooled_width:
         arrays[CELLS] = np.rint(_LARGEST * partials[:, pooled_width:]).astype(np.int8)
     return arrays
+
+
+def largest_rounding(partials: NDArray[np.float16]) -> float:
+    """Return the largest possible rounding error of stored partial activations (N, pooled), read block by block.
+
+    It is half a unit in the last of the eleven bits of float16's fraction.
+    """
+    starts = range(0, len(partials), _BLOCK_ROWS)
+    return max(float(np.abs(partials[start : start + _BLOCK_ROWS]).max()) for start in starts) * 2.0**-11
 
 
 Partials = NDArray[np.floating[Any]] | StoredPartials

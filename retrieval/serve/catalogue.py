@@ -15,7 +15,7 @@ from retrieval.data.text import replace_surrogates
 from retrieval.errors import ImageError
 from retrieval.report.pages import jpeg, thumbnail
 from retrieval.search.query.neighbours import nearest_photos
-from retrieval.search.query.objects import ListedPhoto, listed_photo
+from retrieval.search.query.objects import ListedPhoto
 from retrieval.serve.documents import (
     CatalogueDocument,
     IndexDocument,
@@ -39,11 +39,11 @@ MAX_PHOTO_PX = 4096
 """Maximum longer side, in pixels, of a photo that is converted to JPEG."""
 
 
-def _row(generation: ServedGeneration, photo: str) -> dict[str, object]:
-    (row,) = generation.shard.rows([photo])
-    if row is None:
+def _listed(generation: ServedGeneration, photo: str) -> ListedPhoto:
+    (found,) = generation.shard.photos([photo])
+    if found is None:
         raise HttpProblem("unknown", f"The index has no photo {photo!r}. /v1/catalogue lists the photos.")
-    return row
+    return found
 
 
 Offset = Annotated[int, Query(ge=0, le=2**31)]
@@ -61,13 +61,13 @@ def catalogue(
     """Return one page of the index's photos, in index order."""
     generation = parts.generations.current
     found = generation.shard.page(search.casefold().split(), name, offset, limit)
-    end = offset + len(found.rows)
+    end = offset + len(found.photos)
     return CatalogueDocument(
         generation=generation.name,
         total=found.total,
         offset=offset,
         next=end if offset < end < found.total else None,
-        items=[_document(listed_photo(row)) for row in found.rows],
+        items=[_document(listed) for listed in found.photos],
     )
 
 
@@ -87,15 +87,15 @@ def photo(
     Formats that browsers lack are converted to JPEG.
     """
     generation = parts.generations.current
-    row = _row(generation, photo)
-    headers = {"etag": f'"{row["digest"]}-{px}"', "cache-control": "private, no-cache"}
+    listed = _listed(generation, photo)
+    headers = {"etag": f'"{listed.digest}-{px}"', "cache-control": "private, no-cache"}
     if request.headers.get("if-none-match") == headers["etag"]:
         return Response(status_code=304, headers=headers)
-    path = generation.searcher.catalogue / listed_photo(row).path
+    path = generation.searcher.catalogue / listed.path
     try:
         data = read_bytes(path) if px is None else b""
         if not data.startswith(tuple(BROWSER_IMAGE_TYPES)):
-            data = _thumbnail(path, str(row["digest"]), px or MAX_PHOTO_PX)
+            data = _thumbnail(path, listed.digest, px or MAX_PHOTO_PX)
     except ImageError as error:
         detail = f"The photo {photo!r} cannot be read any more. Run `retrieve build-index` again."
         raise HttpProblem("unknown", detail) from error
@@ -126,7 +126,7 @@ def image_response(data: bytes, headers: Mapping[str, str] | None = None) -> Res
 def nearest(photo: str, parts: Parts, count: Annotated[int, Query(ge=1, le=100)] = 12) -> NearPhotosDocument:
     """Return visually similar photos, by the model's embeddings."""
     generation = parts.generations.current
-    if _row(generation, photo).get("touch"):
+    if _listed(generation, photo).is_touch:
         raise HttpProblem("unknown", f"{photo!r} is a gel image of a reference touch, not a photo.")
     items = [
         NearPhoto(**_document(near.photo).model_dump(), score=near.score)

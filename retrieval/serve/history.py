@@ -11,7 +11,6 @@ from pydantic import BaseModel, Field
 from retrieval.data.images import read_bytes
 from retrieval.errors import BadInput, ImageError
 from retrieval.search.query.answer import MATCH, NONE_OF_THESE, UNCALIBRATED
-from retrieval.search.query.objects import listed_photo
 from retrieval.serve.catalogue import IMAGE_RESPONSES, image_response
 from retrieval.serve.documents import QueryDocument
 from retrieval.serve.errors import HttpProblem
@@ -198,11 +197,11 @@ def _resolve_feedback(
         raise HttpProblem("bad-input", 'Feedback "object" requires object_id.')
     shown = next((one["photo"] for one in results if one["object_id"] == body.object_id), None)
     if shown is None:
-        rows = generation.shard.page([], body.object_id, 0, 1).rows
-        if not rows:
+        photos = generation.shard.page([], body.object_id, 0, 1).photos
+        if not photos:
             detail = f'The index has no object {body.object_id!r}. Send "none" if the catalogue lacks the object.'
             raise HttpProblem("bad-input", detail)
-        shown = listed_photo(rows[0]).path
+        shown = photos[0].path
     return OBJECT, body.object_id, _read_photo(generation, shown)
 
 
@@ -211,9 +210,9 @@ def _read_photo(generation: ServedGeneration, photo: str) -> bytes | None:
 
     None if the file is gone, or if the row is a gel image of a reference touch: the feedback is stored, not recorded.
     """
-    (row,) = generation.shard.rows([photo])
-    if row is None or row.get("touch"):
+    (found,) = generation.shard.photos([photo])
+    if found is None or found.is_touch:
         return None
     with suppress(ImageError):
-        return read_bytes(generation.searcher.catalogue / listed_photo(row).path)
+        return read_bytes(generation.searcher.catalogue / found.path)
     return None

@@ -8,7 +8,6 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from retrieval.search.query.objects import listed_photo
 from retrieval.serve.documents import GraspDocument
 from retrieval.serve.errors import HttpProblem
 from retrieval.serve.generations import ServedGeneration
@@ -52,8 +51,8 @@ def _object_ids(generation: ServedGeneration, name: str | None) -> list[str]:
             raise HttpProblem("unknown", f"The index has no object {name!r}. /v1/catalogue lists the objects.")
         return [name]
     step = max(1, photos // MAX_OBJECT_NAMES)
-    rows = [row for number in range(0, photos, step) for row in shard.page([], None, number, 1).rows]
-    return sorted({listed_photo(row).object_id for row in rows})
+    found = [photo for number in range(0, photos, step) for photo in shard.page([], None, number, 1).photos]
+    return sorted({photo.object_id for photo in found})
 
 
 @router.get(

@@ -19,7 +19,6 @@ from indexes.store.folder import IndexStore
 from indexes.store.sharded import is_sharded, read_sharded_manifest
 from retrieval.data.images import encode_image
 from retrieval.errors import BadInput
-from retrieval.search.query.objects import listed_photo
 from retrieval.serve.service import GraspResult, LiveRig
 from robot.devices import TactileSensor
 from robot.errors import RobotConfigError
@@ -74,7 +73,7 @@ def _seed(index: str | Path) -> int | None:
     try:
         folder = Path(index)
         folder = folder / read_sharded_manifest(folder).shards[0].folder if is_sharded(folder) else folder
-        first = listed_photo(IndexStore(folder).open(verify=False).rows[0]).object_id
+        first = IndexStore(folder).open(verify=False).rows[0].object_id
     except IndexesError:
         return None  # reported when the index is opened
     found = _SIMULATED_OBJECT_ID.fullmatch(first)

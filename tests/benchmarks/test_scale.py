@@ -26,19 +26,16 @@ def crowd():
     return scale.BlendedPhotos(checkpoint, scorer_of(matcher.head), photos, touches[:12], touches[12:])
 
 
-def test_every_kind_returns_its_figures(crowd, tmp_path, monkeypatch):
-    monkeypatch.setattr(scale, "ADDED", 20)
-    size = scale.measure(crowd, 700, ("flat", "ivf_sq8"), tmp_path / "index", queries=5)
-    assert (size.photos, size.queries, size.held_out) == (700, 5, 7)
-    for kind in ("flat", "ivf_sq8"):
+def test_every_kind_returns_its_figures(crowd, tmp_path):
+    size = scale.measure(crowd, 2000, ("flat", "IVF{lists},SQ8"), tmp_path / "index", queries=5)
+    assert (size.photos, size.queries, size.held_out) == (2000, 5, 7)
+    for kind in ("flat", "IVF{lists},SQ8"):
         figures = size.kinds[kind]
         assert 0 <= figures["low"] <= figures["recall"] <= figures["high"] <= 1
-        assert all(
-            figures[name] > 0 for name in ("k", "search_s", "rerank_s", "structure_s", "add_s", "open_s", "gain")
-        )
+        assert all(figures[name] > 0 for name in ("k", "search_s", "rerank_s", "structure_s", "open_s", "gain"))
     text = "\n".join(scale.lines(size))
-    assert "700 photos: written in " in text
-    assert "  flat {}: " in text
+    assert "2,000 photos: written in " in text
+    assert "  flat: " in text
     json.dumps(vars(size), allow_nan=False)
 
 
@@ -60,8 +57,10 @@ def test_held_out_touches_evaluate_the_number_of_candidates_that_others_chose(cr
             count=9,
             manifest=None,
             arrays={"partials": np.zeros((9, crowd.photos.shape[1]), np.float16)},
-            index=SimpleNamespace(search_variants=lambda: [SimpleNamespace(settings=dict)]),
-            search=lambda query, k: [(np.array([top1_of(numbers.get(query[0].tobytes()))]), None)],
+            index=SimpleNamespace(
+                kind="flat", candidates=lambda query, k: [np.array([top1_of(numbers.get(query[0].tobytes()))])]
+            ),
+            search=lambda query, k: (None, np.array([[top1_of(numbers.get(query[0].tobytes()))]])),
         )
         touches = np.concatenate([crowd.touches, crowd.held_out])
         exhaustive_top1 = np.concatenate([np.arange(12), np.full(7, 8)]) % 9
@@ -73,12 +72,12 @@ def test_held_out_touches_evaluate_the_number_of_candidates_that_others_chose(cr
 
 
 def test_a_kind_that_needs_more_photos_reports_it(crowd, tmp_path):
-    size = scale.measure(crowd, 100, ("ivf_sq8",), tmp_path / "index", queries=2)
-    assert "624 or more vectors" in "\n".join(scale.lines(size))
+    size = scale.measure(crowd, 100, ("IVF{lists},SQ8",), tmp_path / "index", queries=2)
+    assert "needs at least 312 photos" in "\n".join(scale.lines(size))
 
 
 def test_the_exhaustive_top1_has_the_greatest_match_logit(crowd):
-    partials = np.concatenate([block.arrays["partials"] for block in crowd.blocks(0, 60, 0)])
+    partials = np.concatenate([block["partials"] for block in crowd.blocks(0, 60, 0)])
     exhaustive_top1, seconds = scale._top1(crowd.scorer, crowd.touches[:3], partials)
     with torch.inference_mode():
         head, photos = crowd.checkpoint.matcher.head, torch.from_numpy(partials.astype(np.float32))

@@ -218,7 +218,7 @@ def test_the_collector_does_not_import_a_rig():
 
 
 def test_indexes_can_be_imported_with_numpy_only():
-    code = "import indexes, indexes.store.folder, indexes.kinds.exact, indexes.kinds.measure"
+    code = "import indexes, indexes.store.folder, indexes.kinds.measure"
     done = run_blocked(code, ("torch", "faiss", "cv2", "PIL", "scipy", "sklearn"))
     assert done.returncode == 0, done.stderr
 

@@ -30,21 +30,16 @@ class BuildReport:
         warnings: Sentences about suspicious object names.
         embedded: Number of photos that were encoded now.
         reused: Number of photos that were not.
-        renamed: Reused photos that had another name before.
-        resumed: Reused photos that an interrupted build had embedded.
-        re_embedded: Reused photos with a new embedding, computed from the stored partial activation.
-        removed: Number of photos of the previous index that the catalogue lacks.
-        unread: Number of photos whose files were not read, because their stat did not change
-            (`retrieval.search.build.stat_cache`).
+        unread: Number of photos whose files were not read, because size and time did not change.
         skipped: Images that could not be read.
         ignored: Files that are not images, by their names.
         without_photo: Objects without a readable image.
         notes: Remarks on metadata.
         kind: Kind of index.
-        reason: Reason for the choice of the operating point (`retrieval.search.build.operating`).
-        recall: Measured recall of the vector index.
+        reason: What changed since the previous index, and the number of candidates.
+        recall: Measured recall and time of the vector index.
         candidates: Measured number of candidates; None if the checkpoint stores no touches to measure with.
-        partial_error: Largest rounding error of a stored partial activation.
+        partial_error: Largest possible rounding error of a stored partial activation.
         cells: Whether the index stores the cells of photos, for late interaction; None for a model without cells.
         photo_bytes: Bytes of a photo in each array: of its pooled partial activation (`partials`), and of its cells.
         seconds: Time of decoding and encoding.
@@ -71,10 +66,6 @@ class BuildReport:
     warnings: list[str]
     embedded: int
     reused: int
-    renamed: int
-    resumed: int
-    re_embedded: int
-    removed: int
     unread: int
     skipped: list[SkippedPhoto]
     ignored: list[str]
@@ -109,21 +100,12 @@ class BuildReport:
     def lines(self) -> Iterator[str]:
         """Yield the lines of the printed report."""
         rate = f", {self.embedded / self.seconds:.1f} photos per second" if self.embedded else ""
-        renamed = f" ({self.renamed} renamed)" if self.renamed else ""
-        resumed = f", {self.resumed} from an interrupted build" if self.resumed else ""
-        re_embedded = f", {self.re_embedded} with recomputed embeddings" if self.re_embedded else ""
-        unchanged = self.reused - self.resumed - self.re_embedded
-        counts = (
-            f"{self.embedded} embedded{resumed}{re_embedded}, {unchanged} unchanged{renamed}, {self.removed} removed"
-        )
-        yield f"{self.index} ({self.generation}): {self.photos} photos of {self.objects} objects; {counts}{rate}"
+        counts = f"{self.embedded} embedded, {self.reused} unchanged{rate}"
+        yield f"{self.index} ({self.generation}): {self.photos} photos of {self.objects} objects; {counts}"
         if not self.written:
             yield "nothing changed: the index stays as it is"
         if self.unread:
-            yield (
-                f"{self.unread} photos were not read, because size, times and inode of their files did not change; the "
-                f"other {self.photos - self.unread} were read (--verify reads all)"
-            )
+            yield f"{self.unread} photos were not read, because size and time of their files did not change"
         each = " / ".join(f"{self.per_object[name]:g}" for name in ("min", "median", "max"))
         yield f"{self.objects} objects by --objects-from {self.objects_from}; photos of each: {each} (min, median, max)"
         yield from (f"  {name} <- {photo}" for name, photo in self.examples)
@@ -136,8 +118,11 @@ class BuildReport:
             )
         measured = ""
         if self.recall["queries"]:  # else exact by construction
-            at, recall = self.recall["at"], self.recall["value"]
-            measured = f" Recall@{at} compared with exact search: {recall:.3f}, measured on this index."
+            recall = self.recall
+            measured = (
+                f" Recall@{recall['at']} compared with exact search: {recall['value']:.3f}; a search takes "
+                f"{recall['ms']:.3g} ms, exact search {recall['exact_ms']:.3g} ms."
+            )
         for shard in self.shards or ():
             yield f"  {shard['folder']} ({shard['generation']}): {shard['photos']} photos of {shard['objects']} objects"
         yield f"candidate search: {self.kind}. {self.reason}{measured}"

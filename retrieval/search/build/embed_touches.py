@@ -1,9 +1,9 @@
-"""Encode the reference touches of a catalogue for its index; unchanged ones are reused."""
+"""Encode the reference touches of a catalogue for its index; codes of unchanged ones come from its cache."""
 
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from indexes.store.generation import Generation
-from indexes.store.rows import keys_of
-from indexes.store.tables import Tables
+from indexes.store.codes import CodeCache
+from indexes.store.generation import Arrays
+from indexes.store.rows import Row
 from retrieval.console.progress import Bar
 from retrieval.data.catalogue import Catalogue, CataloguePhoto, PhotoTable
 from retrieval.data.catalogue_touches import CatalogueTouch
@@ -24,7 +24,7 @@ from retrieval.model.calibration_touches import CalibrationTouches
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, batches, touch_features
 from retrieval.model.fusion import scorer_of
-from retrieval.model.fusion_scorer import CONTACT
+from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL
 from retrieval.model.posterior import ScoredTouches
 from retrieval.model.reference_calibration import (
     REFERENCE_PARTIALS,
@@ -33,6 +33,7 @@ from retrieval.model.reference_calibration import (
     unit_embeddings,
 )
 from retrieval.model.stored_partials import StoredPartials
+from retrieval.search.build.codes import code_model
 
 Partials = NDArray[np.float16]
 MIN_OBJECTS = 10
@@ -40,6 +41,8 @@ MIN_OBJECTS = 10
 MAX_REFERENCE_QUERIES = 600
 """Largest number of touches of the catalogue for that calibration."""
 BATCH = 32
+_SHOWS = (CONTACT, NO_CONTACT, NOT_A_GEL)
+"""Results of the gel check, by their number in a code."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +55,8 @@ class ReferenceBuild:
         touch_only: Objects without photos.
         skipped: Touches that could not be used.
         encoded: Number of touches that were encoded now.
+        digests: Content digest by path, of the gel images that could be read.
+        codes: Digests of the touches' codes in the cache.
     """
 
     rows: list[dict[str, Any]] = field(default_factory=list)
@@ -59,6 +64,8 @@ class ReferenceBuild:
     touch_only: list[str] = field(default_factory=list)
     skipped: list[SkippedPhoto] = field(default_factory=list)
     encoded: int = 0
+    digests: dict[str, str] = field(default_factory=dict)
+    codes: list[str] = field(default_factory=list)
 
     @property
     def documents(self) -> dict[str, Any]:
@@ -95,7 +102,7 @@ class ReferenceBuild:
         photos = sorted([*catalogue.photos, *pictures], key=lambda photo: photo.path)
         return replace(catalogue, photos=PhotoTable.of(photos))
 
-    def calibrate(self, checkpoint: Checkpoint, tables: Tables) -> dict[str, Any]:
+    def calibrate(self, checkpoint: Checkpoint, photos: Sequence[Row], arrays: Arrays) -> dict[str, Any]:
         """Return the calibration of the references and its source, for the manifest.
 
         The calibration is that of the checkpoint. If it has none, it is fitted to the catalogue's own touches: the
@@ -103,7 +110,8 @@ class ReferenceBuild:
 
         Args:
             checkpoint: The model.
-            tables: Tables of the new generation.
+            photos: The N rows of the new generation.
+            arrays: Its per-row arrays (N, ...).
 
         Raises:
             BadInput: There are too few touches.
@@ -113,14 +121,12 @@ class ReferenceBuild:
         names = np.array([row["object_id"] for row in self.rows])
         sample = _sample_objects(names)
         codes = unit_embeddings(self.partials[sample], checkpoint.config.matcher.cosine_columns)
-        photographed = ~np.isin(tables.objects, keys_of(self.touch_only))
         touched, owner = np.unique(names[sample], return_inverse=True)
-        keys = keys_of(touched.tolist())
-        photos = np.flatnonzero(photographed & np.isin(tables.objects, keys))
-        order = np.argsort(keys)
-        photo_owner = order[np.searchsorted(keys[order], tables.objects[photos])]
+        number_of = {name: number for number, name in enumerate(touched.tolist()) if name not in self.touch_only}
+        rows = np.array([row for row, photo in enumerate(photos) if photo.object_id in number_of], dtype=np.int64)
+        photo_owner = np.array([number_of[photos[row].object_id] for row in rows], dtype=np.int64)
         scorer = scorer_of(checkpoint.matcher.head)
-        touch_partials, photo_partials = self.partials[sample].astype(np.float32), StoredPartials(tables.arrays)[photos]
+        touch_partials, photo_partials = self.partials[sample].astype(np.float32), StoredPartials(arrays)[rows]
         logits = np.stack([scorer.logits(partial[None], photo_partials) for partial in touch_partials])
         scored = ScoredTouches(logits, owner, photo_owner, np.zeros(logits.shape, np.bool_))
         photo_codes = unit_embeddings(photo_partials, checkpoint.config.matcher.cosine_columns)
@@ -139,16 +145,17 @@ class ReferenceBuild:
 
 
 def embed_references(
-    catalogue: Catalogue, checkpoint: Checkpoint, parent: Generation | None, quiet: bool
+    catalogue: Catalogue, checkpoint: Checkpoint, cache: CodeCache, known: Mapping[str, str], quiet: bool
 ) -> ReferenceBuild:
-    """Encode the touches of a catalogue that the parent lacks.
+    """Encode the touches of a catalogue whose codes the cache lacks.
 
     Touches that cannot be read, have another number of fingers or show no contact are left out.
 
     Args:
         catalogue: The catalogue.
         checkpoint: The model.
-        parent: Generation whose encoded touches are reused; None to reuse none.
+        cache: The cache of the index.
+        known: Digests of unchanged files by path.
         quiet: Show no progress.
 
     Raises:
@@ -157,39 +164,59 @@ def embed_references(
     if not catalogue.touches:
         return ReferenceBuild()
     _require_fit(checkpoint)
-    known: Mapping[tuple[str, ...], Partials] = {}
-    if parent is not None and REFERENCE_ROWS in parent.documents:
-        # An index that drops its cells has longer ones.
-        before = parent.documents[REFERENCE_PARTIALS][:, : checkpoint.config.matcher.touch_partial_width]
-        stored = zip(parent.documents[REFERENCE_ROWS]["touches"], before, strict=True)
-        known = {tuple(row["digests"]): partial for row, partial in stored}
-    skipped: list[SkippedPhoto] = []
-    rows: list[dict[str, Any]] = []
-    partials: list[Partials] = []
+    layout = touch_layout(checkpoint)
+    model = code_model(checkpoint, layout)
+    stored = cache.known(model)
+    skipped, digests = list[SkippedPhoto](), dict[str, str]()
+    read: list[tuple[CatalogueTouch, str]] = []
     encoded = 0
     with Bar("embed touches", len(catalogue.touches), "touches", quiet=quiet) as bar:
         for some in batches(catalogue.touches, BATCH):
-            found = list(_read(catalogue, checkpoint, some, known, skipped))
-            new = [views for _, views, partial in found if partial is None]
-            made = iter(_encode_touches(checkpoint, new) if new else ())
-            for row, _, partial in found:
-                if partial is None:
-                    partial, shows = next(made)
-                    encoded += 1
-                    if shows != CONTACT:
-                        skipped.append(SkippedPhoto(row["touch"][0], f"{shows}: not usable as a reference touch"))
-                        continue
-                rows.append(row)
-                partials.append(partial)
+            new: dict[str, list[Image]] = {}
+            for touch in some:
+                try:
+                    images = _read(catalogue, checkpoint, touch, known, stored, digests)
+                except ImageError as error:
+                    skipped.append(SkippedPhoto(touch.paths[0], error.reason))
+                    continue
+                key = touch_code_digest(digests[path] for path in touch.paths)
+                read.append((touch, key))
+                if images:
+                    new[key] = images
+            if new:
+                cache.add(model, dict(zip(new, _encode_touches(checkpoint, layout, list(new.values())), strict=True)))
+                stored |= new.keys()
+                encoded += len(new)
             bar.advance(len(some))
+    keys = [key for _, key in read]
+    records = np.frombuffer(b"".join(cache.read(model, keys)), layout)
+    is_used = records["shows"] == _SHOWS.index(CONTACT)
+    rows: list[dict[str, Any]] = []
+    for (touch, _), shows in zip(read, records["shows"].tolist(), strict=True):
+        if _SHOWS[shows] == CONTACT:
+            named = {"touch": list(touch.paths), "digests": [digests[path] for path in touch.paths]}
+            rows.append({"object_id": touch.object_id, **named})
+        else:
+            skipped.append(SkippedPhoto(touch.paths[0], f"{_SHOWS[shows]}: not usable as a reference touch"))
     photographed, counts = set(catalogue.photos.objects), Counter(row["object_id"] for row in rows)
-    stacked = np.stack(partials) if partials else np.empty((0, 0), np.float16)
-    references = ReferenceBuild(rows, stacked, sorted(counts.keys() - photographed), skipped, encoded)
+    references = ReferenceBuild(
+        rows, records["partial"][is_used], sorted(counts.keys() - photographed), skipped, encoded, digests, keys
+    )
     if rows and checkpoint.references is None:  # count objects with photos, if any touched object has photos
         both = counts.keys() & photographed
         if sum(count > 1 and (name in both or not both) for name, count in counts.items()) < MIN_OBJECTS:
             raise references.too_few_error()
     return references
+
+
+def touch_layout(checkpoint: Checkpoint) -> np.dtype[Any]:
+    """Return the type of a touch's code in the cache: its partial activation and its gel check."""
+    return np.dtype([("partial", "<f2", (checkpoint.config.matcher.touch_partial_width,)), ("shows", "u1")])
+
+
+def touch_code_digest(digests: Iterable[str]) -> str:
+    """Return the digest of a touch's code in the cache from those of its gel images."""
+    return hashlib.sha256("".join(digests).encode()).hexdigest()
 
 
 def _require_fit(checkpoint: Checkpoint) -> None:
@@ -209,44 +236,45 @@ def _require_fit(checkpoint: Checkpoint) -> None:
 def _read(
     catalogue: Catalogue,
     checkpoint: Checkpoint,
-    touches: list[CatalogueTouch],
-    known: Mapping[tuple[str, ...], Partials],
-    skipped: list[SkippedPhoto],
-) -> Iterator[tuple[dict[str, Any], list[Image], Partials | None]]:
-    """Yield the row of each touch, the tower's inputs, and its partial activation if it is known.
+    touch: CatalogueTouch,
+    known: Mapping[str, str],
+    stored: Collection[str],
+    digests: dict[str, str],
+) -> list[Image]:
+    """Add the digests of a touch's gel images, and return the tower's inputs; none if its code is stored.
 
-    Touches that cannot be used are added to `skipped`.
+    Raises:
+        ImageError: A gel image cannot be read, or the touch has another number of fingers than the model.
     """
     fingers, preprocess = checkpoint.config.matcher.fingers, checkpoint.config.preprocessing.touch
-    for touch in touches:
-        if len(touch.paths) != fingers:
-            ends = " and ".join(f"_{letter}" for letter in "abcdefghij"[:fingers])
-            reason = f"the touch has {len(touch.paths)} gel image(s), the model takes {fingers}: names end in {ends}"
-            skipped.append(SkippedPhoto(touch.paths[0], reason))
-            continue
-        try:
-            files = [catalogue.read(path) for path in touch.paths]
-            digests = [hashlib.sha256(data).hexdigest() for data in files]
-            row = {"object_id": touch.object_id, "touch": list(touch.paths), "digests": digests}
-            partial = known.get(tuple(digests))
-            named = zip(files, touch.paths, strict=True)
-            views = [] if partial is not None else [preprocess(decode_rgb(data, path), None) for data, path in named]
-        except ImageError as error:
-            skipped.append(SkippedPhoto(touch.paths[0], error.reason))
-            continue
-        yield row, views, partial
+    if len(touch.paths) != fingers:
+        ends = " and ".join(f"_{letter}" for letter in "abcdefghij"[:fingers])
+        reason = f"the touch has {len(touch.paths)} gel image(s), the model takes {fingers}: names end in {ends}"
+        raise ImageError(touch.paths[0], reason)
+    noted = {path: known[path] for path in touch.paths if path in known}
+    if len(noted) == fingers and touch_code_digest(noted.values()) in stored:
+        digests |= noted
+        return []
+    files = [catalogue.read(path) for path in touch.paths]
+    own = {path: hashlib.sha256(data).hexdigest() for path, data in zip(touch.paths, files, strict=True)}
+    images: list[Image] = []
+    if touch_code_digest(own.values()) not in stored:
+        images = [preprocess(decode_rgb(data, path), None) for data, path in zip(files, touch.paths, strict=True)]
+    digests |= own
+    return images
 
 
 @torch.inference_mode()
-def _encode_touches(checkpoint: Checkpoint, touches: list[list[Image]]) -> Iterator[tuple[Partials, str]]:
-    """Yield the partial activation of each touch, and its gel check: contact, no contact or not a gel image."""
+def _encode_touches(checkpoint: Checkpoint, layout: np.dtype[Any], touches: list[list[Image]]) -> list[bytes]:
+    """Return the codes of touches: partial activation and gel check."""
     matcher = checkpoint.matcher
     features = touch_features(matcher, touches)
-    partials = matcher.touch_encoding(features).partial.cpu().numpy().astype(np.float16)
-    readings = matcher.gel_readings(features)
-    check = checkpoint.gel_check
-    shows = [CONTACT] * len(touches) if check is None or readings is None else check.classify(readings.cpu().numpy())
-    yield from zip(partials, shows, strict=True)
+    readings, check = matcher.gel_readings(features), checkpoint.gel_check
+    records = np.zeros(len(touches), layout)
+    records["partial"] = matcher.touch_encoding(features).partial.cpu().numpy()
+    if check is not None and readings is not None:
+        records["shows"] = [_SHOWS.index(shows) for shows in check.classify(readings.cpu().numpy())]
+    return [record.tobytes() for record in records]
 
 
 def _sample_objects(names: NDArray[np.str_]) -> NDArray[np.int64]:

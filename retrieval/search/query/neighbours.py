@@ -43,15 +43,13 @@ def nearest_photos(searcher: Searcher, photo: str, count: int = 10) -> list[Neig
         raise BadInput(f"count must be 1 or more; got {count}")
     if not searcher.checkpoint.config.has_embeddings:
         raise BadInput("this model has no trained embeddings, so they cannot measure similarity")
-    try:
-        own = generation.row_number(photo)
-    except KeyError:
-        raise BadInput(f"the index has no photo {photo!r}") from None
-    vector = np.ascontiguousarray(generation.embeddings[generation.slots[own]][None])
-    numbers, scores = generation.search(vector, min(count + 1, generation.count))[0]
+    own = generation.rows.find(photo)
+    if own < 0:
+        raise BadInput(f"the index has no photo {photo!r}")
+    scores, rows = generation.search(np.ascontiguousarray(generation.embeddings[own][None]), count + 1)
     found = [
-        Neighbour(listed_photo(generation.rows[int(number)]), float(score))
-        for number, score in zip(numbers, scores, strict=True)
-        if number != own
+        Neighbour(listed_photo(generation.rows[row]), score)
+        for score, row in zip(scores[0].tolist(), rows[0].tolist(), strict=True)
+        if row not in (own, -1)
     ]
     return found[:count]

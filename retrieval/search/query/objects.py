@@ -1,9 +1,5 @@
-"""Photos and objects of an index: checked rows, object logits from photo logits, the best objects, and a sample.
+"""Photos and objects of an index: object logits from photo logits, the best objects, and a sample."""
 
-An index may come from an untrusted source, so rows are checked when they are read.
-"""
-
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -13,8 +9,8 @@ from numpy.typing import NDArray
 
 from indexes.errors import AGAIN, CorruptIndex
 from indexes.store.generation import Generation
-from indexes.store.rows import keys_of
-from retrieval.data.text import is_inside, replace_surrogates
+from indexes.store.rows import Row
+from retrieval.data.text import is_inside
 from retrieval.model.posterior import Posterior
 from retrieval.model.stored_partials import Layout
 
@@ -26,34 +22,35 @@ SAMPLE = 100
 
 @dataclass(frozen=True)
 class ListedPhoto:
-    """A row of an index.
+    """A photo of an index, or a gel image of a reference touch.
 
     Attributes:
         object_id: The object.
         path: Path relative to the catalogue, and inside it.
         metadata: The user's metadata.
+        digest: SHA-256 of the file, in hexadecimal.
+        is_touch: Whether it is a gel image.
     """
 
     object_id: str
     path: str
     metadata: dict[str, Any]
+    digest: str = ""
+    is_touch: bool = False
 
 
-def listed_photo(row: dict[str, Any]) -> ListedPhoto:
-    """Return the photo of a row; U+FFFD replaces text that UTF-8 cannot represent, which old indexes may contain.
+def listed_photo(row: Row) -> ListedPhoto:
+    """Return the photo of a row.
 
     Args:
         row: A row of an index.
 
     Raises:
-        CorruptIndex: A field is missing, or the path is outside the catalogue. Pages would show such a file.
+        CorruptIndex: The path is outside the catalogue. Pages would show such a file.
     """
-    object_id, path, metadata = (row.get(name) for name in ("object_id", "path", "metadata"))
-    if not (isinstance(object_id, str) and isinstance(path, str) and isinstance(metadata, dict)):
-        raise CorruptIndex(f"row {row['id']!r} must have an object_id, a path and metadata; {AGAIN}")
-    if not is_inside(path):
-        raise CorruptIndex(f"row {row['id']!r} must name a photo inside the catalogue, got {path!r}; {AGAIN}")
-    return ListedPhoto(replace_surrogates(object_id), replace_surrogates(path), replace_surrogates(metadata))
+    if not is_inside(row.path):
+        raise CorruptIndex(f"the index must list photos inside the catalogue, but has {row.path!r}; {AGAIN}")
+    return ListedPhoto(row.object_id, row.path, row.metadata, row.digest)
 
 
 def check_usable(generation: Generation, layout: Layout) -> None:
@@ -97,28 +94,17 @@ class ScoredObjects(NamedTuple):
 
 
 class Objects:
-    """The objects of an index. In all methods, `rows` (n,) selects photos, and `logits` (n,) are their logits."""
+    """The objects of an index, numbered in the order of their names.
+
+    In all methods, `rows` (n,) selects photos, and `logits` (n,) are their logits.
+    """
 
     def __init__(self, generation: Generation) -> None:
-        self._rows = generation.rows
-        self._of_row = generation.codes("object_id")
-        contents = generation.codes("digest")
-        first = np.unique(contents, return_index=True)[1]
-        self._original = first[contents] if len(first) < len(contents) else None
+        rows = generation.rows
+        self._of_row, self.count = rows.objects, rows.object_count
+        self._original = None if (rows.originals == np.arange(len(rows))).all() else rows.originals
         """For each photo the first one with the same bytes; None if all photos differ."""
         self._photos = np.bincount(self._of_row)
-
-    @property
-    def count(self) -> int:
-        """Number of objects."""
-        return len(self._photos)
-
-    def numbers_of(self, names: Sequence[str]) -> Rows:
-        """Return the number of each object; -1 for a missing one."""
-        keys, first = np.unique(self._rows.keys("object_id"), return_index=True)
-        requested = keys_of(names)
-        places = np.minimum(np.searchsorted(keys, requested), len(keys) - 1)
-        return np.asarray(np.where(keys[places] == requested, self._of_row[first[places]], -1))
 
     def align_duplicates(self, rows: Rows, logits: Floats) -> Floats:
         """Return the logits with equal values for photos with equal bytes.
@@ -153,12 +139,7 @@ class Objects:
         selected = np.arange(len(scored.logits))
         if top < len(selected):  # including ties with the last one
             selected = np.flatnonzero(scored.logits >= np.partition(scored.logits, -top)[-top])
-        logits = scored.logits[selected]
-        if len(set(logits.tolist())) == len(selected):  # parse rows for their names only if there are ties
-            order = np.argsort(-logits)
-        else:
-            names = np.array([listed_photo(self._rows[row]).object_id for row in scored.rows[selected]])
-            order = np.lexsort((names, -logits))
+        order = np.lexsort((scored.numbers[selected], -scored.logits[selected]))  # numbers are in the order of names
         return np.asarray(selected[order[:top]])
 
     def remaining_rows(self, numbers: Rows, rows: Rows) -> Rows:

@@ -25,7 +25,7 @@ from retrieval.model.reference_calibration import (
     unit_embeddings,
 )
 from retrieval.search.query.answer import NearestReference
-from retrieval.search.query.objects import Objects, ScoredObjects
+from retrieval.search.query.objects import ListedPhoto, Objects, ScoredObjects
 
 Similarities = NDArray[np.float64]
 
@@ -91,7 +91,8 @@ class References:
             )
         except (BadInput, TypeError) as error:
             raise CorruptIndex(f"{where}: the calibration of its references is damaged ({error}); {AGAIN}") from error
-        known = objects.numbers_of([one.object_id for one in touches] + touch_only)
+        names = [one.object_id for one in touches] + touch_only
+        known = np.array([generation.rows.find_object(name) for name in names], dtype=np.int64)
         numbers, without_photos = known[: len(touches)], known[len(touches) :]
         order = np.flatnonzero(numbers >= 0)  # an object without a readable photo has no number
         order = order[np.argsort(numbers[order], kind="stable")]
@@ -101,25 +102,18 @@ class References:
         self._columns, self._touch_only = columns, np.zeros(objects.count, np.bool_)
         self._touch_only[without_photos[without_photos >= 0]] = True
 
-    def image(self, path: str) -> dict[str, Any] | None:
-        """Return a row for a gel image of a reference touch, like a photo's row but with `touch`.
-
-        Args:
-            path: Path of the gel image in the catalogue.
-
-        Returns:
-            The row; None if no reference has this image.
-        """
-        if path not in self._images:
-            return None
-        one, digest = self._images[path]
-        fields = {"object_id": one.object_id, "digest": digest, "metadata": {}, "touch": True}
-        return {"id": path, "path": path, **fields}
+    def image(self, path: str) -> ListedPhoto | None:
+        """Return the gel image of a reference touch with this path in the catalogue; None if there is none."""
+        return self._images.get(path)
 
     @cached_property
-    def _images(self) -> dict[str, tuple[_ReferenceTouch, str]]:
-        """Touch and digest of each gel image; queries do not need them."""
-        return {path: (one, digest) for one in self._all for path, digest in zip(one.touch, one.digests, strict=True)}
+    def _images(self) -> dict[str, ListedPhoto]:
+        """Gel images by path; queries do not need them."""
+        return {
+            path: ListedPhoto(one.object_id, path, {}, digest, is_touch=True)
+            for one in self._all
+            for path, digest in zip(one.touch, one.digests, strict=True)
+        }
 
     def similarities_to_objects(self, partials: Floats) -> Similarities:
         """Return the similarities (count,) of grasps, as partial activations (G, touch_partial_width), with objects."""

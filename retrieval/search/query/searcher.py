@@ -266,7 +266,7 @@ class Searcher:
                 "cells"
             )
         bounds = calibration.bounds(far)
-        number = int(self.folder_shard.objects.numbers_of([expect])[0])
+        number = self.generation.rows.find_object(expect)
         if number < 0:
             raise BadInput(f"the catalogue of {self.index} has no object {expect!r}; give the name of its folder")
         return number, bounds, posterior

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexes.store.generation import Generation
-from indexes.store.rows import key_of
 from retrieval.errors import BadInput
 from retrieval.model.fusion_scorer import FusionScorer
 from retrieval.model.posterior import EvidenceMass, Posterior
@@ -98,10 +97,10 @@ class IndexInfo:
 
 
 class Page(NamedTuple):
-    """Some rows, and the total number of matching rows."""
+    """Some photos, and the total number of matching photos."""
 
     total: int
-    rows: list[dict[str, Any]]
+    photos: list[ListedPhoto]
 
 
 class Shard(Protocol):
@@ -125,8 +124,8 @@ class Shard(Protocol):
             NumericalError: A logit is not finite.
         """
 
-    def rows(self, ids: Sequence[str]) -> list[dict[str, Any] | None]:
-        """Return the row of each id: a photo, or a reference touch's gel image (with key `touch`); None if missing."""
+    def photos(self, paths: Sequence[str]) -> list[ListedPhoto | None]:
+        """Return the photo with each path, or a reference touch's gel image; None if missing."""
 
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
         """Return a page of the photos that contain all words in object, path or metadata.
@@ -204,38 +203,36 @@ class FolderShard:
         scored = self._objects_of(rows, self._logits(partials, rows), posterior, len(partials), similarities)
         return float(scored.logits[0])
 
-    def rows(self, ids: Sequence[str]) -> list[dict[str, Any] | None]:
-        """As `Shard.rows`."""
-        numbers = self.generation.rows.find(ids).tolist()
-        found = [None if number < 0 else self.generation.rows[number] for number in numbers]
-        if self.references is None:
-            return found
-        images = map(self.references.image, ids)
-        # For an object without photos, the index has a gel image as a row, in place of a photo. The result has the
-        # fields of this row, and the key `touch`.
-        return [row if image is None else {**image, **(row or {})} for row, image in zip(found, images, strict=True)]
+    def photos(self, paths: Sequence[str]) -> list[ListedPhoto | None]:
+        """As `Shard.photos`."""
+        return [self._photo(path) for path in paths]
+
+    def _photo(self, path: str) -> ListedPhoto | None:
+        # For an object without photos, the index has a gel image as a row, in place of a photo.
+        if self.references is not None and (image := self.references.image(path)) is not None:
+            return image
+        number = self.generation.rows.find(path)
+        return None if number < 0 else listed_photo(self.generation.rows[number])
 
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
         """As `Shard.page`."""
-        if object_id is None and not words:
-            return Page(self.generation.count, self.generation.rows[offset : offset + limit])
-        found = np.arange(self.generation.count)
+        rows = self.generation.rows
+        found = np.arange(len(rows))
         if object_id is not None:
-            found = found[self.generation.rows.keys("object_id") == key_of(object_id)]
+            found = np.flatnonzero(rows.objects == rows.find_object(object_id))
         if words:
             with self._lock:
                 texts = self._texts
             found = np.array([row for row in found if all(word in texts[row] for word in words)], dtype=np.int64)
-        return Page(len(found), [self.generation.rows[int(row)] for row in found[offset : offset + limit]])
+        return Page(len(found), [listed_photo(rows[int(row)]) for row in found[offset : offset + limit]])
 
     @cached_property
     def _texts(self) -> list[str]:
         """Searched text of each row: object, path and metadata in lower case."""
-        found = []
-        for row in self.generation.rows:
-            values = [row.get("object_id"), row.get("path"), *(row.get("metadata") or {}).values()]
-            found.append(" ".join(str(value) for value in values).casefold())
-        return found
+        return [
+            " ".join(map(str, (row.object_id, row.path, *row.metadata.values()))).casefold()
+            for row in self.generation.rows
+        ]
 
     def limit(self, top: int, candidates: int | None) -> int:
         """Return the number of photos to rerank: `candidates`, else the measured number, else `DEFAULT_CANDIDATES`.
@@ -255,7 +252,7 @@ class FolderShard:
         """
         if not self.has_embeddings or k >= self.generation.count:
             return np.arange(self.generation.count)
-        rows = np.sort(self.generation.candidates(combined_embedding(embeddings), k)[0])
+        rows = np.sort(self.generation.index.candidates(combined_embedding(embeddings), k)[0])
         if self.references is None or similarities is None or len(rows) == self.generation.count:
             return rows
         return np.union1d(rows, self.objects.remaining_rows(self.references.nearest_objects(similarities, k), rows))
@@ -339,9 +336,9 @@ class Shards:
         """As `Shard.search`."""
         return merge_results([shard.search(query, top, candidates, posterior) for shard in self.shards], top)
 
-    def rows(self, ids: Sequence[str]) -> list[dict[str, Any] | None]:
-        """As `Shard.rows`."""
-        return merge_rows([shard.rows(ids) for shard in self.shards])
+    def photos(self, paths: Sequence[str]) -> list[ListedPhoto | None]:
+        """As `Shard.photos`."""
+        return merge_photos([shard.photos(paths) for shard in self.shards])
 
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
         """As `Shard.page`, in the order of the shards."""
@@ -380,14 +377,14 @@ def merge_pages(pages: Sequence[Callable[[int, int], Page]], offset: int, limit:
         offset: Number of photos to skip.
         limit: Largest number of photos to return.
     """
-    total, rows = 0, list[dict[str, Any]]()
+    total, photos = 0, list[ListedPhoto]()
     for page in pages:
-        found = page(max(0, offset - total), limit - len(rows))
+        found = page(max(0, offset - total), limit - len(photos))
         total += found.total
-        rows += found.rows
-    return Page(total, rows)
+        photos += found.photos
+    return Page(total, photos)
 
 
-def merge_rows(found: Sequence[Sequence[dict[str, Any] | None]]) -> list[dict[str, Any] | None]:
-    """Return the row of each photo from the shard that has it; `found` has one list of rows per shard."""
-    return [next((row for row in rows if row is not None), None) for rows in zip(*found, strict=True)]
+def merge_photos(found: Sequence[Sequence[ListedPhoto | None]]) -> list[ListedPhoto | None]:
+    """Return each photo from the shard that has it; `found` has one list of photos per shard."""
+    return [next((photo for photo in photos if photo is not None), None) for photos in zip(*found, strict=True)]

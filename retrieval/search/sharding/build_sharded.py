@@ -1,14 +1,11 @@
 """Build a sharded index: several index folders over one catalogue, which are switched together.
 
-All photos of an object go to one shard, and each shard is built as an ordinary index. Codes (embeddings and stored
-partial activations) are reused from the same shard, from the shards of an earlier build with another number of shards,
-and from an interrupted build. The manifest is written when every shard is on the disk, so a killed build does not
-change the index.
+All photos of an object go to one shard, and each shard is built as an ordinary index, with a cache of codes of its own.
+The manifest is written when every shard is on the disk, so a killed build does not change the index.
 """
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from _touch_retrieval.files import remove_folder
-from indexes.errors import CorruptIndex, IndexesError, NoIndex, UnsupportedFormat
+from indexes import kind_name
+from indexes.errors import CorruptIndex, NoIndex, UnsupportedFormat
 from indexes.kinds.vector_index import VectorIndex
 from indexes.store.folder import IndexStore
-from indexes.store.generation import Generation
 from indexes.store.locking import WriterLock
 from indexes.store.sharded import (
     MAX_SHARDS,
@@ -46,14 +43,13 @@ from retrieval.model.reference_calibration import REFERENCE_CALIBRATION, REFEREN
 from retrieval.model.stored_partials import CELLS
 from retrieval.search.build.build_index import BuildOptions, build_listed, naming_by, stores_cells
 from retrieval.search.build.build_report import BuildReport
-from retrieval.search.build.embed import no_photo
-from retrieval.search.build.operating import SearchRequirements
+from retrieval.search.build.codes import no_photo
 from retrieval.version import __version__
 
 MAX_UNREADABLE = 0.05
 """Fraction of a catalogue's photos that may be unreadable, by default."""
 _KEEP_ALL = 10**6
-ADDITIVE_FIELDS = ("photos", "embedded", "reused", "renamed", "resumed", "re_embedded", "removed", "unread", "seconds")
+ADDITIVE_FIELDS = ("photos", "embedded", "reused", "unread", "seconds")
 """Fields of a report that add up over the shards."""
 
 
@@ -67,7 +63,6 @@ class ShardJob:
         catalogue: The shard's photos and touches.
         model: Path of the checkpoint.
         options: As for an index folder.
-        donors: Shards of an earlier build with another number of shards, whose codes may be reused.
     """
 
     index: Path
@@ -75,7 +70,6 @@ class ShardJob:
     catalogue: Catalogue
     model: Path
     options: BuildOptions
-    donors: Sequence[ShardEntry]
 
 
 @dataclass(frozen=True)
@@ -108,12 +102,9 @@ def build_sharded(
     shards: int,
     *,
     objects_from: str | None = None,
-    kind: str | type[VectorIndex] | None = None,
-    min_recall: float | None = None,
-    max_ms: float | None = None,
+    kind: str | type[VectorIndex] = "flat",
     cells: bool | None = None,
     max_unreadable: float = MAX_UNREADABLE,
-    verify: bool = False,
     quiet: bool = False,
     run: ShardRunner | None = None,
 ) -> BuildReport:
@@ -126,11 +117,8 @@ def build_sharded(
         shards: Number of shards.
         objects_from: As for `build_index`.
         kind: As for `build_index`.
-        min_recall: As for `build_index`.
-        max_ms: As for `build_index`.
         cells: As for `build_index`.
         max_unreadable: Largest fraction of photos that may be unreadable.
-        verify: As for `build_index`.
         quiet: Show no progress.
         run: Builds the shards; None to build them in this process, one after another.
 
@@ -148,7 +136,7 @@ def build_sharded(
     own = Path(out)
     if (own / "CURRENT").is_file():
         raise BadInput(f"{out} is an index folder; give another folder for a sharded index of {shards} shards")
-    requirements = SearchRequirements.of(kind, min_recall, max_ms)
+    name = kind_name(kind)
     with WriterLock(own / "LOCK"):
         before: ShardedManifest | None = None
         note = ""
@@ -171,10 +159,9 @@ def build_sharded(
                 "train` with enough validation objects"
             )
         _delete_old_shards(own, before, shards)
-        donors = [] if before is None or before.of == shards else before.shards
-        options = BuildOptions(naming, requirements, quiet, verify, keep=_KEEP_ALL, cells=cells)
+        options = BuildOptions(naming, name, quiet, keep=_KEEP_ALL, cells=cells)
         jobs = [
-            ShardJob(own, folder, part, checkpoint.path, replace(options, about={"shard": folder}), donors)
+            ShardJob(own, folder, part, checkpoint.path, replace(options, about={"shard": folder}))
             for folder, part in _split_catalogue(catalogue, shards)
         ]
         built = sorted((run or build_in_process)(jobs, checkpoint), key=lambda one: one.folder)
@@ -187,7 +174,7 @@ def build_sharded(
                 f"{bad} of {every} {what} cannot be read, more than the allowed fraction {max_unreadable:g} "
                 f"(--max-unreadable); the index was not changed. The first: {first.path}: {first.reason}"
             )
-        manifest = _manifest(before, built, shards, checkpoint, catalogue, report, requirements)
+        manifest = _manifest(before, built, shards, checkpoint, catalogue, report)
         written = before is None or manifest.generation != before.generation
         if written:
             write_sharded_manifest(own, manifest)
@@ -214,18 +201,14 @@ def build_shard(job: ShardJob, checkpoint: Checkpoint | None = None) -> ShardBui
         RetrievalError: As for `build_index`, except if none of the shard's photos can be read.
     """
     model = checkpoint or load_checkpoint(job.model)
-    store, donors = IndexStore(job.index / job.folder), list[Generation]()
-    for donor in job.donors:
-        with suppress(IndexesError):  # an unusable donor is skipped
-            donors.append(IndexStore(job.index / donor.folder).open(name=donor.generation, expect=fingerprint(model)))
+    store = IndexStore(job.index / job.folder)
     try:
-        report = build_listed(job.catalogue, model, store.path, replace(job.options, donors=donors))
+        report = build_listed(job.catalogue, model, store.path, job.options)
     except NoReadablePhoto as error:
         return ShardBuild(job.folder, None, None, [], error.skipped)
     generation = store.open(name=report.generation, verify=False)
-    counts = np.bincount(generation.codes("object_id")).tolist()
-    entry = shard_entry(job.index, job.folder, generation, len(counts))
-    return ShardBuild(job.folder, entry, report, counts, report.skipped)
+    counts = np.bincount(generation.rows.objects).tolist()
+    return ShardBuild(job.folder, shard_entry(job.index, job.folder, generation), report, counts, report.skipped)
 
 
 def _delete_old_shards(out: Path, before: ShardedManifest | None, shards: int) -> None:
@@ -301,14 +284,12 @@ def _manifest(
     checkpoint: Checkpoint,
     catalogue: Catalogue,
     report: BuildReport,
-    requirements: SearchRequirements,
 ) -> ShardedManifest:
     """Return the new manifest, or the current one if they would be equal."""
     about: dict[str, Any] = {
         "checkpoint": str(checkpoint.path.resolve()),
         "catalogue": catalogue.where,
         "objects_from": report.objects_from,
-        "requirements": asdict(requirements),
         "partial_error": report.partial_error,
         **({} if report.cells is None else {CELLS: report.cells}),
     }

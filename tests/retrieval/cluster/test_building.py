@@ -13,11 +13,11 @@ import torch
 
 from indexes.store.sharded import read_sharded_manifest
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search.build import measuring
+from retrieval.search.build import candidates
 from retrieval.search.build.build_index import build_index
 from retrieval.search.sharding.build_sharded import build_sharded
 from tests import reference_model
-from tests.retrieval.search.test_operating import checkpoint_of
+from tests.retrieval.search.test_candidates import checkpoint_of
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore"),  # Ray's own warnings
@@ -52,10 +52,10 @@ def test_photos_and_touches_are_encoded_on_the_models_device(catalogue_with_touc
 
 
 def test_measurements_work_on_any_device_of_the_model(catalogue, tmp_path, fetched, monkeypatch):
-    monkeypatch.setattr(measuring, "EXHAUSTIVE_LIMIT", 5)
+    monkeypatch.setattr(candidates, "EXHAUSTIVE_LIMIT", 5)
     checkpoint = checkpoint_of()
     checkpoint.matcher.to("meta")
-    report = build_index(catalogue, checkpoint, tmp_path / "index", min_recall=0.5, max_ms=1000.0, quiet=True)
+    report = build_index(catalogue, checkpoint, tmp_path / "index", quiet=True)
     assert (report.embedded, report.candidates["queries"]) == (24, len(checkpoint.queries))
     assert (len(checkpoint.queries), checkpoint.config.matcher.embedding_dim) in fetched
 

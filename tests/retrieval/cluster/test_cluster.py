@@ -234,7 +234,7 @@ from retrieval.search.query.searcher import Searcher
 with ray_session(2) as ray:
     served = Deployments(ray, ReplicaSettings(cpus=0.1, wait_s=240.0))
     with Searcher.open(sys.argv[1], shards=served.open) as searcher, ThreadPoolExecutor(12) as threads:
-        print(set(threads.map(lambda _: str(searcher.shard.rows(["nothing"])), range(12))), flush=True)
+        print(set(threads.map(lambda _: str(searcher.shard.photos(["nothing"])), range(12))), flush=True)
     served.close()
 time.sleep(12)
 print(ray.is_initialized())
@@ -258,7 +258,7 @@ def partials_of(cluster):
     for entry in read_sharded_manifest(cluster).shards:
         generation = IndexStore(cluster / entry.folder).open(name=entry.generation)
         found |= {
-            row["id"]: partial.tobytes()
+            row.path: partial.tobytes()
             for row, partial in zip(generation.rows, generation.arrays["partials"], strict=True)
         }
     return found
@@ -308,7 +308,7 @@ def test_a_killed_worker_loses_nothing_and_repeats_little(ray, many, model, tmp_
     thread.start()
     deadline, killed = time.monotonic() + 240, 0
     while thread.is_alive() and killed < 2 and time.monotonic() < deadline:
-        records = sum(path.stat().st_size for path in (tmp_path / "c").glob("shard-*/unfinished.sqlite"))
+        records = sum(path.stat().st_size for path in (tmp_path / "c").glob("shard-*/codes/cache.sqlite"))
         if records and (workers := ray_processes.processes_named(WORKER)):
             os.kill(workers[0], signal.SIGKILL)
             killed += 1
@@ -332,7 +332,7 @@ def test_the_service_on_a_cluster_gives_the_results_of_the_folder_and_restarts_a
             assert numbers(answer) == pytest.approx(numbers(expected), abs=1e-5)
             assert answer.index["shards"] == 4
             found = httpx.get(f"{address}/v1/catalogue", params={"limit": 500}).json()
-            assert {item["id"] for item in found["items"]} == {row["id"] for row in searcher.generation.rows}
+            assert {item["id"] for item in found["items"]} == {row.path for row in searcher.generation.rows}
             assert httpx.get(f"{address}/v1/photos/{answer.top.photo}").status_code == 200
             assert httpx.get(f"{address}/v1/nearest/{answer.top.photo}").status_code == 422
             below = ray_processes.descendants(process.pid)

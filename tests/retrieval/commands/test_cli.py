@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 import typer
 
-from indexes import KINDS
 from retrieval.commands.main import application, main
 from retrieval.commands.options import Command
 from retrieval.frontier import APPROXIMATIONS
@@ -332,7 +331,6 @@ def test_the_package_runs_the_command_line():
     ("command", "choices"),
     [
         ("train", ["match|relief|grasp-success"]),
-        ("build-index", KINDS),
         ("evaluate", METHODS),
         ("frontier", APPROXIMATIONS),
     ],

@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+import indexes
 from retrieval.errors import ConfigError, DatasetError
 from retrieval.frontier import APPROXIMATIONS, load_approximation
 from retrieval.frontier import measure as measuring_module
@@ -27,8 +28,7 @@ from retrieval.frontier.sample import Sample, Scale, blend
 from retrieval.metrics.k_way import binomial_interval
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import encode_touches
-from retrieval.search.build.measuring import ExhaustiveBench
-from retrieval.search.build.operating import SearchRequirements, choose_by_agreement
+from retrieval.search.build.candidates import measure_candidates
 from tests import synthetic
 
 TINY = Scale(photos=700, queries=6, touches=6, repeats=1, quick=True)
@@ -156,24 +156,13 @@ def test_an_unknown_name_lists_the_known_ones():
 # Defaults are what the code uses ---------------------------------------------------------------------------
 
 
-class WithQueries:
-    """Checkpoint stand-in for `build-index` with the calibration touches of a sample."""
-
-    def __init__(self, sample):
-        self.matcher, self.config = sample.checkpoint.matcher, sample.checkpoint.config
-        self.queries = sample.queries["partial"].astype(np.float16)
-
-
-def test_the_default_number_of_candidates_is_that_of_build_index(candidate_sample):
-    photos = candidate_sample.catalogue
-    slots = np.arange(len(photos.partials))
-    bench = ExhaustiveBench(
-        WithQueries(candidate_sample), photos.embeddings["candidate encoder"], slots, photos.partials
-    )
-    point = choose_by_agreement(bench, SearchRequirements())
-    assert default_k(candidate_sample) == point.candidates["k"]
+def test_the_default_kind_and_number_of_candidates_are_those_of_build_index(candidate_sample):
+    photos, queries = candidate_sample.catalogue, candidate_sample.queries["partial"].astype(np.float16)
+    checkpoint = dataclasses.replace(candidate_sample.checkpoint, queries=queries)
+    index = indexes.build(photos.embeddings["candidate encoder"])
+    assert default_k(candidate_sample) == measure_candidates(checkpoint, index, photos.partials)["k"]
     kinds = load_approximation("index_kinds")(candidate_sample)
-    assert all(one.default.series == point.kind for one in kinds.panels)
+    assert all(one.default.series == index.kind for one in kinds.panels)
 
 
 @pytest.fixture(scope="module")

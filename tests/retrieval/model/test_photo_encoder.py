@@ -44,13 +44,13 @@ def test_a_long_build_gives_the_same_index_with_either_encoder(catalogue, model,
     checkpoint = load_checkpoint(model)
     build_index(catalogue, checkpoint, tmp_path / "torch", quiet=True)
     calls = []
-    monkeypatch.setattr("retrieval.search.build.embed.MIN_PHOTOS_TO_TUNE", 1)
+    monkeypatch.setattr("retrieval.search.build.codes.MIN_PHOTOS_TO_TUNE", 1)
     monkeypatch.setattr(
-        "retrieval.search.build.embed.fastest_photo_encoder", lambda made: calls.append(1) or onnx_photo_encoder(made)
+        "retrieval.search.build.codes.fastest_photo_encoder", lambda made: calls.append(1) or onnx_photo_encoder(made)
     )
     build_index(catalogue, checkpoint, tmp_path / "onnx", quiet=True)
     assert calls == [1]  # once per build
     ours, theirs = (IndexStore(tmp_path / name).open() for name in ("torch", "onnx"))
-    assert [row["id"] for row in ours.rows] == [row["id"] for row in theirs.rows]
+    assert [row.path for row in ours.rows] == [row.path for row in theirs.rows]
     partials = [np.asarray(each.arrays["partials"], np.float32) for each in (ours, theirs)]
     assert np.allclose(*partials, atol=2e-3 * np.abs(partials[0]).max())

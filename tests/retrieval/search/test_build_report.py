@@ -31,7 +31,7 @@ def catalogue_of(folder, photos, *names):
 
 
 def objects(index):
-    return {row["path"]: row["object_id"] for row in IndexStore(index).open().rows}
+    return {row.path: row.object_id for row in IndexStore(index).open().rows}
 
 
 def test_the_report_has_photo_counts_and_three_examples(tmp_path, photos, checkpoint, index):

@@ -95,10 +95,9 @@ def moments(count, build, rng):
 def checked_rows(index, model, touch):
     """Rows of a complete index, {id: digest}, after a query on it."""
     searcher = Searcher.open(index, model=model)
-    searcher.generation.self_check()
     result = searcher.query([touch], top=100)
-    rows = {row["id"]: row["digest"] for row in searcher.generation.rows}
-    assert {match.object_id for match in result.results} == {row["object_id"] for row in searcher.generation.rows}
+    rows = {row.path: row.digest for row in searcher.generation.rows}
+    assert {match.object_id for match in result.results} == {row.object_id for row in searcher.generation.rows}
     assert result.index["scored"] == len(rows)
     return rows
 

@@ -9,6 +9,7 @@ import pytest
 
 from _touch_retrieval.files import file_digest
 from indexes.store.folder import IndexStore
+from indexes.store.rows import Row
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.checkpoint_info import read_checkpoint_info
 from retrieval.search import defaults
@@ -76,7 +77,7 @@ def shipped_in(folder, monkeypatch):
 
 
 def index_built_with(model, folder):
-    rows = [{"id": name, "digest": name} for name in "ab"]
+    rows = [Row(name, name, name) for name in "ab"]
     about = {"checkpoint": str(model)}
     IndexStore(folder).write(
         rows, np.eye(2, dtype=np.float32), fingerprint={"checkpoint": file_digest(model)}, about=about

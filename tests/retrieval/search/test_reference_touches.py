@@ -75,7 +75,7 @@ def test_photos_and_references_of_an_object_combine_as_computed_by_hand(
     match = {one.object_id: one for one in result.results}[NAMES[0]]
     with Searcher.open(index) as searcher:
         partials = searcher.encode(files).partials
-        rows = [at for at, row in enumerate(searcher.generation.rows) if row["object_id"] == NAMES[0]]
+        rows = [at for at, row in enumerate(searcher.generation.rows) if row.object_id == NAMES[0]]
         photos = searcher.scorer.logits(partials, searcher.generation.arrays["partials"][rows])
         mine = [at for at, row in enumerate(searcher.generation.documents["references"]["touches"]) if at < 2]
         stored = unit_embeddings(searcher.generation.documents["touches"][mine], EMBEDDING)
@@ -121,7 +121,7 @@ def test_photos_of_the_nearest_reference_are_always_scored(
         for name in NAMES[:4]:
             searcher.query(touches[name][0], top=1, candidates=1)
             rows = scored.pop().tolist()
-            photos = {at for at, row in enumerate(searcher.generation.rows) if row["object_id"] == name}
+            photos = {at for at, row in enumerate(searcher.generation.rows) if row.object_id == name}
             assert photos <= set(rows)
             assert len(rows) <= len(photos) + 1
 
@@ -281,9 +281,9 @@ def forged(index, **changed):
     about = {**current.manifest.about, **{name: changed[name] for name in changed if name == "reference_calibration"}}
     store.write(
         rows,
-        current.embeddings[current.slots],
+        current.embeddings,
         {name: np.array(part) for name, part in current.arrays.items()},
-        documents,
+        documents=documents,
         fingerprint=current.fingerprint,
         about=about,
     )

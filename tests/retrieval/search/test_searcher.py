@@ -146,13 +146,14 @@ def test_a_running_query_finishes_when_the_searcher_is_closed(index, touch, monk
 
 def test_the_inner_product_of_embeddings_is_the_score_of_candidate_search(searcher, grasps, catalogue, model):
     rows = list(searcher.generation.rows)
-    photos = retrieval.embed_photos([catalogue / row["path"] for row in rows], model=model)
+    photos = retrieval.embed_photos([catalogue / row.path for row in rows], model=model)
     touches = searcher.encode(grasps[0])
     np.testing.assert_allclose(np.linalg.norm(touches.embeddings, axis=1), 1, atol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(photos.embeddings, axis=1), 1, atol=1e-6)
     scores = touches.embeddings @ photos.embeddings.T
-    for own, (numbers, theirs) in zip(scores, searcher.generation.search(touches.embeddings, len(rows)), strict=True):
-        np.testing.assert_allclose(own[numbers], theirs, atol=1e-5)  # other batches round in another order
+    theirs, numbers = searcher.generation.search(touches.embeddings, len(rows))
+    # other batches round in another order
+    np.testing.assert_allclose(np.take_along_axis(scores, numbers, axis=1), theirs, atol=1e-5)
 
 
 def test_the_scorer_gives_the_logits_of_two_partials(searcher, grasps, catalogue, model):
@@ -163,7 +164,7 @@ def test_the_scorer_gives_the_logits_of_two_partials(searcher, grasps, catalogue
     object_logits = searcher.posterior.object_logits(photo_logits, np.arange(count), np.ones(count, dtype=int))
     # These are the best photos of each object; the mean likelihood of all its photos is no larger.
     assert (object_logits + 0.01 >= [match.logit for match in answer.results]).all()
-    rows = [photo["path"] for photo in searcher.generation.rows]
+    rows = [photo.path for photo in searcher.generation.rows]
     places = np.array([rows.index(match.photo) for match in answer.results])
     stored = searcher.scorer.logits(searcher.encode(grasps[0]).partials, searcher.generation.arrays["partials"], places)
     np.testing.assert_allclose(photo_logits, stored, atol=0.01)  # stored as float16

@@ -14,12 +14,12 @@ def test_pages_contain_every_photo_once_in_index_order(client, searcher):
         page = client.get("/v1/catalogue", params={"offset": offset, "limit": 7}).json()
         assert (page["total"], page["offset"], page["generation"]) == (24, offset, searcher.generation.name)
         found, offset = found + page["items"], page["next"]
-    assert [item["id"] for item in found] == [row["path"] for row in searcher.generation.rows]
+    assert [item["id"] for item in found] == [row.path for row in searcher.generation.rows]
     assert client.get("/v1/catalogue", params={"offset": 500}).json()["items"] == []
 
 
 def test_object_and_words_filter_the_catalogue(client, searcher):
-    name = searcher.generation.rows[0]["object_id"]
+    name = searcher.generation.rows[0].object_id
     own = client.get("/v1/catalogue", params={"object": name}).json()["items"]
     assert {item["object_id"] for item in own} == {name}
     assert len(own) == 3
@@ -31,7 +31,7 @@ def test_object_and_words_filter_the_catalogue(client, searcher):
 
 
 def test_a_photo_is_its_file_and_a_thumbnail_is_small(client, catalogue, searcher):
-    name = searcher.generation.rows[0]["path"]
+    name = searcher.generation.rows[0].path
     whole = client.get(f"/v1/photos/{name}")
     assert whole.content == (catalogue / name).read_bytes()
     assert whole.headers["content-type"] == "image/jpeg"
@@ -54,7 +54,7 @@ def test_names_outside_the_index_are_unknown(client, path, name):
 def test_nearest_photos_equal_those_of_the_searcher(client, searcher):
     from retrieval import nearest_photos
 
-    name = searcher.generation.rows[0]["path"]
+    name = searcher.generation.rows[0].path
     items = client.get(f"/v1/nearest/{name}", params={"count": 5}).json()["items"]
     expected = nearest_photos(searcher, name, 5)
     assert [item["id"] for item in items] == [near.photo.path for near in expected]

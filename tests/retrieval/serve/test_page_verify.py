@@ -41,7 +41,7 @@ def text_of(locator):
 
 def object_names(index):
     with Searcher.open(index) as searcher:
-        return sorted({row["object_id"] for row in searcher.generation.rows})
+        return sorted({row.object_id for row in searcher.generation.rows})
 
 
 @pytest.mark.parametrize(

@@ -68,7 +68,7 @@ def test_verification_returns_the_document_of_the_searcher(grasps, model, catalo
     store_checkpoint(made, tmp_path / "m.safetensors")
     build_index(catalogue, load_checkpoint(tmp_path / "m.safetensors"), tmp_path / "index", quiet=True)
     with Searcher.open(tmp_path / "index") as searcher, service(tmp_path / "index") as client:
-        name = searcher.generation.rows[0]["object_id"]
+        name = searcher.generation.rows[0].object_id
         found = client.post("/v1/verify", json={"expect": name, "touches": encoded(grasps), "far": 0.1}).json()
         assert found["decision"] == "accept"
         assert found == json.loads(json.dumps(searcher.verify(grasps, name, far=0.1).to_dict()))
