@@ -20,7 +20,7 @@ from retrieval.model.posterior import EvidenceMass, Posterior
 from retrieval.search.query.objects import ListedPhoto
 from retrieval.search.query.searcher import Searcher
 from retrieval.search.query.shard import RankedObject, ShardResult, merge_results
-from retrieval.search.sharding.build_sharded import build_shard, build_sharded
+from retrieval.search.sharding.build_sharded import build_sharded
 
 NUMBERS = ("logit", "probability", "probability_if_present")
 STEEP = Posterior(slope=2.0, offset=-1.5, dependence=0.25, tests=1)
@@ -312,47 +312,17 @@ def test_an_invalid_number_of_shards_or_an_index_folder_raises(catalogue, model,
 # Building with Ray ----------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def failing(monkeypatch):
-    """Make Ray fail as a whole several times, each time after some shards; returns the requested shards."""
-    building, requested, plain = pytest.importorskip("retrieval.cluster.building"), [], build_shard
+def test_a_failure_of_ray_ends_the_build_with_a_clear_error(catalogue, model, tmp_path, monkeypatch):
+    building = pytest.importorskip("retrieval.cluster.building")
 
-    def fail(times, after):
-        def results(ray, jobs, checkpoint, processes):
-            requested.append([job.folder for job in jobs])
-            for number, job in enumerate(jobs):
-                if number == after and len(requested) <= times:
-                    raise KeyError("ObjectRef(00ff)")
-                yield plain(job, checkpoint)
-
-        monkeypatch.setattr(building, "_results", results)
-        return requested
+    def failing(*arguments):
+        raise KeyError("ObjectRef(00ff)")
 
     parts = SimpleNamespace(data=SimpleNamespace(DataContext=SimpleNamespace(get_current=SimpleNamespace)))
     monkeypatch.setattr(building, "ray_session", lambda cpus: nullcontext(parts))
-    return fail
-
-
-def test_after_a_failure_of_ray_only_missing_shards_are_built_again(failing, catalogue, model, tmp_path, embedded):
-    from retrieval.cluster.building import ray_runner
-
-    requested = failing(times=2, after=1)
-    report = build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=ray_runner(1, 1))
-    assert (report.photos, sum(embedded), len(report.shards)) == (24, 24, 4)
-    assert [len(jobs) for jobs in requested] == [4, 3, 2]
-    assert requested[2] == requested[0][2:]
-
-
-def test_repeated_failures_of_ray_end_the_build_with_a_clear_error(failing, catalogue, model, tmp_path):
-    from retrieval.cluster.building import MAX_FAILURES, ray_runner
-
-    requested = failing(times=99, after=0)
-    with pytest.raises(
-        RetrievalError,
-        match=r"Ray failed 4 times without a finished shard \(KeyError: .*same command again to continue",
-    ):
-        build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=ray_runner(1, 1))
-    assert len(requested) == MAX_FAILURES + 1
+    monkeypatch.setattr(building, "_results", failing)
+    with pytest.raises(RetrievalError, match=r"KeyError: .*same command again to continue"):
+        build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=building.ray_runner(1, 1))
 
 
 # Damage ---------------------------------------------------------------------------------------------------------------
