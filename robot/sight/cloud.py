@@ -11,7 +11,6 @@ from robot.readings import RGBD, Region
 
 Array = npt.NDArray[np.float64]
 Depth = npt.NDArray[np.float32]
-Mask = npt.NDArray[np.bool_]
 
 MAX_HEIGHT_MM = 400.0
 _NEAR_TABLE_MM = 40.0
@@ -80,13 +79,11 @@ class ObjectPoints:
     Attributes:
         points: (N, 3) in mm, z above the table.
         table: The table.
-        missing: Fraction of pixels without depth inside the object's outline, 0 to 1.
         is_cut_off: Whether the object touches the picture's border, so that a part of it is not visible.
     """
 
     points: Array
     table: TablePlane
-    missing: float
     is_cut_off: bool
 
 
@@ -158,83 +155,33 @@ def find_object_points(depth_mm: Depth, rays: Rays, table: TablePlane, region: R
     Raises:
         PlanError: There is no object.
     """
-    above = height_above(depth_mm, rays, table)
+    normal = np.array([-table.a, -table.b, 1.0])
+    start = float(normal @ rays.pose[:3, 3]) - table.c
+    above = np.asarray(depth_mm * rays.along(normal) + np.float32(start))  # the height of each pixel
     min_height_mm = max(_MIN_HEIGHT_MM, 3.0 * table.noise_mm * abs(_steepness(rays)))
     raised = (above > min_height_mm) & (above < MAX_HEIGHT_MM)
     if region is not None:
-        raised &= _inside(depth_mm, rays, region)
+        for axis in (0, 1):
+            position = depth_mm * rays.along(np.eye(3)[axis]) + np.float32(rays.pose[axis, 3])
+            raised &= (position >= region.lower[axis]) & (position <= region.upper[axis])
     # The median filter removes single pixels.
-    patch = largest_patch(cv2.medianBlur(raised.astype(np.uint8), _FILTER_PX), _MIN_PX)
-    if patch is None:
+    candidates = cv2.medianBlur(raised.astype(np.uint8), _FILTER_PX)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(candidates, connectivity=8)
+    sizes = stats[1:, cv2.CC_STAT_AREA]
+    if sizes.max(initial=0) < _MIN_PX:
         raise PlanError("no object in the depth picture: it is missing, transparent or outside the picture")
-    rows, columns = (patch.mask & raised[patch.window]).nonzero()
-    rows, columns = rows + patch.window[0].start, columns + patch.window[1].start
+    best = 1 + int(sizes.argmax())
+    left, top, width, height = (int(value) for value in stats[best, :4])
+    last_row, last_column = (size - 1 for size in raised.shape)
+    is_cut_off = left <= 1 or top <= 1 or left + width >= last_column or top + height >= last_row
+    rows, columns = ((labels == best) & raised).nonzero()
     points = rays.points(depth_mm, rows, columns)
     points[:, 2] = above[rows, columns]
     level = abs(_steepness(rays)) / (float(np.median(depth_mm[rows, columns])) * rays.pixel) ** 2
     points = _remove_outliers(points, level)
     if len(points) > _MAX_POINTS:
         points = points[np.sort(np.random.default_rng(0).choice(len(points), _MAX_POINTS, replace=False))]
-    return ObjectPoints(points, table, _missing(depth_mm[patch.window], patch.mask), patch.is_cut_off)
-
-
-def height_above(depth_mm: Depth, rays: Rays, table: TablePlane) -> Depth:
-    """Return the (H, W) height above the table in mm, NaN where depth is unknown."""
-    normal = np.array([-table.a, -table.b, 1.0])
-    start = float(normal @ rays.pose[:3, 3]) - table.c
-    return np.asarray(depth_mm * rays.along(normal) + np.float32(start))
-
-
-def _inside(depth_mm: Depth, rays: Rays, region: Region) -> Mask:
-    inside = np.ones(depth_mm.shape, bool)
-    for axis in (0, 1):
-        unit = np.eye(3)[axis]
-        position = depth_mm * rays.along(unit) + np.float32(rays.pose[axis, 3])
-        inside &= (position >= region.lower[axis]) & (position <= region.upper[axis])
-    return inside
-
-
-@dataclass(frozen=True)
-class Patch:
-    """Connected pixels of a picture.
-
-    Attributes:
-        window: Slices of rows and columns of the bounding box.
-        mask: Pixels of the patch within the window.
-        is_cut_off: Whether the patch touches the picture's border.
-    """
-
-    window: tuple[slice, slice]
-    mask: Mask
-    is_cut_off: bool
-
-
-def largest_patch(candidates: npt.NDArray[np.uint8], min_px: int) -> Patch | None:
-    """Return the largest connected patch of pixels that are not 0, or None if it has fewer than `min_px` pixels."""
-    first_column, first_row, columns, rows = cv2.boundingRect(candidates)
-    around = candidates[first_row : first_row + rows, first_column : first_column + columns]
-    if around.size == 0:
-        return None
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(np.ascontiguousarray(around), connectivity=8)
-    sizes = stats[1:, cv2.CC_STAT_AREA]
-    if sizes.max() < min_px:
-        return None
-    best = 1 + int(sizes.argmax())
-    mask = labels == best
-    left, top, width, height = (int(value) for value in stats[best, :4])
-    mask = mask[top : top + height, left : left + width]
-    left, top, (rows, columns) = left + first_column, top + first_row, candidates.shape
-    is_cut_off = left <= 1 or top <= 1 or left + width >= columns - 1 or top + height >= rows - 1
-    return Patch((slice(top, top + height), slice(left, left + width)), mask, is_cut_off)
-
-
-def _missing(depth_mm: Depth, mask: Mask) -> float:
-    """Return the fraction of unknown pixels in the convex hull of the mask, 0 to 1."""
-    ys = np.flatnonzero(mask.any(axis=1))
-    first, last = mask[ys].argmax(axis=1), mask.shape[1] - 1 - mask[ys, ::-1].argmax(axis=1)  # of each row
-    hull = cv2.convexHull(np.stack([np.concatenate([first, last]), np.tile(ys, 2)], axis=1).astype(np.int32))
-    outline = cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), hull, 1).astype(bool)
-    return float(np.isnan(depth_mm[outline]).mean())
+    return ObjectPoints(points, table, is_cut_off)
 
 
 def _remove_outliers(points: Array, level: float, cell_mm: float = 6.0) -> Array:

@@ -9,7 +9,6 @@ reliable, a cruder method is used. `method` and `notes` of the result name it:
     lying               a cylinder on its side
     enclosing circle    smallest circle around the points without outliers, if the side has too few points, shows too
                         short an arc or fits no circle, or if no simple solid fits
-    silhouette          outline in the colour picture, for objects without depth, such as glass
 """
 
 import math
@@ -22,8 +21,7 @@ import numpy.typing as npt
 
 from robot.errors import PlanError, RobotConfigError
 from robot.readings import RGBD, Region
-from robot.sight.cloud import Depth, ObjectPoints, Rays, TablePlane, find_object_points, find_table
-from robot.sight.silhouette import fit_silhouette
+from robot.sight.cloud import ObjectPoints, Rays, find_object_points, find_table
 from robot.sight.solids import (
     OUTLIER_CUT,
     Array,
@@ -40,14 +38,10 @@ from robot.sight.solids import (
 MIN_SIDE_POINTS = 10
 MIN_ARC_DEG = 60.0
 _SECTOR_DEG = 10.0
-_MAX_MISSING = 0.5
 _MIN_CUT_OFF_ARC_DEG = 90.0
 _MAX_OUTLIER_FRACTION = 0.3
 _MIN_TOP_FRACTION = 0.05
 _MAX_LOSS, _OUTLIER_MM = 0.35, 2.0
-_OUTLINE_ERROR = 0.15
-"""Standard error of a silhouette fit relative to the radius, measured on cylinders with a visible base."""
-
 _CRUDE_MM, _ROUGH_MM, _GUESS_MM = 3.0, 6.0, 10.0
 """Smallest standard errors of the centre when the hidden side is guessed.
 
@@ -125,7 +119,7 @@ def fit_cylinder(image: RGBD, extrinsics: npt.ArrayLike, region: Region | None =
         region: Box in the rig's frame that limits the search in x and y; None for no limit.
 
     Raises:
-        PlanError: No object is visible, or too little of it.
+        PlanError: No object is visible in depth (glass is not), or too little of it.
         RobotConfigError: The extrinsics are not finite.
     """
     if image.depth_m is None:
@@ -136,23 +130,7 @@ def fit_cylinder(image: RGBD, extrinsics: npt.ArrayLike, region: Region | None =
     depth = np.where(image.depth_m > 0, image.depth_m, np.nan) * np.float32(1000)
     rays = Rays.from_image(image, np.asarray(extrinsics, np.float64))
     table = find_table(depth, rays)
-    try:
-        object_points = find_object_points(depth, rays, table, region)
-    except PlanError:
-        return _from_colour(image, depth, rays, table, region)
-    if object_points.missing > _MAX_MISSING:
-        try:
-            return _from_colour(image, depth, rays, table, region)
-        except PlanError:
-            pass  # the sparse depth is used
-    return _fit(object_points, rays)
-
-
-def _from_colour(image: RGBD, depth_mm: Depth, rays: Rays, table: TablePlane, region: Region | None) -> CylinderFit:
-    found = fit_silhouette(image.colour, depth_mm, rays, table, region)
-    notes = (*table.notes, "no depth at the object: fitted to its outline in the colour picture")
-    error_mm = max(3.0, _OUTLINE_ERROR * found.radius)
-    return CylinderFit(found.x, found.y, found.height, found.radius, error_mm, "silhouette", found.half, notes=notes)
+    return _fit(find_object_points(depth, rays, table, region), rays)
 
 
 @dataclass(frozen=True)
