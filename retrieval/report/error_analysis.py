@@ -18,9 +18,9 @@ def objects(builder: Builder) -> Iterator[Block | None]:
 
 def _per_object_blocks(builder: Builder, name: str) -> Iterator[Block]:
     label, per_object = method_label(name), builder.results.data["methods"][name]["per_object"]
-    for key, make, candidates in (
-        ("test", plots.objects_among_test, "(a) candidates: test objects only"),
-        ("all", plots.objects_among_all, "(b) candidates: all objects"),
+    for key, candidates in (
+        ("test", "(a) candidates: test objects only"),
+        ("all", "(b) candidates: all objects (red: test, grey: validation, blue: training)"),
     ):
         if not (accuracy := per_object.get(f"{key}_candidates")):
             continue
@@ -30,9 +30,10 @@ def _per_object_blocks(builder: Builder, name: str) -> Iterator[Block]:
             f"objects-{key}-{file_name(name)}.png",
             f"Bars, {label}, {candidates}: {high} % ({best}) to {low} % ({worst}).",
             f"Top-1 accuracy among five objects for each object, {label}; {candidates}.",
-            make,
+            plots.objects,
             builder.results,
             name,
+            key,
         )
 
 
@@ -86,8 +87,6 @@ def calibration(builder: Builder) -> Iterator[Block | None]:
     """Yield the calibration of the probabilities."""
     yield from builder.each("reliability", _reliability)
     found = {name: builder.results.data["methods"][name] for name in builder.results.methods}
-    if any(one.get("reliability") for one in found.values()):
-        yield tables.calibrations(builder.results, plots.RELIABILITIES)
     if fitted := {name: one["calibration"] for name, one in found.items() if one.get("calibration")}:
         yield Details("Calibration fitted on validation objects", (Listing.of_json(fitted),))
 

@@ -112,62 +112,33 @@ def _against_counts(panel: Axes, results: Results, metric: Callable[[int], str],
 # Objects ---------------------------------------------------------------------------------------------
 
 
-def objects_among_test(results: Results, method: str) -> Figure:
-    """Plot the top-1 accuracy of five for every test object, with candidates from test objects only."""
-    accuracies = results.data["methods"][method]["per_object"]["test_candidates"]
+def objects(results: Results, method: str, which: str) -> Figure:
+    """Plot the top-1 accuracy of five for each object, coloured by part; `which` is "test" or "all" (candidates)."""
+    accuracies = results.data["methods"][method]["per_object"][f"{which}_candidates"]
     ranked = sorted(accuracies, key=lambda name: (-accuracies[name], name))
-    figure = canvas(10.5, 3.6)
-    panel = figure.subplots()
-    bars = [(name, accuracies[name], PART_COLOURS["test"]) for name in ranked]
-    _bars(panel, bars, results, "topn_k5", method, letters=36)
-    return figure
-
-
-def objects_among_all(results: Results, method: str) -> Figure:
-    """Plot the top-1 accuracy of five for every object, with all objects as candidates, coloured by split part."""
-    from matplotlib.patches import Patch
-
-    accuracies = results.data["methods"][method]["per_object"]["all_candidates"]
     bars = [
-        (name, accuracies[name], PART_COLOURS[part])
-        for part in ("test", "validation", "train")
-        for name in sorted(
-            set(results.data["split"][part]) & set(accuracies), key=lambda name: (-accuracies[name], name)
-        )
+        (name, accuracies[name], colour)
+        for part, colour in PART_COLOURS.items()
+        for name in ranked
+        if name in results.data["split"][part]
     ]
     figure = canvas(13, 3.8)
     panel = figure.subplots()
-    _bars(panel, bars, results, "topn_k5_all_objects", method, letters=24)
-    handles = [Patch(color=PART_COLOURS[part], label=part) for part in ("test", "validation", "train")]
-    panel.legend(handles=handles, loc="lower right", bbox_to_anchor=(1, 1), ncols=3, frameon=False)
-    return figure
-
-
-def _bars(
-    panel: Axes,
-    bars: Sequence[tuple[str, float, str]],
-    results: Results,
-    measure: str,
-    method: str,
-    letters: int,
-) -> None:
-    """Plot bars of (object, accuracy, colour), with names of at most `letters` letters, and the measure's chance."""
-    values = [100 * accuracy for _, accuracy, _ in bars]
-    panel.bar(range(len(bars)), values, 0.78, color=[colour for _, _, colour in bars])
-    if summary := results.summary(method, measure):
+    values, colours = [100 * accuracy for _, accuracy, _ in bars], [colour for *_, colour in bars]
+    panel.bar(range(len(bars)), values, 0.78, color=colours)
+    if summary := results.summary(method, "topn_k5" if which == "test" else "topn_k5_all_objects"):
         panel.axhline(100 * summary["chance"][0], color="#333333", ls="--", lw=1.2)
         panel.text(len(bars) - 0.4, 100 * summary["chance"][0], " chance", va="center", fontsize=8)
     if len(bars) <= _LABELLED_OBJECTS:
         size = float(np.clip(700 / len(bars), 5.5, 8))
-        panel.set_xticks(
-            range(len(bars)), [shortened(name, letters) for name, _, _ in bars], rotation=90, fontsize=size
-        )
+        panel.set_xticks(range(len(bars)), [shortened(name, 24) for name, *_ in bars], rotation=90, fontsize=size)
     else:
         panel.set_xticks([])
         panel.set_xlabel(f"{len(bars)} objects")
     panel.set_xlim(-0.7, len(bars) - 0.3)
     panel.grid(axis="x", visible=False)
     percent_axis(panel, "top-1 accuracy, %")
+    return figure
 
 
 # Decisions -------------------------------------------------------------------------------------------

@@ -235,21 +235,6 @@ def _has_entry(results: Results, name: str, entry: str) -> bool:
     return bool(results.data["methods"][name].get(entry))
 
 
-def calibrations(results: Results, kinds: Mapping[str, str]) -> Table:
-    """Return the expected calibration errors."""
-    found = {name: results.data["methods"][name].get("reliability") for name in results.methods}
-    rows = [
-        (method_label(name), *(percent(diagrams.get(kind, {}).get("ece")) for kind in kinds))
-        for name, diagrams in found.items()
-        if diagrams
-    ]
-    note = (
-        "On test objects; fitted on validation objects. Among candidates that contain the true object, it is the error "
-        "of the posterior's top-1 probability, with a none_prior of 0."
-    )
-    return Table(("expected calibration error, %", *kinds.values()), tuple(rows), (note,))
-
-
 def times(results: Results) -> Table:
     """Return the run times of each method."""
     columns = {

@@ -1,11 +1,11 @@
-"""Tables on stdout: drawn on a terminal, else plain lines that are never cut."""
+"""Tables on stdout: aligned lines that are never cut."""
 
 import sys
 from collections.abc import Collection, Sequence
 from itertools import chain, repeat
 from typing import TYPE_CHECKING
 
-from retrieval.console.output import checked_stdout, printable, show
+from retrieval.console.output import printable, show
 from retrieval.search.query.answer import NearestReference, QueryResult
 
 if TYPE_CHECKING:
@@ -68,22 +68,10 @@ def print_columns(title: str, header: Sequence[str], rows: Sequence[Sequence[str
         words: Columns of text, which are left-aligned; all others are right-aligned.
     """
     printable_rows = [[printable(cell) for cell in row] for row in rows]
-    if not sys.stdout.isatty():
-        widths = [max(map(len, column)) for column in zip(header, *printable_rows, strict=True)]
-        for row in (header, *printable_rows):
-            cells = enumerate(zip(row, widths, strict=True))
-            aligned = [cell.ljust(width) if at in words else cell.rjust(width) for at, (cell, width) in cells]
-            show("  ".join(aligned).rstrip())
-        return
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(title=title)
-    for column, name in enumerate(header):
-        # Fold long names; never cut them.
-        table.add_column(name, justify="left" if column in words else "right", overflow="fold")
-    for row in printable_rows:
-        table.add_row(*map(Text, row))  # Text: names may contain markup of rich, such as "[bold]"
-    with checked_stdout():
-        Console().print(table)
+    if sys.stdout.isatty():
+        show(title)
+    widths = [max(map(len, column)) for column in zip(header, *printable_rows, strict=True)]
+    for row in (header, *printable_rows):
+        cells = enumerate(zip(row, widths, strict=True))
+        aligned = [cell.ljust(width) if at in words else cell.rjust(width) for at, (cell, width) in cells]
+        show("  ".join(aligned).rstrip())

@@ -90,7 +90,7 @@ def test_results_describe_data_and_settings(made, grasped):
     assert results["recording"]["objects"] == 18
     assert results["recording"]["grasps"] == 72
     assert results["setting"]["seeds"] == [0, 1]
-    features = {"touch": 256, "photo": 256, "fingers": 2, "digest": "", "pairs": 0}
+    features = {"touch": 256, "photo": 256, "fingers": 2, "digest": ""}
     assert results["setting"]["features"] | {"digest": ""} == features
     assert [len(results["split"][part]) for part in ("train", "validation", "test")] == [8, 4, 6]
     assert list(results["methods"]) == list(FEW)
@@ -147,17 +147,6 @@ def test_each_measure_has_an_interval_and_ten_candidates_need_ten_objects(made):
             assert parts == set(summary)
 
 
-def test_four_validation_objects_give_no_threshold_and_a_reason_instead_of_pair_accuracy(made):
-    results, folder = made
-    reason = "one fitted on at least 10 validation objects; the split has 4"
-    for method in results["methods"].values():
-        assert "pair_accuracy" not in method["measures"]
-        assert method["pair_threshold"]["reason"].endswith(reason)
-    assert not any("pair_accuracy" in one["measures"] for one in results["controls"].values())
-    write_report(folder, None)
-    assert f"{reason}." in (folder / "report.md").read_text()
-
-
 def test_late_interaction_changes_late_fusion_and_no_method_without_cells(run, tmp_path):
     matcher = dataclasses.replace(CONFIG.matcher, tower_output="stages")
     cells = dataclasses.replace(matcher, cell_dim=4, touch_cells=2, photo_cells=2)
@@ -174,25 +163,6 @@ def test_late_interaction_changes_late_fusion_and_no_method_without_cells(run, t
 def test_a_constant_scorer_is_exactly_at_chance_in_every_measure(made):
     for name, summary in made[0]["methods"][CONSTANT]["measures"].items():
         assert summary["value"] == pytest.approx(summary["chance"], abs=1e-12), name
-
-
-def test_rejection_is_measured_for_single_grasps_and_by_number_of_grasps(made):
-    for name, method in made[0]["methods"].items():
-        found = method["reject"]
-        assert set(found) == {
-            "auroc", "false_accepts_at_95", "balanced_accuracy", "roc", "risk_coverage", "by_grasps"
-        }  # fmt: skip
-        single = found["by_grasps"]["1"]
-        assert single == {key: found[key] for key in ("auroc", "false_accepts_at_95")}, name
-        assert found["risk_coverage"][-1][0] == pytest.approx(1)
-        assert set(method["calibration"]) == {"pairs", "posteriors"}
-        assert set(method["reliability"]) == {"pairs", "k5"}
-    constant = made[0]["methods"][CONSTANT]["reject"]
-    values = [constant[key]["value"][0] for key in ("auroc", "false_accepts_at_95", "balanced_accuracy")]
-    assert values == pytest.approx([0.5, 0.95, 0.5], abs=1e-12)
-    assert constant["risk_coverage"] == [
-        [pytest.approx(1), pytest.approx(0.9)]
-    ]  # one right of five, in half of the queries
 
 
 def test_six_test_objects_support_no_rate_of_verification(made, run, tmp_path):
@@ -339,13 +309,6 @@ def test_an_informative_modality_has_a_high_ceiling_and_noise_stays_at_chance(tm
         found[name] = entry["measures"]["topn_k5"]["value"][0]
     assert found["photo_to_photo"] > 0.99
     assert found["touch_to_touch"] < 0.4  # chance is .2
-
-
-def test_objects_with_one_photo_have_no_photo_ceiling():
-    one = np.zeros((6, 1, 2), np.float32)
-    features = Features(tuple("abcdef"), tuple("xxyyzz"), one, np.arange(3, dtype=np.float32).repeat(2)[:, None])
-    experiment = Experiment(Path(), CONFIG, None, features, None, None, None, shuffled=False, quiet=True)
-    assert set(ceiling_experiments(experiment)) == {"touch_to_touch"}
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,5 @@
 """Touch to touch: nothing uses the left-out sequence, the common frame removes the leak, controls are measured."""
 
-import dataclasses
 import json
 from importlib import resources
 from pathlib import Path
@@ -13,15 +12,11 @@ from retrieval.commands.main import main
 from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.data.images import read_rgb
 from retrieval.errors import DatasetError
-from retrieval.evaluation.real.conditions import TowerEncoder
 from retrieval.evaluation.real.touch_to_touch import (
     Sequences,
-    _SequenceEncoder,
     leave_one_out_scores,
     with_common_frame,
 )
-from retrieval.metrics import protocols
-from retrieval.model.config import load_config
 from robot.importers.physiclear import import_physiclear
 from tests.miniatures import physiclear
 
@@ -64,14 +59,6 @@ def test_components_of_all_rows_depend_on_the_query():
     strict = leave_one_out_scores(vectors, 20)
     off = ~np.eye(30, dtype=bool)
     assert np.abs(naive - strict)[off].max() > 0.1
-
-
-def test_constant_vectors_get_exactly_chance():
-    """Three objects with two videos: a random order ranks the right one of five videos first in 1 of 5."""
-    sequences = Sequences.of(grasps({"a": 2, "b": 2, "c": 2}))
-    measure = protocols.recall(sequences.table(leave_one_out_scores(np.zeros((6, 4)))), 1)
-    assert measure.values.ravel().tolist() == [pytest.approx(0.2)] * 6
-    assert measure.chance.tolist() == [pytest.approx(0.2)]
 
 
 # Sequences -------------------------------------------------------------------------------------------------
@@ -214,15 +201,3 @@ def test_the_towers_of_other_configurations_are_rows_compared_with_the_first(rec
 def test_a_tower_without_a_name_of_its_own_is_refused(recording, tmp_path, capsys, choice, message):
     assert benchmark(recording, tmp_path / "report", "--towers", choice) == 2
     assert message in capsys.readouterr().err
-
-
-def test_cells_are_not_compared_since_a_part_is_pressed_at_any_place(recording, tmp_path):
-    grasps = load_grasps(recording / "recording")
-    config = load_config("small")
-    config = dataclasses.replace(
-        config, matcher=dataclasses.replace(config.matcher, tower_output="stages", cosine=True, cell_dim=4)
-    )
-    towers = TowerEncoder.of_config(grasps, config, tmp_path, True)
-    assert towers.matcher.touch_tower.output_count > towers.matcher.touch_tower.feature_count
-    encoder = _SequenceEncoder(Sequences.of(grasps), towers, grasps)
-    assert encoder.vectors("difference", "touch").shape[1] == towers.matcher.touch_tower.feature_count

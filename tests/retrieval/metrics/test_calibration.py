@@ -148,20 +148,6 @@ def test_the_fit_recovers_the_true_odds():
 # Extreme logits --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("scale", [1e-30, 1e-3, 1.0, 1e3, 1e4, 1e30, FLOAT32_MAX / 10])
-@pytest.mark.parametrize("offset", [0.0, 3.0, -1e3])
-def test_the_fit_is_finite_within_bounds_and_preserves_the_order_at_any_scale(scale, offset, seed):
-    logits, labels = overlapping(offset=0.0, seed=seed)
-    logits = logits * scale + offset * min(scale, 1e30)
-    fitted = fit_calibration(logits, labels)
-    assert all(math.isfinite(value) for value in dataclasses.asdict(fitted).values())
-    assert SLOPE_BOUNDS[0] <= fitted.slope <= SLOPE_BOUNDS[1]
-    ranked = np.sort(logits)
-    assert (np.diff(fitted.log_odds(ranked)) >= 0).all()
-    assert (np.diff(fitted.probability(ranked)) >= 0).all()
-
-
 @pytest.mark.parametrize("offset", [1e3, -1e5, 1e6])
 def test_an_offset_of_all_logits_changes_only_the_intercept(offset):
     """A quasi-Newton fit of both parameters gave slope 0.89 instead of 1.21 at an offset of 1000."""
@@ -190,13 +176,6 @@ def test_constant_logits_make_both_answers_equally_likely(value):
     fitted = fit_calibration([value] * 6, [0, 1, 0, 1, 1, 0])
     assert fitted.slope == SLOPE_BOUNDS[0]
     assert fitted.probability(value) == 0.5
-
-
-def test_logits_with_wrong_information_get_the_smallest_slope_and_never_a_negative_one():
-    logits, labels = overlapping()
-    fitted = fit_calibration(-logits, labels)
-    assert fitted.slope == SLOPE_BOUNDS[0]
-    assert fitted.probability(0.0) == pytest.approx(0.5, abs=0.01)
 
 
 finite_logits = st.floats(-FLOAT32_MAX, FLOAT32_MAX, width=32)

@@ -1,6 +1,5 @@
 """Intervals by object: against loops, a published table, scipy, and their coverage."""
 
-import json
 from itertools import product
 
 import numpy as np
@@ -43,17 +42,6 @@ def test_seeds_are_averaged_by_object_and_listed_one_by_one():
     # Naively, three seeds would count as three times as many objects.
     assert found["high"][0] - found["low"][0] > 0.4 * (one_seed["high"][0] - one_seed["low"][0])
     assert summarise([parts[0]] * 3)["low"] == pytest.approx(one_seed["low"])
-
-
-def test_a_top_n_curve_has_an_interval_for_each_n_and_is_json():
-    rng = np.random.default_rng(0)
-    curves = np.cumsum(rng.dirichlet(np.ones(5), 60), axis=1)
-    measure = Measure(curves, np.repeat(np.arange(12), 5), np.arange(1, 6) / 5, "")
-    found = summarise([measure])
-    for low, value, high in zip(found["low"], found["value"], found["high"], strict=True):
-        assert 0 <= low <= value <= high <= 1
-    assert found["low"][-1] == pytest.approx(1)
-    assert json.loads(json.dumps(found, allow_nan=False)) == found
 
 
 def test_measures_of_different_queries_are_not_combined():

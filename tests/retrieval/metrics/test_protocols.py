@@ -279,26 +279,6 @@ def every_measure_of_few(table):
     return {"accuracy": pair_accuracy(table, 0.0), "k2": k_way(table, 2), **full_gallery(table)}
 
 
-def test_a_gallery_of_one_object_is_refused_where_rivals_are_needed():
-    table = table_of(np.zeros((3, 3)), [0, 0, 0])
-    for protocol in (pair_auc, lambda table: pair_accuracy(table, 0.0)):
-        with pytest.raises(BadInput, match="at least two objects"):
-            protocol(table)
-    with pytest.raises(BadInput, match="1 other candidates; got 0"):
-        k_way(table, 2)
-
-
-def test_the_gallery_is_described_in_plain_words():
-    table = ScoreTable(
-        np.zeros((4, 4), dtype=np.float32), np.array([0, 0, 1, 1]), np.array([0, 0, 1, 1]), np.eye(4, dtype=bool),
-        object_words="unseen objects",
-    )  # fmt: skip
-    assert pair_auc(table).gallery == "2 unseen objects, 4 photos; those of the same grasp left out"
-    assert full_gallery(table.transposed())["map"].gallery.startswith("2 unseen objects, 4 touches; ")
-    assert k_way(table, 2).gallery.startswith("2 of these objects, each with a photo: 2 unseen objects, 4 photos")
-    assert "each with 3 photos" in k_way(table, 2, photos=3).gallery
-
-
 # By object -------------------------------------------------------------------------------------------------
 
 

@@ -116,22 +116,6 @@ def test_chance_equals_the_value_of_a_constant_scorer(count, right, hidden, valu
     np.testing.assert_allclose(chance_of_average_precision(relevant, shown), expected, rtol=1e-12)
 
 
-@pytest.mark.parametrize(("count", "right", "k"), [(792, 43, 1), (792, 43, 10), (10, 8, 5), (4, 4, 1), (9, 1, 9)])
-def test_chance_of_recall_is_hypergeometric(count, right, k):
-    relevant = np.arange(count)[None] < right
-    expected = 1 - comb(count - right, k) / comb(count, k)
-    np.testing.assert_allclose(chance_of_recall(k, relevant, np.ones_like(relevant)), expected, rtol=1e-12)
-
-
-def test_with_one_true_photo_chance_of_mean_average_precision_is_the_harmonic_mean_of_ranks():
-    """ObjectFolder's random row: 5.19 % for one positive in 100, 3.73 % in 150."""
-    for count, expected in ((100, 0.0519), (150, 0.0373)):
-        relevant = np.arange(count)[None] == 0
-        every = np.ones_like(relevant)
-        assert chance_of_average_precision(relevant, every)[0] == pytest.approx(expected, abs=5e-5)
-        assert chance_of_reciprocal_rank(relevant, every)[0] == pytest.approx(expected, abs=5e-5)
-
-
 def test_many_ties_neither_overflow_nor_lose_precision():
     """Binomials of 4,000 items overflow a float; the products do not. Compared with the mean over 20,000 orders."""
     with pytest.raises(OverflowError):

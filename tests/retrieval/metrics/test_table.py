@@ -9,7 +9,7 @@ import pytest
 from retrieval.errors import BadInput, NumericalError
 from retrieval.metrics.measure import Measure
 from retrieval.metrics.table import ScoreTable, object_scores
-from tests.retrieval.metrics.test_protocols import mine_of, others_of, table_of, uneven
+from tests.retrieval.metrics.test_protocols import table_of, uneven
 
 # The table -------------------------------------------------------------------------------------------------
 
@@ -23,14 +23,6 @@ def test_a_score_that_is_not_finite_is_refused_although_sorting_would_rank_a_nan
         assert np.argsort(scores[1])[::-1][0] == 2
     with pytest.raises(NumericalError, match="row 1, column 2"):
         table_of(scores, [0, 0, 1])
-
-
-@pytest.mark.parametrize(
-    ("scores", "own"), [((2, 3), (3, 3)), ((3, 3), (3, 2)), ((3,), (3, 3))], ids=["scores", "own", "flat"]
-)
-def test_shapes_that_do_not_fit_are_refused(scores, own):
-    with pytest.raises(BadInput, match="a row for each of the 3 touches and a column for each of the 3 photos"):
-        table_of(np.zeros(scores), [0, 0, 1], own=np.zeros(own))
 
 
 def test_an_empty_table_and_an_own_photo_of_another_object_are_refused():
@@ -76,15 +68,6 @@ def test_every_photo_is_drawn_equally_often():
         for column in allowed:
             frequency = np.mean(drawn[:, row, name] >> column & 1)
             assert frequency == pytest.approx(2 / len(allowed), abs=0.05)  # six standard errors
-
-
-def test_an_object_with_fewer_photos_is_represented_by_all_of_them():
-    table = uneven()
-    found = object_scores(table, 100, 1, seed=0)[0]
-    for row in range(14):
-        for place, name in enumerate(table.objects):
-            columns = mine_of(table, row) if name == table.touch_owner[row] else others_of(table, row)[name]
-            assert found[row, place] == pytest.approx(np.mean(table.scores[row, columns], dtype=float), abs=1e-12)
 
 
 def test_the_draws_depend_on_the_seed_and_not_on_the_scores():

@@ -267,7 +267,7 @@ class Guard:
 
 
 sys.meta_path.insert(0, Guard())
-sys.stdout.isatty = lambda: True  # in a terminal, rich draws the table
+sys.stdout.isatty = lambda: True  # a terminal gets a title
 from retrieval.commands.main import main
 code = main({arguments!r})
 used = set().union(*(theirs.get(name.partition(".")[0], set()) for name in set(sys.modules) - before))

@@ -109,19 +109,6 @@ def test_numbers_are_printed_without_recomputation(report, tmp_path):
 
 
 @pytest.mark.usefixtures("text_only")
-def test_the_highest_value_of_a_column_is_bold_and_ties_are_not(report, tmp_path):
-    def change(results):
-        for name, value in (("late_fusion", 0.7), ("cca", 0.7), ("chance", 0.5)):
-            results["methods"][name]["measures"]["pair_accuracy"]["value"] = [value]
-            results["methods"][name]["measures"]["pair_auc"]["value"] = [value + 0.1 * (name == "cca")]
-
-    rows = remake(report, tmp_path, change=change)[1].splitlines()
-    cca = next(row for row in rows if row.startswith("| CCA |")).split(" | ")
-    assert cca[1].startswith("70.0")
-    assert cca[2].startswith("**80.0")
-
-
-@pytest.mark.usefixtures("text_only")
 def test_the_report_cites_the_papers_number_and_names_simulation(report, tmp_path):
     page, _, _ = remake(report, tmp_path)
     assert "64.3 %" in page
@@ -238,12 +225,6 @@ def test_unknown_methods_are_shown_under_their_names(report, tmp_path):
     page, _, files = remake(report, tmp_path, change=change)
     assert "brand/new method" in page
     assert "objects-test-brand-new_method.png" in {path.name for path in files}
-
-
-@pytest.mark.parametrize("methods", [("chance",), ("late_fusion",)])
-def test_one_method_is_enough(folder, tmp_path, methods):
-    out = write_synthetic_results(folder, tmp_path, methods)
-    assert write_report(out, None)
 
 
 def rename(results, old, new):
