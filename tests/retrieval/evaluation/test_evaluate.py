@@ -302,7 +302,7 @@ def test_an_informative_modality_has_a_high_ceiling_and_noise_stays_at_chance(tm
     split = Split(0, tuple(names[:12]), tuple(names[12:16]), tuple(names[16:]))
     features = Features(tuple(map(str, range(144))), owners, touch, photo)
     queries = draw_queries(grasps, split, 0)
-    experiment = Experiment(tmp_path, CONFIG, split, features, None, queries, None, shuffled=False, quiet=True)
+    experiment = Experiment(tmp_path, CONFIG, split, features, queries, None, shuffled=False, quiet=True)
     found = {}
     for name, ceiling in ceiling_experiments(experiment).items():
         entry = score_control(CEILINGS[name], "cca", ceiling, 0, draws=100)

@@ -58,7 +58,7 @@ def evaluated(objects, grasps=7, gap=0.0, posterior=POSTERIOR, validation=0):
     features = SimpleNamespace(photo=np.eye(objects // 2, dtype=np.float32)[owner // 2])
     matcher = SimpleNamespace(photo_encoding=lambda photo: SimpleNamespace(embedding=photo))
     checkpoint = SimpleNamespace(matcher=matcher, posterior=posterior)
-    experiment = Experiment("", None, Split(0, (), (), names), features, None, queries, checkpoint, False, True)
+    experiment = Experiment("", None, Split(0, (), (), names), features, queries, checkpoint, False, True)
     return score_verification(experiment, [Predictions(logits.astype(np.float32), {}, {}, {})], [0], 0)
 
 
