@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,6 @@ from retrieval.metrics.intervals import summarise
 from retrieval.metrics.measure import Measure
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import one_thread
-from retrieval.model.towers.concatenated import feature_counts_of
 from retrieval.report.canvas import MUTED_COLOUR, Figure, canvas, draw, percent_axis
 from retrieval.training.features import Features
 from retrieval.version import __version__
@@ -27,9 +26,7 @@ OBJECTS, TOUCHES = (5, 10, 20, 1000), (5, 20, 100)
 SETTINGS = CcaSettings()
 """Settings of every fit on the curve: few objects leave none for validation."""
 ADAPTED = "adapted"
-WITHOUT_PUBLISHED, ONLY_PUBLISHED = "without the published touch tower", "only the published touch tower"
 LOW_PASS, UNADAPTED = "adapted, low-pass touches", "the unadapted model"
-TOUCHES_ONLY, LOW_PASS_TOUCHES_ONLY = "touches only", "touches only, low-pass"
 COLOURS = ("#9ecae1", "#56b4e9", "#0072b2", "#08306b")
 
 
@@ -74,9 +71,7 @@ def learning_curve(
 ) -> list[CurvePoint]:
     """Fit to fewer touches of fewer objects and measure the accuracy on held-out objects.
 
-    For comparison the curve includes the unadapted model and, with all objects and touches, the low-pass control and
-    fits without the published touch tower and with it alone. Its last rows are for touches only: neither the fit nor
-    the catalogue has photos, and a touch is compared with one other touch of each object.
+    For comparison the curve includes the unadapted model and, with all objects and touches, the low-pass control.
 
     Args:
         data: The recorded grasps and their features.
@@ -89,27 +84,20 @@ def learning_curve(
         BadInput: There are fewer than six objects.
     """
     folds = draw_folds(data.grasps, seed)
-    features, blocks = data.features, data.blocks
+    features = data.features
     max_objects = min(len(set(features.object_ids)) - len(fold) for fold in folds)
     max_touches = int(np.bincount(features.owner).min())
     objects, touches = (
         sorted({min(count, end) for count in counts})
         for counts, end in ((OBJECTS, max_objects), (TOUCHES, max_touches))
     )
-    fits = [(ADAPTED, features, blocks, count, each) for count in objects for each in touches]
-    fits.append((LOW_PASS, data.low_pass, blocks, objects[-1], touches[-1]))
-    if blocks.touch_towers > 1:
-        for name, places in ((WITHOUT_PUBLISHED, slice(-1)), (ONLY_PUBLISHED, slice(-1, None))):
-            fits.append((name, *touch_towers(data, places), objects[-1], touches[-1]))
-    touches_alone = [(TOUCHES_ONLY, features, count) for count in objects]
-    for label, inputs, count in (*touches_alone, (LOW_PASS_TOUCHES_ONLY, data.low_pass, objects[-1])):
-        widths = TowerWidths(blocks.touch, blocks.touch, blocks.touch_towers)
-        fits.append((label, touches_as_photos(inputs), widths, count, touches[-1]))
+    fits = [(ADAPTED, features, count, each) for count in objects for each in touches]
+    fits.append((LOW_PASS, data.low_pass, objects[-1], touches[-1]))
     baseline = UnadaptedBaseline.of(start, data.grasps, cache, quiet).fold_accuracies(folds)
     points = [CurvePoint.of(UNADAPTED, 0, 0, measure(baseline, "top1"), measure(baseline, "pair_accuracy"))]
     with Bar("learning curve", len(fits), "fits", quiet=quiet) as bar:
-        for label, inputs, widths, count, each in fits:
-            points.append(_point(label, inputs, widths, folds, count, each, seed))
+        for label, inputs, count, each in fits:
+            points.append(_point(label, inputs, data.blocks, folds, count, each, seed))
             bar.advance()
     return points
 
@@ -138,25 +126,6 @@ def _point(
     return CurvePoint.of(label, objects, touches, measure(parts, "top1"), measure(parts, "pair_accuracy"))
 
 
-def touch_towers(data: AdaptationData, places: slice) -> tuple[Features, TowerWidths]:
-    """Return the features with some of the combined touch towers and all photo towers, and their widths.
-
-    Args:
-        data: The recorded grasps and their features.
-        places: Places of the towers among the combined ones.
-    """
-    widths, fingers = feature_counts_of(data.matcher.touch_tower), data.config.matcher.fingers
-    blocks = np.split(data.features.touch, np.cumsum(widths)[:-1], axis=2)
-    touch = np.concatenate(blocks[places], axis=2)
-    used = widths[places]
-    return replace(data.features, touch=touch), TowerWidths(used * fingers, data.blocks.photo, len(used))
-
-
-def touches_as_photos(features: Features) -> Features:
-    """Return the features with those of each touch in place of those of its photo."""
-    return replace(features, photo=features.touch.reshape(len(features), -1))
-
-
 def write_curve(folder: Path, points: Sequence[CurvePoint]) -> Path:
     """Write curve.json, curve.png and curve.md to `folder`; return the path of curve.md."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -171,8 +140,7 @@ def write_curve(folder: Path, points: Sequence[CurvePoint]) -> Path:
 def _text(points: Sequence[CurvePoint]) -> Iterator[str]:
     yield from ("# Accuracy by number of fitted objects and touches", "")
     yield "Top-1 accuracy and pair accuracy of one touch on objects that were left out of the fit. Intervals resample"
-    yield f"objects; chance is {points[0].chance:.3f} and 0.500. In rows with touches only, another touch of an object"
-    yield "replaces its photo, in the fit and in the test; both are of one recording, so drift may help.\n"
+    yield f"objects; chance is {points[0].chance:.3f} and 0.500.\n"
     yield "| fit | objects | touches of each | top-1 accuracy | pair accuracy |\n|---|---|---|---|---|"
     for point in points:
         yield (

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from benchmarks.frontier.closed_forms import Grid, hertz
+from benchmarks.frontier.closed_forms import hertz
 from benchmarks.frontier.contact import contact_panels, products_panel
 from benchmarks.frontier.light import light_panel, sky_panel
 from benchmarks.frontier.optics import optics_panel
@@ -50,13 +50,6 @@ def test_hertz_by_hand():
     # F = 4/3 E* sqrt(R) d^1.5 with R = 4, d = .25, E* = .3: 4/3 * .3 * 2 * .125 = .1 N; a = sqrt(R d) = 1.
     a, depth, peak = hertz(0.1, 4.0, 0.3)
     assert (a, depth, peak) == pytest.approx((1.0, 0.25, 0.15 / math.pi))
-
-
-def test_a_grid_has_its_middle_between_pixels():
-    y, x = Grid.of_field(60).axes()
-    assert (y.shape, x.shape) == ((60, 1), (1, 80))
-    assert y[29, 0] == -y[30, 0] == pytest.approx(-0.12)
-    assert str(Grid.of_field(60)) == "60x80"
 
 
 def test_the_optics_have_a_point_for_each_degree_and_error_falls():

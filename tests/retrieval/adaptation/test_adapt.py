@@ -13,13 +13,8 @@ from retrieval.adaptation import folds
 from retrieval.adaptation.curve import (
     ADAPTED,
     LOW_PASS,
-    LOW_PASS_TOUCHES_ONLY,
-    ONLY_PUBLISHED,
-    TOUCHES_ONLY,
     UNADAPTED,
-    WITHOUT_PUBLISHED,
     learning_curve,
-    touches_as_photos,
     write_curve,
 )
 from retrieval.adaptation.data import PUBLISHED_TOWER, config_for, load_adaptation_data, load_towers
@@ -32,14 +27,12 @@ from retrieval.data.dataset import Split, load_grasps
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.methods import cca_towers
 from retrieval.methods.cca_towers import GRID, CcaSettings, TowerWidths, fit_projections, select_settings
-from retrieval.methods.reduced_features import AffineMap
 from retrieval.methods.selection import Validator
 from retrieval.model.calibration_touches import CalibrationTouches
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.fusion import Matcher
 from retrieval.model.posterior import ScoredTouches, fit_posterior
 from retrieval.model.towers import build_tower
-from retrieval.model.towers.small import SmallTower
 from retrieval.model.towers.weights import initialise_tower
 from retrieval.model.verification import fit_verification, verification_sequences
 from retrieval.training.features import Features
@@ -87,14 +80,6 @@ def test_combined_towers_have_equal_weight_at_any_scale():
         dict(fit_projections(x, photo, owner, TowerWidths([4, 8], [10])))[CcaSettings()] for x in (touch, scaled)
     )
     assert np.allclose(plain.cosines(touch, photo), rescaled.cosines(scaled, photo), atol=1e-4)
-
-
-def test_two_maps_compose_to_one():
-    rng = np.random.default_rng(0)
-    first = AffineMap(rng.standard_normal((4, 3)), rng.standard_normal(3))
-    second = AffineMap(rng.standard_normal((3, 2)), rng.standard_normal(2))
-    x = rng.standard_normal((5, 4))
-    assert np.allclose(first.compose(second)(x), second(first(x)))
 
 
 def test_every_object_is_held_out_once_and_objects_of_one_sequence_together(recording):
@@ -212,15 +197,6 @@ def test_touches_are_encoded_by_the_shipped_the_gel_and_the_published_tower_and_
         parts = [gel.eval()(images), added.eval()(images)]
         assert torch.allclose(matcher.touch_tower.eval()(images), torch.cat([shipped, *parts], 1), atol=1e-5)
         assert torch.allclose(matcher.photo_tower.eval()(images), parts[1], atol=1e-5)
-
-
-def test_without_a_published_tower_the_shipped_towers_are_used():
-    start = load_checkpoint(retrieval.shipped_model(1))
-    matcher = Matcher(config_for(start, 1, None, seed=0).matcher)
-    load_towers(matcher, start, "none")
-    for side in ("touch_tower", "photo_tower"):
-        for name, tensor in getattr(start.matcher, side).state_dict().items():
-            assert torch.equal(getattr(matcher, side).state_dict()[name], tensor), name
 
 
 @pytest.mark.slow
@@ -341,26 +317,6 @@ def published(tmp_path_factory):
     return path
 
 
-def test_features_of_combined_towers_are_those_of_each(model, published):
-    start = load_checkpoint(model)
-    config = config_for(start, 2, PUBLISHED_TOWER, seed=0)
-    matcher = Matcher(config.matcher, 2).eval()
-    load_towers(matcher, start, str(published))
-    own, added = start.matcher.touch_tower, build_tower("mobilenet_v2", "pooled").eval()
-    initialise_tower(added, str(published))
-    images = torch.rand(2, 3, 64, 64)
-    with torch.inference_mode():
-        together = torch.cat([own(images), added(images)], 1)
-        assert torch.allclose(matcher.touch_tower(images), together, atol=1e-5)
-
-
-def test_the_published_tower_is_a_name_or_a_class(model):
-    start = load_checkpoint(model)
-    assert config_for(start, 2, "resnet18", seed=0).matcher.tower == "small+resnet18"
-    assert config_for(start, 2, SmallTower, seed=0).matcher.tower == "small+small"
-    assert config_for(start, 2, None, seed=0).matcher.tower == "small"
-
-
 def test_initial_weights_are_for_all_towers_or_for_each(published):
     two = build_tower("mobilenet_v2+small", "pooled")
     initialise_tower(two, f"{published}+random")
@@ -371,17 +327,6 @@ def test_initial_weights_are_for_all_towers_or_for_each(published):
         initialise_tower(two, "random+random+random")
 
 
-def test_touches_only_compares_a_touch_with_another_touch_of_each_object():
-    touch, photo, owner = correlated_features(objects=6, grasps=4)
-    names = tuple(f"object-{number}" for number in owner)
-    features = Features(tuple(map(str, range(len(names)))), names, touch[:, None], photo)
-    alone = touches_as_photos(features)
-    assert np.array_equal(alone.photo, touch)
-    scores = touch @ touch.T
-    np.fill_diagonal(scores, 1e6)  # a touch itself would always rank first
-    assert score_accuracy(scores, alone).top1.mean() < 1
-
-
 @pytest.mark.slow
 def test_the_curve_has_smaller_fits_and_their_comparisons(recording, model, published, tmp_path, monkeypatch):
     monkeypatch.setattr("retrieval.adaptation.curve.OBJECTS", (4, 1000))
@@ -389,19 +334,7 @@ def test_the_curve_has_smaller_fits_and_their_comparisons(recording, model, publ
     start = load_checkpoint(model)
     data = load_adaptation_data(recording, start, init=str(published), split=None, cache=None, seed=0, quiet=True)
     points = learning_curve(data, start, quiet=True)
-    assert [point.label for point in points] == [
-        UNADAPTED,
-        ADAPTED,
-        ADAPTED,
-        ADAPTED,
-        ADAPTED,
-        LOW_PASS,
-        WITHOUT_PUBLISHED,
-        ONLY_PUBLISHED,
-        TOUCHES_ONLY,
-        TOUCHES_ONLY,
-        LOW_PASS_TOUCHES_ONLY,
-    ]
+    assert [point.label for point in points] == [UNADAPTED, *[ADAPTED] * 4, LOW_PASS]
     assert [(point.objects, point.touches) for point in points[1:5]] == [(4, 1), (4, 3), (6, 1), (6, 3)]
     assert all(low <= value <= high for point in points for value, low, high in (point.top1, point.pair_accuracy))
     text = write_curve(tmp_path / "curve", points).read_text()

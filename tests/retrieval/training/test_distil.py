@@ -1,7 +1,6 @@
 """Distillation of the candidate encoder: its loss, its data, its agreement with exhaustive search, and invariants."""
 
 import dataclasses
-import itertools
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from retrieval.errors import JobInterrupted, NumericalError
 from retrieval.methods.late_fusion import LateFusion
 from retrieval.methods.method import MethodSettings
 from retrieval.methods.retrieve_rerank import RetrieveRerank
-from retrieval.model.checkpoint import Checkpoint, load_checkpoint, read_tensors, store_checkpoint, write_tensors
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from retrieval.model.fusion import Matcher
 from retrieval.training import distil
@@ -68,12 +67,6 @@ def same(left, right):
 # The loss --------------------------------------------------------------------------------------------------
 
 
-def test_the_loss_is_zero_for_scores_that_equal_the_logits_up_to_a_constant_per_touch():
-    logits = torch.tensor([[3.0, -1.0, 0.5], [200.0, -200.0, 0.0]])
-    loss = distil.distillation_loss(logits + torch.tensor([[7.0], [-20.0]]), logits)
-    torch.testing.assert_close(loss, torch.tensor(0.0), rtol=0, atol=1e-5)
-
-
 def test_the_loss_is_the_divergence_plus_the_weighted_error():
     scores, logits = np.array([[0.0, 1.0], [2.0, 2.0]]), np.array([[1.0, 0.0], [3.0, 5.0]])
     targets = [np.exp(row) / np.exp(row).sum() for row in logits]
@@ -115,23 +108,6 @@ def test_a_blend_of_partials_is_the_partial_of_blended_features(matcher):
 @torch.no_grad()
 def _partial(matcher, features):
     return matcher.photo_encoding(features).partial
-
-
-def test_a_blend_lies_between_two_rows_and_nearer_to_one():
-    corners = torch.eye(3)
-    blends = distil.blend(corners, 200, torch.Generator().manual_seed(0))
-    torch.testing.assert_close(blends.sum(1), torch.ones(200))
-    assert ((blends > 0).sum(1) <= 2).all()
-    assert (blends.max(1).values >= 0.5).all()
-    assert len(blends.unique(dim=0)) > 100
-
-
-def test_every_touch_is_scored_with_every_photo(matcher, partials):
-    touches, photos = partials[0][:4], partials[1][:6]
-    table = matcher.head.all_logits(touches, photos)
-    for row, column in itertools.product(range(4), range(6)):
-        one = matcher.head(touches[row][None], photos[column][None])
-        torch.testing.assert_close(table[row, column], one[0], rtol=1e-5, atol=1e-6)
 
 
 def test_photos_of_the_pool_are_nearer_to_the_touches_than_random_blends(matcher, partials):
@@ -291,27 +267,6 @@ def test_queries_are_limited_in_number_and_finite_in_float16():
     np.testing.assert_array_equal(queries, distil.select_queries(partials, seed=0))
     assert partials.half()[7, 1].isinf()
     assert distil.select_queries(partials[7:8], seed=0) is None
-
-
-def test_an_older_checkpoint_without_linear_values_opens_and_searches_as_before(checkpoint, partials):
-    store_checkpoint(
-        distil.with_candidate_encoder(checkpoint, config_with_encoder(2), partials, quiet=True), checkpoint.path
-    )
-    state, header = read_tensors(checkpoint.path)
-    del header["config"]["matcher"]["candidate_linear"]
-    before = checkpoint.matcher.candidate_encoder.photo(partials[1])
-    write_tensors(checkpoint.path, state, {name: header[name] for name in header if name not in ("format", "software")})
-    opened = load_checkpoint(checkpoint.path)
-    assert opened.config.matcher.candidate_linear == 0
-    assert torch.equal(opened.matcher.candidate_encoder.photo(partials[1]), before)
-
-
-def test_an_older_checkpoint_without_a_candidate_encoder_searches_by_contrastive_embeddings():
-    tables = TINY.to_dict()
-    del tables["matcher"]["candidate_width"], tables["training"]["distil_steps"]
-    config = Config.from_dict(tables)
-    assert (config.matcher.candidate_width, config.has_embeddings) == (0, True)
-    assert Matcher(config.matcher).candidate_encoder is None
 
 
 # In the harness --------------------------------------------------------------------------------------------

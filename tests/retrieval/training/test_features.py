@@ -195,39 +195,6 @@ def some_features():
     return Features(("a", "b", "c", "d"), ("mug", "can", "mug", "box"), touch, touch[:, 0] + 100)
 
 
-def test_objects_are_numbered_by_their_sorted_names():
-    assert some_features().owner.tolist() == [2, 1, 2, 0]
-
-
-def test_selected_rows_are_in_the_requested_order():
-    part = some_features().select(np.array([3, 0]))
-    assert (part.grasp_ids, part.object_ids) == (("d", "a"), ("box", "mug"))
-    assert part.touch[:, 0, 0].tolist() == [18, 0]
-    assert part.photo[:, 0].tolist() == [118, 100]
-    assert some_features().of_objects(["mug", "spoon"]).grasp_ids == ("a", "c")
-
-
-def test_equal_features_have_equal_digests_and_different_ones_do_not():
-    one = some_features()
-    assert one.digest == some_features().digest
-    renamed = dataclasses.replace(one, object_ids=("mug", "can", "mug", "can"))
-    moved = dataclasses.replace(one, photo=one.photo + np.float32(1e-3))
-    assert len({one.digest, renamed.digest, moved.digest, one.select(np.array([1, 0, 2, 3])).digest}) == 4
-
-
-@pytest.mark.parametrize(
-    ("touch", "photo"),
-    [
-        (np.zeros((4, 3), np.float32), np.zeros((4, 3), np.float32)),
-        (np.zeros((4, 2, 3), np.float32), np.zeros((3, 3), np.float32)),
-        (np.zeros((4, 2, 3)), np.zeros((4, 3), np.float32)),
-    ],
-)
-def test_features_of_another_shape_or_type_are_refused(touch, photo):
-    with pytest.raises(BadInput, match="features must be"):
-        Features(("a", "b", "c", "d"), ("m",) * 4, touch, photo)
-
-
 @pytest.mark.parametrize("part", ["touch", "photo"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_feature_that_is_not_finite_is_an_error_that_names_its_grasp(part, value):

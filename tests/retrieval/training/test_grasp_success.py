@@ -138,7 +138,6 @@ def test_misses_and_held_grasps_of_new_objects_are_distinguished(trained):
     assert report.accepted == {"held": (4, 4), "missed": (0, 4)}
     assert (report.accuracy, report.chance) == (1.0, 0.5)
     assert report.interval == pytest.approx((0.025 ** (1 / 8), 1.0))
-    assert report.lowest_acceptance[1] == 1.0
 
 
 def test_the_frame_after_the_lift_shows_a_slip_that_the_frame_during_the_grasp_does_not(attempts, tmp_path):
@@ -162,7 +161,6 @@ def test_the_frame_after_the_lift_is_used_if_there_is_one(attempts, tmp_path):
 def test_the_report_contains_the_chance_accuracy_and_the_accepted_grasps(trained):
     text = "\n".join(trained[1].lines())
     assert "accuracy 1.000 (95 %: 0.631 to 1.000) on 8 grasps of 2 other objects" in text
-    assert "with so few objects (2) the interval is too narrow" in text
     assert "always predicting the more frequent class: 0.500" in text
     assert "accepted: 4 of 4 held, 0 of 4 missed" in text
 
@@ -283,17 +281,7 @@ def test_a_recording_that_cannot_train_a_gate_is_refused(tmp_path, case):
         train_gate(write(tmp_path / "r", **options), tmp_path / "g.safetensors", settings=settings, quiet=True)
 
 
-def test_training_objects_with_only_one_outcome_are_refused(tmp_path):
-    """Seed 0 assigns the objects c and e, the only ones with misses, to validation."""
-    folder = write(tmp_path / "r", ("held",), objects="abdfgh")
-    write(folder, ("missed",), objects="ce")
-    with pytest.raises(DatasetError, match=r"training objects of seed 0 must have both .*got 6 successful of 6"):
-        train_gate(folder, tmp_path / "g.safetensors", quiet=True)
-
-
-def test_settings_out_of_range_are_refused(misses, tmp_path):
-    with pytest.raises(ConfigError, match="at least 1; got 0"):
-        train_gate(misses, tmp_path / "g.safetensors", iterations=0, quiet=True)
+def test_settings_out_of_range_are_refused():
     with pytest.raises(ConfigError, match="one of after, during; got 'later'"):
         GateSettings(frame="later")
     with pytest.raises(ConfigError, match="touch_px"):
