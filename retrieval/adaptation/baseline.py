@@ -66,13 +66,7 @@ class UnadaptedBaseline:
     def calibration_touches(
         self, folds: Sequence[Sequence[str]], max_touches: int, *, pooled: bool = False
     ) -> list[CalibrationTouches]:
-        """Return the touches of each fold, for the calibrations.
-
-        Args:
-            folds: Objects of each fold.
-            max_touches: Maximum number of touches of one object.
-            pooled: Score without late interaction.
-        """
+        """Return the touches of each fold, at most `max_touches` of an object; `pooled`: without late interaction."""
         parts = []
         for fold in map(self.features.of_objects, folds):
             features = fold.select(first_rows(fold, max_touches))

@@ -73,13 +73,6 @@ def learning_curve(
 
     For comparison the curve includes the unadapted model and, with all objects and touches, the low-pass control.
 
-    Args:
-        data: The recorded grasps and their features.
-        start: The start model.
-        cache: Folder of the features of the unadapted model.
-        seed: Seed of folds and drawn touches.
-        quiet: No progress on stderr.
-
     Raises:
         BadInput: There are fewer than six objects.
     """

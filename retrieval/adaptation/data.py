@@ -78,17 +78,9 @@ def load_adaptation_data(
     seed: int,
     quiet: bool,
 ) -> AdaptationData:
-    """Read a recording and encode it with the towers of the start model and a published tower.
+    """Read a recording, without the test objects of `split`, and encode it with the towers of `config_for`.
 
-    Args:
-        recording: Folder of the recording.
-        start: The start model.
-        tower: The published tower.
-        init: Weights of that tower, or "none" for no such tower.
-        split: Its test objects are left out.
-        cache: Folder of encoded features.
-        seed: Seed of the configuration.
-        quiet: No progress on stderr.
+    `init` are the weights of the published tower, or "none" for no such tower.
 
     Raises:
         BadInput: Fewer than two objects are left.
@@ -110,14 +102,7 @@ def load_adaptation_data(
 
 
 def config_for(start: Checkpoint, fingers: int, tower: str | type[Tower] | None, *, seed: int) -> Config:
-    """Return the preset with the towers of the fit.
-
-    Args:
-        start: The start model.
-        fingers: Fingers of a touch.
-        tower: The published tower; None for the towers of the start model only.
-        seed: Seed of the configuration.
-    """
+    """Return the preset with the towers of the fit; `tower` None stands for those of the start model only."""
     preset, source = load_config(PRESET), start.config.matcher
     touch, photo, architectures = [source.tower], [source.photo_tower or source.tower], dict(source.architectures)
     if tower is not None:
@@ -143,13 +128,7 @@ def has_gel_tower(start: MatcherConfig) -> bool:
 
 
 def load_towers(matcher: Matcher, start: Checkpoint, init: str) -> None:
-    """Load the weights of the towers of `config_for`.
-
-    Args:
-        matcher: The matcher with the towers.
-        start: The start model.
-        init: Weights of the published tower, or "none" for no such tower.
-    """
+    """Load the weights of the towers of `config_for`; `init` are those of the published tower, or "none"."""
     own, published = start.matcher, [] if init == NO_TOWER else [init]
     gel = [GEL] if published and has_gel_tower(start.config.matcher) else []
     _load_parts(matcher.touch_tower, parts_of(own.touch_tower), [*gel, *published])

@@ -24,12 +24,6 @@ class Estimate:
         choice: The fit to all objects; its settings were selected by holding out half of each kind.
         folds: The fits of the estimate; each selects its settings in the same way among its own fitted objects.
         baseline: The unadapted start model.
-        top1: Top-1 accuracy of the fit among the objects of a fold.
-        pair_accuracy: Pair accuracy of the fit.
-        low_pass_top1: Top-1 accuracy of the control.
-        low_pass_pair_accuracy: Pair accuracy of the control.
-        baseline_top1: Top-1 accuracy of the baseline.
-        baseline_pair_accuracy: Pair accuracy of the baseline.
     """
 
     choice: CcaSelection
@@ -111,18 +105,7 @@ def interval(summary: dict[str, Any]) -> str:
 def estimate_accuracy(
     data: AdaptationData, start: Checkpoint, *, cache: Path | None, seed: int, quiet: bool
 ) -> Estimate | None:
-    """Estimate the accuracy on held-out objects.
-
-    Args:
-        data: The recorded grasps and their features.
-        start: The start model.
-        cache: Folder of the features of the unadapted model.
-        seed: Seed of the folds.
-        quiet: No output on stderr.
-
-    Returns:
-        The estimate; None if there are too few objects.
-    """
+    """Return the accuracy on held-out objects; None if there are too few objects."""
     try:
         drawn = draw_folds(data.grasps, seed)
     except BadInput as error:

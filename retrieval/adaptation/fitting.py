@@ -27,13 +27,7 @@ from retrieval.training.verdicts import fit_calibrations, with_gel_check
 
 @one_thread()
 def fit_matcher(data: AdaptationData, estimate: Estimate | None, out: Path) -> Checkpoint:
-    """Fit projections to all recorded objects and return them in a checkpoint.
-
-    Args:
-        data: The recorded grasps and their features.
-        estimate: Contains the selected settings; without it the largest ridge is used.
-        out: Path of the checkpoint.
-    """
+    """Return a checkpoint with projections fitted to all objects; without an estimate, those of the largest ridge."""
     features, config, matcher = data.features, data.config, data.matcher
     if estimate:
         projections = estimate.choice.projections
@@ -78,14 +72,7 @@ def _log_odds(parts: Iterable[ScoredTouches]) -> tuple[float, float]:
 
 @torch.no_grad()
 def install_projections(matcher: Matcher, projections: CcaProjections, scale: float, offset: float) -> None:
-    """Make the match logit `scale * cosine + offset` of the projected features; the layers of the head contribute 0.
-
-    Args:
-        matcher: The matcher to change.
-        projections: Maps from features to encodings.
-        scale: Scale of the cosine.
-        offset: Offset of the logit.
-    """
+    """Make the match logit `scale * cosine + offset` of the projected features; the layers of the head contribute 0."""
     for layer, found in ((matcher.touch_projection, projections.touch), (matcher.photo_projection, projections.photo)):
         assert isinstance(layer, nn.Linear)  # the configuration of `adapt` has no hidden layer
         used = found.weight.shape[1]  # shorter encodings leave zeros, which do not change the cosine
@@ -105,13 +92,8 @@ def calibrate_fit(
 ) -> Checkpoint:
     """Add the gel check and the calibrations to a fitted checkpoint.
 
-    The calibrations are fitted on held-out objects, because the projections are overfitted to the fitted objects.
-
-    Args:
-        checkpoint: The fitted checkpoint.
-        data: The recorded grasps and their features.
-        estimate: Contains the held-out touches; without it the checkpoint has no calibrations.
-        quiet: No progress on stderr.
+    The calibrations are fitted on the estimate's held-out touches, because the projections are overfitted to the fitted
+    objects; without an estimate there are none.
     """
     checkpoint = _with_gel_check(checkpoint, data.grasps, data.features, quiet)
     if estimate is None:
@@ -133,14 +115,7 @@ def calibrate_fit(
 
 
 def calibrate_baseline(start: Checkpoint, data: AdaptationData, estimate: Estimate, *, quiet: bool) -> Checkpoint:
-    """Return the start model with a gel check and calibrations fitted to the recorded objects.
-
-    Args:
-        start: The start model.
-        data: The recorded grasps and their features.
-        estimate: The estimate with the unadapted baseline.
-        quiet: No progress on stderr.
-    """
+    """Return the start model with a gel check and calibrations fitted to the recorded objects."""
     checkpoint = _with_gel_check(start, data.grasps, estimate.baseline.features, quiet)
     folds = [sorted(set(fold.left_out.object_ids)) for fold in estimate.folds]
     about = {"source": data.source, "data_digest": data_digest(data.grasps)}

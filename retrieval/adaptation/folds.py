@@ -44,10 +44,6 @@ class Fold:
 def draw_folds(grasps: Sequence[Grasp], seed: int) -> list[tuple[str, ...]]:
     """Draw folds of about `GALLERY` objects; objects that share a sequence stay together.
 
-    Args:
-        grasps: The recorded grasps.
-        seed: Seed of the draw.
-
     Raises:
         BadInput: There are fewer than `MIN_OBJECTS` objects.
     """
@@ -64,16 +60,7 @@ def draw_folds(grasps: Sequence[Grasp], seed: int) -> list[tuple[str, ...]]:
 def fit_folds(
     features: Features, folds: Sequence[Sequence[str]], data: AdaptationData, *, seed: int, label: str, quiet: bool
 ) -> Iterator[Fold]:
-    """Yield each fold with the fit to the objects outside it. The settings are selected on the same objects.
-
-    Args:
-        features: Features of all grasps.
-        folds: Objects of each fold.
-        data: The recorded grasps.
-        seed: Seed of the selection.
-        label: Kind of touches, for the progress bar.
-        quiet: No progress on stderr.
-    """
+    """Yield each fold with the fit to the objects outside it. The settings are selected on the same objects."""
     everyone = {name for fold in folds for name in fold}
     with Bar(f"estimate, {label}", len(folds), "folds", quiet=quiet) as bar:
         for fold in folds:
@@ -114,21 +101,13 @@ class FoldAccuracy:
 def fold_accuracy(fold: Fold, seed: int = 0) -> FoldAccuracy:
     """Return the accuracy of each touch of a fold with one random photo of each object of the fold.
 
-    Args:
-        fold: The fold. The photo of the touched object is of another grasp if there is one.
-        seed: Seed of the drawn photos.
+    The photo of the touched object is of another grasp if there is one.
     """
     return score_accuracy(fold.cosines(), fold.left_out, seed)
 
 
 def score_accuracy(scores: NDArray[np.float32], features: Features, seed: int = 0) -> FoldAccuracy:
-    """Return the accuracy of each touch with one random photo of each object.
-
-    Args:
-        scores: (n, n) of every touch with the photo of every grasp.
-        features: Features of the grasps.
-        seed: Seed of the drawn photos.
-    """
+    """Return the accuracy of each touch with one random photo of each object, from scores (n, n) with every photo."""
     rng, owner = np.random.default_rng([seed, 8]), features.owner
     rows = [np.flatnonzero(owner == name) for name in range(owner.max() + 1)]
     higher, equal = np.empty((2, len(features)), np.int64)

@@ -185,14 +185,7 @@ class FrozenFeatures:
     """Features of frozen towers: each image is encoded once."""
 
     def __init__(self, config: Config, device: torch.device, known: Mapping[str | Path, Tensor]) -> None:
-        """Start with known features.
-
-        Args:
-            config: The configuration.
-            device: Device of the features.
-            known: Features by grasp id (of the touch) and by photo file that need no encoding
-                (`retrieval.training.features.features_by_image`).
-        """
+        """Start with features by grasp id (of the touch) and by photo file that need no encoding."""
         self.device, self.images = device, BatchImages(config, keep_bytes=0)  # images are read once
         self._features: dict[str | Path, Tensor] = dict(known)
 
@@ -253,13 +246,7 @@ def recorded_features(
 ) -> tuple[Tensor, dict[Path, Tensor]]:
     """Return features of the touches of grasps (G, fingers * F) and of each of their photo files (F,).
 
-    Args:
-        matcher: The model.
-        source: The source of features.
-        grasps: At least one grasp.
-        what: Purpose of the features, for the progress bar and messages.
-        quiet: No progress on stderr.
-        should_stop: Called between parts.
+    `what` names their purpose, for the progress bar and messages.
 
     Raises:
         JobInterrupted: `should_stop()` returned True.

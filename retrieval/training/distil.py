@@ -71,19 +71,9 @@ def distil(
 ) -> None:
     """Train a candidate encoder from `matcher.head`, and add it and its sizes (`matcher.config`) to `matcher`.
 
-    The other weights do not change. The matcher is unchanged if an error is raised.
-
-    Args:
-        matcher: The matcher.
-        touch_partials: Partial activations (N, P) of touches of training objects. Their cells are not used.
-        photo_partials: Partial activations (M, P) of photos of training objects.
-        width: Hidden units of the candidate encoder.
-        steps: Number of steps.
-        seed: The same seed gives the same candidate encoder.
-        linear: Number of output components of the candidate encoder that are linear in the contrastive embedding
-            (`retrieval.model.config.MatcherConfig`).
-        quiet: No progress on stderr.
-        should_stop: Called after each step.
+    The partial activations (N, P) and (M, P) are those of touches and photos of training objects; their cells are not
+    used. `width` and `linear` are `candidate_width` and `candidate_linear` of the configuration. The same seed gives
+    the same candidate encoder. The other weights do not change. The matcher is unchanged if an error is raised.
 
     Raises:
         JobInterrupted: `should_stop()` returned True.
@@ -231,14 +221,6 @@ def recorded_partials(
 
     At most `MAX_GRASPS` random grasps are used. Grasps may share a photo, so M <= N.
 
-    Args:
-        matcher: The matcher.
-        source: The source of features.
-        grasps: The grasps.
-        seed: Seed of the random choice.
-        quiet: No progress on stderr.
-        should_stop: As for `recorded_features`.
-
     Raises:
         JobInterrupted: `should_stop()` returned True.
     """
@@ -282,19 +264,17 @@ def with_candidate_encoder(
 ) -> Checkpoint:
     """Return `checkpoint` with a distilled candidate encoder, its metric, and validation touches (`queries`).
 
-    The matcher of `checkpoint` is reused and modified.
-
     Args:
-        checkpoint: The checkpoint.
-        config: The configuration, which sets the size of the candidate encoder.
+        checkpoint: The checkpoint. Its matcher is reused and modified.
+        config: Sets the size of the candidate encoder, the steps and the seed.
         train: Partial activations of touches (N, P) and of photos (M, P) of training objects.
         validation: The same of validation objects, if any. The metric ranks all photos by these touches.
         quiet: No progress on stderr.
-        should_stop: As for `distil`.
+        should_stop: Called after each step.
 
     Raises:
-        JobInterrupted: As for `distil`.
-        NumericalError: As for `distil`.
+        JobInterrupted: `should_stop()` returned True.
+        NumericalError: The loss is not finite.
     """
     settings, matcher, metrics = config.training, checkpoint.matcher, checkpoint.provenance["metrics"]
     width, linear, steps = config.matcher.candidate_width, config.matcher.candidate_linear, settings.distil_steps
@@ -318,20 +298,9 @@ def add_candidate_encoder(
     quiet: bool = False,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> Checkpoint:
-    """Return `checkpoint` with a candidate encoder distilled on recorded grasps.
+    """Return `checkpoint` with a candidate encoder distilled on recorded grasps, as by `with_candidate_encoder`.
 
-    Args:
-        checkpoint: The checkpoint. Its matcher is reused and modified; it must be on the device of `source`.
-        config: The configuration, which sets the size of the candidate encoder.
-        source: The source of features.
-        train: Grasps of training objects.
-        validation: Grasps of validation objects; may be empty.
-        quiet: No progress on stderr.
-        should_stop: As for `distil`.
-
-    Raises:
-        JobInterrupted: As for `distil`.
-        NumericalError: As for `distil`.
+    Its matcher must be on the device of `source`. `validation` may be empty.
     """
     partials = [
         recorded_partials(

@@ -204,12 +204,12 @@ def encode_recording(
         cache: Folder of cached parts of 512 images; a later or resumed run reads them. A part's name is a digest of
             tower, preprocessing, variant and image files. None to store nothing.
         touch_variant: One of `TOUCH_VARIANTS`.
-        photo_variant: One of `PHOTO_VARIANTS`.
+        photo_variant: One of `PHOTO_VARIANTS`; "margin" only with whole touches.
         photo_features_from: Features of at least these grasps; their photo features are used without encoding.
         quiet: No progress on stderr.
 
     Raises:
-        BadInput: A variant is unknown, or two variants are combined.
+        BadInput: A variant is unknown.
         DatasetError: A required no-contact frame is missing.
     """
     touched = [_grasp_for_variant(grasp, touch_variant) for grasp in grasps]
@@ -244,17 +244,9 @@ def _config_for_variants(config: Config, touch_variant: str, photo_variant: str)
     ):
         if one not in known:
             raise BadInput(f"{what} must be one of {', '.join(known)}; got {one!r}")
-    if touch_variant == "low_pass" and photo_variant == "margin":
-        raise BadInput("low_pass touches and margin photos are two separate controls; use one at a time")
-    kind = (
-        _LowPassPreprocessing
-        if touch_variant == "low_pass"
-        else _MarginPreprocessing
-        if photo_variant == "margin"
-        else None
-    )
-    if kind is None:
+    if touch_variant != "low_pass" and photo_variant != "margin":
         return config
+    kind = _LowPassPreprocessing if touch_variant == "low_pass" else _MarginPreprocessing
     return dataclasses.replace(config, preprocessing=kind(**config.preprocessing.to_dict()))
 
 
@@ -276,15 +268,10 @@ def _tower_digest(tower: Tower) -> str:
 
 @dataclass(frozen=True)
 class _FeatureCache(Generic[T]):
-    """Features of images in parts: read from the cache, or encoded and stored.
+    """Features of images in parts: read from the cache folder, or encoded and stored.
 
-    Attributes:
-        cache: The cache folder, or None.
-        made_by: Variant, tower and preprocessing.
-        load: Returns the image (or images) of an item.
-        encode: Returns features (B, F) of a list of images.
-        files: Returns the files of an item.
-        quiet: No progress on stderr.
+    `made_by` are variant, tower and preprocessing. `load` returns the image (or images) of an item, `encode` the
+    features (B, F) of a list of images, `files` the files of an item.
     """
 
     cache: Path | None

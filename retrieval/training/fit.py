@@ -130,20 +130,8 @@ def fit_best(
 ) -> BestStep:
     """Train `module` by `fit` with AdamW, and restore the weights of its best step.
 
-    Weight decay applies to matrices only, since biases and temperatures need not be small. The module ends in
-    evaluation mode.
-
-    Args:
-        module: The module.
-        plan: Length and learning rate of the training run.
-        loss: Returns the loss of the step with this number.
-        score: Returns the validation score; higher is better.
-        bar: Progress bar.
-        weight_decay: Weight decay of matrices.
-        after_step: Called with the number of completed steps.
-
-    Returns:
-        The best step.
+    `loss` takes the number of the step; `score` is the validation score, higher is better. Weight decay applies to
+    matrices only, since biases and temperatures need not be small. The module ends in evaluation mode.
     """
     groups: list[dict[str, Any]] = [{"params": [], "weight_decay": 0.0}, {"params": [], "weight_decay": weight_decay}]
     for parameter in module.parameters():

@@ -18,10 +18,6 @@ def training_licences(recording: Path, settings: TrainingConfig) -> list[DataLic
 
     Published weights (`init = "imagenet"`) are not data of a recording and are left out.
 
-    Args:
-        recording: Folder of the recording.
-        settings: Settings of the training.
-
     Raises:
         CheckpointError: The checkpoint `start` cannot be read.
     """

@@ -54,14 +54,10 @@ def save_state(
     *,
     excluded: tuple[str, ...] = (),
 ) -> None:
-    """Write the state of an unfinished training run of `out`.
+    """Write the state of an unfinished training run of `out`: all modules, their optimiser, and a header of JSON types.
 
-    Args:
-        out: The output of the training run.
-        modules: Everything with parameters.
-        optimizer: The optimiser of these parameters.
-        header: The step, and the settings that `load_state` compares; JSON types.
-        excluded: Prefixes of the names of weights that are stored elsewhere.
+    The header holds the step and the settings that `load_state` compares. Weights whose name starts with one of
+    `excluded` are stored elsewhere.
     """
     tensors = {
         f"{_MODEL}{name}": tensor for name, tensor in modules.state_dict().items() if not name.startswith(excluded)
@@ -80,20 +76,12 @@ def load_state(
     *,
     excluded: Callable[[], Mapping[str, Tensor]] = dict,
 ) -> dict[str, Any]:
-    """Load the state that `save_state` wrote into `modules` and `optimizer`.
+    """Load the state that `save_state` wrote into `modules` and `optimizer`, and return its header.
 
-    Args:
-        out: The output of the training run.
-        modules: As in `save_state`.
-        optimizer: As in `save_state`.
-        identity: Settings that the header must contain unchanged.
-        excluded: Returns the weights that the file does not contain, by name.
-
-    Returns:
-        The header.
+    `excluded` returns the weights that the file does not contain, by name.
 
     Raises:
-        CheckpointError: There is no state, or it belongs to another training run.
+        CheckpointError: There is no state, or its header differs from `identity`: it belongs to another training run.
     """
     path = state_path(out)
     tensors, header = read_tensors(path)
@@ -140,10 +128,7 @@ def unfinished_path(done: Path) -> Path:
 def finish_training(trainer: "Trainer", done: Path, quiet: bool) -> Checkpoint:
     """Train to the end and return the checkpoint; read a finished training, and resume an unfinished one.
 
-    Args:
-        trainer: A training whose `out` is `unfinished_path(done)`.
-        done: Path of the finished checkpoint. A checkpoint of another training run is replaced.
-        quiet: No progress on stderr.
+    The trainer's `out` is `unfinished_path(done)`. A checkpoint of another training run at `done` is replaced.
 
     Raises:
         JobInterrupted: After Ctrl-C; the next call resumes.

@@ -76,17 +76,8 @@ def with_verdicts(
     """Return the checkpoint `made` with calibrations and a gel check, if there are enough validation grasps.
 
     A posterior needs three validation objects, and a touch with a second photo of its object. A gel check needs
-    `MIN_GRASPS` validation grasps.
-
-    Args:
-        made: The checkpoint. Its matcher is reused and modified.
-        source: The source of features.
-        train: Grasps of training objects.
-        validation: Grasps of validation objects.
-        foreign: Number of foreign pictures for fitting.
-        max_grasps: Largest number of grasps of each part that are used.
-        quiet: No progress on stderr.
-        should_stop: As for `recorded_features`.
+    `MIN_GRASPS` validation grasps. At most `max_grasps` grasps of each part are used, and `foreign` foreign pictures
+    for fitting. The matcher of `made` is reused and modified.
 
     Raises:
         JobInterrupted: `should_stop()` returned True.
@@ -222,15 +213,9 @@ class GelCheckFeatures:
     def of(
         cls, matcher: Matcher, settings: Preprocessing, grasps: Sequence[Grasp], touches: Tensor, count: int, seed: int
     ) -> "GelCheckFeatures":
-        """Encode no-contact frames of grasps and `count` foreign pictures.
+        """Encode no-contact frames of grasps and `count` foreign pictures, drawn from a seed.
 
-        Args:
-            matcher: The matcher.
-            settings: Preprocessing of the pictures.
-            grasps: G grasps.
-            touches: Their touch features (G, fingers * F), perhaps with cells.
-            count: Number of foreign pictures.
-            seed: Seed of the foreign pictures.
+        `touches` are the features (G, fingers * F) of the grasps' touches, perhaps with cells.
         """
         fingers = matcher.config.fingers
         frames = list(_no_contact_images(settings, grasps, fingers))

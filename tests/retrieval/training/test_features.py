@@ -186,8 +186,6 @@ def test_the_margin_variant_is_cached_separately_from_whole_photos(grasps, match
     assert np.abs(whole.photo - framed.photo).max() > 0.01
     with pytest.raises(BadInput, match="photo, margin; got 'inside'"):
         encode_recording(grasps, matcher, TINY, None, photo_variant="inside", quiet=True)
-    with pytest.raises(BadInput, match="two separate controls"):
-        encode_recording(grasps, matcher, TINY, None, touch_variant="low_pass", photo_variant="margin", quiet=True)
 
 
 def some_features():
