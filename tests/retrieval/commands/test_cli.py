@@ -261,7 +261,7 @@ def test_an_index_is_not_written_among_the_photos(out, workplace, model, capsys)
     assert sorted(workplace.rglob("*")) == before
 
 
-@pytest.mark.parametrize("task", ["match", "relief", "grasp-success"])
+@pytest.mark.parametrize("task", ["match", "grasp-success"])
 def test_a_checkpoint_with_another_suffix_is_refused_before_anything_is_read(task, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["train", "nowhere", "--task", task, "--out", "m.txt"]) == 2
@@ -285,7 +285,7 @@ WRONG_WORDS = {
     "none at all": (["check"], "retrieve check: Missing argument 'recording'"),
     "no touch": (["query", "--top", "3"], "retrieve query: Missing option '--gelsight'"),
     "no number": (["query", "--gelsight", "a.png", "--top", "few"], "retrieve query: Invalid value for '--top'"),
-    "no choice": (["train", "rec", "--out", "m", "--task", "swim"], "is not one of 'match', 'relief', 'grasp-success'"),
+    "no choice": (["train", "rec", "--out", "m", "--task", "swim"], "is not one of 'match', 'grasp-success'"),
     "a forgotten folder": (["collect", "--out", "--preview"], "retrieve collect: --out needs a value"),
     "forgotten files": (["query", "--gelsight", "--json"], "retrieve query: --gelsight needs a value"),
     "a forgotten word": (["rig", "check", "--rig"], "retrieve rig: --rig needs a value"),
@@ -330,7 +330,7 @@ def test_the_package_runs_the_command_line():
 @pytest.mark.parametrize(
     ("command", "choices"),
     [
-        ("train", ["match|relief|grasp-success"]),
+        ("train", ["match|grasp-success"]),
         ("evaluate", METHODS),
         ("frontier", APPROXIMATIONS),
     ],
