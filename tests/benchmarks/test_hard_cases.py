@@ -20,7 +20,7 @@ from tests.retrieval.methods import hard_linear as linear
 from tests.retrieval.metrics import hard_probability as probability
 from tests.retrieval.metrics import hard_ranking as ranking
 from tests.retrieval.model import hard_losses as losses
-from tests.robot.sight.hard_sight import _exact_depth, _picture, _points, naive_circle
+from tests.robot.sight.hard_sight import naive_circle
 from tests.robot.sim.hard_gel_pictures import _columns, _grams, naive_ridge
 
 OF_PACKAGE = {
@@ -131,15 +131,6 @@ def test_the_naive_interval_is_the_t_interval_of_many_values():
     assert high - low == pytest.approx(2 * 1.96 * values.std() / 20, rel=0.1)
 
 
-def test_the_can_is_drawn_at_its_place():
-    points = _points(_picture(_exact_depth()))
-    assert points[:, 2].max() == pytest.approx(120, abs=1e-3)
-    side = points[points[:, 2] < 119]
-    # float32 depth of 800 mm has an error of 6e-5 mm
-    assert np.hypot(side[:, 0], side[:, 1]) == pytest.approx(np.full(len(side), 33), abs=1e-3)
-    assert side[:, 1].max() < 0
-
-
 def test_the_naive_circle_is_right_on_a_whole_circle_without_noise():
     angle = np.linspace(0, 2 * math.pi, 50)
     plan = np.stack([3 + 7 * np.cos(angle), -2 + 7 * np.sin(angle)], axis=1)
@@ -183,20 +174,6 @@ def test_a_hard_case_that_does_not_hold_is_exit_code_1(few_cases, tmp_path, caps
     assert command.main(["--out", str(tmp_path)]) == 1
     assert "FAILS  losses, a logit of 1000: must hold: 1000; naive inf; ours inf" in capsys.readouterr().out
     assert "DOES NOT HOLD" in (tmp_path / "stability.html").read_text()
-
-
-def test_without_a_folder_nothing_is_written(few_cases, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    few_cases(GOOD)
-    assert command.main([]) == 0
-    assert not list(tmp_path.iterdir())
-
-
-def test_cases_name_their_package(monkeypatch):
-    monkeypatch.setattr(command, "hard_cases", lambda package: {"robot": [BAD], "indexes": [GOOD]}.get(package, []))
-    made = command.run_hard_cases()
-    assert [case["package"] for case in made["cases"]] == ["indexes", "robot"]
-    assert made["failed"] == 1
 
 
 def test_the_performance_page_has_the_number_of_cases(rows):
