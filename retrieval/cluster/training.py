@@ -18,7 +18,7 @@ from retrieval.training.state import require_no_unfinished_state, state_path
 from retrieval.training.train import train
 
 MAX_RESTARTS = 3
-"""Largest number of restarts without progress."""
+"""Largest number of restarts after a rank was lost."""
 
 
 def train_on_ray(
@@ -60,31 +60,25 @@ def train_on_ray(
         "resume": resume,
     }
     with ray_session(cpus) as ray, tempfile.TemporaryDirectory() as notes:
-        from ray.train import RunConfig, ScalingConfig, TrainingFailedError
+        from ray.train import FailureConfig, RunConfig, ScalingConfig, TrainingFailedError
         from ray.train.torch import TorchTrainer
 
         has_gpus = ray.cluster_resources().get("GPU", 0) >= workers
-        scaling = ScalingConfig(num_workers=workers, use_gpu=has_gpus, resources_per_worker={"CPU": 1})
-        failures, known = 0, None
         say(f"training on {workers} ranks of Ray; their logs show the progress")
-        while True:
-            trainer = TorchTrainer(
-                _rank, train_loop_config=settings, scaling_config=scaling, run_config=RunConfig(storage_path=notes)
-            )
-            try:
-                trainer.fit()
-                return load_checkpoint(out)
-            except KeyboardInterrupt as error:
-                raise JobInterrupted(f"stopped; --resume continues from {state_path(out)}, if it exists") from error
-            except TrainingFailedError as error:
-                if (own_error := _error_of_rank(error)) is not None:
-                    raise own_error from error
-                state = _state_mtime(out)
-                failures = failures + 1 if state == known else 1
-                known = state
-                if failures > MAX_RESTARTS:
-                    raise RetrievalError(f"ranks were lost {failures} times without progress: {error}") from error
-                say("a rank was lost; all ranks restart" + (" from the last state" if state else ""))
+        trainer = TorchTrainer(
+            _rank,
+            train_loop_config=settings,
+            scaling_config=ScalingConfig(num_workers=workers, use_gpu=has_gpus, resources_per_worker={"CPU": 1}),
+            run_config=RunConfig(storage_path=notes, failure_config=FailureConfig(max_failures=MAX_RESTARTS)),
+        )
+        try:
+            trainer.fit()
+        except KeyboardInterrupt as error:
+            raise JobInterrupted(f"stopped; --resume continues from {state_path(out)}, if it exists") from error
+        except TrainingFailedError as error:
+            lost = RetrievalError(f"ranks were lost more than {MAX_RESTARTS} times; --resume continues: {error}")
+            raise _error_of_rank(error) or lost from error
+    return load_checkpoint(out)
 
 
 def _rank(settings: dict[str, Any]) -> None:
@@ -95,7 +89,7 @@ def _rank(settings: dict[str, Any]) -> None:
 
 
 def _error_of_rank(error: BaseException) -> RetrievalError | None:
-    """Return the error that a rank raised on purpose, which a restart would raise again; None for other failures."""
+    """Return the error that a rank raised on purpose; None for other failures."""
     for failure in getattr(error, "worker_failures", {}).values():
         cause = failure
         while cause is not None:
@@ -103,11 +97,3 @@ def _error_of_rank(error: BaseException) -> RetrievalError | None:
                 return cause
             cause = getattr(cause, "cause", None) or cause.__cause__
     return None
-
-
-def _state_mtime(out: Path) -> float | None:
-    """Return the modification time of the state file; None without one."""
-    try:
-        return state_path(out).stat().st_mtime
-    except FileNotFoundError:
-        return None

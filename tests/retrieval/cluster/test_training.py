@@ -41,7 +41,7 @@ def test_two_ranks_on_ray_train_the_same_model_as_one_process(recording, tmp_pat
 
 
 @pytest.mark.slow
-def test_a_rank_that_is_killed_costs_the_steps_since_the_last_state(recording, tmp_path, capsys):
+def test_a_rank_that_is_killed_costs_the_steps_since_the_last_state(recording, tmp_path):
     out, done = tmp_path / "m.safetensors", {}
     config = with_training(TINY, freeze_towers=True, iterations=600, validate_every=50)
     expected = train(recording, tmp_path / "calm.safetensors", config, quiet=True)
@@ -59,7 +59,6 @@ def test_a_rank_that_is_killed_costs_the_steps_since_the_last_state(recording, t
         time.sleep(0.005)
     thread.join(600)
     assert killed
-    assert "a rank was lost; all ranks restart from the last state" in capsys.readouterr().err
     assert done["checkpoint"].provenance["metrics"] == pytest.approx(expected.provenance["metrics"], abs=1e-3)
     assert load_checkpoint(out).posterior is not None
 
