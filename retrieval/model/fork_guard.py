@@ -10,29 +10,22 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Protocol
+from typing import Any
 from weakref import WeakSet
 
 MAX_FORK_WAIT_S = 10.0
 """Longest wait for computations to end before a fork."""
 
 
-class Closable(Protocol):
-    """Something with threads of its own that opens again when it is used again."""
-
-    def close(self) -> None:
-        """End its threads."""
-
-
 class ForkGuard:
     """Delays a fork until no touch is read or encoded, and closes sessions before it.
 
     Attributes:
-        sessions: What is closed before a fork.
+        sessions: Objects with threads of their own, which `close` ends before a fork; their next use starts new ones.
     """
 
     def __init__(self) -> None:
-        self.sessions: WeakSet[Closable] = WeakSet()
+        self.sessions: WeakSet[Any] = WeakSet()
         self._idle, self._computing, self._threads = threading.Condition(), 0, set[int]()
 
     @contextmanager

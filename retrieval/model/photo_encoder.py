@@ -48,35 +48,31 @@ def torch_photo_encoder(checkpoint: Checkpoint) -> PhotoEncoder:
     return encode
 
 
-def onnx_photo_encoder(checkpoint: Checkpoint) -> PhotoEncoder | None:
-    """Return an encoder by ONNX Runtime; None if it or `onnx` is not installed, or cannot run these towers."""
-    if any(find_spec(name) is None for name in ("onnx", "onnxruntime")):
-        return None
+def fastest_photo_encoder(checkpoint: Checkpoint) -> PhotoEncoder:
+    """Return an encoder by ONNX Runtime, or PyTorch's on a GPU, without `onnx`, or if the partial activations differ.
+
+    Do not call this while other threads encode: the export would also record their operations.
+    """
+    encode = torch_photo_encoder(checkpoint)
+    is_installed = all(find_spec(name) for name in ("onnx", "onnxruntime"))
+    if not is_installed or next(checkpoint.matcher.parameters()).device.type != "cpu":
+        return encode
     from retrieval.model.export import photo_encoder_to_onnx
 
     try:
         session = open_session(photo_encoder_to_onnx(checkpoint), "the photo encoder", checkpoint.digest, threads=1)
     except CheckpointError as error:
         log.warning("%s; PyTorch encodes the photos", error)
-        return None
-    return lambda images: PhotoEncodings(*session.run(None, {"images": np.stack(images)}))
+        return encode
 
+    def encode_by_onnx(images: Sequence[Image]) -> PhotoEncodings:
+        return PhotoEncodings(*session.run(None, {"images": np.stack(images)}))
 
-def fastest_photo_encoder(checkpoint: Checkpoint) -> PhotoEncoder:
-    """Return the encoder by ONNX Runtime, or PyTorch's on a GPU or if the partial activations differ.
-
-    Do not call this while other threads encode: the export would also record their operations.
-    """
-    torch = torch_photo_encoder(checkpoint)
-    on_cpu = next(checkpoint.matcher.parameters()).device.type == "cpu"
-    onnx = onnx_photo_encoder(checkpoint) if on_cpu else None
-    if onnx is None:
-        return torch
     settings = checkpoint.config.preprocessing
     shape = SAMPLE, settings.photo_px, len(settings.views) * settings.photo_px, 3
     images = list(np.random.default_rng(0).random(shape, dtype=np.float32))
-    partial, other = torch(images).partial, onnx(images).partial
+    partial, other = encode(images).partial, encode_by_onnx(images).partial
     if not np.abs(partial - other).max() <= TOLERANCE * np.abs(partial).max():
         log.warning("ONNX Runtime gives other partial activations than PyTorch; PyTorch encodes the photos")
-        return torch
-    return onnx
+        return encode
+    return encode_by_onnx
