@@ -21,9 +21,9 @@ from retrieval.data.resize import RgbImage
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from retrieval.model.config import Config
 from retrieval.model.encode import batches, encode_photos, one_thread
-from retrieval.model.photo_encoder import fastest_photo_encoder
+from retrieval.model.photo_encoder import choose_photo_encoder
 from retrieval.search.build.build_index import build_index
-from retrieval.search.build.codes import BATCH, MIN_PHOTOS_TO_TUNE, map_ahead
+from retrieval.search.build.codes import BATCH, MIN_PHOTOS_FOR_ONNX, map_ahead
 from retrieval.search.defaults import shipped_model
 from tests import synthetic
 
@@ -77,7 +77,7 @@ def measure_shipped(photos: int = 768, photo_px: int = 512, repetitions: int = 3
     with tempfile.TemporaryDirectory() as name:
         images, build = _ready(Path(name), checkpoint, photos, photo_px)
         paths = sorted((Path(name) / "catalog").rglob("*.jpg"))
-        encode, threads = fastest_photo_encoder(checkpoint), torch.get_num_threads()
+        encode, threads = choose_photo_encoder(checkpoint), torch.get_num_threads()
 
         def on_threads(work: Callable[[Any], object], items: Iterable[Any]) -> None:
             with one_thread():
@@ -87,10 +87,10 @@ def measure_shipped(photos: int = 768, photo_px: int = 512, repetitions: int = 3
             "build": build,
             "bare": lambda: on_threads(encode, images),
             "work": lambda: on_threads(lambda some: encode([load(path) for path in some]), paths),
-            "looking": lambda: fastest_photo_encoder(checkpoint),
+            "looking": lambda: choose_photo_encoder(checkpoint),
         }
         taken = in_turns(arms, repetitions).seconds
-    if photos < MIN_PHOTOS_TO_TUNE:
+    if photos < MIN_PHOTOS_FOR_ONNX:
         taken["looking"] = [0.0] * repetitions
     without_tuning = [build_s - tuning for build_s, tuning in zip(taken["build"], taken["looking"], strict=True)]
     times = Times({**taken, "beyond": without_tuning})

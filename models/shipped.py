@@ -33,7 +33,6 @@ from retrieval.data.dataset import Grasp, Split, data_digest, load_grasps
 from retrieval.methods.late_fusion import frozen_matcher, trained_checkpoint
 from retrieval.methods.method import MethodSettings
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint, write_tensors
-from retrieval.model.checkpoint_info import PARTIALS_FROM
 from retrieval.model.config import Config, load_config
 from retrieval.model.encode import default_device, one_thread
 from retrieval.model.verification import fit_verification
@@ -279,11 +278,7 @@ def calibrate_shipped(arguments: argparse.Namespace) -> int:
         return code
     for fingers, name in defaults.SHIPPED.items():
         shipped = load_checkpoint(defaults.shipped_model(fingers))
-        made = calibrated(shipped, arguments.folder, fingers)
-        # Towers and head are the same, so indexes keep their partial activations.
-        partials_from = [*shipped.provenance.get(PARTIALS_FROM, []), shipped.digest]
-        made = dataclasses.replace(made, provenance=made.provenance | {PARTIALS_FROM: partials_from})
-        store(made, arguments.folder / name)
+        store(calibrated(shipped, arguments.folder, fingers), arguments.folder / name)
     return 0
 
 

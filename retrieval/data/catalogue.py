@@ -169,37 +169,18 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
         raise DatasetError(f"a catalogue must be a folder of photos, but {root} {what}: {_LAYOUT}")
     walk = FolderWalk(Path(os.path.realpath(root)))
     walk.walk(str(root), "")
-    path = root / METADATA_FILE
+    metadata_file = root / METADATA_FILE
     try:
-        lines = read_regular(path)
+        lines = read_regular(metadata_file)
     except FileNotFoundError:
         lines = b""
     except OSError as error:
-        raise DatasetError(f"{path} cannot be read: {error.strerror}") from error
-    return make_catalogue(root, str(root), walk.names, walk.skipped, naming, lines)
-
-
-def make_catalogue(
-    folder: Path, where: str, names: list[str], skipped_before: list[SkippedPhoto], naming: Naming, metadata: bytes
-) -> Catalogue:
-    """Return the catalogue of a list of files.
-
-    Args:
-        folder: The catalogue's folder on this machine.
-        where: Folder or URL that messages name.
-        names: Paths of the files relative to `where`.
-        skipped_before: Files that are already left out.
-        naming: Rule that names the object of each photo.
-        metadata: Content of METADATA_FILE, perhaps empty.
-
-    Raises:
-        DatasetError: As for `list_catalogue`.
-    """
-    found = _classify_files(names, naming)
-    found.skipped[:0] = skipped_before
+        raise DatasetError(f"{metadata_file} cannot be read: {error.strerror}") from error
+    found = _classify_files(walk.names, naming)
+    found.skipped[:0] = walk.skipped
     if not found.photos and not found.gels:
-        raise _no_photo_error(where, found, naming)
-    by_object, by_photo = _read_metadata(f"{where}/{METADATA_FILE}", metadata, naming)
+        raise _no_photo_error(root, found, naming)
+    by_object, by_photo = _read_metadata(metadata_file, lines, naming)
     touches = group_touches(found.gels, naming)
     unknown = sorted(by_photo.keys() - [*found.photos, *(path for path, _ in found.gels)])
     unknown += sorted(by_object.keys() - [*found.objects, *(touch.object_id for touch in touches)])
@@ -209,7 +190,7 @@ def make_catalogue(
             if own := {**by_object.get(name, {}), **by_photo.get(path, {})}:
                 photo_metadata[path] = own
     return Catalogue(
-        folder,
+        root,
         PhotoTable(found.photos, found.objects, photo_metadata),
         tuple(found.ignored),
         tuple(found.skipped),
@@ -270,7 +251,7 @@ def _classify_files(names: Iterable[str], naming: Naming) -> _FileGroups:
     return found
 
 
-def _no_photo_error(where: str, found: _FileGroups, naming: Naming) -> DatasetError:
+def _no_photo_error(where: Path, found: _FileGroups, naming: Naming) -> DatasetError:
     """Return the error for a catalogue without photos and touches."""
     if found.unfit:
         return DatasetError(
@@ -316,7 +297,7 @@ def decode_photo(file: PhotoBytes, decode: Callable[[bytes, str], RgbImage] = de
 _MetadataTable = dict[str, dict[str, Any]]
 
 
-def _read_metadata(where: str, text: bytes, naming: Naming) -> tuple[_MetadataTable, _MetadataTable]:
+def _read_metadata(where: Path, text: bytes, naming: Naming) -> tuple[_MetadataTable, _MetadataTable]:
     """Return the user's keys by object_id, and by photo path.
 
     Raises:

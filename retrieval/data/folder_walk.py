@@ -52,7 +52,8 @@ class FolderWalk:
                 continue
             path = prefix + name
             if not path.isascii() and not is_utf8(path):
-                self.skipped.append(skipped_non_utf8(path))
+                printable = path.encode(errors="surrogateescape").decode(errors="backslashreplace")
+                self.skipped.append(SkippedPhoto(printable, "the name is not valid UTF-8; rename it"))
                 continue
             try:
                 is_folder = entry.is_dir()
@@ -74,9 +75,3 @@ class FolderWalk:
         else:
             self.link_targets.add(target)
             self.walk(link, path + "/")
-
-
-def skipped_non_utf8(path: str) -> SkippedPhoto:
-    """Return the SkippedPhoto of a file whose name is not valid UTF-8."""
-    printable = path.encode(errors="surrogateescape").decode(errors="backslashreplace")
-    return SkippedPhoto(printable, "the name is not valid UTF-8; rename it")

@@ -1,6 +1,5 @@
 """The header of a checkpoint's file, read without PyTorch: enough for a query whose towers run elsewhere."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,25 +43,6 @@ class CheckpointInfo:
 def fingerprint(checkpoint: CheckpointInfo) -> dict[str, str]:
     """Return the digests that an index and the checkpoint that searches it must share."""
     return {"checkpoint": checkpoint.digest, "preprocessing": checkpoint.config.preprocessing.digest()}
-
-
-PARTIALS_FROM = "partials_from"
-"""Key of the provenance: digests of checkpoints with the same towers, head and preprocessing, so the same partial
-activations."""
-
-
-def can_reuse_partials(checkpoint: CheckpointInfo, made_by: Mapping[str, str]) -> bool:
-    """Whether an index with the fingerprint `made_by` contains the partial activations of this checkpoint.
-
-    Only its embeddings then differ. The candidate encoder recomputes them from the partial activations.
-    """
-    sources = checkpoint.provenance.get(PARTIALS_FROM)
-    same = isinstance(sources, list) and made_by.get("checkpoint") in sources
-    return (
-        same
-        and checkpoint.config.matcher.candidate_width > 0
-        and made_by.get("preprocessing") == fingerprint(checkpoint)["preprocessing"]
-    )
 
 
 def read_checkpoint_info(path: Path) -> CheckpointInfo:

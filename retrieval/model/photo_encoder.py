@@ -48,7 +48,7 @@ def torch_photo_encoder(checkpoint: Checkpoint) -> PhotoEncoder:
     return encode
 
 
-def fastest_photo_encoder(checkpoint: Checkpoint) -> PhotoEncoder:
+def choose_photo_encoder(checkpoint: Checkpoint) -> PhotoEncoder:
     """Return an encoder by ONNX Runtime, or PyTorch's on a GPU, without `onnx`, or if the partial activations differ.
 
     Do not call this while other threads encode: the export would also record their operations.

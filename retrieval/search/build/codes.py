@@ -31,7 +31,7 @@ from retrieval.errors import NoReadablePhoto, NumericalError
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.checkpoint_info import fingerprint
 from retrieval.model.encode import Image, batches, one_thread
-from retrieval.model.photo_encoder import PhotoEncoder, fastest_photo_encoder, torch_photo_encoder
+from retrieval.model.photo_encoder import PhotoEncoder, choose_photo_encoder, torch_photo_encoder
 from retrieval.model.stored_partials import stored_layout, to_stored
 
 T = TypeVar("T")
@@ -42,8 +42,8 @@ READ = 32
 """Files that a thread reads in one task. The overhead of a task is a tenth of the time to read and hash one photo."""
 BLOCK = 1024
 """Codes that are copied from the cache to the index at once."""
-MIN_PHOTOS_TO_TUNE = 256
-"""Smallest number of new photos for which a faster encoder is tried; the trial takes as long as encoding 100 photos."""
+MIN_PHOTOS_FOR_ONNX = 256
+"""Smallest number of new photos that ONNX Runtime encodes: exporting the towers takes about a second."""
 MIN_AGE_NS = 2 * 10**9
 """A file that changed less than this before the build is read again by the next one, as in git: it may change again
 within one tick of the disk's clock, without another time. The coarsest clock of a common disk (FAT) ticks every two
@@ -180,12 +180,8 @@ def code_blocks(cache: CodeCache, checkpoint: Checkpoint, digests: Sequence[str]
 
 
 def _photo_encoder(checkpoint: Checkpoint, photos: int) -> PhotoEncoder:
-    on_cpu = next(checkpoint.matcher.parameters()).device.type == "cpu"
-    return (
-        fastest_photo_encoder(checkpoint)
-        if on_cpu and photos >= MIN_PHOTOS_TO_TUNE
-        else torch_photo_encoder(checkpoint)
-    )
+    choose = choose_photo_encoder if photos >= MIN_PHOTOS_FOR_ONNX else torch_photo_encoder
+    return choose(checkpoint)
 
 
 def _encode(

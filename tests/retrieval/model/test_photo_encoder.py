@@ -6,7 +6,7 @@ import pytest
 from indexes.store.folder import IndexStore
 from retrieval.model import photo_encoder
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.model.photo_encoder import fastest_photo_encoder, torch_photo_encoder
+from retrieval.model.photo_encoder import choose_photo_encoder, torch_photo_encoder
 from retrieval.search.build.build_index import build_index
 from retrieval.search.defaults import shipped_model
 
@@ -20,7 +20,7 @@ def pictures(checkpoint, count=3):
 def test_onnx_runtime_gives_the_partial_activations_and_embeddings_of_several_views():
     pytest.importorskip("onnxruntime")
     shipped = load_checkpoint(shipped_model())
-    ours, theirs = (make(shipped)(pictures(shipped)) for make in (torch_photo_encoder, fastest_photo_encoder))
+    ours, theirs = (make(shipped)(pictures(shipped)) for make in (torch_photo_encoder, choose_photo_encoder))
     assert not np.array_equal(ours.partial, theirs.partial)  # another library
     assert np.abs(ours.partial - theirs.partial).max() <= photo_encoder.TOLERANCE * np.abs(ours.partial).max()
     assert np.allclose(ours.embedding, theirs.embedding, atol=1e-4)
@@ -32,10 +32,10 @@ def test_pytorch_encodes_if_onnx_runtime_is_missing_or_wrong(model, monkeypatch,
     expected = torch_photo_encoder(checkpoint)(images).partial
     with monkeypatch.context() as patch:
         patch.setattr(photo_encoder, "find_spec", lambda name: None)
-        assert np.array_equal(fastest_photo_encoder(checkpoint)(images).partial, expected)
+        assert np.array_equal(choose_photo_encoder(checkpoint)(images).partial, expected)
     pytest.importorskip("onnxruntime")
     monkeypatch.setattr(photo_encoder, "TOLERANCE", -1.0)
-    assert np.array_equal(fastest_photo_encoder(checkpoint)(images).partial, expected)
+    assert np.array_equal(choose_photo_encoder(checkpoint)(images).partial, expected)
     assert "gives other partial activations" in caplog.text
 
 
@@ -44,10 +44,10 @@ def test_a_long_build_gives_the_same_index_with_either_encoder(catalogue, model,
     checkpoint = load_checkpoint(model)
     build_index(catalogue, checkpoint, tmp_path / "torch", quiet=True)
     calls = []
-    monkeypatch.setattr("retrieval.search.build.codes.MIN_PHOTOS_TO_TUNE", 1)
+    monkeypatch.setattr("retrieval.search.build.codes.MIN_PHOTOS_FOR_ONNX", 1)
     monkeypatch.setattr(
-        "retrieval.search.build.codes.fastest_photo_encoder",
-        lambda made: calls.append(1) or fastest_photo_encoder(made),
+        "retrieval.search.build.codes.choose_photo_encoder",
+        lambda made: calls.append(1) or choose_photo_encoder(made),
     )
     build_index(catalogue, checkpoint, tmp_path / "onnx", quiet=True)
     assert calls == [1]  # once per build
