@@ -10,11 +10,9 @@ from retrieval.data.text import is_utf8, replace_surrogates
 from retrieval.errors import DatasetError
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.build.build_index import build_index
-from retrieval.search.query.objects import listed_photo
 from retrieval.serve.errors import HttpProblem
 from robot.errors import RecordingError
 from robot.recording.folder import RecordingWriter, read_recording
-from tests.retrieval.serve.test_history import add_feedback, ask
 from tests.serving import INFO, service
 
 HALF = "\ud83d"  # the first half of an emoji
@@ -52,12 +50,6 @@ def test_a_lone_surrogate_in_a_recording_is_refused_with_its_line(recording, tmp
         read_recording(tmp_path)
 
 
-def test_lone_surrogates_in_rows_of_an_older_index_are_shown_as_replacement_characters():
-    row = {"id": "a", "object_id": f"mug{HALF}", "path": "mug/1.jpg", "metadata": {"note": [HALF, "\U0001f600"]}}
-    found = listed_photo(row)
-    assert (found.object_id, found.metadata) == ("mug\ufffd", {"note": ["\ufffd", "\U0001f600"]})
-
-
 def test_valid_text_is_returned_as_the_same_object():
     document = {"a": ["é", "\U0001f600", 1.5, None]}
     assert replace_surrogates(document) is document
@@ -67,26 +59,6 @@ def test_valid_text_is_returned_as_the_same_object():
 def test_a_problem_response_with_a_file_name_that_is_not_utf8_is_valid_json():
     body = HttpProblem("unknown", f"{NAME}.jpg is gone").response().body
     assert json.loads(body)["detail"] == "mug\ufffd.jpg is gone"
-
-
-def test_queries_over_an_older_index_with_a_lone_surrogate_succeed(catalogue_copy, touch, model, tmp_path, monkeypatch):
-    name = sorted(path.name for path in catalogue_copy.iterdir())[0]
-    (catalogue_copy / "metadata.jsonl").write_text(json.dumps({"object_id": name, "note": HALF}) + "\n")
-    monkeypatch.setattr("retrieval.data.catalogue.require_utf8", lambda row: None)  # like older versions
-    build_index(catalogue_copy, load_checkpoint(model), tmp_path / "index", quiet=True)
-    folder = tmp_path / "history"
-    with (
-        RecordingWriter(folder / "recording", INFO) as writer,
-        service(tmp_path / "index", None, writer, history=folder) as client,
-    ):
-        query, answer = ask(client, [[path.read_bytes() for path in touch]], top=8)
-        notes = [one["metadata"] for one in answer["results"] if one["object_id"] == name]
-        assert notes == [{"note": "\ufffd"}]
-        items = client.get("/v1/catalogue", params={"object": name}).json()["items"]
-        assert [item["metadata"] for item in items] == [{"note": "\ufffd"}] * 3
-        assert client.get(f"/v1/history/{query}").json()["answer"] == answer
-        assert client.get("/v1/history").json()["items"][0]["id"] == query
-        assert add_feedback(client, query, "object", name).status_code == 201
 
 
 def test_a_catalogue_in_a_folder_whose_name_is_not_utf8_is_served(catalogue, touch, model, tmp_path):
