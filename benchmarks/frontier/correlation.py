@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.frontier.clock import time_points
-from retrieval.frontier.pixels import SLACK
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, miss_rate_point, smallest_error
 from retrieval.frontier.sample import Sample
 from retrieval.methods.cca import Cca, canonical_correlations, cosine, decompose, unit_rows
@@ -152,7 +151,7 @@ def cca_components(sample: Sample) -> ApproximationResult:
         time=f"scores of one touch with {sample.scale.photos:,} photos, one thread",
         unit="% of queries",
         reference=f"the object in the hand, one of {len(parts[2])}",
-        tolerance=round(min(point.error for point in points) + SLACK, 1),
+        tolerance=round(min(point.error for point in points) + 2.0, 1),
         points=tuple(points),
         resolution=100 / len(test),
     )

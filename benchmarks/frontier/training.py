@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from retrieval.data.pairs import PairBatch, PairSampler
 from retrieval.frontier.clock import time_points
-from retrieval.frontier.pixels import load_touch
+from retrieval.frontier.formats import load_touch
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, smallest_error
 from retrieval.frontier.sample import Sample
 from retrieval.model.encode import autocast, has_fast_bfloat16, to_batch, touch_batch

@@ -19,8 +19,6 @@ APPROXIMATIONS = {
     "index_kinds": "retrieval.frontier.kinds:index_kinds",
     "towers": "retrieval.frontier.formats:towers",
     "partials": "retrieval.frontier.formats:partials",
-    "image_size": "retrieval.frontier.pixels:image_size",
-    "grasps": "retrieval.frontier.grasps:grasps",
 }
 """Name -> measuring function, imported on first use."""
 

@@ -14,8 +14,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from retrieval.data.dataset import Grasp
+from retrieval.data.preprocessing import Preprocessing
 from retrieval.frontier.clock import time_points
-from retrieval.frontier.pixels import load_touch
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, miss_rate_point, smallest_error
 from retrieval.frontier.sample import Array, Sample
 from retrieval.model.checkpoint import Checkpoint
@@ -84,6 +85,13 @@ def _panels(
         ),
         Panel("changed top-1 photo", time, "% of touches", reference, FLIP_TOLERANCE, of_flips, 100 / queries),
     )
+
+
+def load_touch(settings: Preprocessing, grasp: Grasp) -> list[Array]:
+    """Return the preprocessed images of one touch, one per finger."""
+    without = settings.background == "none"
+    references = [None] * len(grasp.touches) if without else grasp.backgrounds
+    return [settings.load_touch(*pair) for pair in zip(grasp.touches, references, strict=True)]
 
 
 Encode = Callable[[list[Any]], Array]

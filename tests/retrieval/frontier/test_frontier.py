@@ -14,8 +14,7 @@ from retrieval.frontier import APPROXIMATIONS, load_approximation
 from retrieval.frontier import measure as measuring_module
 from retrieval.frontier.candidates import default_k, ranks
 from retrieval.frontier.clock import time_points
-from retrieval.frontier.formats import FORMATS, encoders
-from retrieval.frontier.pixels import load_touch
+from retrieval.frontier.formats import FORMATS, encoders, load_touch
 from retrieval.frontier.points import (
     ApproximationResult,
     Panel,
@@ -97,16 +96,9 @@ def test_a_row_round_trips_through_json():
     assert ApproximationResult.from_dict(json.loads(json.dumps(row.to_dict()))) == row
 
 
-@pytest.mark.parametrize(
-    ("value", "text"), [(0, "0"), (0.5, "0.5"), (1.2345, "1.23"), (1234.0, "1.23e+03"), (1e-7, "1.0e-07")]
-)
-def test_numbers_are_short(value, text):
-    assert format_number(value) == text
-
-
-@pytest.mark.parametrize(("seconds", "text"), [(2.0, "2 s"), (0.0123, "12.3 ms"), (4.5e-5, "45 us")])
-def test_durations_have_a_readable_unit(seconds, text):
-    assert format_duration(seconds) == text
+def test_numbers_and_durations_are_short():
+    assert [format_number(value) for value in (0, 0.5, 1.2345, 1e-7)] == ["0", "0.5", "1.23", "1.0e-07"]
+    assert [format_duration(seconds) for seconds in (2.0, 0.0123, 4.5e-5)] == ["2 s", "12.3 ms", "45 us"]
 
 
 def test_timed_works_take_turns():
@@ -202,14 +194,6 @@ def test_an_index_stores_partials_in_the_default_format(catalogue, model, tmp_pa
     build_index(catalogue, load_checkpoint(model), tmp_path / "index", quiet=True)
     stored = IndexStore(tmp_path / "index").open().arrays["partials"]
     assert [name for name, _, _, is_default in FORMATS if is_default] == [str(np.asarray(stored[:1]).dtype)]
-
-
-def test_images_have_the_default_size_in_a_query(rows, sample):
-    settings = sample.checkpoint.config.preprocessing
-    assert [one.default.setting for one in rows["image_size"].panels] == [
-        f"{settings.touch_px} px",
-        f"{settings.photo_px} px",
-    ]
 
 
 # Sample ----------------------------------------------------------------------------------------------------
