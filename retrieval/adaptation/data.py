@@ -19,7 +19,7 @@ from retrieval.methods.cca_towers import TowerWidths
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config, MatcherConfig, load_config
 from retrieval.model.fusion import Matcher
-from retrieval.model.towers import TOWER_SEPARATOR, architectures_of, tower_name
+from retrieval.model.towers import TOWER_SEPARATOR
 from retrieval.model.towers.concatenated import feature_counts_of, parts_of
 from retrieval.model.towers.tower import Tower
 from retrieval.model.towers.weights import GEL, initialise_tower
@@ -29,11 +29,9 @@ from retrieval.training.licences import checkpoint_licences
 
 PRESET = "adapt"
 PUBLISHED_TOWER = "mobilenet_v2"
-"""Published tower that is combined with the towers of the start model by default."""
+"""Published tower that is combined with the towers of the start model, and backbone of the gel tower."""
 NO_TOWER = "none"
 """Value of `init` for no published tower."""
-GEL_TOWER = "mobilenet_v2"
-"""Backbone of the gel tower."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +69,6 @@ def load_adaptation_data(
     recording: Path,
     start: Checkpoint,
     *,
-    tower: str | type[Tower] = PUBLISHED_TOWER,
     init: str,
     split: Split | None,
     cache: Path | None,
@@ -90,7 +87,7 @@ def load_adaptation_data(
         grasps = [grasp for grasp in grasps if grasp.object_id not in split.test]
     if len({grasp.object_id for grasp in grasps}) < 2:
         raise BadInput("A fit needs a recording of at least 2 objects. Record more.")
-    config = config_for(start, finger_count(grasps), None if init == NO_TOWER else tower, seed=seed)
+    config = config_for(start, finger_count(grasps), init, seed=seed)
     matcher = Matcher(config.matcher, len(config.preprocessing.views)).eval()
     load_towers(matcher, start, init)
     encode = partial(encode_recording, grasps, matcher, config, cache, quiet=quiet)
@@ -101,22 +98,20 @@ def load_adaptation_data(
     return AdaptationData(grasps, config, matcher, features, low_pass, facts.kind_of, facts.source, licences)
 
 
-def config_for(start: Checkpoint, fingers: int, tower: str | type[Tower] | None, *, seed: int) -> Config:
-    """Return the preset with the towers of the fit; `tower` None stands for those of the start model only."""
+def config_for(start: Checkpoint, fingers: int, init: str, *, seed: int) -> Config:
+    """Return the preset with the towers of the fit; with `init` "none" those of the start model only."""
     preset, source = load_config(PRESET), start.config.matcher
-    touch, photo, architectures = [source.tower], [source.photo_tower or source.tower], dict(source.architectures)
-    if tower is not None:
-        published = tower_name(tower)
-        touch += [*([GEL_TOWER] if has_gel_tower(source) else []), published]
-        photo = [published] if is_shipped(start.path) else [*photo, published]
-        architectures |= architectures_of(published)
+    touch, photo = [source.tower], [source.photo_tower or source.tower]
+    if init != NO_TOWER:
+        touch += [*([PUBLISHED_TOWER] if has_gel_tower(source) else []), PUBLISHED_TOWER]
+        photo = [PUBLISHED_TOWER] if is_shipped(start.path) else [*photo, PUBLISHED_TOWER]
     matcher = dataclasses.replace(
         preset.matcher,
         tower=TOWER_SEPARATOR.join(touch),
         photo_tower=TOWER_SEPARATOR.join(photo),
         tower_output=source.tower_output,
         fingers=fingers,
-        architectures=architectures,
+        architectures=source.architectures,
     )
     training = dataclasses.replace(preset.training, init="random", init_touch="", init_photo="", seed=seed)
     return dataclasses.replace(preset, matcher=matcher, training=training)

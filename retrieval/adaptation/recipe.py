@@ -7,18 +7,13 @@ from objects that were left out of the fit.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from retrieval.adaptation.curve import learning_curve, write_curve
-from retrieval.adaptation.data import PUBLISHED_TOWER, AdaptationData, load_adaptation_data
+from retrieval.adaptation.data import AdaptationData, load_adaptation_data
 from retrieval.adaptation.estimate import Estimate, estimate_accuracy
 from retrieval.adaptation.fitting import calibrate_baseline, calibrate_fit, fit_matcher
 from retrieval.data.dataset import AnyRecording, Split, finger_count, folder_of, load_grasps
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable, store_checkpoint
 from retrieval.search.defaults import shipped_model
-
-if TYPE_CHECKING:
-    from retrieval.model.towers.tower import Tower
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,12 +24,11 @@ class Adaptation:
         checkpoint: The written checkpoint.
         data: The fitted grasps and their features.
         estimate: The accuracy estimate; None for fewer than six objects; the checkpoint then has no probabilities.
-        report: Page of the learning curve, if it was requested and there is an estimate.
 
     >>> from pathlib import Path
     >>> made = retrieval.adapt("lab", Path("own.safetensors"), "model.safetensors", init="none", quiet=True)
-    >>> made.checkpoint.path.name, made.report
-    ('own.safetensors', None)
+    >>> made.checkpoint.path.name
+    'own.safetensors'
     >>> 0 <= made.estimate.to_dict()["held_out_top1"] <= 1
     True
     """
@@ -42,13 +36,10 @@ class Adaptation:
     checkpoint: Checkpoint
     data: AdaptationData
     estimate: Estimate | None
-    report: Path | None
 
     def lines(self) -> list[str]:
         """Return the result as lines of text."""
         lines = self.estimate.lines() if self.estimate else []
-        if self.report:
-            lines.append(f"learning curve: {self.report}")
         grasps = self.data.grasps
         objects = len({grasp.object_id for grasp in grasps})
         return [*lines, f"{self.checkpoint.path}: fitted to {objects} objects, {len(grasps)} touches"]
@@ -59,10 +50,8 @@ def adapt(
     out: Path,
     start: str | Path | Checkpoint | None = None,
     *,
-    tower: "str | type[Tower]" = PUBLISHED_TOWER,
     init: str = "imagenet",
     split: Split | None = None,
-    report: Path | None = None,
     cache: Path | None = None,
     seed: int = 0,
     quiet: bool = False,
@@ -76,10 +65,9 @@ def adapt(
         recording: A folder, or the object that `robot.read_recording` returns.
         out: The checkpoint (.safetensors).
         start: The start model. Default: the shipped model for one finger, or for two or more.
-        tower: The published tower to combine with those of the model: a name, "module:Class", or a class.
-        init: Weights of that tower: "imagenet", a file, or "none" to use the towers of the start model only.
+        init: Weights of the published MobileNetV2 that is combined with the towers of the start model: "imagenet", a
+            file, or "none" to use the towers of the start model only.
         split: A split whose test objects are not used at all.
-        report: Folder for the learning curve: accuracy by number of objects and touches.
         cache: Folder of encoded features, so that a stopped run resumes.
         seed: Seed of the folds.
         quiet: No progress on stderr.
@@ -98,16 +86,11 @@ def adapt(
     recording = folder_of(recording)
     if not isinstance(start, Checkpoint):
         start = load_checkpoint(start or shipped_model(min(finger_count(load_grasps(recording)), 2)))
-    data = load_adaptation_data(
-        recording, start, tower=tower, init=init, split=split, cache=cache, seed=seed, quiet=quiet
-    )
+    data = load_adaptation_data(recording, start, init=init, split=split, cache=cache, seed=seed, quiet=quiet)
     estimate = estimate_accuracy(data, start, cache=cache, seed=seed, quiet=quiet)
     if estimate and estimate.is_baseline_better:
         checkpoint = calibrate_baseline(start, data, estimate, quiet=quiet)
     else:
         checkpoint = calibrate_fit(fit_matcher(data, estimate, out), data, estimate, quiet=quiet)
     store_checkpoint(checkpoint, out)
-    page = None
-    if report and estimate:
-        page = write_curve(report, learning_curve(data, start, cache=cache, seed=seed, quiet=quiet))
-    return Adaptation(load_checkpoint(out), data, estimate, page)
+    return Adaptation(load_checkpoint(out), data, estimate)

@@ -24,10 +24,6 @@ def adapt(
         ),
     ] = "imagenet",
     split: Annotated[Path | None, typer.Option(help=f"{SPLIT}; test objects are not used")] = None,
-    report: Annotated[
-        Path | None,
-        typer.Option(help="folder for the learning curve: accuracy against the number of touches and objects"),
-    ] = None,
     cache: Annotated[
         Path | None, typer.Option(help="folder that stores image features, to resume a stopped run")
     ] = None,
@@ -40,9 +36,7 @@ def adapt(
 
     for finding in check_gel_layout(recording):
         say(f"{finding.severity}: {finding.message}")
-    result = fit(recording, out, model, init=init, split=read_split(split), report=report, cache=cache, seed=seed)
+    result = fit(recording, out, model, init=init, split=read_split(split), cache=cache, seed=seed)
     defaults.remember("model", out)
     for line in result.lines():
         say(line)
-    if report and not result.report:
-        say(f"{report} was not written: there are too few objects to hold some out and measure a learning curve")

@@ -5,12 +5,11 @@ import hashlib
 import json
 import logging
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Executor
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -216,16 +215,14 @@ def encode_recording(
     device = default_device()
     matcher = deepcopy(matcher).to(device).eval()
     settings = _config_for_variants(config, touch_variant, photo_variant)
-    images = BatchImages(settings, keep_bytes=0)
-    touch_made_by = (touch_variant, _tower_digest(matcher.touch_tower), settings.preprocessing.digest())
-    encode = partial(touch_features, matcher)
-    touch = _FeatureCache(cache, touch_made_by, images.touch, encode, images.files, quiet).rows(touched)
+    images, digest = BatchImages(settings, keep_bytes=0), settings.preprocessing.digest()
+    made_by, encode = (touch_variant, _tower_digest(matcher.touch_tower), digest), partial(touch_features, matcher)
+    touch = _encoded(cache, made_by, touched, images.touch, encode, images.files, quiet)
     if photo_features_from is None:
-        photo_made_by = (photo_variant, _tower_digest(matcher.photo_tower), settings.preprocessing.digest())
-        encode = partial(photo_features, matcher)
-        parts = _FeatureCache(cache, photo_made_by, images.photo, encode, lambda file: (file,), quiet)
         files = {path: row for row, path in enumerate(dict.fromkeys(grasp.photo for grasp in grasps))}
-        photo = parts.rows(list(files))[[files[grasp.photo] for grasp in grasps]]
+        made_by, encode = (photo_variant, _tower_digest(matcher.photo_tower), digest), partial(photo_features, matcher)
+        photo = _encoded(cache, made_by, list(files), images.photo, encode, lambda file: (file,), quiet)
+        photo = photo[[files[grasp.photo] for grasp in grasps]]
     else:
         row_of = {grasp_id: row for row, grasp_id in enumerate(photo_features_from.grasp_ids)}
         photo = photo_features_from.photo[[row_of[grasp.grasp_id] for grasp in grasps]]
@@ -266,59 +263,47 @@ def _tower_digest(tower: Tower) -> str:
     return tensors_digest(tower.state_dict(), f"{type(tower).__name__} {tower.output} {tower.cells}")
 
 
-@dataclass(frozen=True)
-class _FeatureCache(Generic[T]):
-    """Features of images in parts: read from the cache folder, or encoded and stored.
+def _encoded(
+    cache: Path | None,
+    made_by: tuple[str, ...],
+    items: Sequence[T],
+    load: Callable[[T], Any],
+    encode: Callable[[list[Any]], Tensor],
+    files: Callable[[T], tuple[Path, ...]],
+    quiet: bool,
+) -> NDArray[np.float32]:
+    """Return the features (len(items), F) of items, in parts: read from the cache folder, or encoded and stored.
 
     `made_by` are variant, tower and preprocessing. `load` returns the image (or images) of an item, `encode` the
     features (B, F) of a list of images, `files` the files of an item.
     """
+    unit, parts = "photos" if made_by[0] in PHOTO_VARIANTS else "grasps", []
+    with Bar(f"encode {made_by[0]}", len(items), unit, quiet=quiet) as bar, worker_pool() as pool:
+        for part in batches(items, _PART):
+            path = _cache_path(cache, made_by, [files(item) for item in part]) if cache else None
+            features = _read_cached(path) if path else None
+            if features is None or len(features) != len(part):
+                encoded = []
+                for batch in batches(map_in_order(pool, load, part, _BATCH), _BATCH):
+                    encoded.append(encode(batch).cpu())
+                    bar.advance(len(batch))
+                features = torch.cat(encoded)
+                if path:
+                    write_tensors(path, {"features": features}, {"made_by": made_by})
+            else:
+                bar.advance(len(part))
+            parts.append(features.numpy())
+    return np.concatenate(parts)
 
-    cache: Path | None
-    made_by: tuple[str, ...]
-    load: Callable[[T], Any]
-    encode: Callable[[list[Any]], Tensor]
-    files: Callable[[T], tuple[Path, ...]]
-    quiet: bool
 
-    def rows(self, items: Sequence[T]) -> NDArray[np.float32]:
-        """Return the features (len(items), F) of items, in their order."""
-        variant = self.made_by[0]
-        unit = "photos" if variant in PHOTO_VARIANTS else "grasps"
-        with (
-            Bar(f"encode {variant}", len(items), unit, quiet=self.quiet) as bar,
-            worker_pool() as pool,
-        ):
-            return np.concatenate([self._part(part, pool, bar) for part in batches(items, _PART)])
-
-    def _part(self, items: list[T], pool: Executor, bar: Bar) -> NDArray[np.float32]:
-        path = self._path(items)
-        if path and (cached := _read_cached(path)) is not None and len(cached) == len(items):
-            bar.advance(len(items))
-            return cached.numpy()
-        encoded = []
-        for batch in batches(map_in_order(pool, self.load, items, _BATCH), _BATCH):
-            encoded.append(self.encode(batch).cpu())
-            bar.advance(len(batch))
-        features = torch.cat(encoded)
-        if path:
-            write_tensors(path, {"features": features}, {"made_by": self.made_by})
-        return features.numpy()
-
-    def _path(self, items: list[T]) -> Path | None:
-        """Return the cache file of the features of these items, or None without a cache.
-
-        Raises:
-            DatasetError: A file cannot be read.
-        """
-        if self.cache is None:
-            return None
-        try:
-            digests = [[file_digest(path) for path in self.files(item)] for item in items]
-        except OSError as error:
-            raise DatasetError(f"{error.filename} cannot be read ({error.strerror}); run `retrieve check`") from error
-        key = hashlib.sha256(json.dumps([_FORMAT, *self.made_by, digests]).encode()).hexdigest()
-        return self.cache / f"{self.made_by[0]}-{key[:32]}.safetensors"
+def _cache_path(cache: Path, made_by: tuple[str, ...], files: list[tuple[Path, ...]]) -> Path:
+    """Return the cache file of a part. Raises DatasetError if an image cannot be read."""
+    try:
+        digests = [[file_digest(path) for path in each] for each in files]
+    except OSError as error:
+        raise DatasetError(f"{error.filename} cannot be read ({error.strerror}); run `retrieve check`") from error
+    key = hashlib.sha256(json.dumps([_FORMAT, *made_by, digests]).encode()).hexdigest()
+    return cache / f"{made_by[0]}-{key[:32]}.safetensors"
 
 
 def _read_cached(path: Path) -> Tensor | None:

@@ -107,10 +107,6 @@ class GraspSuccessGate:
         """
         return max(self.logits(fingers).values()) >= 0
 
-    def probabilities(self, fingers: Mapping[str, FingerFrames]) -> dict[str, float]:
-        """Return each finger's probability of success, for a prior probability of 1/2."""
-        return {finger: float(torch.tensor(logit).double().sigmoid()) for finger, logit in self.logits(fingers).items()}
-
     def logits(self, fingers: Mapping[str, FingerFrames]) -> dict[str, float]:
         """Return each finger's log-odds of success.
 

@@ -4,12 +4,12 @@ import hashlib
 import inspect
 import json
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from retrieval.errors import CheckpointError
 from retrieval.model.checkpoint import (
@@ -46,22 +46,12 @@ def require_no_unfinished_state(out: Path) -> None:
         )
 
 
-def save_state(
-    out: Path,
-    modules: nn.ModuleDict,
-    optimizer: torch.optim.Optimizer,
-    header: Mapping[str, Any],
-    *,
-    excluded: tuple[str, ...] = (),
-) -> None:
+def save_state(out: Path, modules: nn.ModuleDict, optimizer: torch.optim.Optimizer, header: Mapping[str, Any]) -> None:
     """Write the state of an unfinished training run of `out`: all modules, their optimiser, and a header of JSON types.
 
-    The header holds the step and the settings that `load_state` compares. Weights whose name starts with one of
-    `excluded` are stored elsewhere.
+    The header holds the step and the settings that `load_state` compares.
     """
-    tensors = {
-        f"{_MODEL}{name}": tensor for name, tensor in modules.state_dict().items() if not name.startswith(excluded)
-    }
+    tensors = {f"{_MODEL}{name}": tensor for name, tensor in modules.state_dict().items()}
     for name, parameter in modules.named_parameters():
         for quantity, tensor in optimizer.state.get(parameter, {}).items():
             tensors[f"{_OPTIMIZER}{name}.{quantity}"] = tensor
@@ -69,16 +59,9 @@ def save_state(
 
 
 def load_state(
-    out: Path,
-    modules: nn.ModuleDict,
-    optimizer: torch.optim.Optimizer,
-    identity: Mapping[str, Any],
-    *,
-    excluded: Callable[[], Mapping[str, Tensor]] = dict,
+    out: Path, modules: nn.ModuleDict, optimizer: torch.optim.Optimizer, identity: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Load the state that `save_state` wrote into `modules` and `optimizer`, and return its header.
-
-    `excluded` returns the weights that the file does not contain, by name.
 
     Raises:
         CheckpointError: There is no state, or its header differs from `identity`: it belongs to another training run.
@@ -91,8 +74,9 @@ def load_state(
                 f"{path} belongs to a training run with another {name.replace('_', ' ')}; resume with the same data "
                 "and configuration, or delete the file to start a new one"
             )
-    weights = {name.removeprefix(_MODEL): tensor for name, tensor in tensors.items() if name.startswith(_MODEL)}
-    load_weights(modules, weights | dict(excluded()))
+    load_weights(
+        modules, {name.removeprefix(_MODEL): tensor for name, tensor in tensors.items() if name.startswith(_MODEL)}
+    )
     for name, parameter in modules.named_parameters():
         prefix = f"{_OPTIMIZER}{name}."
         stored = {key.removeprefix(prefix): tensor for key, tensor in tensors.items() if key.startswith(prefix)}

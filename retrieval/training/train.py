@@ -309,35 +309,20 @@ class Trainer:
         }
 
     def _save_state(self) -> None:
-        excluded = TOWERS if self.config.training.freeze_towers else ()  # these are in the checkpoint
         header = {"step": self.step, "best": None if self.validation is None else self.best, **self._identity()}
-        save_state(self.out, self.modules, self.optimizer, header, excluded=excluded)
+        save_state(self.out, self.modules, self.optimizer, header)
 
     def resume(self) -> None:
         """Continue from the state next to `out`. Raises CheckpointError if it belongs to another run."""
-        header = load_state(self.out, self.modules, self.optimizer, self._identity(), excluded=self._frozen_weights)
-        self.step, self.best = header["step"], -math.inf if header["best"] is None else header["best"]
-
-    def _frozen_weights(self) -> dict[str, Tensor]:
-        weights = self._load_own_checkpoint().matcher.state_dict().items()
-        named = {f"matcher.{name}": tensor for name, tensor in weights}
-        frozen = self.config.training.freeze_towers
-        return {name: tensor for name, tensor in named.items() if frozen and name.startswith(TOWERS)}
-
-    def _load_own_checkpoint(self) -> Checkpoint:
-        """Return the best checkpoint so far, which is part of the state.
-
-        A run writes the checkpoint before the state file. After a crash in between, the checkpoint is newer than the
-        state file. The resumed run repeats these steps and writes the same checkpoint again.
-        """
-        stored = load_checkpoint(self.out)
+        stored = load_checkpoint(self.out)  # the best checkpoint so far is part of the state
         mine = (stored.split, stored.provenance.get("data_digest")) == (self.split, self.data_digest)
         # The configuration changes when the candidate encoder is added.
         if not mine or stored.config not in (self.config_without_encoder, self.config):
             raise CheckpointError(
                 f"{self.out} does not belong to the training run to resume; restore its checkpoint or start a new run"
             )
-        return stored
+        header = load_state(self.out, self.modules, self.optimizer, self._identity())
+        self.step, self.best = header["step"], -math.inf if header["best"] is None else header["best"]
 
 
 TOWERS = tuple(f"matcher.{prefix}" for prefix in TOWER_WEIGHTS)

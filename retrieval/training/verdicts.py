@@ -83,54 +83,60 @@ def with_verdicts(
         JobInterrupted: `should_stop()` returned True.
     """
     seed, matcher = made.config.training.seed, made.matcher
-    train, validation = (_sample_grasps(part, seed)[:max_grasps] for part in (train, validation))
-    if not train or not validation:
+    grasps = _sample_grasps(validation, seed)[:max_grasps]
+    if not train or not grasps:
         return made
-    touches, photos = recorded_features(
-        matcher, source, validation, what="posterior", quiet=quiet, should_stop=should_stop
-    )
-    queries = calibration_touches(matcher, validation, touches, photos)
+    touches, photos = recorded_features(matcher, source, grasps, what="posterior", quiet=quiet, should_stop=should_stop)
+    queries = calibration_touches(matcher, grasps, touches, photos)
     posterior, references = fit_calibrations([queries], seed) if queries else (None, None)
     made = dataclasses.replace(made, posterior=posterior, references=references)
     if queries is not None and posterior is not None:
         made = dataclasses.replace(made, verification=fit_verification([queries], posterior, seed))
     if matcher.config.cell_dim:
-        queries = calibration_touches(matcher, validation, touches, photos, pooled=True)
+        queries = calibration_touches(matcher, grasps, touches, photos, pooled=True)
         posterior, references = fit_calibrations([queries], seed) if queries else (None, None)
         made = dataclasses.replace(made, pooled_posterior=posterior, pooled_references=references)
-    return _with_gel_check(made, source, train, (validation, touches), foreign, quiet, should_stop)
+    return with_gel_check(
+        made,
+        source,
+        train,
+        validation,
+        foreign=foreign,
+        max_grasps=max_grasps,
+        quiet=quiet,
+        should_stop=should_stop,
+    )
 
 
 def with_gel_check(
-    made: Checkpoint, source: FeatureSource, train: Sequence[Grasp], validation: Sequence[Grasp], *, quiet: bool = False
-) -> Checkpoint:
-    """Return the checkpoint `made` with a gel check, if there are enough validation grasps; see `with_verdicts`."""
-    seed = made.config.training.seed
-    train, validation = (_sample_grasps(part, seed)[:MAX_GRASPS] for part in (train, validation))
-    touches, _ = recorded_features(made.matcher, source, validation, what="gel check", quiet=quiet)
-    return _with_gel_check(made, source, train, (validation, touches), FOREIGN_COUNT, quiet)
-
-
-def _with_gel_check(
     made: Checkpoint,
     source: FeatureSource,
     train: Sequence[Grasp],
-    validation: tuple[Sequence[Grasp], Tensor],
-    foreign: int,
-    quiet: bool,
+    validation: Sequence[Grasp],
+    *,
+    foreign: int = FOREIGN_COUNT,
+    max_grasps: int = MAX_GRASPS,
+    quiet: bool = False,
     should_stop: StopRequested = lambda: False,
 ) -> Checkpoint:
-    """Add the gel check; `validation` are the grasps and the features of their touches."""
-    seed, matcher = made.config.training.seed, made.matcher
-    grasps, touches = validation
-    if len(grasps) < MIN_GRASPS:
+    """Return the checkpoint `made` with a gel check, if there are enough validation grasps; see `with_verdicts`."""
+    seed, matcher, settings = made.config.training.seed, made.matcher, made.config.preprocessing
+    train, validation = (_sample_grasps(part, seed)[:max_grasps] for part in (train, validation))
+    if len(validation) < MIN_GRASPS:
         return made
-    train_touches, _ = recorded_features(matcher, source, train, what="gel check", quiet=quiet, should_stop=should_stop)
-    preprocessing = made.config.preprocessing
-    fitting = GelCheckFeatures.of(matcher, preprocessing, train, train_touches, foreign, seed)
-    test = GelCheckFeatures.of(matcher, preprocessing, grasps, touches, foreign // 2, seed + 1)
+    fitting, test = (
+        GelCheckFeatures.of(
+            matcher,
+            settings,
+            grasps,
+            recorded_features(matcher, source, grasps, what="gel check", quiet=quiet, should_stop=should_stop)[0],
+            count,
+            seed + number,
+        )
+        for number, (grasps, count) in enumerate(((train, foreign), (validation, foreign // 2)))
+    )
     matcher.gel_head = fit_gel_head(fitting, PENALTY * FOREIGN_COUNT / foreign)
-    check = fit_gel_check(matcher.gel_head, test, contact_levels(grasps))
+    check = fit_gel_check(matcher.gel_head, test, contact_levels(validation))
     return dataclasses.replace(made, gel_check=check)
 
 

@@ -1,7 +1,6 @@
 """Adaptation to a new sensor: linear maps, cross-validation over objects, and an ordinary checkpoint."""
 
 import dataclasses
-import json
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,14 +9,7 @@ import torch
 
 import retrieval
 from retrieval.adaptation import folds
-from retrieval.adaptation.curve import (
-    ADAPTED,
-    LOW_PASS,
-    UNADAPTED,
-    learning_curve,
-    write_curve,
-)
-from retrieval.adaptation.data import PUBLISHED_TOWER, config_for, load_adaptation_data, load_towers
+from retrieval.adaptation.data import config_for, load_towers
 from retrieval.adaptation.estimate import Estimate
 from retrieval.adaptation.folds import draw_folds, measure, pair_accuracy, score_accuracy
 from retrieval.adaptation.recipe import adapt
@@ -174,7 +166,7 @@ def test_the_preset_builds_the_same_towers_as_adapt_with_the_shipped_model(publi
     preset = training_config("adapt", None, init=str(published))
     preset = dataclasses.replace(preset, matcher=dataclasses.replace(preset.matcher, fingers=1))
     start = load_checkpoint(retrieval.shipped_model(1))
-    expected = Matcher(config_for(start, 1, PUBLISHED_TOWER, seed=0).matcher, 2)
+    expected = Matcher(config_for(start, 1, str(published), seed=0).matcher, 2)
     load_towers(expected, start, str(published))
     made = build_matcher(preset)
     for side in ("touch_tower", "photo_tower"):
@@ -186,7 +178,7 @@ def test_the_preset_builds_the_same_towers_as_adapt_with_the_shipped_model(publi
 
 def test_touches_are_encoded_by_the_shipped_the_gel_and_the_published_tower_and_photos_by_the_last(published):
     start = load_checkpoint(retrieval.shipped_model(1))
-    matcher = Matcher(config_for(start, 1, PUBLISHED_TOWER, seed=0).matcher)
+    matcher = Matcher(config_for(start, 1, str(published), seed=0).matcher)
     load_towers(matcher, start, str(published))
     gel, added = build_tower("mobilenet_v2", "stages"), build_tower("mobilenet_v2", "stages")
     initialise_tower(gel, "gel")
@@ -327,22 +319,6 @@ def test_initial_weights_are_for_all_towers_or_for_each(published):
         initialise_tower(two, "random+random+random")
 
 
-@pytest.mark.slow
-def test_the_curve_has_smaller_fits_and_their_comparisons(recording, model, published, tmp_path, monkeypatch):
-    monkeypatch.setattr("retrieval.adaptation.curve.OBJECTS", (4, 1000))
-    monkeypatch.setattr("retrieval.adaptation.curve.TOUCHES", (1, 100))
-    start = load_checkpoint(model)
-    data = load_adaptation_data(recording, start, init=str(published), split=None, cache=None, seed=0, quiet=True)
-    points = learning_curve(data, start, quiet=True)
-    assert [point.label for point in points] == [UNADAPTED, *[ADAPTED] * 4, LOW_PASS]
-    assert [(point.objects, point.touches) for point in points[1:5]] == [(4, 1), (4, 3), (6, 1), (6, 3)]
-    assert all(low <= value <= high for point in points for value, low, high in (point.top1, point.pair_accuracy))
-    text = write_curve(tmp_path / "curve", points).read_text()
-    assert text.count("\n| ") == len(points) + 1
-    assert len(json.loads((tmp_path / "curve" / "curve.json").read_text())["points"]) == len(points)
-    assert (tmp_path / "curve" / "curve.png").stat().st_size > 1000
-
-
 @pytest.mark.usefixtures("unchecked")
 def test_the_command_prints_the_estimate_and_reuses_its_cache(recording, model, tmp_path, capsys):
     out, cache = tmp_path / "own.safetensors", tmp_path / "cache"
@@ -355,16 +331,3 @@ def test_the_command_prints_the_estimate_and_reuses_its_cache(recording, model, 
     assert stored
     assert main(line) == 0
     assert sorted(cache.iterdir()) == stored
-
-
-@pytest.mark.usefixtures("unchecked")
-def test_a_report_that_cannot_be_written_is_reported_as_missing(recording, model, tmp_path, capsys):
-    names = sorted({grasp.object_id for grasp in load_grasps(recording)})
-    split = tmp_path / "split.json"
-    split.write_text(json.dumps(Split(0, tuple(names[:4]), (), tuple(names[4:])).to_dict()))
-    line = ["adapt", str(recording), "--out", str(tmp_path / "own.safetensors"), "--model", str(model)]
-    assert main([*line, "--init", "none", "--split", str(split), "--report", str(tmp_path / "curve")]) == 0
-    output = capsys.readouterr().err
-    assert "at least 6 objects, got 4" in output
-    assert f"{tmp_path / 'curve'} was not written" in output
-    assert not (tmp_path / "curve").exists()
