@@ -107,7 +107,7 @@ class ReliefTraining(Dataset[tuple[list[int], Tensor]]):
         self.pictures = [picture for picture in pictures if picture.object_id not in names]
         self.validation = [picture for picture in pictures if picture.object_id in names]
         torch.manual_seed(seed)
-        self.tower = build_tower(matcher.tower, matcher.tower_output, matcher.architectures)
+        self.tower = build_tower(matcher.tower, matcher.tower_output)
         initialise_tower(self.tower, config.training.init)
         self.head = LabelHead(self.tower.feature_count, [picture.labels for picture in self.pictures])
         self.modules = nn.ModuleDict({"tower": self.tower, "head": self.head}).to(self.device)

@@ -111,7 +111,6 @@ def config_for(start: Checkpoint, fingers: int, init: str, *, seed: int) -> Conf
         photo_tower=TOWER_SEPARATOR.join(photo),
         tower_output=source.tower_output,
         fingers=fingers,
-        architectures=source.architectures,
     )
     training = dataclasses.replace(preset.training, init="random", init_touch="", init_photo="", seed=seed)
     return dataclasses.replace(preset, matcher=matcher, training=training)

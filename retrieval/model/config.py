@@ -17,7 +17,7 @@ from _touch_retrieval.files import read_regular
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import ConfigError
 from retrieval.model.losses import LOGIT_LOSSES, LOSSES
-from retrieval.model.towers import TOWER_SEPARATOR, architectures_of, tower_name
+from retrieval.model.towers import TOWER_SEPARATOR, tower_name
 
 if TYPE_CHECKING:
     from retrieval.model.losses.loss import Loss
@@ -54,8 +54,6 @@ class MatcherConfig:
         touch_cells: Cells along each side of a gel image.
         photo_cells: Cells along each side of the last view of a photo.
         cosine: Add the scaled cosine of the contrastive embeddings to the match logit. The paper does not do this.
-        architectures: Architecture by name of each backbone that another library builds, so that a checkpoint needs
-            neither its files nor a network. `Config.using` fills it in.
         photo_tower: Backbone of the photo tower, if not empty; `tower` is then that of the touch tower.
     """
 
@@ -73,7 +71,6 @@ class MatcherConfig:
     touch_cells: Count = 4
     photo_cells: Count = 10
     cosine: bool = False
-    architectures: Mapping[str, Any] = field(default_factory=dict)
     photo_tower: str = ""
 
     @property
@@ -301,8 +298,7 @@ class Config:
         if tower is not None:
             name = tower_name(tower)
             photo = config.matcher.photo_tower if name == config.matcher.tower else ""
-            known = architectures_of(TOWER_SEPARATOR.join(filter(None, (name, photo))))
-            matcher = dataclasses.replace(config.matcher, tower=name, photo_tower=photo, architectures=known)
+            matcher = dataclasses.replace(config.matcher, tower=name, photo_tower=photo)
             config = dataclasses.replace(config, matcher=matcher)
         if losses is not None:
             weights = {LOSSES.name_of(loss): weight for loss, weight in losses.items()}
@@ -315,12 +311,6 @@ class Config:
         training = tables["training"]
         for name in ("init", "init_photo", "init_touch", "start"):
             training[name] = TOWER_SEPARATOR.join(Path(part).name for part in training[name].split(TOWER_SEPARATOR))
-        matcher = tables["matcher"]
-        for part in matcher.pop("architectures"):
-            family, _, model = part.partition(":")
-            if Path(model).is_absolute():
-                for side in ("tower", "photo_tower"):
-                    matcher[side] = matcher[side].replace(part, f"{family}:{Path(model).name}")
         return tables
 
     def to_dict(self) -> dict[str, Any]:

@@ -161,8 +161,8 @@ class Matcher(nn.Module):
         self.views = views
         self.config = config
         # All fingers use one set of weights.
-        self.touch_tower = build_tower(config.tower, config.tower_output, config.architectures)
-        self.photo_tower = build_tower(config.photo_tower or config.tower, config.tower_output, config.architectures)
+        self.touch_tower = build_tower(config.tower, config.tower_output)
+        self.photo_tower = build_tower(config.photo_tower or config.tower, config.tower_output)
         if config.cell_dim:
             self.touch_tower.divide(config.touch_cells)
             self.photo_tower.divide(config.photo_cells)

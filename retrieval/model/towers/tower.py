@@ -1,7 +1,6 @@
 """Base class of every tower; a backbone only implements `_encode`."""
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, ClassVar
 
@@ -143,32 +142,6 @@ def _grid_means(maps: Tensor, cells: int) -> Tensor:
     if height % cells or width % cells:
         return nn.functional.adaptive_avg_pool2d(maps, cells)  # the ONNX exporter lacks this one
     return nn.functional.avg_pool2d(maps, (height // cells, width // cells))
-
-
-class TowerFamily(Tower, ABC):
-    """A tower around any model that another library builds."""
-
-    can_fold_batch_norm = False
-
-    def __init__(self, output: str, model: str, architecture: Mapping[str, Any]) -> None:
-        """Build a model.
-
-        Args:
-            output: One of `retrieval.model.towers.OUTPUTS`.
-            model: The part of the name after "family:".
-            architecture: The result of `architecture(model)` when the training was configured.
-        """
-        super().__init__(output)
-        self.model_name = model
-
-    @classmethod
-    @abstractmethod
-    def architecture(cls, model: str) -> dict[str, Any]:
-        """Return plain JSON from which a model can be built without its files.
-
-        Raises:
-            ConfigError: The model is unknown.
-        """
 
 
 def without_autocast(images: Tensor) -> AbstractContextManager[Any]:

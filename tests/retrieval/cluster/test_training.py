@@ -79,7 +79,7 @@ def test_an_unfinished_training_is_not_overwritten_and_workers_are_one_or_more(r
         train_on_ray(recording, out, TINY)
 
 
-@pytest.mark.parametrize("options", [["--cluster", "--task", "relief"], ["--workers", "2"]])
+@pytest.mark.parametrize("options", [["--cluster", "--task", "grasp-success"], ["--workers", "2"]])
 def test_cluster_options_are_only_for_matchers_on_a_cluster(options, recording, tmp_path, capsys):
     assert main(["train", str(recording), "--out", str(tmp_path / "m.safetensors"), *options]) == 2
     assert "--cluster needs --task match" in capsys.readouterr().err
