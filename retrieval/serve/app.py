@@ -3,7 +3,6 @@
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import anyio.to_thread
@@ -13,24 +12,15 @@ from threadpoolctl import threadpool_limits
 
 from retrieval.search.query.opening import OpenShards
 from retrieval.serve import catalogue, errors, health, history, human_baseline, live, queries
-from retrieval.serve.decoders import Decoders
-from retrieval.serve.generations import Generations
-from retrieval.serve.history_writer import HistoryWriter, Recorder
-from retrieval.serve.metrics import Metrics
-from retrieval.serve.queue import Queue
+from retrieval.serve.history_writer import Recorder
 from retrieval.serve.security import Guard
 from retrieval.serve.service import LiveRig, Service
 from retrieval.serve.settings import ServiceSettings
-from retrieval.serve.trials import Trials
 from retrieval.serve.uploads import BodyLimit
 from retrieval.version import __version__
 
 THREADS = 4
 """Number of threads that read files and make thumbnails; the model and the rig have other threads."""
-MAX_RIG_GRASPS = 4
-"""Maximum number of pending rig grasps, including the one in progress."""
-MAX_FRAMES = 8
-"""Maximum number of pending requests for single sensor pictures, in addition to streams."""
 _CLOSING_S = 1.0
 """Time for each queue to close; work that hangs is abandoned."""
 
@@ -54,26 +44,6 @@ def create_app(
     Raises:
         BadInput: An input cannot be used.
     """
-    metrics, rig = Metrics(), rig or LiveRig()
-    generations = Generations(settings, metrics, shards)
-    decoders = Decoders()
-    single = replace(settings, workers=1, max_batch=1)
-    parts = Service(
-        settings,
-        metrics,
-        generations,
-        decoders,
-        Queue(generations, settings, metrics, decoders),
-        Queue(generations, replace(single, queue=MAX_RIG_GRASPS), metrics, decoders),
-        {
-            name: Queue(generations, replace(single, queue=settings.streams + MAX_FRAMES), metrics, decoders)
-            for name in rig.sensors
-        },
-        rig,
-        HistoryWriter(settings.history, recorder, settings, metrics) if settings.history and recorder else None,
-        Trials(trials) if trials else None,
-        asyncio.Semaphore(settings.streams),
-    )
     app = FastAPI(
         title="touch-retrieval",
         summary="From the gel images of a grasp, find which catalogue photo shows the object in the hand.",
@@ -83,13 +53,13 @@ def create_app(
         lifespan=_lifespan,
         responses=errors.PROBLEM_RESPONSES,
     )
-    app.state.service = parts
+    parts = app.state.service = Service(settings, rig, recorder, trials, shards)
     errors.install_handlers(app)
     for module in (queries, catalogue, live, history, human_baseline, health):
         app.include_router(module.router)
     app.mount("/", StaticFiles(directory=Path(__file__).parent / "page", html=True))
     app.add_middleware(BodyLimit, seconds=settings.body_s)
-    app.add_middleware(Guard, settings=settings, metrics=metrics)
+    app.add_middleware(Guard, settings=settings, metrics=parts.metrics)
     return app
 
 

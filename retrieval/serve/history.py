@@ -15,7 +15,8 @@ from retrieval.serve.catalogue import IMAGE_RESPONSES, image_response
 from retrieval.serve.documents import QueryDocument
 from retrieval.serve.errors import HttpProblem
 from retrieval.serve.generations import ServedGeneration
-from retrieval.serve.service import HistoryWriter, Parts, Service
+from retrieval.serve.history_writer import HistoryWriter
+from retrieval.serve.service import Parts, Service
 from retrieval.serve.store import NONE, OBJECT, RIGHT, StoredQuery
 from retrieval.serve.uploads import RequestBody
 

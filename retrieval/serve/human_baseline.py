@@ -13,7 +13,8 @@ from starlette.concurrency import run_in_threadpool
 from retrieval.data.images import read_bytes
 from retrieval.serve.catalogue import IMAGE_RESPONSES, image_response
 from retrieval.serve.errors import HttpProblem
-from retrieval.serve.service import HistoryWriter, Parts, Service
+from retrieval.serve.history_writer import HistoryWriter
+from retrieval.serve.service import Parts, Service
 from retrieval.serve.store import HistoryStore, TrialChoice, TrialRun, new_id
 from retrieval.serve.trials import CHOICES, Trial, TrialAccuracy, Trials, trial_accuracy
 from retrieval.serve.uploads import RequestBody

@@ -2,19 +2,26 @@
 
 from asyncio import Semaphore
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from threading import Event
 from typing import Annotated
 
 from fastapi import Depends, Request
 
+from retrieval.search.query.opening import OpenShards
 from retrieval.serve.decoders import Decoders
 from retrieval.serve.generations import Generations
-from retrieval.serve.history_writer import HistoryWriter as HistoryWriter
+from retrieval.serve.history_writer import HistoryWriter, Recorder
 from retrieval.serve.metrics import Metrics
 from retrieval.serve.queue import Queue
 from retrieval.serve.settings import ServiceSettings
 from retrieval.serve.trials import Trials
+
+MAX_RIG_GRASPS = 4
+"""Maximum number of pending rig grasps, including the one in progress."""
+MAX_FRAMES = 8
+"""Maximum number of pending requests for single sensor pictures, in addition to streams."""
 
 
 @dataclass(frozen=True)
@@ -47,37 +54,47 @@ class LiveRig:
     grasp: Callable[[list[str]], GraspResult] | None = None
 
 
-@dataclass(frozen=True, eq=False)
 class Service:
-    """The parts of one service.
+    """The parts of one service; the arguments are those of `retrieval.serve.app.create_app`.
 
     Attributes:
         settings: Options of the operator.
+        rig: Functions of the live rig.
         metrics: Prometheus metrics.
         generations: The served generation of the index.
         decoders: Processes that decode pictures.
         queue: Queue of the model.
         grasps: Queue of the rig's gripper.
         frames: Queue of each sensor, by name.
-        rig: Functions of the live rig.
         history_writer: Writer of the history; None if no history is stored.
         trials: Trials of the human baseline; None if there is no recording for them.
         streams: Limits the number of live streams.
         stopping: Set at shutdown, to end streams.
     """
 
-    settings: ServiceSettings
-    metrics: Metrics
-    generations: Generations
-    decoders: Decoders
-    queue: Queue
-    grasps: Queue
-    frames: Mapping[str, Queue]
-    rig: LiveRig
-    history_writer: HistoryWriter | None
-    trials: Trials | None
-    streams: Semaphore
-    stopping: Event = field(default_factory=Event)
+    def __init__(
+        self,
+        settings: ServiceSettings,
+        rig: LiveRig | None,
+        recorder: Recorder | None,
+        trials: Path | None,
+        shards: OpenShards | None,
+    ) -> None:
+        self.settings, self.rig, self.metrics = settings, rig or LiveRig(), Metrics()
+        self.generations, self.decoders = Generations(settings, self.metrics, shards), Decoders()
+        single = replace(settings, workers=1, max_batch=1)
+        self.queue = self._queue(settings)
+        self.grasps = self._queue(replace(single, queue=MAX_RIG_GRASPS))
+        frames = replace(single, queue=settings.streams + MAX_FRAMES)
+        self.frames = {name: self._queue(frames) for name in self.rig.sensors}
+        self.history_writer = None
+        if settings.history and recorder:
+            self.history_writer = HistoryWriter(settings.history, recorder, settings, self.metrics)
+        self.trials = Trials(trials) if trials else None
+        self.streams, self.stopping = Semaphore(settings.streams), Event()
+
+    def _queue(self, settings: ServiceSettings) -> Queue:
+        return Queue(self.generations, settings, self.metrics, self.decoders)
 
 
 async def _service(request: Request) -> Service:  # async, because FastAPI calls plain functions in a thread

@@ -12,8 +12,7 @@ import httpx
 import pytest
 
 from retrieval.serve import history_writer
-from retrieval.serve.app import MAX_RIG_GRASPS
-from retrieval.serve.service import GraspResult, LiveRig
+from retrieval.serve.service import MAX_RIG_GRASPS, GraspResult, LiveRig
 from tests.retrieval.serve.test_connections import opened
 from tests.serving import listening, problem, with_history
 from tests.waiting import wait_until
