@@ -63,19 +63,20 @@ class HistoryWriter:
             if self._pending >= MAX_PENDING_WRITES:
                 raise TimeoutError
             self._pending += 1
-            writing = self._writer.submit(
-                self.store.add_query, query_id, pictures.files[0], pictures.background, result
-            )
+            row = query_id, pictures.files[0], pictures.background, result
+            writing = asyncio.wrap_future(self._writer.submit(self.store.add_query, *row))
             writing.add_done_callback(self._count_down)
-            await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(writing)), STORE_S)
+            await asyncio.wait_for(asyncio.shield(writing), STORE_S)
         except Exception as error:
             self._metrics.history_failures.labels("query").inc()
-            log.warning("A query is not stored: %s", error or "the disk takes too long")
+            log.warning("A query is not stored: %s", str(error) or "the disk takes too long")
             return None
         return query_id
 
-    def _count_down(self, _: object) -> None:
+    def _count_down(self, writing: asyncio.Future[None]) -> None:
         self._pending -= 1
+        if not writing.cancelled():
+            writing.exception()  # mark as retrieved: the answer may have been sent without waiting
 
     def record_pending(self) -> None:
         """Record the feedback that is not recorded yet.
