@@ -149,30 +149,3 @@ def _require_public(where, *sources):
             assert not [name for name in modules if name.partition(".")[0] in PACKAGES and "." in name], where
             if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in PACKAGES:
                 assert node.attr in import_module(node.value.id).__all__, f"{where}: {node.value.id}.{node.attr}"
-
-
-def test_the_outputs_of_a_cell_are_its_text_its_last_value_and_its_figures(monkeypatch):
-    monkeypatch.setenv("MPLBACKEND", "Agg")
-    cells = [
-        "a = 2",
-        "print('b')\na",
-        "import matplotlib.pyplot as plt\nfor _ in range(2):\n    plt.figure(figsize=(1, 1))",
-        "from PIL import Image\nImage.new('RGB', (4, 4))",
-        "None",
-    ]
-    document = {"cells": [{"cell_type": "code", "source": [cell]} for cell in cells]}
-    outputs = list(execute(document))
-    assert [kinds(output) for output in outputs] == [set(), {"text", "value"}, {"picture"}, {"picture"}, set()]
-    assert outputs[1][0]["text"] == ["b\n"]
-    assert outputs[1][1]["data"] == {"text/plain": ["2"]}
-    assert len(outputs[2]) == 2
-
-
-def test_parameters_replace_the_first_cell_and_an_error_names_its_cell():
-    document = {"cells": [{"cell_type": "code", "source": [cell]} for cell in ("a = 2", "a", "1 / 0")]}
-    outputs = execute(document, parameters="a = 3")
-    assert next(outputs) == []
-    assert next(outputs)[0]["data"] == {"text/plain": ["3"]}
-    with pytest.raises(ZeroDivisionError) as raised:
-        next(outputs)
-    assert "code cell 3" in raised.value.__notes__[0]

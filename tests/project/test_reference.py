@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-import retrieval
 import robot
 from benchmarks import reference
 from benchmarks.reference import PACKAGES, PAGE
@@ -66,13 +65,6 @@ def test_the_reference_page_is_up_to_date():
     assert PAGE.read_text("utf-8") == reference.reference(), "run `python -m benchmarks.reference`"
 
 
-def test_the_sections_of_a_docstring_become_lists():
-    text = "Do it.\n\nArgs:\n    top: How many\n        objects.\n    none: Prior.\n\nReturns:\n    Answers."
-    assert reference._text(text) == (
-        "Do it.\n\nArgs:\n\n* `top`: How many\n  objects.\n* `none`: Prior.\n\nReturns: Answers.\n"
-    )
-
-
 def test_importing_the_packages_and_listing_their_names_imports_no_large_packages():
     code = "import retrieval, robot, indexes\nprint(dir(retrieval), dir(robot), dir(indexes), indexes.load_kind)"
     done = run_blocked(code, HEAVY)
@@ -108,12 +100,3 @@ def test_type_checkers_find_the_public_names_and_no_others(tmp_path):
     assert 'Module has no attribute "absent"' in done.stdout, done.stdout + done.stderr
     assert done.stdout.count("Revealed type") == sum(len(package.__all__) for package in PACKAGES)
     assert 'Revealed type is "Any"' not in done.stdout
-
-
-def test_every_package_is_marked_as_typed():
-    for package in PACKAGES:
-        assert (Path(package.__file__).parent / "py.typed").is_file()
-
-
-def test_open_is_the_method_of_the_searcher():
-    assert retrieval.open == retrieval.Searcher.open
