@@ -1,4 +1,4 @@
-"""Near copies: pictures made from another one by a new encoding, more light, a small shift or a flip.
+"""Near copies: pictures made from another one by a new encoding, more light, a shift or a flip.
 
 All gel images of a sensor look alike, and so do photos of one table: the median picture of their kind carries no
 information. So each picture is reduced to 16 x 16 grey levels, the best multiple of the median picture and a constant
@@ -14,6 +14,9 @@ For the other pictures, only copies as near as the mildest of the four changes a
 Measured on simulated recordings of 12 objects: limits of .002 to .12, other objects from .17 on. JPEG 20 changed 0 to
 18 bits of 64-bit perceptual hashes, while touches of other objects differed from 2 bits on: no threshold separates
 them, since hashes depend on the common content of the pictures. So this module compares shapes.
+
+Copies with larger shifts are found among the nearest pictures of the nearest objects by a finer comparison, at
+every shift (`retrieval.data.check.shift_alignment`).
 """
 
 from collections.abc import Sequence
@@ -25,13 +28,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from retrieval.data.check.shift_alignment import (
+    MAX_DISTANCE,
+    MIN_LIMIT,
+    RELATIVE_LIMIT,
+    AlignedSet,
+    Doubles,
+    FineGreys,
+    fine_grey_levels,
+)
 from retrieval.data.images import decode_rgb, read_bytes
 from retrieval.data.resize import RgbImage
 
 PX = 16
 SLACK = 1.25
-_DISTORTIONS = 4
 _FLIPS = ((1, 1), (-1, 1), (1, -1), (-1, -1))
+_MOVES = tuple((rows, columns) for rows in (-1, 0, 1) for columns in (-1, 0, 1))
+_MAX_PICTURES, _MAX_OBJECTS, _MAX_PER_OBJECT = 64, 5, 3
+"""Candidates of the finer comparison: numbers of nearest pictures, of objects, and of pictures of each object."""
 _BLOCK = 512
 _NEIGHBOUR_RANK, _RELATIVE_LIMIT = 3, 0.25
 _MIN_LIMIT, _MAX_LIMIT = 0.02, 0.1
@@ -49,12 +63,14 @@ class Thumbnail:
     Attributes:
         digest: SHA-256 (hex) of the file's bytes.
         grey: Grey levels (256,).
-        distorted: Grey levels (4, 256) of the `distorted_copies`.
+        distorted: Grey levels of the distorted copies (4, 256), in the order of `DISTORTIONS`.
+        fine_grey_levels: Grey levels of the finer comparison.
     """
 
     digest: str
     grey: Greys
     distorted: Greys
+    fine_grey_levels: FineGreys
 
 
 def load_thumbnail(path: Path) -> Thumbnail:
@@ -70,23 +86,42 @@ def load_thumbnail(path: Path) -> Thumbnail:
 def thumbnail(data: bytes, image: RgbImage) -> Thumbnail:
     """Return the thumbnail of a picture, from the bytes of its file and the decoded image (H, W, 3)."""
     picture = np.rint(255 * image).astype(np.uint8)
-    distorted = np.stack([_grey(copy) for copy in distorted_copies(picture)])
-    return Thumbnail(sha256(data).hexdigest(), _grey(picture), distorted)
+    return Thumbnail(
+        sha256(data).hexdigest(),
+        _small(picture),
+        np.stack([_small(distort(picture)) for distort in DISTORTIONS]),
+        fine_grey_levels(picture),
+    )
 
 
-def _grey(picture: NDArray[np.uint8]) -> Greys:
+def _small(picture: NDArray[np.uint8]) -> Greys:
     grey = picture.mean(axis=2, dtype=np.float32)
     return np.asarray(cv2.resize(grey, (PX, PX), interpolation=cv2.INTER_AREA).ravel())
 
 
-def distorted_copies(picture: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
-    """Return the picture as a JPEG of quality 20, with a tenth more light, and moved by 2 pixels along diagonals."""
+def as_jpeg(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the picture after JPEG compression of quality 20."""
     data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 20])[1]
-    jpeg = cv2.imdecode(data, cv2.IMREAD_COLOR)  # the two swaps of blue and red cancel
-    brighter = np.clip(np.rint(picture * np.float32(1.1)), 0, 255).astype(np.uint8)
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))  # the two swaps of blue and red cancel
+
+
+def brighter(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the picture with a tenth more light."""
+    return np.asarray(np.clip(np.rint(picture * np.float32(1.1)), 0, 255).astype(np.uint8))
+
+
+def shifted(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the picture moved by 2 pixels down and to the right; the border repeats."""
     height, width = picture.shape[:2]
-    padded = np.pad(picture, ((2, 0), (2, 2), (0, 0)), "edge")
-    return [np.asarray(jpeg), brighter, padded[:height, :width], padded[:height, 4 : 4 + width]]
+    return np.asarray(np.pad(picture, ((2, 0), (2, 0), (0, 0)), "edge")[:height, :width])
+
+
+def shifted_across(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the picture moved by 2 pixels down and to the left; the border repeats."""
+    return shifted(picture[:, ::-1])[:, ::-1]
+
+
+DISTORTIONS = (as_jpeg, brighter, shifted, shifted_across)
 
 
 def shapes(greys: Greys, common: Greys | None = None) -> Greys:
@@ -132,6 +167,13 @@ class NearestPictures:
     copy: NDArray[np.bool_]
 
 
+def shift_thumbnails(greys: Greys, rows: int, columns: int) -> Greys:
+    """Return thumbnails (n, 256) moved by `rows` down and `columns` to the right (-1..1); the border repeats."""
+    padded = np.pad(greys.reshape(-1, PX, PX), ((0, 0), (1, 1), (1, 1)), "edge")
+    part = padded[:, 1 - rows : 1 - rows + PX, 1 - columns : 1 - columns + PX]
+    return np.ascontiguousarray(part).reshape(-1, PX**2)
+
+
 class PictureSet:
     """All pictures of one kind, such as the photos or the touches of one finger, with their objects."""
 
@@ -142,7 +184,8 @@ class PictureSet:
         self._shapes = shapes(self.greys, self.common)
         copies = [shapes(one.distorted, self.common) for one in thumbnails]
         similarity = [copy @ shape for copy, shape in zip(copies, self._shapes, strict=True)]
-        self.distortion_limits = SLACK * (1 - np.array(similarity, dtype=np.float64).reshape(-1, _DISTORTIONS))
+        self.distortion_limits = SLACK * (1 - np.array(similarity, dtype=np.float64).reshape(-1, len(DISTORTIONS)))
+        self._aligned = AlignedSet([one.fine_grey_levels for one in thumbnails])
 
     def nearest(self, queries: NDArray[np.int64], among: NDArray[np.int64]) -> NearestPictures:
         """Return the nearest picture in `among` of another object for each of `queries` (rows of this set)."""
@@ -150,15 +193,44 @@ class PictureSet:
             nothing = np.zeros(len(queries), dtype=bool)
             return NearestPictures(np.zeros(len(queries), np.int64), np.full(len(queries), np.inf), nothing, nothing)
         among = among[np.argsort(self.objects[among], kind="stable")]
-        parts = [self._nearest(queries[at : at + _BLOCK], among) for at in range(0, len(queries), _BLOCK)]
+        blocks = [queries[at : at + _BLOCK] for at in range(0, len(queries), _BLOCK)]
+        parts = [self._nearest(block, among) for block in blocks]
         row, distance, third = (np.concatenate(part) for part in zip(*parts, strict=True))
         maximum = _RELATIVE_LIMIT * third
         checked = self.distortion_limits[queries].max(axis=1) < maximum
         # Either picture may be the copy. A picture that was saved as JPEG hardly changes the second time.
-        limits = np.maximum(self.distortion_limits[queries], self.distortion_limits[row])
-        farthest, nearest = limits.max(axis=1), limits.min(axis=1)
+        distortion_limits = np.maximum(self.distortion_limits[queries], self.distortion_limits[row])
+        farthest, nearest = distortion_limits.max(axis=1), distortion_limits.min(axis=1)
         limit = np.where(farthest < maximum, farthest, np.minimum(nearest, maximum))
-        return NearestPictures(row, distance, checked, np.asarray(distance <= limit))
+        found = NearestPictures(row, distance, checked, np.asarray(distance <= limit))
+        return self._add_shifted_copies(
+            queries, [one for block in blocks for one in self._candidates(block, among)], found
+        )
+
+    def _add_shifted_copies(
+        self, queries: NDArray[np.int64], candidates: Sequence[list[int]], found: NearestPictures
+    ) -> NearestPictures:
+        """Return `found` with the candidates added that are shifted copies of their query."""
+        row, distance, checked, copy = (
+            found.row.copy(),
+            found.distance.copy(),
+            found.checked.copy(),
+            found.copy.copy(),
+        )
+        for at, (query, others) in enumerate(zip(queries.tolist(), candidates, strict=True)):
+            if not others or copy[at]:
+                continue
+            distances = self._aligned.distances(query, others)
+            objects = self.objects[others]
+            by_object = np.sort([distances[objects == one].min() for one in np.unique(objects)])
+            third = by_object[_NEIGHBOUR_RANK - 1] if len(by_object) >= _NEIGHBOUR_RANK else 1.0
+            maximum = min(MAX_DISTANCE, RELATIVE_LIMIT * third)
+            nearest = int(distances.argmin())
+            own, its = (SLACK * self._aligned.half_pixel_distance(one) for one in (query, others[nearest]))
+            checked[at] |= max(own, MIN_LIMIT) <= maximum
+            if distances[nearest] <= min(max(own, its, MIN_LIMIT), maximum):  # either picture may be the copy
+                row[at], distance[at], copy[at] = others[nearest], distances[nearest], True
+        return NearestPictures(row, distance, checked, copy)
 
     def _nearest(
         self, queries: NDArray[np.int64], among: NDArray[np.int64]
@@ -167,19 +239,40 @@ class PictureSet:
 
         The last is 1 if there are fewer than three other objects. `among` must be sorted by object.
         """
-        similarity = np.full((len(queries), len(among)), -1.0, np.float32)
-        for flip in _FLIPS:
-            turned = shapes(flip_thumbnails(self.greys[queries], flip), self.common)
-            np.maximum(similarity, turned @ self._shapes[among].T, out=similarity)
-        distance = 1.0 - similarity.astype(np.float64)
-        distance[self.objects[queries][:, None] == self.objects[among]] = np.inf
+        distance = self._min_distances(queries, among, [flip_thumbnails(self.greys[queries], flip) for flip in _FLIPS])
         first = np.flatnonzero(np.diff(self.objects[among], prepend=-1))
         by_object = np.sort(np.minimum.reduceat(distance, first, axis=1), axis=1)
-        third = np.ones(len(queries))
-        if by_object.shape[1] >= _NEIGHBOUR_RANK:
-            third = np.minimum(by_object[:, _NEIGHBOUR_RANK - 1], 1.0)
+        third = (
+            by_object[:, _NEIGHBOUR_RANK - 1]
+            if by_object.shape[1] >= _NEIGHBOUR_RANK
+            else np.full(len(queries), np.inf)
+        )
         at = distance.argmin(axis=1)
-        return among[at], distance[np.arange(len(queries)), at], third
+        return among[at], distance[np.arange(len(queries)), at], np.minimum(third, 1.0)
+
+    def _candidates(self, queries: NDArray[np.int64], among: NDArray[np.int64]) -> list[list[int]]:
+        """Return candidates for each query, nearest under coarse shifts: a few pictures of each of a few objects."""
+        distance = self._min_distances(queries, among, [shift_thumbnails(self.greys[queries], *by) for by in _MOVES])
+        candidates = []
+        for row in distance:
+            near: dict[int, list[int]] = {}
+            for at in np.argsort(row, kind="stable")[:_MAX_PICTURES].tolist():
+                owner = int(self.objects[among[at]])
+                if np.isfinite(row[at]) and (owner in near or len(near) < _MAX_OBJECTS):
+                    near.setdefault(owner, []).append(int(among[at]))
+            candidates.append([row for rows in near.values() for row in rows[:_MAX_PER_OBJECT]])
+        return candidates
+
+    def _min_distances(
+        self, queries: NDArray[np.int64], among: NDArray[np.int64], variants: Sequence[Greys]
+    ) -> Doubles:
+        """Return each query's minimum distance (q, n) over variants to each picture; infinity for its own object."""
+        similarity = np.full((len(queries), len(among)), -1.0, np.float32)
+        for greys in variants:
+            np.maximum(similarity, shapes(greys, self.common) @ self._shapes[among].T, out=similarity)
+        distance = 1.0 - similarity.astype(np.float64)
+        distance[self.objects[queries][:, None] == self.objects[among]] = np.inf
+        return distance
 
     def within_object_distances(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return each picture's distance to the nearest other picture of its object.
