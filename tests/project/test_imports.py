@@ -151,7 +151,7 @@ def names_of_robot():
         (["robot, robot.recording.folder"], ("numba", "cv2", *DEVICE_PACKAGES)),
         (names_of_robot(), DEVICE_PACKAGES),
         (["retrieval.serve.rig", *(name for name in names_of_robot() if "robot.sim" not in name)], ("numba",)),
-        (["indexes, indexes.store.folder, indexes.kinds.measure"], ("torch", "faiss", "cv2", "PIL", "scipy", "sklearn")),
+        (["indexes.store.folder", "indexes.kinds.measure"], ("torch", "faiss", "cv2", "PIL", "scipy", "sklearn")),
     ],
     ids=["robot without extras", "all of robot without device packages", "real rigs without numba", "indexes"],
 )
