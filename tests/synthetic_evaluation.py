@@ -9,7 +9,6 @@ import numpy as np
 
 from retrieval.data.dataset import load_grasps, make_split
 from retrieval.evaluation import SCHEMA_VERSION
-from retrieval.evaluation.audit import audit
 from retrieval.model.posterior import Posterior
 
 SKILL = {
@@ -97,22 +96,7 @@ def risk_coverage(skill):
     return [[float(x), float((1 - 0.5 * curve(skill, 5)[0]) * x ** (0.5 * skill))] for x in coverage]
 
 
-def examples(rng, grasps, objects, best):
-    """Return six queries with six photos each, mostly correct or all wrong."""
-    candidates = [grasp for grasp in grasps if grasp.object_id in objects]
-    queries = []
-    for index in rng.permutation(len(candidates))[:6]:
-        query = candidates[index]
-        same = [grasp.grasp_id for grasp in candidates if grasp.object_id == query.object_id and grasp is not query]
-        other = [grasp.grasp_id for grasp in candidates if grasp.object_id != query.object_id]
-        ranked = rng.permutation(same)[: 3 if best else 0].tolist()
-        ranked += rng.permutation(other)[: 6 - len(ranked)].tolist()
-        rank = 1 if best else int(rng.integers(60, 500))
-        queries.append({"grasp_id": query.grasp_id, "object_id": query.object_id, "true_rank": rank, "ranked": ranked})
-    return queries
-
-
-def method(rng, name, grasps, split):
+def method(rng, name, split):
     """Return the entry of one method in results.json."""
     skill = SKILL.get(name, 0.9)
     test, everyone = split["test"], [*split["train"], *split["validation"], *split["test"]]
@@ -142,7 +126,6 @@ def method(rng, name, grasps, split):
             "risk_coverage": risk_coverage(skill),
             "by_grasps": {str(count): decision(rng, skill * (1 + 0.35 * np.log(count))) for count in (1, 3)},
         },
-        "examples": {"best": examples(rng, grasps, test, True), "worst": examples(rng, grasps, test, False)},
     }
 
 
@@ -182,7 +165,7 @@ def synthetic_results(recording, methods=tuple(SKILL), seed=0):
     """Return (results, timings) of an evaluation of the recording."""
     rng, grasps = np.random.default_rng(seed), load_grasps(recording)
     split = make_split(grasps, validation=0.16, test=0.2, seed=seed)
-    entries = {name: method(rng, name, grasps, split.to_dict()) for name in methods}
+    entries = {name: method(rng, name, split.to_dict()) for name in methods}
     results = {
         "schema_version": SCHEMA_VERSION,
         "software": "0.1.0",
@@ -201,7 +184,6 @@ def synthetic_results(recording, methods=tuple(SKILL), seed=0):
             "draws": 10000,
             "features": {"touch": 1280, "photo": 1280, "fingers": 2, "digest": "cd" * 32},
         },
-        "audit": audit(grasps, split, quiet=True),
         "methods": entries,
         "controls": {
             name: {

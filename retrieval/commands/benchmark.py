@@ -117,7 +117,7 @@ def real(
             skipped=skipped,
             cache=cache,
         )
-    text, page, *_ = write_report(out, recordings)
+    text, page, *_ = write_report(out)
     say(f"report: {text}, {page}")
     if json:
         print_json(results)

@@ -67,7 +67,7 @@ def evaluate(
             split=read_split(split),
             cache=cache,
         )
-    text, page, *_ = write_report(out, recording)
+    text, page, *_ = write_report(out)
     say(f"report: {text}, {page}")
     if json:
         print_json(results)

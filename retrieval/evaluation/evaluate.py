@@ -13,8 +13,7 @@ from retrieval.console.progress import Bar
 from retrieval.data.dataset import AnyRecording, Split, folder_of
 from retrieval.errors import BadInput
 from retrieval.evaluation import SCHEMA_VERSION
-from retrieval.evaluation.audit import audit
-from retrieval.evaluation.cache import cached_document, resumable, write_document
+from retrieval.evaluation.cache import resumable, write_document
 from retrieval.evaluation.controls import (
     CEILING_METHOD,
     CEILINGS,
@@ -119,11 +118,6 @@ def evaluate(
         }
     results = {
         **_about(data, experiment, preset_name, seed_list),
-        "audit": cached_document(
-            out / "audit.json",
-            {"recording": data.digest, "split": data.split.to_dict()},
-            lambda: audit(data.grasps, data.split, quiet=quiet),  # reads every image
-        ),
         **_score_methods(experiment, predictions, seed, quiet),
         "verification": (
             score_verification(experiment, predictions["late_fusion"], jobs["late_fusion"], seed)
@@ -191,9 +185,7 @@ def _score_methods(experiment: Experiment, predictions: PredictionsByMethod, see
     measures: dict[str, list[Measures]] = {}
     with Bar("score", len(predictions), "methods", quiet=quiet) as bar:
         for name, by_seed in predictions.items():
-            entries[name], measures[name] = score_method(
-                experiment.queries, experiment.features.grasp_ids, by_seed, draws=DRAWS, seed=seed
-            )
+            entries[name], measures[name] = score_method(experiment.queries, by_seed, draws=DRAWS, seed=seed)
             bar.advance(note=name)
     return {"methods": entries, "comparisons": _compare_methods(measures, seed)}
 

@@ -17,7 +17,6 @@ from retrieval.evaluation.calibrate import (
     pair_threshold,
     reliability,
 )
-from retrieval.evaluation.example_grasps import example_queries
 from retrieval.evaluation.predictions import Predictions
 from retrieval.evaluation.queries import Queries
 from retrieval.evaluation.reject import Rejection, reject
@@ -91,14 +90,6 @@ class MethodScores:
         """Return the scores by number of grasps, for calibration: single touches, and sets of more grasps."""
         return {1: self.touches(part, part)} | {size: table for size, table in self.sets(part).items() if size > 1}
 
-    def ids(self, grasp_ids: Sequence[str], part: str) -> tuple[list[str], list[str]]:
-        """Return the grasp ids of the touches (rows) and the photos (columns) of a part."""
-        queries = self.queries
-        return (
-            [grasp_ids[row] for row in queries.touches[_of(queries, queries.touch_owner, part)]],
-            [grasp_ids[row] for row in queries.photos[_of(queries, queries.photo_owner, part)]],
-        )
-
     def score_tables(self) -> MethodScoreTables:
         """Return the tables that metrics need."""
         return MethodScoreTables(
@@ -129,16 +120,15 @@ def summaries(by_seed: Sequence[Measures], draws: int, seed: int) -> dict[str, A
 
 
 def score_method(
-    queries: Queries, grasp_ids: Sequence[str], by_seed: Sequence[Predictions], *, draws: int, seed: int
+    queries: Queries, by_seed: Sequence[Predictions], *, draws: int, seed: int
 ) -> tuple[dict[str, Any], list[Measures]]:
     """Return a method's entry of results.json, and its measures by training seed for comparisons.
 
-    Values are means over the training seeds. Reliability, rejection curves and example grasps are those of the first
-    seed. "reject" is None if there are fewer than three validation or test objects.
+    Values are means over the training seeds. Reliability and rejection curves are those of the first seed. "reject" is
+    None if there are fewer than three validation or test objects.
 
     Args:
         queries: The queries of the evaluation.
-        grasp_ids: Grasp ids of the feature rows.
         by_seed: Predictions of each training seed.
         draws: Resamples of an interval.
         seed: Seed of drawn tests, pairs and resamples.
@@ -155,9 +145,6 @@ def score_method(
         "calibration": calibrations[0].to_dict(),
         "reliability": reliability(calibrations[0], scored[0].by_grasps("test"), CHOICES, seed=seed),
         "reject": _reject(scored, calibrations, draws, seed),
-        "examples": example_queries(
-            scored[0].touches("test", "test"), queries.objects, *scored[0].ids(grasp_ids, "test")
-        ),
     }
     return entry, measures
 

@@ -10,7 +10,7 @@ Settings are chosen from `GRID` on held-out training objects (`select_settings`)
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import groupby, product
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -244,51 +244,31 @@ class CcaTowers(Method):
 
     Settings are chosen by ranking on validation objects. With `fit_on_validation` they are chosen by cross-validation
     within all objects, and the held-out objects also calibrate the cosines ("posterior" in `best_params`).
-
-    If the features of a reference touch follow those of each photo, an entry of the catalogue has both. The touch's
-    cosines with the photo and with the reference, which is encoded as a touch, are then weighted by logistic regression
-    on validation objects.
     """
 
     is_seeded = False
 
     def _fit(self, train: "Features", validation: "Features") -> None:
         blocks = tower_widths(self.settings.config, train)
-        self._width = sum(blocks.photo)
-        photos_only, held_out = (replace(part, photo=part.photo[:, : self._width]) for part in (train, validation))
-        known, folds = photos_only.concatenate(held_out), [tuple(sorted(set(held_out.object_ids)))]
+        known, folds = train.concatenate(validation), [tuple(sorted(set(validation.object_ids)))]
         if self.settings.fit_on_validation:
             folds = held_out_folds(known, self.settings.kind_of, seed=self.settings.seed)
         choice = select_settings(known, blocks, folds)
-        self._projections = choice.projections
         self.best_params = {**choice.settings._asdict(), "validation_auc": choice.auc}
-        self._weights: list[float] | None = None
-        with_references = self._width < train.photo.shape[1]
-        if with_references or not self.settings.fit_on_validation:
-            projections = dict(
-                fit_projections(_rows(photos_only), photos_only.photo, photos_only.owner, blocks, [choice.settings])
-            )[choice.settings]
-            if with_references:
-                self._weights = _weights(projections, Validator.of(validation).features, self._width)
-                self.best_params |= dict(zip(("photo_weight", "reference_weight"), self._weights, strict=True))
-            if not self.settings.fit_on_validation:
-                self._projections = projections
-        else:
-            with suppress(BadInput):  # too few held-out objects, or one photo of each
-                posterior = fit_posterior(*(part.scored for part in choice.held_out_touches))
-                self.best_params["posterior"] = posterior.to_dict()
+        if not self.settings.fit_on_validation:
+            fits = fit_projections(_rows(train), train.photo, train.owner, blocks, [choice.settings])
+            self._projections = dict(fits)[choice.settings]
+            return
+        self._projections = choice.projections
+        with suppress(BadInput):  # too few held-out objects, or one photo of each
+            posterior = fit_posterior(*(part.scored for part in choice.held_out_touches))
+            self.best_params["posterior"] = posterior.to_dict()
 
     def _encode_touch(self, touch: Array) -> Array:
-        encoding = unit_rows(self._projections.touch(touch.reshape(len(touch), -1)))
-        return encoding if self._weights is None else np.tile(encoding, 2)
+        return unit_rows(self._projections.touch(touch.reshape(len(touch), -1)))
 
     def _encode_photo(self, photo: Array) -> Array:
-        encoding = unit_rows(self._projections.photo(photo[:, : self._width]))
-        if self._weights is None:
-            return encoding
-        reference = unit_rows(self._projections.touch(photo[:, self._width :]))
-        parts = zip(self._weights, (encoding, reference), strict=True)
-        return np.concatenate([weight * part for weight, part in parts], 1)
+        return unit_rows(self._projections.photo(photo))
 
     def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
         return cosine(touch_encodings, photo_encodings)
@@ -298,29 +278,8 @@ def _rows(features: "Features") -> Rows:
     return features.touch.reshape(len(features), -1)
 
 
-def _weights(projections: CcaProjections, validation: "Features", width: int) -> list[float]:
-    """Return the weights of the cosine with a photo and with a reference touch in the log-odds of one object.
-
-    Logistic regression over all pairs of a touch and an entry; matching pairs have the same total weight as
-    non-matching ones. No weight is negative.
-    """
-    from sklearn.linear_model import LogisticRegression  # slow to import
-
-    touch, entries = _rows(validation), validation.photo
-    touch_view = unit_rows(projections.touch(touch))
-    cosines = (
-        projections.cosines(touch, entries[:, :width]),
-        touch_view @ unit_rows(projections.touch(entries[:, width:])).T,
-    )
-    same = validation.owner[:, None] == validation.owner
-    found = LogisticRegression(C=1e4, class_weight="balanced").fit(np.stack(cosines, -1).reshape(-1, 2), same.ravel())
-    return [max(0.0, float(weight)) for weight in found.coef_[0]]
-
-
 def tower_widths(config: Config, features: "Features") -> TowerWidths:
     """Return the feature widths of each tower of `config`, of a touch and of a photo.
-
-    Features of a reference touch after those of a photo are not counted. Touches may also take the place of photos.
 
     Raises:
         BadInput: The features are not from these towers.
@@ -333,10 +292,9 @@ def tower_widths(config: Config, features: "Features") -> TowerWidths:
     touch_view = towers * features.touch.shape[1]
     photo_view = feature_counts_of(matcher.photo_tower) * len(config.preprocessing.views)
     expected, got = (sum(touch_view), sum(photo_view)), (_rows(features).shape[1], features.photo.shape[1])
-    accepted = {sum(photo_view) + sum(touch_view): photo_view, sum(touch_view): touch_view, sum(photo_view): photo_view}
-    if expected[0] != got[0] or got[1] not in accepted:
+    if expected != got:
         raise BadInput(
             f"features must be those of the towers {config.matcher.tower} ({config.matcher.tower_output}), "
             f"{expected[0]} of a touch and {expected[1]} of a photo; got {got[0]} and {got[1]}; use these towers"
         )
-    return TowerWidths(touch_view, accepted[got[1]], len(towers))
+    return TowerWidths(touch_view, photo_view, len(towers))

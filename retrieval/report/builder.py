@@ -6,16 +6,14 @@ from typing import Any
 
 from retrieval.report.canvas import draw
 from retrieval.report.document import Block, Details, Picture
-from retrieval.report.galleries import Grasps
 from retrieval.report.results import Results, capitalized, measure_label, method_label, percent
 
 
 class Builder:
-    """Results, grasps and folder of one report; it writes the figures while the sections are built.
+    """Results and folder of one report; it writes the figures while the sections are built.
 
     Args:
         results: Results of the evaluation.
-        grasps: Grasps of the recording by id; empty for a report without pictures.
         out: Folder of the report.
 
     Attributes:
@@ -23,8 +21,8 @@ class Builder:
         figures: The figures written so far.
     """
 
-    def __init__(self, results: Results, grasps: Grasps, out: Path) -> None:
-        self.results, self.grasps, self.out = results, grasps, out
+    def __init__(self, results: Results, out: Path) -> None:
+        self.results, self.out = results, out
         self.main = (results.learned or results.methods)[0]
         self.figures: list[Path] = []
 

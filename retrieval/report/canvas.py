@@ -78,7 +78,7 @@ def draw(path: Path, make: Callable[..., Figure], *arguments: Any) -> None:
     """Write the figure that `make(*arguments)` returns.
 
     Args:
-        path: File to write; .jpg for photographs, .png for plots.
+        path: PNG file to write.
         make: Function that draws the figure.
         *arguments: Arguments of `make`.
 
@@ -98,8 +98,6 @@ def draw(path: Path, make: Callable[..., Figure], *arguments: Any) -> None:
         agg: Any = FigureCanvasAgg(make(*arguments))
         agg.draw()
     image, data = Image.fromarray(np.ascontiguousarray(np.asarray(agg.buffer_rgba())[..., :3])), io.BytesIO()
-    if path.suffix == ".jpg":
-        image.save(data, "JPEG", quality=86)
-    else:  # a palette of 256 colours makes the file of a plot three times smaller
-        image.quantize(256, dither=Image.Dither.NONE).save(data, "PNG", optimize=True)
+    # A palette of 256 colours makes the file three times smaller.
+    image.quantize(256, dither=Image.Dither.NONE).save(data, "PNG", optimize=True)
     write_atomically(path, data.getvalue())

@@ -123,7 +123,7 @@ def to_html(document: Document, folder: Path) -> str:
     """Return one HTML page that embeds the pictures under `folder`."""
 
     def uri(file: str) -> str:
-        return data_uri((folder / file).read_bytes(), "png" if file.endswith(".png") else "jpeg")
+        return data_uri((folder / file).read_bytes(), "png")
 
     def width(file: str) -> int:
         """Return the width of a figure on the page, so that the letters of all figures have one size."""

@@ -3,10 +3,10 @@
 from collections.abc import Iterator
 
 from retrieval.model.verification import ERRORS_NEEDED
-from retrieval.report import galleries, plots, tables
+from retrieval.report import plots, tables
 from retrieval.report.builder import Builder
-from retrieval.report.document import Block, Details, Listing, Text
-from retrieval.report.results import capitalized, file_name, method_label, percent
+from retrieval.report.document import Block, Details, Listing, Table, Text
+from retrieval.report.results import file_name, method_label, percent
 
 TOO_FEW = "Not evaluated: the open-set decision requires at least three validation objects and three test objects."
 
@@ -38,46 +38,18 @@ def _per_object_blocks(builder: Builder, name: str) -> Iterator[Block]:
 
 
 def confusions(builder: Builder) -> Iterator[Block | None]:
-    """Yield pictures of the most frequent confusions."""
-    if not builder.grasps:
-        yield Text("The pictures need the recording, which is not available.")
-        return
+    """Yield the most frequent confusions."""
     yield from builder.each("confusions", _confusion_blocks)
 
 
 def _confusion_blocks(builder: Builder, name: str) -> Iterator[Block]:
     pairs = builder.results.data["methods"][name]["confusions"]
-    descriptions = [f"{one['object_id']} for {one['mistaken_for']} ({percent(one['share'], 0)} %)" for one in pairs]
-    yield builder.picture(
-        f"confusions-{file_name(name)}.jpg",
-        f"Objects next to the objects that they were mistaken for, {method_label(name)}: {'; '.join(descriptions)}.",
-        f"Left: the object. Right (red): the object that {method_label(name)} mistook it for, with the fraction of the "
-        "object's touches for which it ranked first in the full gallery of unseen objects.",
-        galleries.confusions,
-        pairs,
-        {grasp.object_id: grasp.photo for grasp in reversed(list(builder.grasps.values()))},
+    rows = tuple((one["object_id"], one["mistaken_for"], percent(one["share"], 0)) for one in pairs)
+    note = (
+        f"The fraction of the touches of an object for which {method_label(name)} ranked another one first in the full "
+        "gallery of unseen objects."
     )
-
-
-def examples(builder: Builder) -> Iterator[Block | None]:
-    """Yield galleries of the best and worst queries."""
-    if builder.grasps:
-        yield from builder.each("examples", _example_blocks)
-
-
-def _example_blocks(builder: Builder, name: str) -> Iterator[Block]:
-    for which, queries in builder.results.data["methods"][name]["examples"].items():
-        if queries:
-            descriptions = [f"{one['object_id']} (rank {one['true_rank']:g})" for one in queries]
-            yield builder.picture(
-                f"{file_name(which)}-{file_name(name)}.jpg",
-                f"Queries and their ranked photos, {which}, {method_label(name)}: {'; '.join(descriptions)}.",
-                f"{capitalized(which)} queries of {method_label(name)}: gel images, then photos by rank; green: the "
-                "touched object. Rank: that of its best photo in the full gallery.",
-                galleries.examples,
-                queries,
-                builder.grasps,
-            )
+    yield Table(("object", "mistaken for", "of its touches, %"), rows, (note,), words=frozenset({1}))
 
 
 # Decisions -----------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""The report of an evaluation: Markdown, one HTML page and figures, from results.json and the recording's pictures.
+"""The report of an evaluation: Markdown, one HTML page and figures, from results.json.
 
 Every number comes from results.json or timings.json; the report measures nothing.
 """
@@ -6,7 +6,6 @@ Every number comes from results.json or timings.json; the report measures nothin
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from retrieval.data.dataset import AnyRecording, load_grasps
 from retrieval.report import error_analysis, method_comparison, tables
 from retrieval.report.builder import Builder
 from retrieval.report.document import Block, Details, Document, Listing, Section, Table, Text, write_document
@@ -34,19 +33,17 @@ SIMULATION = (
 )
 
 
-def write_report(out: Path, recording: AnyRecording | None) -> list[Path]:
+def write_report(out: Path) -> list[Path]:
     """Write report.md, report.html and figures/ from results.json, and from timings.json if it exists.
 
     Args:
         out: Folder of results.json, to which the report is written.
-        recording: Recording whose pictures the report shows; None for a report without pictures.
 
     Returns:
         The written files.
 
     Raises:
         BadInput: The results cannot be read.
-        DatasetError: The recording cannot be read.
         RetrievalError: matplotlib is not installed.
 
     >>> import dataclasses
@@ -54,12 +51,11 @@ def write_report(out: Path, recording: AnyRecording | None) -> list[Path]:
     >>> config = retrieval.load_config("tiny")
     >>> config = dataclasses.replace(config, training=config.training.with_iterations(2))
     >>> done = retrieval.evaluate("lab", Path("summaries"), config=config, methods=["cca", "chance"], quiet=True)
-    >>> [path.name for path in retrieval.write_report(Path("summaries"), "lab")][:2]
+    >>> [path.name for path in retrieval.write_report(Path("summaries"))][:2]
     ['report.md', 'report.html']
     """
     results = read_results(out)
-    grasps = {grasp.grasp_id: grasp for grasp in load_grasps(recording)} if recording else {}
-    builder = Builder(results, grasps, out)
+    builder = Builder(results, out)
     sections = [Section(title, tuple(block for block in build(builder) if block)) for title, build in SECTIONS.items()]
     document = Document(
         f"Which object was touched? Evaluation on {results.data['recording']['path_name']}",
@@ -88,8 +84,6 @@ def _lead(builder: Builder) -> Iterator[Block]:
         f"{capitalized(method_label(builder.main))} on unseen objects, in percent. {capitalized('; '.join(summaries))}."
     )
     yield Text(f"{text} {FEW_OBJECTS_NOTE}" if FEW_OBJECTS_MARK in text else text)
-    if audit := data.get("audit"):
-        yield Text(f"Leakage audit: {audit['verdict']}", warn=not audit["clean"])
     if builder.results.simulated:
         yield Text(SIMULATION)
     yield Text(PAPER)
@@ -126,10 +120,8 @@ SECTIONS: dict[str, Callable[[Builder], Iterator[Block | None]]] = {
     "Differences between methods": method_comparison.comparisons,
     "Controls": method_comparison.controls,
     "Ceilings": method_comparison.ceilings,
-    "Leakage audit": method_comparison.audit,
     "Accuracy by object": error_analysis.objects,
     "Confusions": error_analysis.confusions,
-    "Best and worst queries": error_analysis.examples,
     "Calibration": error_analysis.calibration,
     "Is the object in the catalogue?": error_analysis.reject,
     "Is it the expected object?": error_analysis.verification,

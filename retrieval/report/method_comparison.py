@@ -12,7 +12,7 @@ from retrieval.metrics.registry import (
 )
 from retrieval.report import plots, tables
 from retrieval.report.builder import Builder
-from retrieval.report.document import Block, Details, Listing, Text
+from retrieval.report.document import Block, Details, Text
 
 INTERVALS = (
     "Brackets contain 95 % intervals of a bootstrap that resamples objects, because queries of one object are "
@@ -129,15 +129,3 @@ def ceilings(builder: Builder) -> Iterator[Block | None]:
             "the worse of the two. The difference between that ceiling and the result is due to the change of modality."
         )
         yield tables.ceilings(builder.results)
-
-
-def audit(builder: Builder) -> Iterator[Block | None]:
-    """Yield the audit of leakage between the parts of the split."""
-    if found := builder.results.data.get("audit"):
-        yield Text(found["verdict"], warn=not found["clean"])
-        examples = [
-            *found["identical"]["examples"],
-            *(pair for one in found["frames"].values() for pair in one["examples"]),
-        ]
-        if examples:
-            yield Listing("\n".join("  =  ".join(places) for places in examples))

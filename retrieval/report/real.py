@@ -1,26 +1,19 @@
-"""The report of the real-data benchmark: Markdown, HTML and figures, from results.json and the recordings' pictures."""
+"""The report of the real-data benchmark: Markdown, HTML and figures, from results.json."""
 
-import dataclasses
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from retrieval.console.output import show
-from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.evaluation.real import PROTOCOLS, SCHEMA_VERSION
-from retrieval.evaluation.real.protocol import PHOTO, TOUCHES
-from retrieval.evaluation.real.reference_rows import replace_photos_by_references
 from retrieval.evaluation.real.verdict import CONTROL_NAMES, RULE
-from retrieval.report import galleries
 from retrieval.report.canvas import MUTED_COLOUR, Figure, canvas, draw, style_of
 from retrieval.report.document import Block, Details, Document, Listing, Picture, Section, Table, Text, write_document
-from retrieval.report.galleries import Grasps
 from retrieval.report.results import (
     FEW_OBJECTS_MARK,
     FEW_OBJECTS_NOTE,
     METHOD_LABELS,
     MISSING_VALUE,
-    file_name,
     method_label,
     percent,
     points,
@@ -40,16 +33,14 @@ INTERVALS_OVER_CHOICES = (
     "and training objects (corrected resampled t-test, because choices share objects). Ties get their expected "
     "rank, so a constant scorer gets exactly chance."
 )
-SEARCH_SPACES = {"gallery": "a gallery", "all": "all test objects, including look-alikes"}
 LOW_PASS_LABEL = "low-pass control (8 x 6)"
 
 
-def write_report(out: Path, recordings: Mapping[str, Path]) -> list[Path]:
+def write_report(out: Path) -> list[Path]:
     """Write report.md, report.html and figures/ from results.json.
 
     Args:
         out: Folder of results.json, to which the report is written.
-        recordings: Folder of each data set's recording, for the pictures of queries; missing ones are left out.
 
     Returns:
         The written files.
@@ -62,12 +53,7 @@ def write_report(out: Path, recordings: Mapping[str, Path]) -> list[Path]:
     entries = _ordered(results)
     figures = [out / "figures" / "overview.png"]
     draw(figures[0], overview, entries)
-    sections = []
-    for name, entry in entries.items():
-        grasps: Grasps = {}
-        if recording := recordings.get(entry["recording"]["data_set"]):
-            grasps = {grasp.grasp_id: grasp for grasp in _grasps(recording, entry["entry"])}
-        sections.append(Section(entry["title"], tuple(_section(name, entry, grasps, out, figures))))
+    sections = [Section(entry["title"], tuple(_section(entry))) for entry in entries.values()]
     words = " ".join(line for entry in entries.values() for line in (entry["title"] + ":", *verdicts(entry)))
     lead: tuple[Block, ...] = (
         Text(RULE),
@@ -77,14 +63,6 @@ def write_report(out: Path, recordings: Mapping[str, Path]) -> list[Path]:
     settings = Section("Settings", (Details("Settings", (Listing.of_json(results["setting"]),)),))
     document = Document("Identification by touch on real data", lead, (*sections, settings))
     return [*write_document(document, out), *figures]
-
-
-def _grasps(recording: Path, entry: str) -> list[Grasp]:
-    """Return the grasps of a protocol, each with the image that represents its object in the gallery as `photo`."""
-    grasps = load_grasps(recording)
-    if entry == TOUCHES:
-        return [dataclasses.replace(grasp, photo=grasp.touches[0]) for grasp in grasps]
-    return grasps if entry == PHOTO else replace_photos_by_references(grasps)
 
 
 def _ordered(results: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -113,7 +91,7 @@ def print_verdicts(results: Mapping[str, Any]) -> None:
             show(line)
 
 
-def _section(name: str, entry: Entry, grasps: Grasps, out: Path, figures: list[Path]) -> Iterator[Block]:
+def _section(entry: Entry) -> Iterator[Block]:
     recording = entry["recording"]
     seeds = len(entry["folds"])
     yield Text(
@@ -125,24 +103,12 @@ def _section(name: str, entry: Entry, grasps: Grasps, out: Path, figures: list[P
     yield from (Text(anchor) for anchor in entry["published_results"])
     yield Text("Controls:")
     yield controls(entry)
-    for table in (choices(entry), reliability(entry)):
+    for table in (choices(entry),):
         if table:
             yield table
     yield Details("Against the controls, all measures", (differences(entry),))
     if compared := towers(entry):
         yield compared
-    for kind in ("best", "worst"):
-        if grasps and (queries := entry["examples"][kind]):
-            file = f"{file_name(name)}-{kind}.jpg"
-            figures.append(out / "figures" / file)
-            draw(figures[-1], galleries.examples, queries, grasps)
-            entries = {PHOTO: "photo", TOUCHES: "touch"}.get(entry["entry"], "reference touch")
-            yield Picture(
-                f"figures/{file}",
-                f"{kind.capitalize()} queries: {', '.join(one['object_id'] for one in queries)}.",
-                f"The {kind} queries of {method_label(entry['examples']['row'])}, first seed: the touch, then the best "
-                f"{entries} of each object, most likely first; the true object framed green.",
-            )
 
 
 # Verdicts and tables -----------------------------------------------------------------------------------
@@ -168,23 +134,18 @@ def _label(name: str, row: Entry) -> str:
 def numbers(entry: Entry) -> Table:
     """Return the main table: each method and its low-pass control, the other controls, and chance."""
     labels: Mapping[str, str] = entry["labels"]
-    counted = any(row["correct_counts"] for row in entry["rows"].values())
     rows = []
     for name, row in entry["rows"].items():
         touch = {None: "", True: "yes", False: "no"}[row["verdict"] and row["verdict"]["counts_as_touch"]]
-        rows.append(
-            (_label(name, row), *_values(row["measures"], labels), *_counts(row["correct_counts"], counted), touch)
-        )
+        rows.append((_label(name, row), *_values(row["measures"], labels), touch))
         if row["low_pass"]:
-            rows.append((LOW_PASS_LABEL, *_values(row["low_pass"], labels), *_counts(None, counted), ""))
+            rows.append((LOW_PASS_LABEL, *_values(row["low_pass"], labels), ""))
     for name, one in entry["controls"].items():
         if one["measures"]:
-            rows.append(
-                (f"control: {name}", *_values(one["measures"], labels), *_counts(one["correct_counts"], counted), "")
-            )
+            rows.append((f"control: {name}", *_values(one["measures"], labels), ""))
     first = next(iter(entry["rows"].values()))["measures"]
     chance = [percent(first[key]["chance"][0]) if key in first else MISSING_VALUE for key in labels]
-    rows.append(("chance, closed form", *chance, *_counts(None, counted), ""))
+    rows.append(("chance, closed form", *chance, ""))
     basis = next(iter(first.values()))
     over_choices = entry["unit"] == "choice"
     queries = f"{basis['queries']:,} queries of {basis['objects']} {'object' if over_choices else entry['unit']}s"
@@ -192,27 +153,14 @@ def numbers(entry: Entry) -> Table:
         INTERVALS_OVER_CHOICES if over_choices else INTERVALS.format(unit=entry["unit"]),
         f"{queries} {'in total' if over_choices else 'per seed'}. Gallery: {basis['gallery']}.",
     ]
-    if counted:
-        measure = next(row["correct_counts"]["measure"] for row in entry["rows"].values() if row["correct_counts"])
-        notes.append(
-            "Right: number of right top-1 answers, mean over the seeds, with an exact binomial interval, for "
-            f"{labels[measure]}."
-        )
     if any(FEW_OBJECTS_MARK in cell for row in rows for cell in row):
         notes.append(FEW_OBJECTS_NOTE)
-    header = ("method", *labels.values(), *(("right",) if counted else ()), "counts as touch")
+    header = ("method", *labels.values(), "counts as touch")
     return Table(header, tuple(rows), tuple(notes))
 
 
 def _values(measures: Mapping[str, Any], labels: Mapping[str, str]) -> list[str]:
     return [with_interval(measures.get(key)) for key in labels]
-
-
-def _counts(counted: Mapping[str, Any] | None, has_column: bool) -> list[str]:
-    if not has_column or counted is None:
-        return [""] if has_column else []
-    right = sum(counted["right"]) / len(counted["right"])
-    return [f"{right:.3g} of {counted['queries']} [{percent(counted['low'])}, {percent(counted['high'])}]"]
 
 
 def controls(entry: Entry) -> Table:
@@ -268,24 +216,6 @@ def choices(entry: Entry) -> Table | None:
 def _spread(summary: Mapping[str, Any]) -> list[str]:
     values = (summary[key][0] for key in ("value", "min", "max"))
     return [*map(percent, values), str(len(summary["by_split"]))]
-
-
-def reliability(entry: Entry) -> Table | None:
-    """Return the calibration errors of the top-1 probabilities; None if no row has probabilities."""
-    rows = [
-        (_label(name, row), SEARCH_SPACES[searched], percent(one["ece"]), f"{sum(b['count'] for b in one['bins']):,}")
-        for name, row in entry["rows"].items()
-        for searched, one in row["reliability"].items()
-    ]
-    if not rows:
-        return None
-    note = (
-        "Top-1 answers to one touch. The candidates are objects with one photo each, including the true object. "
-        "The posterior is fitted on held-out training objects of each fold."
-    )
-    return Table(
-        ("method", "gallery", "expected calibration error, %", "answers"), tuple(rows), (note,), frozenset({1})
-    )
 
 
 # Figure ------------------------------------------------------------------------------------------------

@@ -5,13 +5,12 @@ import re
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from retrieval.console.progress import Bar
-from retrieval.data.dataset import AnyRecording, Grasp, Split, data_digest, folder_of
+from retrieval.data.dataset import AnyRecording, Split, data_digest, folder_of
 from retrieval.errors import BadInput
 from retrieval.evaluation.cache import resumable, write_document
 from retrieval.evaluation.experiment import Experiment
@@ -32,20 +31,13 @@ from retrieval.evaluation.real.fold_measures import (
     read_fold_measures,
     write_fold_measures,
 )
-from retrieval.evaluation.real.protocol import PHOTO, Protocol, RecordingFacts, read_recording_facts
-from retrieval.evaluation.real.reference_rows import (
-    ANY_WIDTH_METHODS,
-    assign_references,
-    facts_with_references,
-    features_with_references,
-)
+from retrieval.evaluation.real.protocol import Protocol, RecordingFacts, read_recording_facts
 from retrieval.evaluation.real.touch_to_touch import FROZEN, TouchToTouch, touch_to_touch_entry
-from retrieval.evaluation.real.verdict import Aggregation, MeasuresBySeed, control_entry, reliability_entry, row_entry
+from retrieval.evaluation.real.verdict import Aggregation, MeasuresBySeed, control_entry, row_entry
 from retrieval.evaluation.scoring import MethodScores
 from retrieval.methods import CHANCE, METHODS
 from retrieval.methods.method import Method
 from retrieval.model.config import Config, named_config
-from retrieval.training.features import Features
 from retrieval.version import __version__
 
 PRESET = "real"
@@ -53,7 +45,6 @@ DEFAULT_METHODS = ("cca_towers", "cca", "late_fusion", "chance")
 DRAWS = 10_000
 MAX_GRASPS = {"train": 1, "validation": 12, "test": 40}
 """Maximum number of scored grasps of one object, by part."""
-EXAMPLES = 6
 
 
 def benchmark(
@@ -143,12 +134,8 @@ def benchmark(
                     protocol, facts[data_set], compared, list(range(seeds)), cache, DRAWS, quiet
                 )
                 continue
-            usable = [row for row in rows[data_set] if protocol.entry == PHOTO or row.method in ANY_WIDTH_METHODS]
-            if not usable:
-                left_out[name] = f"its catalogue entries are touches, which only {', '.join(ANY_WIDTH_METHODS)} accept"
-                continue
             tables[name] = _ProtocolRun(
-                name, protocol, facts[data_set], usable, list(range(seeds)), cache, quiet
+                name, protocol, facts[data_set], rows[data_set], list(range(seeds)), cache, quiet
             ).entry()
     if not tables:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
@@ -196,7 +183,7 @@ class _ProtocolRun:
     Attributes:
         name: Name of the protocol.
         protocol: The protocol.
-        all_facts: The recording with all grasps, also those without a query.
+        facts: The recording.
         rows: The rows of the table.
         seeds: Seeds of folds and fits.
         cache: Folder of features and measures.
@@ -205,29 +192,11 @@ class _ProtocolRun:
 
     name: str
     protocol: Protocol
-    all_facts: RecordingFacts
+    facts: RecordingFacts
     rows: list[BenchmarkRow]
     seeds: list[int]
     cache: Path
     quiet: bool
-
-    @cached_property
-    def facts(self) -> RecordingFacts:
-        """The recording with the grasps that are queries.
-
-        With reference touches these are the grasps that have a reference, which replaces their photo.
-        """
-        return self.all_facts if self.protocol.entry == PHOTO else facts_with_references(self.all_facts)
-
-    @cached_property
-    def _references(self) -> dict[str, Grasp]:
-        return assign_references(self.all_facts.grasps)
-
-    def _features(self, condition: Condition) -> Features:
-        features = condition.features()
-        if self.protocol.entry == PHOTO:
-            return features
-        return features_with_references(features, self._references, self.protocol.entry)
 
     def entry(self) -> dict[str, Any]:
         """Return the protocol's entry of results.json."""
@@ -250,7 +219,6 @@ class _ProtocolRun:
             "published_results": list(self.protocol.published_results),
             "main": self.protocol.main,
             "labels": [[name, metric.label] for name, metric in self.protocol.measures.items()],
-            "entry": self.protocol.entry,
             "unit": "choice" if self.protocol.choices else "sequence" if self.protocol.is_by_sequence else "object",
             "recording": {
                 "data_set": self.protocol.data_set,
@@ -262,7 +230,6 @@ class _ProtocolRun:
             "folds": [[dataclasses.asdict(split) for split in splits] for splits in folds.values()],
             "rows": {row.name: self._row(row, found, self._aggregation(folds)) for row in self.rows},
             "controls": self._controls(found, self._aggregation(folds)),
-            "examples": self._examples(found),
         }
 
     def _conditions(self) -> list[Condition]:
@@ -280,8 +247,6 @@ class _ProtocolRun:
         return self.rows[0].towers
 
     def _missing_reason(self, kind: str) -> str | None:
-        if kind == "background" and self.protocol.entry != PHOTO:
-            return "the catalogue entries are touches"
         return missing_no_contact_reason(self.facts.grasps) if kind == "no_contact" else None
 
     def _aggregation(self, folds: Mapping[int, Sequence[Split]]) -> Aggregation:
@@ -307,7 +272,6 @@ class _ProtocolRun:
             "method": row.method,
             "model": model.digest if model else None,
             **row_entry(self.protocol, touch, low_pass, order, aggregation),
-            "reliability": reliability_entry([one.confidences for folds in mine for one in folds]),
             "best_params": [[one.best_params for one in folds] for folds in mine],
         }
 
@@ -318,15 +282,6 @@ class _ProtocolRun:
             entries[kind] = control_entry(self.protocol, description, self._missing_reason(kind), by_seed, aggregation)
         return entries
 
-    def _examples(self, found: Mapping[str, list[list[FoldMeasures]]]) -> dict[str, Any]:
-        """Return the best and the worst queries of the first seed, for the first row that is not chance."""
-        row = next((row for row in self.rows if row.method != CHANCE), self.rows[0])
-        folds = found[f"{row.name}-touch"][0]
-        every = {kind: [one for fold in folds for one in fold.examples[kind]] for kind in ("best", "worst")}
-        best = sorted(every["best"], key=lambda one: float(one["true_rank"]))
-        worst = sorted(every["worst"], key=lambda one: -float(one["true_rank"]))
-        return {"row": row.name, "best": best[:EXAMPLES], "worst": worst[:EXAMPLES]}
-
     # One fold ----------------------------------------------------------------------------------------
 
     def _fold_measures(self, condition: Condition, seed: int, number: int, split: Split) -> FoldMeasures:
@@ -335,7 +290,7 @@ class _ProtocolRun:
         Scores are not stored: those of all folds take gigabytes.
         """
         self._require_unseen(condition, split)
-        features, towers = self._features(condition), condition.row.towers
+        features, towers = condition.features(), condition.row.towers
         work = self.cache / "fits" / f"{self.name}-{condition.key}-{seed}-{number}"
         experiment = Experiment(
             folder=work,
@@ -360,7 +315,7 @@ class _ProtocolRun:
         if (stored := read_fold_measures(path, cache_key)) is not None:
             return stored
         method_scores = MethodScores(experiment.queries, experiment.run(condition.method, seed), seed)
-        measured = measure_fold(method_scores, protocol, self.facts, split, features.grasp_ids)
+        measured = measure_fold(method_scores, protocol, self.facts, split)
         write_fold_measures(path, measured, cache_key)
         shutil.rmtree(work)
         return measured

@@ -68,7 +68,6 @@ UNSEEN = Protocol(
     {**topn_accuracy(5), **topn_accuracy(10), **topn_accuracy(16), **registered_metrics("pair_auc")},
     allows_own_photos=True,
     is_by_sequence=True,
-    binomial_measure="topn_k16",
 )
 PLACES = Protocol(
     "billets",
@@ -79,5 +78,4 @@ PLACES = Protocol(
     {**topn_accuracy(4), **registered_metrics("pair_auc")},
     allows_own_photos=True,
     is_by_sequence=True,
-    binomial_measure="topn_k4",
 )

@@ -2,25 +2,21 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import compress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from retrieval.data.dataset import Split
 from retrieval.errors import BadInput
 from retrieval.evaluation.cache import CacheKey, read_cached, write_cached
-from retrieval.evaluation.calibrate import KWayTest, draw_k_way_tests, pair_threshold, top1_confidences
-from retrieval.evaluation.example_grasps import example_queries
+from retrieval.evaluation.calibrate import pair_threshold
 from retrieval.evaluation.real.protocol import Protocol, RecordingFacts
 from retrieval.evaluation.scoring import MethodScores
 from retrieval.metrics.measure import Measure, pooled
 from retrieval.metrics.registry import MethodScoreTables
 from retrieval.metrics.table import ScoreTable
-from retrieval.model.posterior import Posterior
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,15 +26,10 @@ class FoldMeasures:
     Attributes:
         measures: Measures by name; their owners are numbers in `ResamplingUnits`.
         best_params: Parameters that the method selected.
-        examples: Best and worst queries.
-        confidences: (Q, 2) by gallery ("gallery", or "all" test objects if there are several galleries): the
-            probability of the top-1 answer and its accuracy. Empty if the method has no posterior.
     """
 
     measures: Mapping[str, Measure]
     best_params: Mapping[str, Any]
-    examples: Mapping[str, Any]
-    confidences: Mapping[str, NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
@@ -66,7 +57,6 @@ def measure_fold(
     protocol: Protocol,
     facts: RecordingFacts,
     split: Split,
-    grasp_ids: Sequence[str],
 ) -> FoldMeasures:
     """Measure one method in one fold.
 
@@ -75,7 +65,6 @@ def measure_fold(
         protocol: The protocol.
         facts: The recording.
         split: The split of the fold.
-        grasp_ids: Grasp ids of the feature rows.
 
     Raises:
         BadInput: The gallery is too small for the main measure.
@@ -91,29 +80,15 @@ def measure_fold(
     sets = {size: allowed(table) for size, table in method_scores.sets("test").items()}
     gallery_of = protocol.gallery_of(facts, split)
     found: dict[str, list[Measure]] = {}
-    test_ids = method_scores.ids(grasp_ids, "test")
-    queries: dict[str, list[Any]] = {"best": [], "worst": []}
-    confidences: dict[str, list[NDArray[np.float64]]] = {}
-    posterior = method_scores.predictions.best_params.get("posterior")
     for one in sorted(set(gallery_of.values())):
         mine = np.array([gallery_of.get(name) == one for name in objects])
         gallery = _of(whole, mine)
-        ids = (
-            list(compress(*pair))
-            for pair in zip(test_ids, (mine[whole.touch_owner], mine[whole.photo_owner]), strict=True)
-        )
-        for kind, some in example_queries(gallery, objects, *ids, one_of_each=True).items():
-            queries[kind] += some
         tables = MethodScoreTables(
             gallery, gallery, {size: _of(one, mine) for size, one in sets.items()}, threshold, method_scores.seed
         )
         for name, metric in protocol.measures.items():
             if (value := metric.compute(tables)) is not None:
                 found.setdefault(name, []).append(value)
-        if posterior:
-            confidences.setdefault("gallery", []).append(_top1_confidences(gallery, posterior, method_scores.seed))
-    if posterior and protocol.galleries:
-        confidences["all"] = [_top1_confidences(whole, posterior, method_scores.seed)]
     if protocol.main not in found:
         raise BadInput(
             f"{protocol.title}: a gallery has {len(whole.objects)} objects, too few for "
@@ -123,15 +98,7 @@ def measure_fold(
     return FoldMeasures(
         {name: pooled(parts, [number] * len(parts)) for name, parts in found.items()},
         method_scores.predictions.best_params,
-        queries,
-        {name: np.concatenate(parts) for name, parts in confidences.items()},
     )
-
-
-def _top1_confidences(gallery: ScoreTable, posterior: Mapping[str, Any], seed: int) -> NDArray[np.float64]:
-    """Return confidence and accuracy (Q, 2) of top-1 among the objects of a gallery, with one photo each."""
-    fitted = Posterior.from_dict(posterior)
-    return top1_confidences(draw_k_way_tests(gallery, KWayTest(len(gallery.objects)), seed, fitted), fitted)
 
 
 def _of(table: ScoreTable, mine: Any) -> ScoreTable:
@@ -145,13 +112,13 @@ def _of(table: ScoreTable, mine: Any) -> ScoreTable:
 
 def write_fold_measures(path: Path, measured: FoldMeasures, cache_key: CacheKey) -> None:
     """Write the measures of a fold to a cache file."""
-    tensors = {f"confidences/{name}": torch.from_numpy(part) for name, part in measured.confidences.items()} | {
+    tensors = {
         f"{name}/{part}": torch.from_numpy(np.ascontiguousarray(getattr(found, part)))
         for name, found in measured.measures.items()
         for part in ("values", "owner", "chance")
     }
     galleries = {name: found.gallery for name, found in measured.measures.items()}
-    about = {"galleries": galleries, "best_params": dict(measured.best_params), "examples": dict(measured.examples)}
+    about = {"galleries": galleries, "best_params": dict(measured.best_params)}
     write_cached(path, cache_key, tensors, about)
 
 
@@ -169,12 +136,7 @@ def read_fold_measures(path: Path, cache_key: CacheKey) -> FoldMeasures | None:
         )
         for name, gallery in header["galleries"].items()
     }
-    confidences = {
-        name.removeprefix("confidences/"): tensor.numpy()
-        for name, tensor in tensors.items()
-        if name.startswith("confidences/")
-    }
-    return FoldMeasures(measures, header["best_params"], header["examples"], confidences)
+    return FoldMeasures(measures, header["best_params"])
 
 
 def pool_folds(folds: Sequence[FoldMeasures]) -> dict[str, Measure]:

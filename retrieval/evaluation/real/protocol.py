@@ -12,9 +12,6 @@ from retrieval.data.dataset import Grasp, Split, load_grasps
 from retrieval.errors import DatasetError
 from retrieval.metrics.registry import METRICS, Metric, k_way_measure
 
-PHOTO, REFERENCE, BOTH, TOUCHES = "photo", "reference", "both", "touches"
-"""Content of a catalogue entry: a photo, a reference touch, both, or touches without any training
-(`retrieval.evaluation.real.touch_to_touch`)."""
 VALIDATION_OBJECTS = 5
 """Default number of validation objects, on which methods select their settings."""
 
@@ -89,10 +86,7 @@ class Protocol:
         allows_own_photos: Whether a touch is compared with the photo of its own grasp, because the data set pairs them
             at random or has one photo of each object.
         is_by_sequence: Whether a gallery contains the objects of one sequence; intervals then resample sequences.
-        binomial_measure: A measure of right and wrong answers, whose counts get an exact binomial interval.
         published_results: Results of others, one sentence each.
-        entry: Content of the catalogue entries: `PHOTO`, `REFERENCE` or `BOTH`
-            (`retrieval.evaluation.real.reference_rows`).
         galleries: Function from recording and split to the gallery of each test object, if there are several galleries.
         choices: Whether the folds are different, overlapping choices of test objects. Values are then means over the
             folds, and intervals cover the choice.
@@ -112,9 +106,7 @@ class Protocol:
     measures: Mapping[str, Metric]
     allows_own_photos: bool = False
     is_by_sequence: bool = False
-    binomial_measure: str | None = None
     published_results: tuple[str, ...] = ()
-    entry: str = PHOTO
     galleries: Callable[[RecordingFacts, Split], Mapping[str, str]] | None = None
     choices: bool = False
 
@@ -167,19 +159,18 @@ def registered_metrics(*names: str) -> dict[str, Metric]:
     return {name: METRICS[name] for name in names}
 
 
-def topn_accuracy(k: int, *, grasps: int = 1, photos: int = 1, entries: str = "photos") -> dict[str, Metric]:
+def topn_accuracy(k: int, *, grasps: int = 1, photos: int = 1) -> dict[str, Metric]:
     """Return the metric of top-1..top-k accuracy among k objects.
 
     Args:
         k: Number of candidate objects.
         grasps: Touches of a query.
         photos: Photos of a candidate.
-        entries: Plural name of the catalogue entries for the label.
     """
     name = f"topn_k{k}" + (f"_g{grasps}" if grasps > 1 else "") + (f"_p{photos}" if photos > 1 else "")
     label = f"top-1 of {k}"
     label += f", {grasps} touches" if grasps > 1 else ""
-    label += f", {photos} {entries}" if photos > 1 else ""
+    label += f", {photos} photos" if photos > 1 else ""
     return {
         name: Metric(
             label,

@@ -25,14 +25,13 @@ from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, Split, data_digest
 from retrieval.data.images import encode_image, read_rgb
 from retrieval.errors import DatasetError
-from retrieval.evaluation.example_grasps import example_queries
 from retrieval.evaluation.real.conditions import (
     CONTROLS,
     TowerEncoder,
     clock_features,
     missing_no_contact_reason,
 )
-from retrieval.evaluation.real.protocol import TOUCHES, Protocol, RecordingFacts
+from retrieval.evaluation.real.protocol import Protocol, RecordingFacts
 from retrieval.evaluation.real.verdict import Aggregation, control_entry, row_entry
 from retrieval.metrics import protocols
 from retrieval.metrics.measure import Measure, pooled
@@ -69,7 +68,6 @@ class TouchToTouch(Protocol):
 
     folds: Any = _no_folds
     measures: Mapping[str, Metric] = dataclasses.field(default_factory=lambda: MEASURES)
-    entry: str = TOUCHES
 
 
 def leave_one_out_scores(vectors: Vectors, components: int = COMPONENTS) -> NDArray[np.float32]:
@@ -138,11 +136,6 @@ class Sequences:
     def owner(self) -> NDArray[np.int64]:
         """(S,) object number of each sequence, in the order of the sorted names."""
         return np.unique(np.array(self.objects), return_inverse=True)[1].astype(np.int64)
-
-    @property
-    def middle(self) -> list[str]:
-        """The grasp that represents each sequence in a report: the middle one."""
-        return [self.grasps[rows[len(rows) // 2]].grasp_id for rows in self.rows]
 
     def mean(self, features: NDArray[np.float32]) -> Vectors:
         """Return the mean (S, F) of features (G, F) over the grasps of each sequence."""
@@ -279,7 +272,6 @@ def touch_to_touch_entry(
     order = _measures(protocol, sequences, clock_features(len(sequences.names)).astype(np.float64))
     entries: dict[str, Any] = {}
     controls: dict[str, list[dict[str, Measure]]] = {"order": [order]}
-    first_row: tuple[str, ScoreTable] | None = None
     frozen: dict[str, dict[str, Measure]] = {}
     for label, towers in towers_of.items():
         encoder = _SequenceEncoder(sequences, towers, common)
@@ -297,21 +289,16 @@ def touch_to_touch_entry(
                 "model": model.digest if model else None,
                 **row_entry(protocol, [measured], [low_pass], [order], aggregation, [no_contact]),
                 "tower_differences": None if first is measured else aggregation.differences([measured], [first]),
-                "reliability": {},
                 "best_params": [],
             }
             controls.setdefault("permuted", list(_permuted_measures(protocol, sequences, table.scores, seeds)))
-            first_row = first_row or (name, table)
-    assert first_row is not None
     objects = sorted(set(sequences.objects))
-    examples = example_queries(first_row[1], objects, sequences.middle, sequences.middle, one_of_each=True)
     return {
         "title": protocol.title,
         "rule": protocol.rule,
         "published_results": list(protocol.published_results),
         "main": protocol.main,
         "labels": [[name, metric.label] for name, metric in protocol.measures.items()],
-        "entry": protocol.entry,
         "unit": "object",
         "recording": {
             "data_set": protocol.data_set,
@@ -328,7 +315,6 @@ def touch_to_touch_entry(
             )
             for name, by_seed in controls.items()
         },
-        "examples": {"row": first_row[0], **examples},
     }
 
 

@@ -4,14 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from retrieval.evaluation.real.protocol import Protocol
-from retrieval.metrics.intervals import LEVEL, compare, summarise
-from retrieval.metrics.k_way import clopper_pearson
+from retrieval.metrics.intervals import compare, summarise
 from retrieval.metrics.measure import Measure
-from retrieval.metrics.pairs import reliability_bins
 from retrieval.metrics.resampled_splits import compare_splits, summarise_splits
 
 RULE = (
@@ -85,7 +80,6 @@ def row_entry(
     """
     measures = aggregation.summaries(touch)
     entry: dict[str, Any] = {"measures": measures, "low_pass": None, "verdict": None, **dict.fromkeys(CONTROL_NAMES)}
-    entry["correct_counts"] = _correct_counts(touch, protocol.binomial_measure)
     if low_pass:
         entry["low_pass"] = aggregation.summaries(low_pass)
         entry |= {
@@ -107,7 +101,6 @@ def control_entry(
         "description": description,
         "reason": reason,
         "measures": aggregation.summaries(by_seed) if by_seed else None,
-        "correct_counts": _correct_counts(by_seed, protocol.binomial_measure),
     }
 
 
@@ -134,28 +127,3 @@ def _against(difference: Mapping[str, Any], control: str) -> str:
     if high < 0:
         return f"{points} below {control}"
     return f"{points} against {control}, an interval that contains 0"
-
-
-def reliability_entry(confidences: Sequence[Mapping[str, NDArray[np.float64]]]) -> dict[str, Any]:
-    """Return the reliability of top-1 confidences (`reliability_bins`), by gallery.
-
-    Args:
-        confidences: For each fold and gallery (Q, 2): probability and accuracy of the top-1 answer.
-    """
-    names = dict.fromkeys(name for one in confidences for name in one)
-    return {
-        name: reliability_bins(*np.concatenate([one[name] for one in confidences if name in one]).T) for name in names
-    }
-
-
-def _correct_counts(by_seed: MeasuresBySeed, name: str | None) -> dict[str, Any] | None:
-    """Return the number of right top-1 answers by seed, and the exact interval of the mean rate.
-
-    All seeds have the same queries, so more seeds do not add queries.
-    """
-    if name is None or not by_seed or any(name not in found for found in by_seed):
-        return None
-    values = [found[name].values[:, 0] for found in by_seed]
-    right, queries = [float(one.sum()) for one in values], len(values[0])
-    low, high = clopper_pearson(sum(right) / len(right), queries, LEVEL)
-    return {"measure": name, "right": right, "queries": queries, "low": low, "high": high}

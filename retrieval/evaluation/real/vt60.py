@@ -4,7 +4,6 @@
 """
 
 from collections import defaultdict
-from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -12,8 +11,6 @@ import numpy as np
 from retrieval.data.dataset import Split
 from retrieval.errors import DatasetError
 from retrieval.evaluation.real.protocol import (
-    BOTH,
-    REFERENCE,
     Protocol,
     RecordingFacts,
     folds,
@@ -34,17 +31,6 @@ _MEASURES = {
 _SPLIT_NOTE = (
     "08_bottlefull is left out, because it is 02_bottleempty filled. Settings are selected on five of the other "
     "objects."
-)
-_REFERENCE_MEASURES = {
-    **topn_accuracy(GALLERY),
-    **topn_accuracy(GALLERY, photos=3, entries="references"),
-    **topn_accuracy(GALLERY, grasps=5, photos=3, entries="references"),
-    **registered_metrics("pair_auc"),
-}
-_REFERENCE_SPLIT = (
-    "The first quarter of each object's touches are references, the last half are queries. Both come from one session "
-    "and one finger, so the order of capture identifies every object. Only the difference from the low-pass control "
-    "is evidence of touch."
 )
 
 
@@ -160,24 +146,3 @@ CLASSES = Protocol(
     _MEASURES,
     allows_own_photos=True,
 )
-
-
-def _with_references(name: str, protocol: Protocol, entry: str) -> Protocol:
-    """Return the protocol `name` with a catalogue of reference touches."""
-    label, content = {
-        REFERENCE: ("reference touches", "touches in place of photos"),
-        BOTH: ("reference touches with photos", "a touch with each photo"),
-    }[entry]
-    return replace(
-        protocol,
-        title=protocol.title.replace("VT60", f"VT60, {label}"),
-        rule=f"As {name}, but the catalogue contains {content}. {_REFERENCE_SPLIT} {_SPLIT_NOTE}",
-        measures=_REFERENCE_MEASURES,
-        entry=entry,
-    )
-
-
-REFERENCE_SEEN_CLASSES = _with_references("vt60-seen-classes", SEEN_CLASSES, REFERENCE)
-REFERENCE_RANDOM = _with_references("vt60-random", RANDOM, REFERENCE)
-REFERENCE_AND_PHOTO = _with_references("vt60-seen-classes", SEEN_CLASSES, BOTH)
-REFERENCE_AND_PHOTO_RANDOM = _with_references("vt60-random", RANDOM, BOTH)

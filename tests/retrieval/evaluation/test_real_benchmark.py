@@ -61,16 +61,12 @@ def test_trained_rows_have_a_low_pass_control_and_a_verdict(results):
         assert (chance["low_pass"], chance["verdict"]) == (None, None)
 
 
-def test_a_billet_gallery_has_the_places_of_one_billet_and_right_answers_are_counted(results):
+def test_a_billet_gallery_has_the_places_of_one_billet(results):
     entry = results["protocols"]["billets-places"]
     summary = entry["rows"]["cca"]["measures"]["topn_k4"]
     assert (entry["unit"], summary["objects"], summary["queries"]) == ("sequence", 3, 48)
     assert summary["few_objects"]
     assert "4 test objects, 4 photos" in summary["gallery"]
-    counts = entry["rows"]["cca"]["correct_counts"]
-    assert counts["queries"] == 48
-    assert np.mean(counts["right"]) / 48 == pytest.approx(summary["value"][0])
-    assert counts["low"] < summary["value"][0] < counts["high"]
 
 
 def test_controls_have_a_description_or_a_reason(results):
@@ -86,7 +82,7 @@ def test_controls_have_a_description_or_a_reason(results):
     assert permuted["low"][0] < 1 / 9 < permuted["high"][0]
 
 
-def test_the_report_has_verdicts_tables_and_queries(out, results):
+def test_the_report_has_verdicts_and_tables(out, results):
     text, page = (out / "report.md").read_text(), (out / "report.html").read_text()
     for entry in results["protocols"].values():
         assert entry["title"] in text
@@ -95,25 +91,11 @@ def test_the_report_has_verdicts_tables_and_queries(out, results):
         assert words in page
     assert "counts as touch only if" in text
     assert "control: order" in text
-    assert "exact binomial interval" in text
-    for name in ("overview.png", "vt60-random-best.jpg", "vt60-random-worst.jpg", "billets-places-best.jpg"):
-        assert (out / "figures" / name).is_file()
-        assert f"figures/{name}" in text
+    assert (out / "figures" / "overview.png").is_file()
+    assert "figures/overview.png" in text
 
 
-def test_reference_catalogue_has_low_pass_control_on_both_sides(data, out, tmp_path):
-    again = tmp_path / "again"
-    shutil.copytree(out, again)
-    assert benchmark(data, again, "--protocols", "vt60-references,vt60-references-photos", "--seeds", "1") == 0
-    for entry in json.loads((again / "results.json").read_text())["protocols"].values():
-        assert set(entry["rows"]) == {"cca", "chance"}
-        assert entry["rows"]["cca"]["low_pass"]
-        assert entry["controls"]["background"]["reason"] == "the catalogue entries are touches"
-        assert entry["controls"]["order"]["measures"]["topn_k9"]["value"][0] > 0.5
-    assert "reference touch of each object" in (again / "report.md").read_text()
-
-
-def test_choices_report_each_fold_with_confidences(tmp_path, monkeypatch):
+def test_choices_report_each_fold(tmp_path, monkeypatch):
     monkeypatch.setattr(vt60, "DRAWN_CHOICES", 1)
     real_data_sets.write_vt60(tmp_path / "data" / "vt60", instances=3)
     options = ["--preset", "tiny", "--seeds", "2", "--methods", "cca_towers,chance", "--protocols", "vt60-choices"]
@@ -131,17 +113,10 @@ def test_choices_report_each_fold_with_confidences(tmp_path, monkeypatch):
     assert summary["value"][0] == pytest.approx(np.mean(by_choice))
     assert (summary["min"][0], summary["max"][0]) == (min(by_choice), max(by_choice))
     assert summary["low"][0] <= summary["value"][0] <= summary["high"][0]
-    assert sum(one["count"] for one in row["reliability"]["gallery"]["bins"]) == 4 * 4 * 18 * 4  # drawn four times each
     assert set(row["best_params"][0][0]) >= {"ridge", "photo_ridge", "directions", "power", "posterior"}
     text = re.sub(r"\\", "", (tmp_path / "out" / "report.md").read_text())
-    for words in ("over choices", "expected calibration error", "the order of capture", "4 choice(s) each"):
+    for words in ("over choices", "the order of capture", "4 choice(s) each"):
         assert words in text
-
-
-def test_methods_with_photo_heads_cannot_use_reference_touches(data, tmp_path, capsys):
-    options = ["--protocols", "vt60-references", "--methods", "late_fusion"]
-    assert benchmark(data, tmp_path / "out", *options) == 2
-    assert "vt60-references: its catalogue entries are touches, which only cca_towers, " in capsys.readouterr().err
 
 
 def test_a_second_run_reuses_fits_and_is_byte_identical(data, out, tmp_path, monkeypatch):
@@ -227,8 +202,7 @@ def test_every_protocol_runs_on_its_miniature(tmp_path):
         if name == "physiclear":
             assert set(entry["rows"]) == {"frozen-difference", "frozen-common-frame"}
             continue
-        heads = set() if "references" in name else {"late_fusion"}
-        assert set(entry["rows"]) == {"cca", "chance"} | heads
+        assert set(entry["rows"]) == {"cca", "chance", "late_fusion"}
 
 
 @pytest.mark.slow
@@ -253,7 +227,6 @@ def test_unseen_real_billets_are_near_chance(tmp_path):
     options = ["--protocols", "billets-unseen", "--seeds", "1", "--methods", "cca", "--init", str(weights)]
     assert benchmark(data, tmp_path, methods=options) == 0
     entry = json.loads((tmp_path / "results.json").read_text())["protocols"]["billets-unseen"]
-    counts = entry["rows"]["cca"]["correct_counts"]
-    assert counts["queries"] == 80
-    assert counts["low"] < 0.25
+    summary = entry["rows"]["cca"]["measures"][entry["main"]]
+    assert summary["low"][0] < 0.25
     assert (tmp_path / "report.html").is_file()

@@ -11,16 +11,10 @@ from retrieval.errors import BadInput, ConfigError, DatasetError
 from retrieval.evaluation.real import PROTOCOLS
 from retrieval.evaluation.real.conditions import clock_features, missing_no_contact_reason
 from retrieval.evaluation.real.protocol import RecordingFacts
-from retrieval.evaluation.real.reference_rows import (
-    assign_references,
-    features_with_references,
-    replace_photos_by_references,
-)
 from retrieval.evaluation.real.touch_to_touch import TouchToTouch
-from retrieval.evaluation.real.verdict import reliability_entry, verdict
+from retrieval.evaluation.real.verdict import verdict
 from retrieval.metrics.measure import Measure, pooled
 from retrieval.metrics.resampled_splits import compare_splits, summarise_splits
-from retrieval.training.features import Features
 
 
 def facts(sequence_of, about=None, splits=None):
@@ -48,10 +42,6 @@ RECORDINGS = {
     "vt60-seen-classes": vt60(),
     "vt60-random": vt60(),
     "vt60-classes": vt60(),
-    "vt60-references": vt60(),
-    "vt60-references-random": vt60(),
-    "vt60-references-photos": vt60(),
-    "vt60-references-photos-random": vt60(),
     "billets-unseen": billets(),
     "billets-places": billets(),
     "objectfolder": facts(
@@ -175,53 +165,6 @@ def test_an_unknown_protocol_lists_the_known_ones():
         PROTOCOLS.load("ycb")
 
 
-# Reference touches -----------------------------------------------------------------------------------
-
-
-def touched(counts):
-    return [
-        Grasp(f"{name}-{turn}", name, name, Path(f"{name}-photo-{turn}"), (Path(f"{name}-gel-{turn}"),), ())
-        for turn in range(max(counts.values()))
-        for name, count in counts.items()
-        if turn < count
-    ]
-
-
-def test_the_first_quarter_of_touches_are_references_and_the_last_half_queries():
-    found = assign_references(touched({"mug": 8, "tin": 5}))
-    assert {query: reference.grasp_id for query, reference in found.items()} == {
-        "mug-4": "mug-0",
-        "mug-5": "mug-1",
-        "mug-6": "mug-0",
-        "mug-7": "mug-1",
-        "tin-2": "tin-0",
-        "tin-3": "tin-0",
-        "tin-4": "tin-0",
-    }
-    replaced = replace_photos_by_references(touched({"mug": 8}))
-    assert [(one.grasp_id, one.photo.name) for one in replaced][:2] == [("mug-4", "mug-gel-0"), ("mug-5", "mug-gel-1")]
-
-
-def test_entries_are_features_of_the_reference_not_of_the_query():
-    grasps = touched({"mug": 8, "tin": 4})
-    rows = np.arange(len(grasps), dtype=np.float32)
-    features = Features(
-        tuple(one.grasp_id for one in grasps),
-        tuple(one.object_id for one in grasps),
-        rows[:, None, None].repeat(2, 2),
-        -rows[:, None],
-    )
-    row_of = {name: row for row, name in enumerate(features.grasp_ids)}
-    references = assign_references(grasps)
-    touches, both = (features_with_references(features, references, entry) for entry in ("reference", "both"))
-    assert touches.grasp_ids == both.grasp_ids == tuple(references)
-    for row, name in enumerate(touches.grasp_ids):
-        reference = row_of[references[name].grasp_id]
-        assert touches.touch[row].tolist() == [[row_of[name]] * 2]
-        assert touches.photo[row].tolist() == [reference] * 2
-        assert both.photo[row].tolist() == [-reference, reference, reference]
-
-
 # Controls and verdicts -------------------------------------------------------------------------------
 
 
@@ -297,19 +240,6 @@ def test_an_interval_over_choices_is_the_corrected_resampled_t_interval():
     assert difference["p"] == pytest.approx(1 - 1.7320508 / np.sqrt(5))
     with pytest.raises(BadInput, match="needs at least two splits; got 1"):
         summarise_splits(of_choices(0.5, 0.6, 0.7)[:1], ratio=1.0)
-
-
-def test_the_reliability_of_a_gallery_is_that_of_all_folds():
-    confidences = [
-        {"gallery": np.array([[0.72, 1.0], [0.73, 0.0]]), "all": np.array([[1.0, 1.0]])},
-        {"gallery": np.array([[0.71, 0.5], [0.05, 0.0]])},
-    ]
-    found = reliability_entry(confidences)
-    assert list(found) == ["gallery", "all"]
-    low, high = found["gallery"]["bins"]
-    assert (low["count"], high["count"], high["frequency"]) == (1, 3, pytest.approx(0.5))
-    assert found["gallery"]["ece"] == pytest.approx((0.05 + 3 * 0.22) / 4)
-    assert found["all"]["ece"] == 0
 
 
 def test_pooled_galleries_have_every_query_under_its_unit():

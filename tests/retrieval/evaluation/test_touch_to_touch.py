@@ -86,7 +86,6 @@ def test_a_sequence_is_the_mean_of_its_own_grasps():
     assert sequences.owner.tolist() == [0, 0, 1, 1]
     features = np.arange(8, dtype=np.float32)[:, None]
     assert sequences.mean(features).ravel().tolist() == [0.5, 2.5, 4.5, 6.5]
-    assert sequences.middle == ["a-0-1", "a-1-1", "b-0-1", "b-1-1"]
 
 
 @pytest.mark.parametrize(
@@ -169,9 +168,8 @@ def test_each_representation_is_compared_with_three_controls(out):
 
 def test_the_report_shows_touch_to_touch_results(out):
     text = (out / "report.md").read_text().replace("\\", "")
-    for words in ("one video left out", "control: permuted", "frozen-common-frame", "the best touch of each object"):
+    for words in ("one video left out", "control: permuted", "frozen-common-frame"):
         assert words in text
-    assert (out / "figures" / "physiclear-best.jpg").is_file()
 
 
 def test_the_towers_of_other_configurations_are_rows_compared_with_the_first(recording, tmp_path):

@@ -305,29 +305,6 @@ def test_the_setting_that_ranks_held_out_objects_best_is_chosen_not_the_one_that
     assert len({round(one, 6) for one in plain.values()}) > 1
 
 
-def with_references(features):
-    """Append to each photo the touch of the next grasp of its object."""
-    rows = np.arange(len(features))
-    following = rows // 8 * 8 + (rows + 1) % 8
-    touches = features.touch[following].reshape(len(features), -1)
-    return replace(features, photo=np.concatenate([features.photo, touches], axis=1))
-
-
-def test_a_reference_touch_after_a_photo_is_encoded_as_a_touch_and_weighted_on_validation_objects():
-    train, validation, test = (with_references(part) for part in (TRAIN, VALIDATION, TEST))
-    method = METHODS.load("cca_towers")(MethodSettings(CONFIG))
-    method.fit(train, validation)
-    plain = fitted("cca_towers")
-    assert method.best_params["ridge"] == plain.best_params["ridge"]
-    weights = method.best_params["photo_weight"], method.best_params["reference_weight"]
-    assert min(weights) >= 0 < max(weights)
-    touches = plain.encode_touch(test.touch)
-    references = plain.encode_touch(test.photo[:, TEST.photo.shape[1] :].reshape(test.touch.shape))
-    expected = weights[0] * plain.score(*encodings(plain)) + weights[1] * (touches @ references.T)
-    found = method.score(method.encode_touch(test.touch), method.encode_photo(test.photo))
-    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-4)  # float32 sums of some hundred terms
-
-
 def test_concatenated_towers_accept_only_their_own_features():
     other = Features(TRAIN.grasp_ids, TRAIN.object_ids, TRAIN.touch, TRAIN.photo[:, 1:])
     with pytest.raises(BadInput, match=r"towers small \(pooled\), 512 of a touch and 256 of a photo; got 512 and 255"):

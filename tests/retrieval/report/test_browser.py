@@ -15,7 +15,7 @@ def opened(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     recording = synthetic.write_recording(folder / "recording", synthetic.make_objects(12), 3)
     out = write_synthetic_results(recording, folder / "out", ("late_fusion", "cca", "chance"))
-    write_report(out, recording)
+    write_report(out)
     with chromium() as browser, page(browser, (out / "report.html").as_uri(), offline=True) as found:
         yield found
 

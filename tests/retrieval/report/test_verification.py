@@ -18,7 +18,7 @@ def found():
 
 def build(found, out):
     """Return the builder and the blocks of the section."""
-    builder = Builder(Results({"methods": {"late_fusion": {}}, "verification": found}, {}), {}, out)
+    builder = Builder(Results({"methods": {"late_fusion": {}}, "verification": found}, {}), out)
     return builder, list(verification(builder))
 
 
