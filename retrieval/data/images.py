@@ -1,8 +1,7 @@
 """Decode picture files to float32 RGB in 0..1.
 
-Pillow reads and checks every file. Pillow keeps only the high byte of 16-bit colour, so OpenCV decodes such samples a
-second time, after Pillow has loaded the whole file. (OpenCV fills the missing part of a truncated JPEG with grey,
-without an error.) Colour profiles and gamma chunks are not applied.
+Pillow reads and checks every file. (OpenCV fills the missing part of a truncated JPEG with grey, without an error.) Of
+16-bit colour Pillow keeps the high byte; 16-bit grey keeps all bits. Colour profiles and gamma chunks are not applied.
 """
 
 import io
@@ -19,7 +18,7 @@ import numpy.typing as npt
 from PIL import Image, UnidentifiedImageError, features
 
 from _touch_retrieval.files import read_regular
-from retrieval.data.picture_structure import check_structure, png_chunks
+from retrieval.data.picture_structure import check_structure
 from retrieval.data.resize import RgbImage, Samples, to_unit
 from retrieval.errors import BadInput, ImageError
 
@@ -39,9 +38,8 @@ MAX_BYTES = 512 * 2**20
 _FORMATS = ("BMP", "JPEG", "PNG", "TIFF", "WEBP")
 _NO_IMAGE = "not a PNG, JPEG, BMP, TIFF, WebP, AVIF or HEIC picture, or its header is damaged or of an unsupported kind"
 _EIGHT_BIT_MODES = frozenset({"1", "L", "P", "RGB", "RGBX", "CMYK", "YCbCr", "LA", "PA", "RGBA", "RGBa"})
-_DEEP_MODES = frozenset({"I;16", "I;16B", "I;16L", "I;16N", "RGB", "RGBA"})
 _STRIP = 1 << 20  # pixels
-_ORIENTATION, _BITS, _PHOTOMETRIC, _PLANAR, _EXTRA_SAMPLES = 274, 258, 262, 284, 338
+_ORIENTATION, _BITS, _PHOTOMETRIC = 274, 258, 262
 
 
 class _SuppressedWarnings:
@@ -131,11 +129,8 @@ def decode(data: bytes, name: str | Path, min_side: int | None = None) -> Sample
         _apply_draft_mode(image, min_side)
         check_pixels(image.size, name)
         image.load()
-        orientation = _orientation(image)
-        # Byte 24 of a PNG file is its bit depth.
-        bits = data[24] if image.format == "PNG" else max(_tiff_tag(image, _BITS, (8,)))
-        samples = _deep_rgb(image, data, name) if bits > 8 else _eight_bit_rgb(image, name)
-        return _apply_orientation(samples, orientation)
+        samples = _deep_grey(image, name) if image.mode.startswith("I;16") else _eight_bit_rgb(image, name)
+        return _apply_orientation(samples, _orientation(image))
 
 
 def picture_size(data: bytes, name: str | Path) -> tuple[int, int]:
@@ -336,37 +331,20 @@ def encode_image(pixels: npt.NDArray[np.uint8], ending: str = ".png") -> bytes:
     return bytes(cv2.imencode(ending, np.ascontiguousarray(pixels[..., ::-1]))[1])
 
 
-def _deep_rgb(image: Image.Image, data: bytes, name: str | Path) -> RgbImage:
-    """Decode 16-bit samples with OpenCV, which returns blue first and neither inverts nor un-premultiplies."""
-    import cv2
-
-    layout = (_tiff_tag(image, _PHOTOMETRIC, (2,)), _tiff_tag(image, _PLANAR, (1,)))
-    bits = set(_tiff_tag(image, _BITS, (16,)))
-    if image.mode not in _DEEP_MODES or bits != {16} or layout not in (((1,), (1,)), ((2,), (1,))):
-        raise ImageError(name, f"this pixel type ({image.mode}, {max(bits)} bits) is not supported; save it as PNG")
-    if image.format == "PNG":  # OpenCV allocates the length that a chunk claims
-        kind, end = list(png_chunks(data))[-1]
-        if kind != b"IEND" or end > len(data):
-            raise ImageError(name, "damaged or truncated: a PNG chunk is longer than the file")
-    samples = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if samples is None or samples.dtype != np.uint16 or samples.shape[:2] != (image.height, image.width):
-        raise ImageError(name, "its 16-bit samples cannot be decoded; save it as 8-bit PNG")
-    samples = np.atleast_3d(samples)
-    rgb = np.repeat(samples, 3, axis=2) if samples.shape[2] < 3 else samples[..., 2::-1]
-    if image.mode == "RGBA":
-        premultiplied = _tiff_tag(image, _EXTRA_SAMPLES, (2,)) == (1,)
-        return _on_white(to_float(rgb), to_float(samples[..., 3:]), premultiplied)
-    if "transparency" in image.info:  # a PNG file may name one transparent colour
-        opaque = (rgb != np.asarray(image.info["transparency"])).any(axis=2, keepdims=True)
-        return _on_white(to_float(rgb), opaque.astype(np.float32))
-    return to_float(rgb)
+def _deep_grey(image: Image.Image, name: str | Path) -> RgbImage:
+    """Decode 16-bit grey samples, which Pillow's conversion would clip."""
+    if _tiff_tag(image, _BITS, (16,)) != (16,) or _tiff_tag(image, _PHOTOMETRIC, (1,)) != (1,):
+        raise ImageError(name, "samples of 9 to 15 bits, or inverted ones, are not supported; save it as PNG")
+    samples = np.asarray(image)[..., None]
+    rgb = to_float(samples.astype(np.uint16).repeat(3, axis=2))
+    if "transparency" in image.info:  # a PNG file may name one transparent level
+        return _on_white(rgb, (samples != image.info["transparency"]).astype(np.float32))
+    return rgb
 
 
-def _on_white(rgb: RgbImage, alpha: npt.NDArray[np.float32], premultiplied: bool = False) -> RgbImage:
+def _on_white(rgb: RgbImage, alpha: npt.NDArray[np.float32]) -> RgbImage:
     """Composite on white: `rgb` (H, W, 3), `alpha` (H, W, 1), all in 0..1."""
-    colour = rgb if premultiplied else rgb * alpha
-    white: RgbImage = np.minimum(colour + (1 - alpha), np.float32(1))
-    return white
+    return rgb * alpha + (1 - alpha)
 
 
 def _orientation(image: Image.Image) -> int:

@@ -16,7 +16,7 @@ from retrieval.data.check import appearance
 from retrieval.data.check.drift import check_drift
 from retrieval.data.check.near_copies import PictureSet, is_copy
 from retrieval.data.check.pictures import Finding, ImageRecords, findings_for, read_pictures, thumbnails
-from retrieval.data.check.split import check_neighbours, check_split
+from retrieval.data.check.split import check_split
 from retrieval.data.dataset import Attempt, Grasp, Split, load_all_attempts, require_accepted
 
 COMPARED_COPIES = "compared-copies"
@@ -77,7 +77,6 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
     findings += _near_copies(unnamed(used, besides=appearance.COLOUR_LAYOUT), records, accepted)
     if split:
         findings += check_split(accepted, split)
-        findings += check_neighbours([attempt.grasp for attempt in used], split, records)
     return sorted(findings, key=lambda finding: finding.severity == "note")
 
 

@@ -1,23 +1,12 @@
-"""Checks of a split: objects, sequences or neighbouring frames in two of its parts."""
+"""Checks of a split: objects or sequences in two of its parts."""
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
-
-import numpy as np
-from numpy.typing import NDArray
+from collections.abc import Iterable, Sequence
 
 from retrieval.console.output import abbreviate_list
-from retrieval.data.check.pictures import Finding, ImageRecords, thumbnails
+from retrieval.data.check.pictures import Finding
 from retrieval.data.dataset import Grasp, Split
 from retrieval.errors import DatasetError
-
-_MAX_QUERIES = 5000
-_BLOCK = 512
-_OWN_QUANTILE, _OTHER_QUANTILE = 0.75, 0.05
-"""Quantiles of the distance to the nearest touch of the same object, and of another object. Neighbouring frames can be
-recognised if the first quantile is below the second."""
-_MIN_FRACTION, _MIN_COUNT = 0.1, 3
-"""Smallest fraction and number of held-out grasps with such a neighbour in training that cause a warning."""
 
 
 def check_split(grasps: Sequence[Grasp], split: Split) -> Iterable[Finding]:
@@ -62,64 +51,3 @@ def require_fit(split: Split, grasps: Sequence[Grasp]) -> None:
             raise DatasetError(
                 f"pairs need at least 2 objects in the {part} part of the split; the recording has {count} of them"
             )
-
-
-def check_neighbours(grasps: Sequence[Grasp], split: Split, records: ImageRecords) -> Iterator[Finding]:
-    """Find held-out touches that have a training touch as near, by raw pixels, as touches of one object are.
-
-    Such touches are probably neighbouring frames of one video. (TVL draws its validation rows frame by frame from its
-    training videos; the authors of RCT noticed it.) This can be seen only where touches of two objects are rarely that
-    near.
-    """
-    train = split.select(grasps, "train")
-    if len(train) < 2:
-        return
-    own, other = _nearest(train, train, records)
-    own, other = own[np.isfinite(own)], other[np.isfinite(other)]
-    if not len(own) or not len(other) or np.quantile(own, _OWN_QUANTILE) >= np.quantile(other, _OTHER_QUANTILE):
-        return
-    limit = float(np.quantile(own, _OWN_QUANTILE))
-    for part in ("validation", "test"):
-        held_out = [grasp for grasp in split.select(grasps, part) if grasp.object_id not in split.train]
-        near = _nearest(held_out, train, records)[1] <= limit
-        if near.sum() >= _MIN_COUNT and near.mean() > _MIN_FRACTION:
-            yield Finding(
-                "warning",
-                "sequences-in-training",
-                f"{near.mean():.0%} of {len(near)} {part} touches have a training touch, of another object, that is as "
-                f"near by raw pixels as touches of one object are ({np.mean(other <= limit):.0%} of the training "
-                "touches have one): neighbouring frames may be on both sides of the split; give them one sequence_id "
-                "and split by it",
-            )
-
-
-def _nearest(
-    queries: Sequence[Grasp], train: Sequence[Grasp], records: ImageRecords
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the distances (q,) to the nearest training touch of the same object, and of another object.
-
-    At most `_MAX_QUERIES` queries, evenly spaced, are compared. A distance is the root mean square of grey levels, and
-    infinite where there is no such touch.
-    """
-    queries = queries[:: max(-(-len(queries) // _MAX_QUERIES), 1)]
-    known = _greys(train, records)
-    objects, names = (np.array([getattr(one, key) for one in train]) for key in ("object_id", "grasp_id"))
-    squares = np.square(known).sum(axis=1)
-    own, other = [np.zeros(0)], [np.zeros(0)]
-    for start in range(0, len(queries), _BLOCK):
-        block = queries[start : start + _BLOCK]
-        greys = _greys(block, records)
-        squared = np.square(greys).sum(axis=1)[:, None] - 2.0 * (greys @ known.T) + squares
-        distances = np.sqrt(np.maximum(squared, 0.0) / known.shape[1])
-        distances[np.array([one.grasp_id for one in block])[:, None] == names] = np.inf
-        same = np.array([one.object_id for one in block])[:, None] == objects
-        own.append(np.where(same, distances, np.inf).min(axis=1))
-        other.append(np.where(same, np.inf, distances).min(axis=1))
-    return np.concatenate(own), np.concatenate(other)
-
-
-def _greys(grasps: Sequence[Grasp], records: ImageRecords) -> NDArray[np.float64]:
-    """Return all fingers' thumbnails (n, 256 fingers), minus their means, so that a flickering lamp has no effect."""
-    greys = np.array([[one.grey for one in thumbnails(records, grasp.touches)] for grasp in grasps], np.float64)
-    greys -= greys.mean(axis=2, keepdims=True)
-    return greys.reshape(len(grasps), -1)

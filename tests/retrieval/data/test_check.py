@@ -13,7 +13,6 @@ from retrieval.data.check.recording import check_gel_layout, check_recording
 from retrieval.data.check.split import check_split
 from retrieval.data.dataset import Split, load_grasps, make_split
 from retrieval.errors import DatasetError
-from robot.recording.folder import RecordingWriter
 from tests import synthetic
 
 GELS = ("touch_a", "touch_b", "touch_a_before", "touch_b_before")
@@ -444,38 +443,3 @@ def test_objects_and_sequences_in_two_parts_are_errors_and_objects_in_none_are_w
     broken.change(numbers, lambda row: row.update(sequence_id="one take"))  # an earlier split separates the objects
     assert split_kinds(broken.folder, split) == {("error", "split-sequences")}
     assert split_kinds(broken.folder, good_split(broken.folder)) == set()
-
-
-def write_videos(folder, sequences, frames=6, mixed=True):
-    """Write frames of videos: one press each, which moves by a pixel a frame, with sensor noise.
-
-    With `mixed`, every second frame of a video belongs to another object, as in splits that ignore videos.
-    """
-    rng = np.random.default_rng(0)
-    with RecordingWriter(folder, {"source": "videos", "sensor": "drawn gel"}) as writer:
-        for sequence, drawn in enumerate(synthetic.make_objects(sequences)):
-            press = synthetic.draw_touch(drawn, 0, fingers="a")["a"]
-            for frame in range(frames):
-                noise = rng.normal(0, 2, press.shape)
-                touch = np.clip(np.roll(press, frame, axis=1) + noise, 0, 255).astype(np.uint8)
-                part = "odd" if mixed and frame % 2 else "even"
-                photo = synthetic.draw_photo(drawn, frame, px=96)
-                writer.append(f"{sequence:02d}-{frame}", f"{sequence:02d}-{part}", {"photo": photo, "touch_a": touch})
-    return folder
-
-
-def test_neighbouring_frames_on_both_sides_of_a_split_are_a_warning_with_both_fractions(tmp_path):
-    folder = write_videos(tmp_path / "r", 10)
-    objects = sorted({grasp.object_id for grasp in load_grasps(folder)})
-    even, odd = ([name for name in objects if name.endswith(part)] for part in ("even", "odd"))
-    split = Split(0, tuple(even), (), tuple(odd))
-    (finding,) = [one for one in remarks(folder, split) if one.kind == "sequences-in-training"]
-    assert finding.severity == "warning"
-    assert int(finding.message.split("%")[0]) > 90
-    assert "(0% of the training touches have one)" in finding.message
-
-
-def test_a_split_that_keeps_videos_together_has_no_such_finding(tmp_path):
-    folder = write_videos(tmp_path / "r", 10, mixed=False)
-    split = make_split(load_grasps(folder), validation=0.2, test=0.3, seed=0)
-    assert "sequences-in-training" not in {finding.kind for finding in remarks(folder, split)}
