@@ -34,7 +34,7 @@ from retrieval.console.output import say
 from retrieval.console.progress import Bar
 from retrieval.data.images import read_rgb, to_float
 from retrieval.data.resize import resize
-from retrieval.model.checkpoint import as_float16, write_tensors
+from retrieval.model.checkpoint import write_tensors
 from retrieval.model.encode import autocast, default_device
 from retrieval.model.towers import build_tower
 from retrieval.model.towers.tower import Tower
@@ -285,7 +285,7 @@ class GelTowerTraining(Dataset[Batch]):
             )
         if self.step < steps:
             return False
-        weights = as_float16(self.tower.state_dict(), out)
+        weights = self.tower.half().state_dict()
         write_tensors(out, weights, {"tower": "mobilenet_v2", "tower_output": "stages", **identity})
         write_atomically(out.with_suffix(".md"), self.card(steps).encode())
         state_path(out).unlink(missing_ok=True)

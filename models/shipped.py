@@ -313,7 +313,8 @@ def store(made: Checkpoint, out: Path) -> None:
     """Write a checkpoint as float16, without the paths of its first weights on this machine."""
     training = dataclasses.replace(made.config.training, init="imagenet", init_photo="", init_touch="")
     made = dataclasses.replace(made, config=dataclasses.replace(made.config, training=training))
-    store_checkpoint(made, out, float16=True)
+    made.matcher.half()  # halves the file; loading converts the weights to float32
+    store_checkpoint(made, out)
 
 
 def score_shipped(arguments: argparse.Namespace) -> int:

@@ -1,13 +1,12 @@
 """`retrieve export`: write a checkpoint's touch encoder as ONNX."""
 
-import dataclasses
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from retrieval.commands.options import DEFAULT_MODEL, Json
-from retrieval.console.output import print_json, say
+from retrieval.commands.options import DEFAULT_MODEL
+from retrieval.console.output import say
 
 
 def export(
@@ -16,7 +15,6 @@ def export(
     out: Annotated[
         Path | None, typer.Option(help="file to write (default: next to the checkpoint, with the suffix .onnx)")
     ] = None,
-    json: Json = False,
 ) -> None:
     """Export a checkpoint's touch encoder to ONNX. With it, `query` runs without PyTorch."""
     from retrieval.model.checkpoint import load_checkpoint
@@ -25,7 +23,4 @@ def export(
 
     path, reason = defaults.find_model(model)
     say(f"model: {path} ({reason})")
-    result = write_export(load_checkpoint(path), out)
-    say(str(result))
-    if json:
-        print_json(dataclasses.asdict(result))
+    say(f"written: {write_export(load_checkpoint(path), out)}")

@@ -249,5 +249,7 @@ def top1_confidences(logits: NDArray[np.float64], posterior: Posterior) -> NDArr
         (Q, 2): probability; 1 if right, 0 if wrong, 1/n for n tied candidates that include the true one.
     """
     tied = logits == logits.max(1, keepdims=True)
-    confidences = [posterior.probabilities(row, none_prior=0).objects.max() for row in logits]
+    confidences = [
+        posterior.probabilities_given(row, posterior.mass(row), none_prior=0).objects.max() for row in logits
+    ]
     return np.column_stack([confidences, tied[:, 0] / tied.sum(1)])

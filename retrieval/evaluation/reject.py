@@ -175,8 +175,9 @@ def _risk_coverage(pair: Galleries, true: Bools, weights: Floats) -> list[list[f
     """
     first = np.concatenate([gallery == gallery.max(1, keepdims=True) for gallery in pair])
     wrong = 1 - (first & np.tile(true, (2, 1))).sum(1) / first.sum(1)
+    finite = [row[np.isfinite(row)] for row in np.concatenate(pair)]
     confidences = np.array(
-        [_IDENTITY_POSTERIOR.probabilities(row[np.isfinite(row)]).objects.max() for row in np.concatenate(pair)]
+        [_IDENTITY_POSTERIOR.probabilities_given(row, _IDENTITY_POSTERIOR.mass(row)).objects.max() for row in finite]
     )
     fraction = np.tile(weights, 2) / 2
     levels, place = np.unique(-confidences, return_inverse=True)

@@ -104,7 +104,6 @@ def save_checkpoint(
     *,
     split: Split | None,
     provenance: Mapping[str, Any],
-    float16: bool = False,
     **calibrations: Any,
 ) -> None:
     """Write `path` and its model card, as `store_checkpoint`.
@@ -115,27 +114,25 @@ def save_checkpoint(
         config: Its settings.
         split: Its training, validation and test objects.
         provenance: Source, step, seed, data digest, licences of the data and metrics of the training.
-        float16: As for `store_checkpoint`.
         **calibrations: Further fields of `Checkpoint`, such as `posterior`; None for those left out.
 
     Raises:
-        CheckpointError: The file cannot be written, or a weight exceeds float16.
+        CheckpointError: The file cannot be written.
     """
     calibrations = {"gel_check": None, "verification": None, **calibrations}
     made = Checkpoint(path, "", config, dict(provenance), matcher=matcher, split=split, **calibrations)
-    store_checkpoint(made, path, float16=float16)
+    store_checkpoint(made, path)
 
 
-def store_checkpoint(checkpoint: Checkpoint, path: Path, *, float16: bool = False) -> None:
+def store_checkpoint(checkpoint: Checkpoint, path: Path) -> None:
     """Write a checkpoint and its model card (the same name with .md) atomically.
 
     Args:
         checkpoint: The checkpoint; the calibrations without late interaction are stored only if the model has cells.
         path: A name that ends in .safetensors.
-        float16: Store weights as float16, which halves the file. Loading converts them to float32.
 
     Raises:
-        CheckpointError: The file cannot be written, or a weight exceeds float16.
+        CheckpointError: The file cannot be written.
     """
     require_writable(path)
     parts = ["split", "posterior", "gel_check", "verification", "references"]
@@ -146,20 +143,10 @@ def store_checkpoint(checkpoint: Checkpoint, path: Path, *, float16: bool = Fals
         part = getattr(checkpoint, name)
         header[name] = part.to_dict() if part else None
     state = checkpoint.matcher.state_dict()
-    if float16:
-        state = as_float16(state, path)
     if checkpoint.queries is not None:
         state[_QUERIES] = torch.from_numpy(checkpoint.queries)
     write_tensors(path, state, header)
     write_atomically(sibling_file(path, ".md"), _model_card(path.name, header).encode())
-
-
-def as_float16(state: Mapping[str, Tensor], path: Path) -> dict[str, Tensor]:
-    """Return weights for the file `path` as float16. Raises CheckpointError if one exceeds its range."""
-    half = {name: tensor.half() if tensor.is_floating_point() else tensor for name, tensor in state.items()}
-    if over := [name for name, tensor in half.items() if not bool(torch.isfinite(tensor).all())]:
-        raise CheckpointError(f"{path}: {over[0]} exceeds 65504, the limit of float16; store it as float32")
-    return half
 
 
 def require_writable(path: Path) -> None:

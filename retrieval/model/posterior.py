@@ -145,28 +145,13 @@ class Posterior:
         total = np.bincount(owner, np.exp(scaled - top[owner]), len(counts))
         return np.asarray((top + np.log(total / counts)) / weight)  # if all photos have one logit: log 1 = 0, exactly
 
-    def probabilities(
-        self,
-        logits: ArrayLike,
-        grasps: int = 1,
-        *,
-        none_prior: float = NONE_PRIOR,
-        unscored: int = 0,
-        sample: ArrayLike = (),
-    ) -> PosteriorProbabilities:
-        """Return the posterior over scored objects, unscored objects, and none.
+    def mass(self, logits: ArrayLike, grasps: int = 1, *, unscored: int = 0, sample: ArrayLike = ()) -> EvidenceMass:
+        """Return the evidence mass of objects.
 
         logits (J,) are those of the scored objects, J >= 1 (`object_logits`); `unscored` counts the other objects.
         sample (S,) are the logits of a random sample of these, required if there are any. Raises BadInput, and
         NumericalError for a logit that is not finite.
         """
-        require_prior(none_prior)
-        return self.probabilities_given(
-            logits, self.mass(logits, grasps, unscored=unscored, sample=sample), grasps, none_prior
-        )
-
-    def mass(self, logits: ArrayLike, grasps: int = 1, *, unscored: int = 0, sample: ArrayLike = ()) -> EvidenceMass:
-        """Return the evidence mass of objects; the arguments are those of `probabilities`."""
         known, drawn = _finite(logits, "every logit"), _finite(sample, "every logit of the sample")
         if not len(known) or unscored < 0 or (unscored and not len(drawn)):
             raise BadInput(

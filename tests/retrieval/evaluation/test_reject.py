@@ -112,7 +112,7 @@ def test_the_decision_is_that_of_a_query_at_even_prior():
     for gallery in galleries(ratios, true):
         for row, log_odds in zip(gallery, statistic(gallery), strict=True):
             logits = (row[np.isfinite(row)] - posterior.offset) / posterior.slope
-            none = posterior.probabilities(logits, none_prior=0.5).none
+            none = posterior.probabilities_given(logits, posterior.mass(logits)).none
             assert log_odds == pytest.approx(np.log((1 - none) / none))
 
 

@@ -62,7 +62,8 @@ def _many_grasps() -> HardCase:
     """Eight grasps and two objects, the second slightly less unlikely: its odds are e^0.8 to 1."""
     logits = np.array([[-100.0] * 8, [-99.9] * 8])
     naive = expit(logits.astype(np.float32)).prod(axis=1)
-    ours = _ADDING.probabilities(logits.sum(axis=1), grasps=8, none_prior=0).objects
+    summed = logits.sum(axis=1)
+    ours = _ADDING.probabilities_given(summed, _ADDING.mass(summed, 8), 8, none_prior=0).objects
     text = f"probabilities {ours[0]:.3f} and {ours[1]:.3f}"
     products = f"products {naive[0]:g} and {naive[1]:g}"
     must = float(expit(0.8))
@@ -146,7 +147,10 @@ def _choices_without_errors() -> HardCase:
     """Thirty choices among five, all correct: the likelihood grows with the factor until the arithmetic ends."""
     scores = np.tile([2.0, 1.0, 0.0, -1.0, -2.0], (30, 1))
     fitted = fit_posterior(scored_choices(scores))
-    probabilities = [softmax(naive_slope(scores) * scores[0]), fitted.probabilities(scores[0]).objects]
+    probabilities = [
+        softmax(naive_slope(scores) * scores[0]),
+        fitted.probabilities_given(scores[0], fitted.mass(scores[0])).objects,
+    ]
     wrong = [float(1 - each[0]) for each in probabilities]
     naive, ours = (f"wrong with probability {each:.2g}" for each in wrong)
     expected = "wrong once in 100, or more often"

@@ -87,28 +87,6 @@ def test_every_tensor_and_every_header_entry_comes_back(tmp_path):
     assert loaded.path == tmp_path / "deep" / "er" / "m.safetensors"
 
 
-def test_float16_halves_the_file_and_gives_nearly_the_same_logits(tmp_path):
-    matcher = save(tmp_path / "whole.safetensors").eval()
-    save(tmp_path / "half.safetensors", float16=True)
-    sizes = [(tmp_path / f"{name}.safetensors").stat().st_size for name in ("whole", "half")]
-    assert sizes[1] < 0.55 * sizes[0]
-    again = load_checkpoint(tmp_path / "half.safetensors").matcher
-    assert {tensor.dtype for tensor in again.state_dict().values()} <= {torch.float32, torch.int64}
-    touch, photo = torch.rand(3, 2, 3, 32, 32), torch.rand(3, 3, 48, 48)
-    with torch.inference_mode():
-        torch.testing.assert_close(again(touch, photo), matcher(touch, photo), atol=5e-3, rtol=5e-3)
-
-
-def test_a_weight_that_exceeds_float16_is_refused_before_a_file_is_written(tmp_path):
-    matcher = Matcher(TINY.matcher)
-    with torch.no_grad():
-        next(matcher.parameters()).fill_(1e6)
-    contents = {"split": SPLIT, "posterior": POSTERIOR, "provenance": PROVENANCE}
-    with pytest.raises(CheckpointError, match="float16"):
-        save_checkpoint(tmp_path / "m.safetensors", matcher, TINY, float16=True, **contents)
-    assert not (tmp_path / "m.safetensors").exists()
-
-
 def test_the_gel_check_comes_back_with_its_layer_and_is_readable_without_the_weights(tmp_path):
     path = tmp_path / "m.safetensors"
     layer = save(path, gel_check=GEL_CHECK).gel_head.classifier

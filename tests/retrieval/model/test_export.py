@@ -168,8 +168,7 @@ def test_an_encoder_that_gives_a_nan_is_refused_with_the_touch_named(part, model
 
 def test_a_checkpoint_without_an_export_gets_one_in_the_cache_once(model_copy, index, touch):
     checkpoint = load_checkpoint(model_copy)
-    report = exporting.export_to_cache(checkpoint)
-    assert Path(report.path) == onnx_encoder.cached_export_path(checkpoint.digest)
+    assert exporting.export_to_cache(checkpoint) == onnx_encoder.cached_export_path(checkpoint.digest)
     assert Searcher.open(index).query([touch]).index["encoder"] == "onnx"
     assert exporting.export_to_cache(checkpoint) is None
     assert not model_copy.with_suffix(".onnx").exists()
@@ -211,11 +210,9 @@ def test_without_a_cache_a_build_continues(trouble, model_copy, monkeypatch, tmp
 # The command -----------------------------------------------------------------------------------------------------
 
 
-def test_the_command_writes_the_export_next_to_the_checkpoint_and_prints_the_differences(model_copy, capsys):
-    assert main(["export", str(model_copy), "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
-    assert document["path"] == str(model_copy.with_suffix(".onnx"))
-    assert document["partial_difference"] < 1e-4
+def test_the_command_writes_the_export_next_to_the_checkpoint(model_copy, capsys):
+    assert main(["export", str(model_copy)]) == 0
+    assert f"written: {model_copy.with_suffix('.onnx')}" in capsys.readouterr().err
     assert model_copy.with_suffix(".onnx").is_file()
 
 
@@ -227,7 +224,7 @@ def test_nothing_is_written_if_the_numbers_differ(model_copy, monkeypatch):
 
 
 def test_the_export_is_written_to_the_requested_file(model_copy, tmp_path):
-    assert export(load_checkpoint(model_copy), tmp_path / "other.onnx").path == str(tmp_path / "other.onnx")
+    assert export(load_checkpoint(model_copy), tmp_path / "other.onnx") == tmp_path / "other.onnx"
     assert not model_copy.with_suffix(".onnx").exists()
     with pytest.raises(BadInput, match=r"must be named \*\.onnx"):
         export(load_checkpoint(model_copy), tmp_path / "other.bin")

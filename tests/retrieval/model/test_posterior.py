@@ -8,24 +8,38 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from retrieval.errors import BadInput, NumericalError
-from retrieval.model.posterior import MAX_GRASPS, SLOPE_BOUNDS, EvidenceMass, Posterior, ScoredTouches, fit_posterior
+from retrieval.model.posterior import (
+    MAX_GRASPS,
+    SLOPE_BOUNDS,
+    EvidenceMass,
+    Posterior,
+    ScoredTouches,
+    fit_posterior,
+    require_prior,
+)
 
 ADDING = Posterior(slope=1.0, offset=0.0, dependence=0.0)
 
 
+def probabilities(posterior, logits, grasps=1, *, none_prior=0.5, unscored=0, sample=()):
+    """Return the posterior over objects with these logits, unscored objects, and none."""
+    mass = posterior.mass(logits, grasps, unscored=unscored, sample=sample)
+    return posterior.probabilities_given(logits, mass, grasps, none_prior)
+
+
 def test_probabilities_equal_those_calculated_by_hand():
     # Weights: none 1/2; objects 1/4 * 3 and 1/4; together 3/2.
-    found = ADDING.probabilities([math.log(3), 0.0], none_prior=0.5)
+    found = probabilities(ADDING, [math.log(3), 0.0], none_prior=0.5)
     assert found.none == pytest.approx(1 / 3)
     assert found.objects == pytest.approx([1 / 2, 1 / 6])
     # A prior of 1/5: 1/5, 4/10 * 3 and 4/10; together 9/5.
-    found = ADDING.probabilities([math.log(3), 0.0], none_prior=0.2)
+    found = probabilities(ADDING, [math.log(3), 0.0], none_prior=0.2)
     assert (found.none, *found.objects) == pytest.approx((1 / 9, 6 / 9, 2 / 9))
 
 
 def test_unscored_objects_have_the_probability_of_the_sample():
     # Four objects, two of them scored: 1/8 * 4 and 1/8; the two others like the sample, whose ratios 1 and 3 average 2.
-    found = ADDING.probabilities([math.log(4), 0.0], none_prior=0.5, unscored=2, sample=[0.0, math.log(3)])
+    found = probabilities(ADDING, [math.log(4), 0.0], none_prior=0.5, unscored=2, sample=[0.0, math.log(3)])
     total = 4 / 8 + 4 / 8 + 1 / 8 + 2 * 2 / 8
     assert found.none == pytest.approx(0.5 / total)
     assert found.unscored == pytest.approx(0.5 / total)
@@ -40,7 +54,7 @@ def test_unscored_objects_have_the_probability_of_the_sample():
 )
 def test_probabilities_add_up_to_one_and_have_the_order_of_the_logits(logits, prior, grasps, sample):
     posterior = Posterior(slope=0.7, offset=-0.3, dependence=0.6)
-    found = posterior.probabilities(logits, grasps, none_prior=prior, unscored=7 if sample else 0, sample=sample)
+    found = probabilities(posterior, logits, grasps, none_prior=prior, unscored=7 if sample else 0, sample=sample)
     assert found.none + found.unscored + found.objects.sum() == pytest.approx(1)
     order = np.argsort(logits)
     assert (np.diff(found.objects[order]) >= 0).all()
@@ -51,21 +65,21 @@ def test_large_logits_give_probabilities_where_the_naive_formula_gives_nan():
     with np.errstate(over="ignore", invalid="ignore"):
         naive = np.exp(logits) / (np.exp(logits).sum() + 1)
     assert np.isnan(naive).all()
-    found = ADDING.probabilities(logits, none_prior=0.5)
+    found = probabilities(ADDING, logits, none_prior=0.5)
     assert found.objects == pytest.approx([1 / (1 + math.exp(-1)), math.exp(-1) / (1 + math.exp(-1))])
-    assert ADDING.probabilities(-logits, none_prior=0.5).none == 1.0
+    assert probabilities(ADDING, -logits, none_prior=0.5).none == 1.0
 
 
 def test_the_probability_if_present_equals_that_by_hand_for_any_prior_and_offset():
     # Weights 3 and 1, together 4.
     for offset, prior in ((0.0, 0.5), (-3.0, 0.9), (2.0, 0.0)):
-        found = Posterior(1.0, offset, 0.0).probabilities([math.log(3), 0.0], none_prior=prior)
+        found = probabilities(Posterior(1.0, offset, 0.0), [math.log(3), 0.0], none_prior=prior)
         assert found.objects_if_present == pytest.approx([3 / 4, 1 / 4])
     # Four objects, two of them scored: weights 4 and 1; the two others weigh 2 each, the mean of the sample.
-    found = ADDING.probabilities([math.log(4), 0.0], unscored=2, sample=[0.0, math.log(3)])
+    found = probabilities(ADDING, [math.log(4), 0.0], unscored=2, sample=[0.0, math.log(3)])
     assert found.objects_if_present == pytest.approx([4 / 9, 1 / 9])
     # Two grasps: w = 1 / 1.5, so logits of 1.5 log 3 and 0 weigh 3 and 1.
-    found = Posterior(1.0, 0.0, 0.5).probabilities([1.5 * math.log(3), 0.0], 2)
+    found = probabilities(Posterior(1.0, 0.0, 0.5), [1.5 * math.log(3), 0.0], 2)
     assert found.objects_if_present == pytest.approx([3 / 4, 1 / 4])
 
 
@@ -77,13 +91,13 @@ def test_merged_parts_of_a_catalogue_give_the_probability_if_present_of_the_whol
 
 
 def test_where_none_rounds_to_one_the_probability_if_present_is_exact_and_the_quotient_is_nan():
-    found = ADDING.probabilities([-1000.0, -1001.0])
+    found = probabilities(ADDING, [-1000.0, -1001.0])
     assert found.none == 1.0
     with np.errstate(invalid="ignore"):
         assert np.isnan(found.objects / (1 - found.none)).all()
     assert found.objects_if_present == pytest.approx([1 / (1 + math.exp(-1)), 1 / (1 + math.e)])
     # Before that point the quotient has lost its digits: 1 - P(none) is a multiple of 1e-16.
-    found = ADDING.probabilities([-32.0, -33.0])
+    found = probabilities(ADDING, [-32.0, -33.0])
     exact = 1 / (1 + math.exp(-1))
     assert found.objects[0] / (1 - found.none) != pytest.approx(exact, rel=1e-3)
     assert found.objects_if_present[0] == pytest.approx(exact)
@@ -117,7 +131,7 @@ def test_after_the_further_grasps_and_no_fewer_the_best_object_is_more_likely_th
     """The further grasps resemble the previous ones."""
     posterior = Posterior(1.0, offset, dependence)
     totals = range(grasps, MAX_GRASPS + 1)
-    answers = [posterior.probabilities([logit * n / grasps, -1e6, -1e6], n, none_prior=prior) for n in totals]
+    answers = [probabilities(posterior, [logit * n / grasps, -1e6, -1e6], n, none_prior=prior) for n in totals]
     gaps = [answer.objects[0] - answer.none for answer in answers]
     assume(gaps[0] <= 0 and min(map(abs, gaps)) > 1e-9)  # otherwise rounding decides
     matches = [more for more, gap in enumerate(gaps) if gap > 0]
@@ -178,7 +192,7 @@ def test_logits_without_errors_have_a_finite_slope():
     scored = ScoredTouches(np.where(np.eye(20, dtype=bool), 5.0, -5.0), owner, owner, np.zeros((20, 20), dtype=bool))
     found = fit_posterior(scored)
     assert SLOPE_BOUNDS[0] < found.slope < 3
-    assert 0.5 < found.probabilities([5.0] + [-5.0] * 18).objects[0] < 1
+    assert 0.5 < probabilities(found, [5.0] + [-5.0] * 18).objects[0] < 1
 
 
 def test_logits_without_information_leave_the_prior():
@@ -186,7 +200,7 @@ def test_logits_without_information_leave_the_prior():
     for noise in (0.0, 1.0):
         scores = noise * np.random.default_rng(0).normal(size=(20, 20))
         found = fit_posterior(ScoredTouches(scores, owner, owner, np.zeros((20, 20), dtype=bool)))
-        assert found.probabilities(scores[0][:10]).none == pytest.approx(0.5, abs=0.12)
+        assert probabilities(found, scores[0][:10]).none == pytest.approx(0.5, abs=0.12)
 
 
 def test_a_photo_of_the_touchs_own_grasp_never_counts():
@@ -202,13 +216,13 @@ def test_a_photo_of_the_touchs_own_grasp_never_counts():
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_a_logit_that_is_not_finite_is_refused(bad):
     with pytest.raises(NumericalError, match="every logit must be finite"):
-        ADDING.probabilities([0.0, bad])
+        probabilities(ADDING, [0.0, bad])
 
 
 @pytest.mark.parametrize("prior", [-0.1, 1.0, math.nan])
 def test_an_invalid_prior_is_refused(prior):
     with pytest.raises(BadInput, match="must be at least 0 and less than 1"):
-        ADDING.probabilities([0.0], none_prior=prior)
+        require_prior(prior)
 
 
 def test_two_objects_are_too_few_to_fit_on():
