@@ -212,7 +212,9 @@ class IndexStore:
         return sorted(int(match[1]) for match in found if match)
 
     def _sweep(self) -> None:
-        """Delete the unfinished folders of killed writers."""
+        """Delete the unfinished files and folders of killed writers."""
+        for path in self.path.glob(".CURRENT.*.tmp"):
+            path.unlink()
         for path in [path for path in self.path.iterdir() if UNFINISHED_FOLDER.fullmatch(path.name)]:
             if path.is_dir() and not path.is_symlink():
                 files.remove_folder(path)

@@ -37,23 +37,6 @@ def an_index(folder):
     return folder
 
 
-@pytest.fixture(scope="module")
-def of_a_fixture():
-    return defaults._state_file()
-
-
-def test_tests_do_not_change_the_users_state(of_a_fixture, monkeypatch):
-    """Otherwise a model that a test trained would become the user's default."""
-    of_this_test = defaults._state_file()
-    monkeypatch.delenv("XDG_STATE_HOME")
-    assert len({AT_IMPORT, of_a_fixture, of_this_test, defaults._state_file()}) == 4
-
-
-def test_an_explicit_choice_is_used_even_if_it_is_missing():
-    assert defaults.find_model("none.safetensors") == (Path("none.safetensors"), "given")
-    assert defaults.find_index("none") == (Path("none"), "given")
-
-
 def test_a_file_in_place_of_an_index_raises(tmp_path):
     (tmp_path / "model.safetensors").touch()
     with pytest.raises(BadInput, match=r"model\.safetensors is a file; an index is a folder"):
@@ -145,21 +128,6 @@ def test_a_damaged_index_does_not_determine_the_model(tmp_path, monkeypatch):
     assert defaults.find_model(None)[1].startswith("shipped")
 
 
-def test_a_limited_number_of_folders_is_remembered(tmp_path, monkeypatch):
-    monkeypatch.setattr(defaults, "MAX_FOLDERS", 2)
-    for name in "abac":
-        (tmp_path / name).mkdir(exist_ok=True)
-        monkeypatch.chdir(tmp_path / name)
-        defaults.remember("model", tmp_path / name / "m.safetensors")
-    assert [Path(folder).name for folder in json.loads(state_file().read_text())] == ["a", "c"]
-
-
-@pytest.mark.usefixtures("nothing_shipped")
-def test_the_error_without_any_model_names_the_command():
-    with pytest.raises(CheckpointError, match=r"make one with `retrieve train`, or name it with --model"):
-        defaults.find_model(None)
-
-
 def test_an_index_in_this_folder_precedes_the_last_one(tmp_path):
     (tmp_path / "index").mkdir()
     (tmp_path / "other").mkdir()
@@ -210,15 +178,3 @@ def test_commands_work_without_a_writable_state_file(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "home", lambda: tmp_path / "home")
     defaults.remember("model", tmp_path / "m.safetensors")
     assert (tmp_path / "home" / ".local" / "state" / "touch-retrieval" / "last.json").is_file()
-
-
-def test_a_crash_while_writing_leaves_the_old_state_file(tmp_path, monkeypatch):
-    defaults.remember("model", tmp_path / "old.safetensors")
-    before = state_file().read_bytes()
-
-    def refuse(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Path, "replace", refuse)
-    defaults.remember("model", tmp_path / "new.safetensors")
-    assert state_file().read_bytes() == before

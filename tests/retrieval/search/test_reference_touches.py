@@ -100,14 +100,6 @@ def test_logits_of_objects_without_references_do_not_change(
     assert [after[name] for name in NAMES[4:]] == pytest.approx([before[name] for name in NAMES[4:]], abs=1e-5)
 
 
-def test_all_probabilities_add_up_to_one(catalogue_with_touches, calibrated_model, tmp_path, touches):
-    result = query_new_index(
-        catalogue_with_touches, calibrated_model, tmp_path / "index", [touches[NAMES[0]][2], touches[NAMES[0]][1]]
-    )
-    whole = result.none_probability + sum(match.probability for match in result.results)
-    assert whole + result.posterior["unscored_probability"] == pytest.approx(1.0)
-
-
 def test_photos_of_the_nearest_reference_are_always_scored(
     catalogue_with_touches, calibrated_model, tmp_path, touches, monkeypatch
 ):

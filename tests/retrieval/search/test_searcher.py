@@ -52,22 +52,6 @@ def test_one_grasp_needs_no_list_of_grasps(searcher, grasps):
     assert ranking(searcher.query(grasps[0][0])) == ranking(searcher.query(grasps[0][:1]))
 
 
-def test_a_result_names_arrays_by_their_position_and_photos_by_absolute_paths(searcher, grasps, catalogue):
-    answer = searcher.query([array(path) for path in grasps[0][0]])
-    assert answer.touches == [
-        ["grasp 1, finger a (array 120 x 160 x 3 uint8)", "grasp 1, finger b (array 120 x 160 x 3 uint8)"]
-    ]
-    assert answer.top is answer.results[0]
-    assert answer.top.photo_path == catalogue.absolute() / answer.top.photo
-    assert answer.top.photo_path.is_file()
-    assert "photo_path" not in answer.to_dict()["results"][0]
-
-
-def test_one_pillow_image_can_serve_both_fingers(searcher, touch):
-    image = Image.open(touch[0])
-    assert ranking(searcher.query([image, image])) == ranking(searcher.query([touch[0], touch[0]]))
-
-
 # Several objects -----------------------------------------------------------------------------------------------------
 
 
@@ -95,10 +79,6 @@ def test_the_grasps_of_all_objects_are_encoded_in_batches(searcher, grasps, monk
     monkeypatch.setattr(searcher.encoder, "encode", counted)
     assert len(searcher.query_many([grasps[0][:2]] * 20, top=1)) == 20
     assert sizes == [32, 8]
-
-
-def test_no_object_gives_no_result(searcher):
-    assert searcher.query_many([]) == []
 
 
 def test_the_bad_one_of_several_objects_is_reported_before_reading(searcher, grasps):
