@@ -5,7 +5,6 @@ exits with `exit_code`; any other error is a bug.
 
     RetrievalError             the job ran and failed (exit code 1)
     +-- NumericalError         a value is NaN or infinite
-    +-- TooManyUnreadable      more photos are unreadable than the user allows
     +-- IncompleteSearch       a shard did not answer, so not all of the catalogue was searched
     +-- JobInterrupted         the user stopped the job; results so far are stored
     +-- BadInput               wrong use or bad input (exit code 2)
@@ -36,10 +35,6 @@ class RetrievalError(Exception):
 
 class NumericalError(RetrievalError):
     """A value is NaN or infinite."""
-
-
-class TooManyUnreadable(RetrievalError):
-    """More photos of a catalogue are unreadable than the user allows; the index is unchanged."""
 
 
 class IncompleteSearch(RetrievalError):

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from retrieval.commands.options import COUNT, FRACTION, Json, Model, announce_resume
+from retrieval.commands.options import COUNT, Json, Model, announce_resume
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput, RetrievalError
 
@@ -59,14 +59,6 @@ def build_index(
             help="number of shards (index folders) of the catalogue (default: as in OUT, else none)",
         ),
     ] = None,
-    max_unreadable: Annotated[
-        float | None,
-        typer.Option(
-            metavar="FRACTION",
-            parser=FRACTION,
-            help="with shards: fraction of photos that may be unreadable (default: 0.05)",
-        ),
-    ] = None,
     cluster: Annotated[
         bool,
         typer.Option(
@@ -76,6 +68,7 @@ def build_index(
     json: Json = False,
 ) -> None:
     """Make a folder of photos searchable."""
+    from indexes.store.sharded import is_sharded, read_sharded_manifest
     from retrieval.data.catalogue import require_separate_folders
     from retrieval.model.checkpoint import load_checkpoint
     from retrieval.model.export import export_to_cache
@@ -85,7 +78,10 @@ def build_index(
 
     require_separate_folders(catalogue, out)
     sheet = _preview_path(catalogue, out) if preview else None
-    shards = _shard_count(shards, out, has_shard_options=max_unreadable is not None or cluster)
+    if shards is None and is_sharded(out):
+        shards = read_sharded_manifest(out).of
+    if shards is None and cluster:
+        raise BadInput("--cluster needs shards; give --shards too")
     path, reason = defaults.find_model(model, out)
     say(f"model: {path} ({reason})")
     checkpoint = load_checkpoint(path)
@@ -99,10 +95,7 @@ def build_index(
         if shards is None:
             report = build.build_index(catalogue, checkpoint, out, **options)
         else:
-            allowed = build_sharded.MAX_UNREADABLE if max_unreadable is None else max_unreadable
-            report = build_sharded.build_sharded(
-                catalogue, checkpoint, out, shards, max_unreadable=allowed, run=run, **options
-            )
+            report = build_sharded.build_sharded(catalogue, checkpoint, out, shards, run=run, **options)
     defaults.remember("index", out)
     if defaults.is_shipped(path) and (exported := export_to_cache(checkpoint)):
         say(f"exported once, for queries without PyTorch: {exported}")
@@ -130,26 +123,6 @@ def _preview_path(catalogue: Path, out: Path) -> Path:
             f"{sheet} would become a photo of the catalogue {catalogue}; choose an --out outside it for --preview"
         )
     return sheet
-
-
-def _shard_count(requested: int | None, out: Path, *, has_shard_options: bool) -> int | None:
-    """Return the number of shards to build: the requested one, else that of `out`; None for one index folder.
-
-    Args:
-        requested: The value of `--shards`.
-        out: Index folder.
-        has_shard_options: Whether options were given that apply to shards only.
-
-    Raises:
-        BadInput: Options that apply to shards only were given without shards.
-    """
-    from indexes.store.sharded import is_sharded, read_sharded_manifest
-
-    if requested is None and is_sharded(out):
-        return read_sharded_manifest(out).of
-    if requested is None and has_shard_options:
-        raise BadInput("--max-unreadable and --cluster need shards; give --shards too")
-    return requested
 
 
 def _write_views(sheet: Path, catalogue: Path, index: Path, report: "BuildReport", checkpoint: "Checkpoint") -> None:

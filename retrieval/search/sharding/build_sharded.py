@@ -36,7 +36,7 @@ from retrieval.data.catalogue import Catalogue, CataloguePhoto, PhotoTable, list
 from retrieval.data.catalogue_touches import CatalogueTouch
 from retrieval.data.folder_walk import SkippedPhoto
 from retrieval.data.naming import Naming, count_summary, naming_warnings
-from retrieval.errors import BadInput, NoReadablePhoto, TooManyUnreadable
+from retrieval.errors import BadInput, NoReadablePhoto
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.checkpoint_info import fingerprint
 from retrieval.model.reference_calibration import REFERENCE_CALIBRATION, REFERENCE_ROWS
@@ -46,8 +46,6 @@ from retrieval.search.build.build_report import BuildReport
 from retrieval.search.build.codes import no_photo
 from retrieval.version import __version__
 
-MAX_UNREADABLE = 0.05
-"""Fraction of a catalogue's photos that may be unreadable, by default."""
 _KEEP_ALL = 10**6
 ADDITIVE_FIELDS = ("photos", "embedded", "reused", "unread", "seconds")
 """Fields of a report that add up over the shards."""
@@ -104,7 +102,6 @@ def build_sharded(
     objects_from: str | None = None,
     kind: str | type[VectorIndex] = "flat",
     cells: bool | None = None,
-    max_unreadable: float = MAX_UNREADABLE,
     quiet: bool = False,
     run: ShardRunner | None = None,
 ) -> BuildReport:
@@ -118,7 +115,6 @@ def build_sharded(
         objects_from: As for `build_index`.
         kind: As for `build_index`.
         cells: As for `build_index`.
-        max_unreadable: Largest fraction of photos that may be unreadable.
         quiet: Show no progress.
         run: Builds the shards; None to build them in this process, one after another.
 
@@ -127,12 +123,9 @@ def build_sharded(
 
     Raises:
         BadInput: The number of shards is out of range, or `out` is an index folder.
-        TooManyUnreadable: More photos than `max_unreadable` cannot be read.
     """
     if not 1 <= shards <= MAX_SHARDS:
         raise BadInput(f"shards must be from 1 to {MAX_SHARDS}; got {shards}")
-    if not 0 <= max_unreadable <= 1:
-        raise BadInput(f"the fraction of unreadable photos must be from 0 to 1; got {max_unreadable}")
     own = Path(out)
     if (own / "CURRENT").is_file():
         raise BadInput(f"{out} is an index folder; give another folder for a sharded index of {shards} shards")
@@ -166,14 +159,6 @@ def build_sharded(
         ]
         built = sorted((run or build_in_process)(jobs, checkpoint), key=lambda one: one.folder)
         report = _report(out, catalogue, naming, checkpoint, built)
-        every = len(catalogue.photos) + len(catalogue.touches)
-        what = "photos and touches" if catalogue.touches else "photos"
-        if (bad := len(report.skipped)) > max_unreadable * every:
-            first = report.skipped[0]
-            raise TooManyUnreadable(
-                f"{bad} of {every} {what} cannot be read, more than the allowed fraction {max_unreadable:g} "
-                f"(--max-unreadable); the index was not changed. The first: {first.path}: {first.reason}"
-            )
         manifest = _manifest(before, built, shards, checkpoint, catalogue, report)
         written = before is None or manifest.generation != before.generation
         if written:

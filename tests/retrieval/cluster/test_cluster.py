@@ -301,7 +301,7 @@ def test_a_killed_worker_loses_nothing_and_repeats_little(ray, many, model, tmp_
 
     def build():
         done["report"] = build_sharded(
-            many, load_checkpoint(model), tmp_path / "c", 3, quiet=True, run=ray_runner(workers=1), max_unreadable=0
+            many, load_checkpoint(model), tmp_path / "c", 3, quiet=True, run=ray_runner(workers=1)
         )
 
     thread = threading.Thread(target=build)

@@ -452,7 +452,6 @@ def test_a_trained_gate_decides_which_grasps_are_accepted(workplace, capsys):
         (["collect", "--out", "r", "--dry-run", "--preview"], "--preview has no effect with --dry-run"),
         (["serve", "--index", "i", "--replicas", "2"], "--replicas needs --cluster"),
         (["serve", "--index", "i", "--no-history", "--history", "h"], "--history contradicts --no-history"),
-        (["build-index", "catalog/", "--max-unreadable", "0.1"], "give --shards too"),
         (["build-index", "catalog/", "--cluster"], "give --shards too"),
     ],
 )
