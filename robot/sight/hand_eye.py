@@ -85,8 +85,13 @@ def fit_hand_eye(camera_mm: npt.ArrayLike, rig_mm: npt.ArrayLike, *, written: da
     if distinct < 4:
         raise RobotConfigError(f"a calibration requires at least 4 different points, got {distinct}; measure more")
     arms = [points - points.mean(0) for points in (camera, rig)]
-    _check_unit(*(float(np.sqrt((arm**2).sum(1).mean())) for arm in arms))
-    for name, arm in zip(("camera", "rig"), arms, strict=True):
+    extents = [float(np.sqrt((arm**2).sum(1).mean())) for arm in arms]
+    for name, arm, own, other in zip(("camera", "rig"), arms, extents, extents[::-1], strict=True):
+        if own < _MIN_EXTENT_MM or own * _METRES_RATIO < other:
+            raise RobotConfigError(
+                f"the {name} points must be in mm, but extend only {own:.3g}, and those of the other frame "
+                f"{other:.3g}; if they are in metres, multiply them by 1000"
+            )
         along, across, _ = np.linalg.svd(arm, compute_uv=False)
         if across < MIN_SPREAD * along:
             raise RobotConfigError(f"the {name} points must not lie on one line; add points beside it")
@@ -98,16 +103,6 @@ def fit_hand_eye(camera_mm: npt.ArrayLike, rig_mm: npt.ArrayLike, *, written: da
     rigid[:3, 3] = rig.mean(0) - rotation.apply(camera.mean(0))
     residuals = np.linalg.norm(rotation.apply(arms[0]) - arms[1], axis=1)
     return HandEye(rigid, residuals, (written or datetime.now(UTC)).replace(microsecond=0))
-
-
-def _check_unit(camera_extent: float, rig_extent: float) -> None:
-    """Raise RobotConfigError for points in metres, by the RMS distances from their means."""
-    for name, own, other in (("camera", camera_extent, rig_extent), ("rig", rig_extent, camera_extent)):
-        if own < _MIN_EXTENT_MM or own * _METRES_RATIO < other:
-            raise RobotConfigError(
-                f"the {name} points must be in mm, but extend only {own:.3g}, and those of the other frame "
-                f"{other:.3g}; if they are in metres, multiply them by 1000"
-            )
 
 
 def read_pairs(path: Path) -> tuple[Points, Points]:

@@ -85,7 +85,7 @@ class UprightCylinder(Solid):
     def face_distances(self, points: Array) -> tuple[Array, ...]:
         """Return the distances beyond the side, and beyond bottom and top."""
         rho = np.hypot(points[:, 0] - self.x, points[:, 1] - self.y)
-        return rho - self.radius, _slab(points[:, 2] - self.height / 2, self.height / 2)
+        return rho - self.radius, np.abs(points[:, 2] - self.height / 2) - self.height / 2
 
     def surface(self) -> tuple[Array, Array]:
         """Return points and normals of the side and the top."""
@@ -119,9 +119,9 @@ class Cuboid(Solid):
         """Return the distances beyond the ends, beyond the sides, and beyond bottom and top."""
         along, across = rotate_plan(points[:, :2] - [self.x, self.y], self.yaw_rad).T
         return (
-            _slab(along, self.half_length),
-            _slab(across, self.half_width),
-            _slab(points[:, 2] - self.height / 2, self.height / 2),
+            np.abs(along) - self.half_length,
+            np.abs(across) - self.half_width,
+            np.abs(points[:, 2] - self.height / 2) - self.height / 2,
         )
 
     def surface(self) -> tuple[Array, Array]:
@@ -158,7 +158,7 @@ class LyingCylinder(Solid):
     def face_distances(self, points: Array) -> tuple[Array, ...]:
         """Return the distances beyond the round side and beyond the ends."""
         along, across = rotate_plan(points[:, :2] - [self.x, self.y], self.yaw_rad).T
-        return np.hypot(across, points[:, 2] - self.radius) - self.radius, _slab(along, self.half_length)
+        return np.hypot(across, points[:, 2] - self.radius) - self.radius, np.abs(along) - self.half_length
 
     def surface(self) -> tuple[Array, Array]:
         """Return points and normals of the round side and the ends."""
@@ -195,10 +195,6 @@ def rotate_plan(plan: Array, yaw_rad: float) -> Array:
     """Return the (N, 2) coordinates along and across the direction of yaw."""
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
     return np.asarray(plan @ np.array([[c, -s], [s, c]]))
-
-
-def _slab(position: Array, half: float) -> Array:
-    return np.asarray(np.abs(position) - half)
 
 
 # Circles ---------------------------------------------------------------------------------------------------

@@ -20,7 +20,6 @@ from robot.recording.folder import UNITS
 from robot.rig import Rig, check_seed
 from robot.settings import TypedSettings, bounded
 from robot.sim.camera import PinholeCamera, Placement
-from robot.sim.gel.marks import Markers
 from robot.sim.gel.sensor import draw_sensor
 from robot.sim.objects.draw import STROKE_MM, SimObject, draw_object
 from robot.sim.objects.shapes import SHAPES
@@ -88,12 +87,10 @@ class SimSettings(TypedSettings):
         optics: led, grey (white lamps, a grey camera), varied (sensors of any make), or a sensor fitted to real
             presses (gelsight, gelsight_mini).
         gels: number of gel pairs; the objects are divided between them.
-        markers: whether the gels have black dots.
         families: shape families to draw from; all if empty.
         meshes: folder of STL, OBJ or PLY files to use instead of procedural objects (needs the extra `mesh`).
         contact_grid: rows and columns of the contact solver.
         contact_tolerance: tolerance of the contact solver.
-        shadow: whether the lamp casts a shadow.
         focal_px: focal length of the camera. Its pictures have 256 x 256 px. At the default of 860 px they show about
             190 mm; a larger object is cut off.
         localisation_mm: range from which the error of the camera's calibration is drawn.
@@ -109,12 +106,10 @@ class SimSettings(TypedSettings):
     fingers: tuple[str, ...] = ("a", "b")
     optics: str = "led"
     gels: int = bounded(1, 1000, 1, unit="pairs")
-    markers: bool = False
     families: tuple[str, ...] = ()
     meshes: str = ""
     contact_grid: tuple[int, int] = (120, 160)
     contact_tolerance: float = bounded(1e-12, 0.999, 1e-2)
-    shadow: bool = True
     focal_px: float = bounded(300, 10_000, 860.0, unit="px")
     localisation_mm: tuple[float, float] = (5.0, 10.0)
     grasp: Mapping[str, Any] = field(default_factory=dict)
@@ -161,7 +156,6 @@ class SimRig(Rig):
         self._seed, self._families = seed, tuple(sorted(options.families))
         attempt = parse_attempt_settings(options.attempt, options.grasp)
         self.meshes = _mesh_folder(options.meshes, seed, attempt.grasp) if options.meshes else None
-        self._shadow = options.shadow
         self._hand = Hand(
             grid=options.contact_grid, tolerance=options.contact_tolerance, turns_about_grip=self.meshes is not None
         )
@@ -171,10 +165,6 @@ class SimRig(Rig):
             {finger: draw_sensor(int(pair), finger, optics=options.optics, gel=known[finger]) for finger in fingers}
             for pair in drawn
         ]
-        if options.markers:
-            self._gels = [
-                {finger: replace(sensor, markers=Markers()) for finger, sensor in pair.items()} for pair in self._gels
-            ]
         self._camera = PinholeCamera(focal_px=options.focal_px)
         clock, self.error_mm = SimClock(), _calibration_error(seed, options.localisation_mm)
         self.sim_state = SimState(clock)
@@ -224,7 +214,6 @@ class SimRig(Rig):
             sensors=self._gels[name % len(self._gels)],
             hand=self._hand,
             seed=int(rng.integers(2**31)),
-            shadow=self._shadow,
         )
         self.sim_state.clock.now_s = number * _ATTEMPT_S
 

@@ -4,7 +4,7 @@
     images = scene.run()        # {"photo": (256, 256, 3) uint8, "touch_a": (240, 320, 3) uint8}
 
 Outputs have the names of a recording's image columns. Nothing else is computed: `scene.passes` counts the
-computations (view, photo, shadow, depth, turn, wall, bare_finger, contact, gel, background).
+computations (view, photo, depth, turn, wall, bare_finger, contact, gel, background).
 """
 
 import re
@@ -40,7 +40,6 @@ class Scene:
         hand: the gripper.
         grip: pose and force of the jaws; None before a grasp.
         seed: seed of light, noise and the error of the object's turn.
-        shadow: whether the lamp casts a shadow.
         outputs: names of the outputs that `run` computes.
         passes: counts of the computations done, by name.
 
@@ -59,7 +58,6 @@ class Scene:
     hand: Hand = field(default_factory=Hand)
     grip: Grip | None = None
     seed: int = 0
-    shadow: bool = True
     outputs: Set[str] = frozenset()
     passes: Counter[str] = field(default_factory=Counter, repr=False)
 
@@ -95,9 +93,9 @@ class Scene:
         return self._touch(touch[1], touch[2])
 
     def _photo(self) -> npt.NDArray[np.uint8]:
-        self.passes.update(["photo", "shadow"] if self.shadow else ["photo"])
+        self.passes["photo"] += 1
         lighting = Lighting.draw(np.random.default_rng([91, self.seed]))
-        return cameras.photo(self._view, lighting, self._noise(0, 0), self.shadow)
+        return cameras.photo(self._view, lighting, self._noise(0, 0))
 
     @cached_property
     def _view(self) -> cameras.CameraView:

@@ -10,8 +10,7 @@ to its listener and its Freenect2, so Python references to both must live as lon
 import contextlib
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,50 +18,25 @@ import numpy.typing as npt
 from robot.devices import Clock
 from robot.drivers.discover import decode_serial
 from robot.drivers.vendor import VendorCamera, VendorSettings, import_package, vendor_errors
-from robot.errors import DeviceError, RobotConfigError
+from robot.errors import DeviceError
 from robot.readings import RGBD, Intrinsics
 
-T = TypeVar("T", bound=np.generic)
 WIDTH, HEIGHT = 512, 424
-PIPELINES = {
-    "opengl": "OpenGLPacketPipeline",
-    "opencl": "OpenCLPacketPipeline",
-    "cuda": "CudaPacketPipeline",
-    "cpu": "CpuPacketPipeline",
-}
+_PIPELINES = ("OpenGLPacketPipeline", "OpenCLPacketPipeline", "CudaPacketPipeline", "CpuPacketPipeline")
 """Processors of the depth, in order of preference; a build of libfreenect2 may lack all but the last."""
 
 _POLL_S = 0.002
 
 
-@dataclass(frozen=True, kw_only=True)
-class Kinect2Settings(VendorSettings):
-    """Settings of a Kinect 2.
-
-    Attributes:
-        pipeline: One of PIPELINES, or "auto" for the first that this build has.
-        upside_down: Whether the camera hangs upside down; picture and intrinsics are then rotated by 180 degrees.
-    """
-
-    pipeline: str = "auto"
-    upside_down: bool = False
-
-    def __post_init__(self) -> None:
-        """Raise RobotConfigError for a setting out of range."""
-        super().__post_init__()
-        if self.pipeline not in ("auto", *PIPELINES):
-            raise RobotConfigError(f"pipeline must be auto or one of {', '.join(PIPELINES)}, got {self.pipeline!r}")
-
-
 class Kinect2(VendorCamera):
-    """A Kinect 2; the fields of Kinect2Settings are keyword arguments of the constructor."""
+    """A Kinect 2; the fields of VendorSettings are keyword arguments of the constructor."""
 
-    Settings = Kinect2Settings
+    Settings = VendorSettings
 
     def __init__(self, *, extrinsics: npt.ArrayLike, clock: Clock = time.monotonic, **settings: Any) -> None:
         """Check the settings without using the device; raise RobotConfigError for one out of range."""
         super().__init__("kinect2", extrinsics, clock=clock)
-        self._options = Kinect2Settings(**settings)
+        self._options = VendorSettings(**settings)
         self._package: Any = None
         self._freenect: Any = None
         self._device: Any = None
@@ -89,25 +63,23 @@ class Kinect2(VendorCamera):
             self._device.start()
             self._read_parameters(decode_serial(serial), name)
             for _ in range(self._options.warmup_frames):
-                self._discard()
+                with self._frames():
+                    pass
 
     def _make_pipeline(self) -> tuple[str, Any]:
-        """Return the first requested pipeline that this build has and this computer can run."""
+        """Return the first pipeline that this build has and this computer can run."""
         failures = []
-        for name in PIPELINES if self._options.pipeline == "auto" else (self._options.pipeline,):
+        for name in _PIPELINES:
             try:
-                return name, getattr(self._package, PIPELINES[name])()
+                return name, getattr(self._package, name)()
             except Exception as error:
                 failures.append(f"{name}: {error}")
-        raise DeviceError(f"kinect2 has no usable pipeline {self._options.pipeline}: {'; '.join(failures)}")
+        raise DeviceError(f"kinect2 has no usable pipeline: {'; '.join(failures)}")
 
     def _read_parameters(self, serial: str, pipeline: str) -> None:
         infrared = self._device.getIrCameraParams()
         self._registration = self._package.Registration(infrared, self._device.getColorCameraParams())
-        cx, cy = float(infrared.cx), float(infrared.cy)
-        if self._options.upside_down:
-            cx, cy = WIDTH - 1 - cx, HEIGHT - 1 - cy
-        self._intrinsics = Intrinsics(float(infrared.fx), float(infrared.fy), cx, cy)
+        self._intrinsics = Intrinsics(*(float(getattr(infrared, name)) for name in ("fx", "fy", "cx", "cy")))
         self._reported = {"serial": serial, "pipeline": pipeline, "width": WIDTH, "height": HEIGHT}
 
     def _close(self) -> None:
@@ -141,30 +113,18 @@ class Kinect2(VendorCamera):
         finally:
             self._listener.release(frames)
 
-    def _discard(self) -> None:
-        with self._frames():
-            pass
-
     def _read(self, depth: bool) -> RGBD:
         with vendor_errors("kinect2 returned no picture"):
             if self._device is not None and self._listener.hasNewFrame():
-                self._discard()  # it may be as old as the last read
+                with self._frames():
+                    pass  # it may be as old as the last read
             with self._frames() as frames:
                 time_s = self.clock()
-                colour, depth_mm = self._register(frames)
+                undistorted, registered = (self._package.Frame(WIDTH, HEIGHT, 4) for _ in range(2))
+                self._registration.apply(frames["color"], frames["depth"], undistorted, registered)
+                # Copies, because the package reuses the memory.
+                colour = np.array(registered.asarray(np.uint8)[:, :, 2::-1])
+                depth_mm = np.array(undistorted.asarray(np.float32))
         known = np.isfinite(depth_mm) & (depth_mm > 0)
         depth_m = np.where(known, depth_mm, np.float32(np.nan)) * np.float32(1e-3)
-        return RGBD(
-            self._rotate_upright(colour), self._rotate_upright(depth_m) if depth else None, self._intrinsics, time_s
-        )
-
-    def _register(self, frames: Any) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32]]:
-        """Return the colour (RGB) of the depth pixels, and the depth in mm, as copies of the package's memory."""
-        make = self._package.Frame
-        undistorted, registered = make(WIDTH, HEIGHT, 4), make(WIDTH, HEIGHT, 4)
-        self._registration.apply(frames["color"], frames["depth"], undistorted, registered)
-        colour = np.array(registered.asarray(np.uint8)[:, :, 2::-1])
-        return colour, np.array(undistorted.asarray(np.float32))
-
-    def _rotate_upright(self, picture: npt.NDArray[T]) -> npt.NDArray[T]:
-        return np.ascontiguousarray(picture[::-1, ::-1] if self._options.upside_down else picture)
+        return RGBD(colour, depth_m if depth else None, self._intrinsics, time_s)

@@ -15,7 +15,6 @@ arrives as automatic updates every few milliseconds; without them the motion is 
 
 import logging
 import math
-import struct
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -140,13 +139,6 @@ class WSG50Settings(TypedSettings):
         `finger_share` to the measured force on one finger divided by the limit.
         """
         return gripper_n * self.finger_share
-
-    def to_gripper_force(self, finger_n: float) -> float:
-        """Convert a force on each finger (N) to the gripper's force (N), rounded down to 32 bits."""
-        packed = struct.pack("<f", finger_n / self.finger_share)
-        if struct.unpack("<f", packed)[0] > finger_n / self.finger_share:
-            packed = struct.pack("<I", struct.unpack("<I", packed)[0] - 1)  # the next smaller positive float
-        return float(struct.unpack("<f", packed)[0])
 
 
 @dataclass(frozen=True)
@@ -392,7 +384,12 @@ class WSG50(Gripper):
             if status not in (None, Status.CMD_PENDING):
                 break
             self._check_updates(now)
-            if status is Status.CMD_PENDING or self._updates_show_motion():
+            system, grasping = (link.updates[command][0] for command in _UPDATED)
+            try:
+                is_moving = _is_moving(codec.system_state(system), codec.grasping_state(grasping))
+            except WireError:
+                is_moving = True  # unknown: read again
+            if is_moving or status is Status.CMD_PENDING:
                 still_since = now
             if now - still_since > link.timeout_s:
                 break
@@ -420,14 +417,6 @@ class WSG50(Gripper):
         except DeviceError as second:
             error.add_note(str(second))
         raise error
-
-    def _updates_show_motion(self) -> bool:
-        """Return whether the last updates report a motion."""
-        system, grasping = (self._link.updates[command][0] for command in _UPDATED)
-        try:
-            return _is_moving(codec.system_state(system), codec.grasping_state(grasping))
-        except WireError:
-            return True  # unknown: read again
 
     def _wait_until_still(self, deadline: float) -> GripperReading:
         """Return the gripper's state when it is still; raise DeviceError at the deadline."""
@@ -558,7 +547,7 @@ class WSG50(Gripper):
     def _set_force(self, force_n: float) -> None:
         """Set the force limit and read it back; raise DeviceError if the gripper would clamp harder."""
         limit_n, ceiling_n = (
-            max(self._options.to_gripper_force(each), self._limits.min_force_n)
+            max(each / self._options.finger_share, self._limits.min_force_n)
             for each in (force_n, self._options.max_force_n)
         )
         self._link.send(codec.command(CommandId.SET_FORCE_LIMIT, limit_n))
@@ -566,7 +555,7 @@ class WSG50(Gripper):
         self.refused.pop("force_n", None)
         if not math.isclose(has, limit_n, rel_tol=0.01):
             self.refused["force_n"] = f"requested {force_n:g}, has {self._options.to_finger_force(has):g}"
-        if has > min(limit_n * (1 + _ROUNDING), ceiling_n):
+        if has > min(limit_n, ceiling_n) * (1 + _ROUNDING):
             raise DeviceError(
                 f"{self.name}: the force limit (both fingers) must be {limit_n:g} N, but the gripper has "
                 f"{has:g} N; the jaws do not close"

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robot.errors import SceneError
 from robot.sim.objects.boxes import clip_to_box
 from robot.sim.objects.formula import trace_formula
 from robot.sim.objects.packets import DisplacedSolid, Formula, Rays, first_hits, gradients, hits
@@ -61,29 +60,21 @@ class Body(ABC):
             origins: (N, 3) start points; a ray that starts inside hits at 0.
             directions: (N, 3) unit vectors.
             step_mm: finest detail of interest. A camera passes the size of its pixel on the object, which is faster.
-
-        Raises:
-            SceneError: The arrays have the wrong shape, an origin is not finite, or a direction is not of unit length.
         """
         return self._cast(self._clip_rays(origins, directions, step_mm))
 
     def hit(self, origins: Points, directions: Points, step_mm: float = GEL_STEP_MM) -> NDArray[np.bool_]:
-        """Return which rays hit, (N,), without the distance. Raise SceneError as `cast` does."""
+        """Return which rays hit, (N,), without the distance."""
         return self._hit(self._clip_rays(origins, directions, step_mm))
 
     def _clip_rays(self, origins: Points, directions: Points, step_mm: float) -> ClippedRays:
         start, along = _contiguous(origins), _contiguous(directions)
-        if start.ndim != 2 or start.shape[1] != 3 or start.shape != along.shape:
-            raise SceneError(f"rays must be two arrays of shape (N, 3), got {start.shape} and {along.shape}")
         near, far = clip_to_box(start, along, self.lower, self.upper)
         return ClippedRays(start, along, near, far, step_mm)
 
     def normals(self, points: Points, step_mm: float = GEL_STEP_MM) -> Vectors:
         """Return the outward unit normals (N, 3) at surface points (N, 3), with relief, smoothed over `step_mm`."""
-        array = _contiguous(points)
-        if array.ndim != 2 or array.shape[1] != 3:
-            raise SceneError(f"points must be an array of shape (N, 3), got {array.shape}")
-        gradient = self._normals(array, step_mm)
+        gradient = self._normals(_contiguous(points), step_mm)
         size = np.linalg.norm(gradient, axis=1, keepdims=True)
         return np.where(size > 0, gradient / np.where(size > 0, size, 1), [0.0, 0.0, 1.0])
 

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from robot.errors import SceneError
 from robot.sim.objects.body import SdfBody
 from robot.sim.objects.draw import draw_object
 from robot.sim.objects.relief import RELIEFS, Relief
@@ -254,23 +253,3 @@ def test_relief_fades_before_the_edges():
         np.testing.assert_allclose(body.cast(origins, directions), smooth.cast(origins, directions), atol=0.02)
     middle = body.cast(-60 * directions + [0, 0, 40], directions)
     assert np.ptp(middle) > 1.5
-
-
-# Bad rays, pickles -----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("origins", "directions", "message"),
-    [
-        (np.zeros((3, 3)), np.ones((3, 3)), "unit length"),
-        (np.zeros((3, 3)), np.full((3, 3), np.nan), "unit length"),
-        (np.full((1, 3), np.inf), np.array([[1.0, 0, 0]]), "finite"),
-        (np.full((1, 3), np.nan), np.array([[1.0, 0, 0]]), "finite"),
-        (np.zeros((3, 2)), np.zeros((3, 2)), r"shape \(N, 3\)"),
-        (np.zeros((3, 3)), np.zeros((2, 3)), r"shape \(N, 3\)"),
-        (np.zeros(3), np.array([1.0, 0, 0]), r"shape \(N, 3\)"),
-    ],
-)
-def test_wrong_rays_are_refused(origins, directions, message):
-    with pytest.raises(SceneError, match=message):
-        can().cast(origins, directions)

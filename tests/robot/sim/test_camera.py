@@ -1,12 +1,10 @@
 """Photo and depth agree with the geometry of the scene on the table."""
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
 
-from robot.errors import SceneError
 from robot.sim import camera as cameras
 from robot.sim.camera import Lighting, PinholeCamera, Placement, cast_camera_rays
 from robot.sim.objects.draw import draw_object
@@ -97,16 +95,16 @@ def test_depth_has_holes_flying_pixels_and_whole_millimetres():
 
 
 def test_the_shadow_darkens_the_table_on_the_side_away_from_the_lamp():
-    light = dataclasses.replace(LIGHT, direction=(0.8, 0.0, 0.6))
+    lights = [dataclasses.replace(LIGHT, direction=(x, 0.0, 0.6)) for x in (0.8, -0.8)]
     view = cast_camera_rays(POST, Placement(), CAMERA)
-    with_shadow, without = (cameras.photo(view, light, 1, shadow).astype(float) for shadow in (True, False))
-    darker = (without - with_shadow).mean(axis=2).reshape(-1)
+    from_right, from_left = (cameras.photo(view, light, 1).astype(float) for light in lights)
+    darker = (from_left - from_right).mean(axis=2).reshape(-1)
     rim_mm = float(POST.body.upper[0])
     table = ~view.is_object & (np.abs(view.points[:, 1]) < 5)
     behind = table & (view.points[:, 0] < -rim_mm - 3) & (view.points[:, 0] > -rim_mm - 10)
     before = table & (view.points[:, 0] > rim_mm + 3) & (view.points[:, 0] < rim_mm + 10)
     assert darker[behind].mean() > 20
-    assert abs(darker[before].mean()) < 1
+    assert darker[before].mean() < -20
 
 
 def test_relief_that_is_large_enough_for_the_pixels_shows():
@@ -123,18 +121,3 @@ def test_relief_that_is_large_enough_for_the_pixels_shows():
         patch = photo[rows, columns]
         roughness.append(max(np.abs(np.diff(patch, 2, axis=axis)).mean() for axis in (0, 1)))
     assert roughness[0] > 1.5 * roughness[1]
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"px": 0},
-        {"focal_px": 0.0},
-        {"position_mm": (0.0, -500.0, -10.0)},
-        {"position_mm": (0.0, 0.0, 500.0)},
-        {"position_mm": (0.0, math.nan, 500.0)},
-    ],
-)
-def test_an_impossible_camera_is_refused(settings):
-    with pytest.raises(SceneError):
-        PinholeCamera(**settings)

@@ -42,7 +42,6 @@ def test_a_whole_scene_does_each_thing_once_for_each_finger():
     assert passes_of(ALL) == {
         "view": 1,
         "photo": 1,
-        "shadow": 1,
         "depth": 1,
         "turn": 2,
         "wall": 2,
@@ -57,8 +56,7 @@ def test_no_outputs_need_no_work():
 
 
 def test_a_photo_needs_neither_depth_nor_touch():
-    assert passes_of(["photo"]) == {"view": 1, "photo": 1, "shadow": 1}
-    assert passes_of(["photo"], shadow=False) == {"view": 1, "photo": 1}
+    assert passes_of(["photo"]) == {"view": 1, "photo": 1}
 
 
 def test_a_depth_image_needs_no_shading():
@@ -70,7 +68,7 @@ def test_photo_and_depth_share_one_geometry_pass():
 
 
 def test_touches_need_no_camera():
-    assert not set(passes_of(["touch_a", "touch_b"])) & {"view", "photo", "depth", "shadow"}
+    assert not set(passes_of(["touch_a", "touch_b"])) & {"view", "photo", "depth"}
 
 
 def test_a_no_contact_frame_needs_no_contact_solve_and_no_grip():
