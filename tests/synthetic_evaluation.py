@@ -51,15 +51,9 @@ def measures(rng, skill):
         flat[f"topn_k{k}"] = (curve(skill, k), np.arange(1, k + 1) / k)
     for count in (1, 2, 3, 5, 8, 12, 20):
         flat[f"topn_k5_g{count}_p3"] = (curve(skill * (1 + 0.35 * np.log(count)), 5), np.arange(1, 6) / 5)
-    for count in (2, 3, 5, 10, 20):
-        flat[f"topn_k5_p{count}"] = (curve(skill * (1 + 0.1 * np.log(count)), 5), np.arange(1, 6) / 5)
     flat["topn_k5_all_objects"] = (curve(skill * 0.9, 5), np.arange(1, 6) / 5)
-    for prefix in ("", "photo_to_touch_"):
-        flat |= {
-            f"{prefix}{key}": (0.06 + 0.2 * skill + 0.05 * index, 0.06 + 0.05 * index)
-            for index, key in enumerate(RANKS)
-        }
-    flat |= dict.fromkeys(("objectfolder_touch_to_photo", "objectfolder_photo_to_touch"), (0.08 + 0.2 * skill, 0.07))
+    for index, key in enumerate(RANKS):
+        flat[key] = (0.06 + 0.2 * skill + 0.05 * index, 0.06 + 0.05 * index)
     return {name: summary(rng, value, chance) for name, (value, chance) in flat.items()}
 
 
@@ -137,13 +131,11 @@ def verification(rng):
         return {**(dict.fromkeys(interval) if needed > 80 else interval), "objects_needed": needed}
 
     def one(difficulty):
-        fars = np.geomspace(1e-4, 0.5, 60)
         return {
             "objects": 80,
             "sequences": 640,
             "eer": rate(float(0.1 * difficulty), 40),
             "frr": {"0.1": rate(0.1 * difficulty, 25), "0.01": rate(0.3 * difficulty, 78), "0.001": rate(0.6, 246)},
-            "det": [[float(far), float((1 - far) ** 9 * difficulty * 0.8), bool(far > 0.01)] for far in fars],
         }
 
     difficulties = {"random": 1.0, "similar": 1.2}

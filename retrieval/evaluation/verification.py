@@ -22,7 +22,6 @@ from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.posterior import MIN_OBJECTS, Posterior, ScoredTouches, fit_posterior
 from retrieval.model.verification import (
     ERRORS_NEEDED,
-    LEVELS,
     error_rate,
     objects_needed,
     verification_sequences,
@@ -48,7 +47,7 @@ def score_verification(
         seed: Seed of the sequences.
 
     Returns:
-        The rates, averaged over training seeds, and the curve of the first seed. None for fewer than
+        The rates, averaged over training seeds. None for fewer than
         three test objects, or for a model without posterior and fewer than three validation objects.
     """
     touches = [
@@ -73,11 +72,6 @@ def score_verification(
                 "sequences": len(genuine[0]),
                 "eer": _rate(eer, objects, needed(eer) if eer else None),
                 "frr": {name: _rate(frr, objects, needed(far)) for name, (far, frr) in rates.items()},
-                "det": [
-                    [far, false_rejects(far, *pairs[0]), objects >= needed(far)]
-                    for far in LEVELS
-                    if far * len(impostors[0]) >= 1
-                ],
             }
     return found if found["random"] else None
 

@@ -8,9 +8,8 @@ import numpy as np
 
 from retrieval.console.files import text_bytes, write_output
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, format_duration, format_number
-from retrieval.report.canvas import MUTED_COLOUR, Axes, Figure, canvas, draw
+from retrieval.report.canvas import MUTED_COLOUR, Axes, Figure, canvas, draw, logarithmic
 from retrieval.report.document import Block, Details, Document, Picture, Section, Table, Text, to_html
-from retrieval.report.plots import logarithmic
 from retrieval.report.results import capitalized
 
 # Palette of Okabe and Ito; the markers distinguish series without colour.

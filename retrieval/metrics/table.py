@@ -92,12 +92,6 @@ class ScoreTable:
         """(O,) numbers of the objects that have photos, ascending."""
         return np.unique(self.photo_owner)
 
-    @cached_property
-    def min_photos(self) -> int:
-        """Smallest number of photos of an object in the gallery of a query, which excludes its own photos."""
-        owners = np.unique(self.with_targets.photo_owner, return_counts=True)[1]
-        return int(min(owners.min(), (self.with_targets.relevant & ~self.with_targets.own).sum(1).min()))
-
     def select(
         self, rows: NDArray[np.int64] | NDArray[np.bool_], columns: NDArray[np.int64] | NDArray[np.bool_]
     ) -> "ScoreTable":

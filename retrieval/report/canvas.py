@@ -74,6 +74,15 @@ def percent_axis(panel: Axes, label: str) -> None:
     panel.set_ylabel(label)
 
 
+def logarithmic(axis: Any, steps: tuple[int, ...]) -> None:
+    """Label a logarithmic axis with plain numbers, at `steps` times powers of ten; matplotlib's labels are formulas."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(subs=steps, numticks=16))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
 def draw(path: Path, make: Callable[..., Figure], *arguments: Any) -> None:
     """Write the figure that `make(*arguments)` returns.
 

@@ -108,15 +108,6 @@ def verification(builder: Builder) -> Iterator[Block | None]:
     """Yield the error rates of late fusion in verification, by number of grasps."""
     if found := builder.results.data.get("verification"):
         one = next(iter(found["random"].values()))
-        yield builder.picture(
-            "det.png",
-            "DET curves of late fusion, falling from left to right, for each number of grasps; the table below has the "
-            "numbers.",
-            "Detection error trade-off: false-reject rate (FRR) against false-accept rate (FAR), probit axes; on the "
-            "dashed diagonal both are equal (EER). Dotted: too few objects to support the FAR.",
-            plots.verification,
-            builder.results,
-        )
         yield tables.verification(builder.results)
         yield Text(
             f"{one['sequences']:,} sequences of grasps of {one['objects']} unseen objects. A sequence is accepted if "

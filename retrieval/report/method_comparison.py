@@ -2,14 +2,7 @@
 
 from collections.abc import Iterator
 
-from retrieval.metrics.registry import (
-    PHOTO_COUNTS,
-    PHOTO_TO_TOUCH,
-    SET_SIZES,
-    TOUCH_TO_PHOTO,
-    grasps_metric_name,
-    photos_metric_name,
-)
+from retrieval.metrics.registry import SET_SIZES, grasps_metric_name
 from retrieval.report import plots, tables
 from retrieval.report.builder import Builder
 from retrieval.report.document import Block, Details, Text
@@ -20,14 +13,6 @@ INTERVALS = (
     "other objects of this kind; it does not cover another recording, split or rig. Ties get their expected rank, "
     "so a constant scorer gets exactly chance."
 )
-
-
-SECTIONS = {
-    TOUCH_TO_PHOTO: "From a touch to all photos of the unseen objects; any photo of the object is right.",
-    PHOTO_TO_TOUCH: "From a photo to all touches of the unseen objects.",
-    "objectfolder": "ObjectFolder's cross-sensory retrieval: mAP over all instances, including the query's grasp.",
-}
-"""Sections of the full gallery, with the text above each table."""
 
 
 def method_overview(builder: Builder) -> Iterator[Block | None]:
@@ -63,43 +48,31 @@ def topn_curves(builder: Builder) -> Iterator[Block | None]:
             yield Details(f"Numbers for {k} candidates", (table,))
 
 
-def grasps_and_photos(builder: Builder) -> Iterator[Block | None]:
-    """Yield the effect of several grasps of one object, and of several photos of each candidate."""
-    keys = [*map(grasps_metric_name, SET_SIZES), *map(photos_metric_name, PHOTO_COUNTS[1:])]
-    if builder.any(*keys):
+def grasps(builder: Builder) -> Iterator[Block | None]:
+    """Yield the effect of several grasps of one object."""
+    keys = [key for key in map(grasps_metric_name, SET_SIZES) if builder.any(key)]
+    if keys:
         yield builder.picture(
             "grasps.png",
-            "Top-1 accuracy against grasps in a query, and against photos of a candidate. "
-            f"{'. '.join(builder.values(k) for k in keys if builder.any(k))}.",
-            "Left: a query of several grasps of one object against three photos of each of five objects. Right: a "
-            "query of one grasp against several photos of each. Dashed: chance.",
-            plots.grasps_and_photos,
+            f"Top-1 accuracy against grasps in a query. {'. '.join(map(builder.values, keys))}.",
+            "A query of several grasps of one object against three photos of each of five objects. Dashed: chance.",
+            plots.grasps,
             builder.results,
         )
         yield tables.section(builder.results, "grasps")
-        yield tables.section(builder.results, "photos")
 
 
 def time(builder: Builder) -> Iterator[Block | None]:
-    """Yield accuracy against run time, and all run times."""
+    """Yield all run times."""
     if builder.results.timings.get("methods"):
-        if builder.any("topn_k5"):
-            yield builder.picture(
-                "time.png",
-                f"Accuracy against time on a logarithmic scale. {builder.values('topn_k5')}. Times in the table.",
-                "Upper left is better. The grey steps join the methods on the Pareto front; dashed: chance.",
-                plots.accuracy_and_time,
-                builder.results,
-            )
         yield tables.times(builder.results)
 
 
 def gallery(builder: Builder) -> Iterator[Block | None]:
-    """Yield ranks in the full gallery, in both directions, and the protocol of ObjectFolder."""
-    for name, text in SECTIONS.items():
-        if table := tables.section(builder.results, name):
-            yield Text(text)
-            yield table
+    """Yield ranks in the full gallery."""
+    if table := tables.section(builder.results, "gallery"):
+        yield Text("From a touch to all photos of the unseen objects; any photo of the object is right.")
+        yield table
 
 
 def comparisons(builder: Builder) -> Iterator[Block | None]:

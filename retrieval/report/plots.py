@@ -1,16 +1,16 @@
 """Plots of an evaluation: each function returns a matplotlib figure of the results."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.methods import CHANCE
-from retrieval.metrics.registry import PHOTO_COUNTS, SET_SIZES, grasps_metric_name, photos_metric_name
-from retrieval.report.canvas import MUTED_COLOUR, PART_COLOURS, Axes, Figure, Style, canvas, percent_axis, style_of
-from retrieval.report.results import IMPOSTORS, Results, measure_label, method_label, percent, shortened
+from retrieval.metrics.registry import SET_SIZES, grasps_metric_name
+from retrieval.report.canvas import MUTED_COLOUR, PART_COLOURS, Axes, Figure, canvas, percent_axis, style_of
+from retrieval.report.results import Results, measure_label, method_label, percent, shortened
 
 OVERVIEW = ("pair_accuracy", "topn_k5", "topn_k10", grasps_metric_name(5), "map")
 _LABELLED_OBJECTS = 130
@@ -82,31 +82,25 @@ def _legend(figure: Figure, names: Sequence[str]) -> None:
     figure.legend(handles=handles, loc="outside right center", frameon=False)
 
 
-def grasps_and_photos(results: Results) -> Figure:
-    """Plot top-1 accuracy of five against grasps (3 photos of each candidate), and against photos (1 grasp)."""
-    figure = canvas(12.5, 4.4)
-    left, right = figure.subplots(1, 2)
-    _against_counts(left, results, grasps_metric_name, SET_SIZES)
-    _against_counts(right, results, photos_metric_name, PHOTO_COUNTS)
-    left.set_xlabel("grasps of the same object in one query")
-    right.set_xlabel("photos of each candidate")
-    _legend(figure, results.methods)
-    return figure
-
-
-def _against_counts(panel: Axes, results: Results, metric: Callable[[int], str], counts: Sequence[int]) -> None:
-    """Plot each method's values of a metric for each count, with its chance; counts without values are left out."""
-    counts = [count for count in counts if any(results.summary(name, metric(count)) for name in results.methods)]
+def grasps(results: Results) -> Figure:
+    """Plot top-1 accuracy of five against the number of grasps, with 3 photos of each candidate."""
+    figure = canvas(8, 4.4)
+    panel = figure.subplots()
+    keys = {grasps_metric_name(count): count for count in SET_SIZES}
+    keys = {key: count for key, count in keys.items() if any(results.summary(name, key) for name in results.methods)}
     for place, name in enumerate(results.methods):
         shift, style = 0.055 * (place - (len(results.methods) - 1) / 2), style_of(name)
-        found = [(at, summary) for at, key in enumerate(map(metric, counts)) if (summary := results.summary(name, key))]
+        found = [(at, summary) for at, key in enumerate(keys) if (summary := results.summary(name, key))]
         points = np.array([(at + shift, *_first(summary)) for at, summary in found]).reshape(-1, 4)
         panel.plot(points[:, 0], points[:, 1], color=style.colour, marker=style.marker, ls=style.line, ms=5)
         panel.vlines(points[:, 0], points[:, 2], points[:, 3], color=style.colour, lw=1.4, alpha=0.7)
         for at, summary in found:
             panel.hlines(100 * summary["chance"][0], at - 0.4, at + 0.4, color=MUTED_COLOUR, ls="--", lw=1.2, zorder=1)
-    panel.set_xticks(range(len(counts)), list(map(str, counts)))
+    panel.set_xticks(range(len(keys)), list(map(str, keys.values())))
+    panel.set_xlabel("grasps of the same object in one query")
     percent_axis(panel, "top-1 accuracy among 5 objects, %")
+    _legend(figure, results.methods)
+    return figure
 
 
 # Objects ---------------------------------------------------------------------------------------------
@@ -168,20 +162,10 @@ def reliability(results: Results, method: str) -> Figure:
         panel.set_title(f"{RELIABILITIES[kind]}\nECE {percent(diagrams[kind]['ece'])} %", fontsize=9)
         counts.bar(stated, [one["count"] for one in bins], width=6, color=colour, alpha=0.6)
         counts.set_yscale("log")
-        logarithmic(counts.yaxis, (1,))
         counts.set_xlabel("stated probability, %")
     percent_axis(grid[0][0], "right answers, %")
     grid[1][0].set_ylabel("answers")
     return figure
-
-
-def logarithmic(axis: Any, steps: tuple[int, ...]) -> None:
-    """Label a logarithmic axis with plain numbers, at `steps` times powers of ten; matplotlib's labels are formulas."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    axis.set_major_locator(LogLocator(subs=steps, numticks=16))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
-    axis.set_minor_formatter(NullFormatter())
 
 
 def reject(results: Results) -> Figure:
@@ -211,78 +195,3 @@ def _decisions(panel: Axes, name: str, corners: Sequence[Sequence[float]]) -> No
     panel.plot(points[:, 0], points[:, 1], color=style.colour, ls=style.line)
     step = max(1, len(points) // 6)
     panel.plot(points[step:-1:step, 0], points[step:-1:step, 1], style.marker, color=style.colour, ms=5)
-
-
-DET_TICKS = (0.001, 0.01, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 0.95, 0.99)
-_GRASP_STYLES = {
-    "1": Style("#d55e00", "o"), "2": Style("#e69f00", "s"), "3": Style("#009e73", "D"), "5": Style("#0072b2", "^")
-}  # fmt: skip
-
-
-def verification(results: Results) -> Figure:
-    """Plot the false-reject rate against the false-accept rate on probit axes: a panel for each kind of impostor."""
-    from matplotlib.lines import Line2D
-    from scipy.stats import norm
-
-    found = results.data["verification"]
-    figure = canvas(10.5, 4.6)
-    panels = figure.subplots(1, 2, sharey=True)
-    for panel, kind in zip(panels, found, strict=True):
-        for grasps, style in _GRASP_STYLES.items():
-            if grasps not in found[kind]:
-                continue
-            far, frr, supported = np.array(found[kind][grasps]["det"]).T
-            x, y = norm.ppf(far), np.where((frr > 0) & (frr < 1), norm.ppf(frr), math.nan)
-            panel.plot(x, y, ":", color=style.colour, lw=1.2)
-            panel.plot(x, np.where(supported > 0, y, math.nan), color=style.colour)
-            panel.plot(x[::8], y[::8], style.marker, color=style.colour, ms=5)
-        panel.plot(norm.ppf([0.001, 0.5]), norm.ppf([0.001, 0.5]), color=MUTED_COLOUR, ls="--", lw=1.2)
-        ticks = [tick for tick in DET_TICKS if tick < 0.5]
-        panel.set_xticks(norm.ppf([*ticks, 0.5]), [f"{100 * tick:g}" for tick in [*ticks, 0.5]])
-        panel.set(xlim=norm.ppf([0.0008, 0.52]), xlabel="false-accept rate (FAR), %")
-        panel.set_title(f"impostors: {IMPOSTORS[kind]}")
-    panels[0].set_yticks(norm.ppf(DET_TICKS), [f"{100 * tick:g}" for tick in DET_TICKS])
-    panels[0].set_ylabel("false-reject rate (FRR), %")
-    handles = [
-        Line2D([], [], color=style.colour, marker=style.marker, label=f"grasps: {grasps}")
-        for grasps, style in _GRASP_STYLES.items()
-    ]
-    figure.legend(handles=handles, loc="outside right center", frameon=False)
-    return figure
-
-
-# Time ------------------------------------------------------------------------------------------------
-
-
-def accuracy_and_time(results: Results) -> Figure:
-    """Plot top-1 accuracy of five against the time of a query, and against the time of fitting."""
-    figure = canvas(10.5, 4.4)
-    panels = figure.subplots(1, 2, sharey=True)
-    titles = {"query_ms": "one query against the whole gallery, ms", "fit_s": "fitting, s"}
-    for panel, (key, title) in zip(panels, titles.items(), strict=True):
-        front: list[tuple[float, float]] = []
-        for name in results.methods:
-            time, summary = results.time(name, key), results.summary(name, "topn_k5")
-            if not (time and summary):
-                continue
-            value, low, high = _first(summary)
-            front.append((time, value))
-            panel.errorbar(
-                time, value, [[value - low], [high - value]], fmt=style_of(name).marker, color=style_of(name).colour
-            )
-            panel.axhline(100 * summary["chance"][0], color=MUTED_COLOUR, ls="--", lw=1.2, zorder=0)
-        # The Pareto front of time and accuracy.
-        front = [
-            (time, value)
-            for time, value in sorted(front)
-            if not any(other != (time, value) and other[0] <= time and other[1] >= value for other in front)
-        ]
-        if front:
-            panel.step(*zip(*front, strict=True), where="post", color="#222222", lw=1, alpha=0.45, zorder=0)
-        panel.set_xscale("log")
-        low, high = panel.get_xlim()
-        logarithmic(panel.xaxis, (1, 2, 5) if high < 1000 * low else (1,))
-        panel.set_xlabel(title)
-    percent_axis(panels[0], "top-1 accuracy among 5 objects, %")
-    _legend(figure, results.methods)
-    return figure

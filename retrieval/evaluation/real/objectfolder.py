@@ -3,6 +3,8 @@
 from retrieval.data.dataset import Split
 from retrieval.errors import DatasetError
 from retrieval.evaluation.real.protocol import Protocol, RecordingFacts, registered_metrics
+from retrieval.metrics import protocols
+from retrieval.metrics.registry import Metric
 
 
 def _published(facts: RecordingFacts, seed: int) -> list[Split]:
@@ -21,7 +23,15 @@ PUBLISHED = Protocol(
     "The published split: its test objects are queries; settings are selected on its validation objects. Every image "
     "of the object is a correct answer, also the one with the query's own number.",
     _published,
-    registered_metrics("objectfolder_touch_to_photo", "objectfolder_photo_to_touch", "pair_auc", "topn_k10"),
+    {
+        "objectfolder_touch_to_photo": Metric(
+            "mAP, touch to photo", "real", lambda of: protocols.average_precision(of.test.with_own())
+        ),
+        "objectfolder_photo_to_touch": Metric(
+            "mAP, photo to touch", "real", lambda of: protocols.average_precision(of.test.transposed().with_own())
+        ),
+        **registered_metrics("pair_auc", "topn_k10"),
+    },
     published_results=(
         "On 100 unseen simulated objects the benchmark's authors report a mAP from touch to photo of 8.50 % for CCA "
         "and 8.80 % for a neural network (DAR, Deep Aligned Representations).",

@@ -95,22 +95,6 @@ def test_a_rate_has_the_binomial_interval_with_each_object_as_one_trial():
     assert (rate["low"], rate["high"]) == (0, pytest.approx(1 - 0.025 ** (1 / 30)))
 
 
-def test_the_curve_marks_the_false_accept_rates_that_the_objects_support(found):
-    curve = found["random"]["1"]["det"]
-    supported = [far for far, _, enough in curve if enough]
-    assert min(supported) == pytest.approx(30 / 1225, rel=0.13)  # rates are 12 % apart
-    assert min(supported) >= 30 / 1225
-    assert [far for far, _, _ in curve] == sorted(far for far, _, _ in curve)
-    rates = [frr for _, frr, _ in curve]
-    assert rates == sorted(rates, reverse=True)
-
-
-def test_similar_objects_are_accepted_more_often_than_random_ones(found):
-    last = {kind: by_grasps["3"]["det"][-1] for kind, by_grasps in found.items()}
-    assert last["random"][:2] == [0.5, 0]
-    assert last["similar"][:2] == [0.5, pytest.approx(0.5, abs=0.1)]  # similar objects have equal logits
-
-
 def test_numbers_of_grasps_that_the_objects_lack_are_left_out():
     assert list(evaluated(20, grasps=4)["random"]) == ["1", "2", "3"]  # one more grasp gives the photo
     assert evaluated(20, grasps=1) is None

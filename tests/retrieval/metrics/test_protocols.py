@@ -22,7 +22,6 @@ from retrieval.metrics.registry import (
     MethodScoreTables,
     compute,
     grasps_metric_name,
-    photos_metric_name,
 )
 from retrieval.metrics.table import ScoreTable, object_scores
 
@@ -216,20 +215,9 @@ def test_a_metric_that_the_scores_do_not_allow_is_left_out():
     shared = table.select(np.arange(16), np.arange(0, 16, 2))
     shared.own[np.arange(1, 16, 2), np.arange(8)] = True
     taken = set(compute(MethodScoreTables(shared, shared, {}, 0.0, seed=0)))
-    assert {"pair_accuracy", "recall_1", "photo_to_touch_map"} <= taken
+    assert {"pair_accuracy", "recall_1", "map"} <= taken
     left_out = {"topn_k5", "topn_k10", "topn_k100", "topn_k5_all_objects"}
     assert not taken & (left_out | set(map(grasps_metric_name, SET_SIZES)))
-
-
-def test_a_number_of_photos_is_used_only_if_every_candidate_has_as_many_besides_a_rows_own():
-    table = perfect(objects=6, grasps=4)
-    assert table.min_photos == 3
-    assert table.with_own().min_photos == 4
-    taken = compute(MethodScoreTables(table, table, {}, 0.0, seed=0))
-    assert {photos_metric_name(1), photos_metric_name(2), photos_metric_name(3)} <= set(taken)
-    assert photos_metric_name(5) not in taken
-    fewer = table.select(np.arange(24), np.delete(np.arange(24), [4, 5]))
-    assert fewer.min_photos == 1  # the second object has two photos; one is a row's own
 
 
 # Chance and certainty --------------------------------------------------------------------------------------

@@ -1,8 +1,7 @@
-"""Verification in the report of an evaluation: rates, refusals and the DET plot."""
+"""Verification in the report of an evaluation: rates and refusals."""
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from retrieval.report.builder import Builder
 from retrieval.report.error_analysis import verification
@@ -41,22 +40,6 @@ def test_rates_are_shown_from_the_largest_false_accept_rate_and_refusals_with_th
         "5.1 [2.0, 11.0]", "1.0 [0.0, 6.0]", "23.4 [10.0, 40.0]", "refused: needs 1,246 objects"
     )  # fmt: skip
     assert rows["most similar object", "1"][0] == "refused: no errors"
-
-
-def test_the_section_has_a_plot_with_a_panel_for_each_kind_of_impostor(found, tmp_path):
-    builder, blocks = build(found, tmp_path)
-    assert [path.name for path in builder.figures] == ["det.png"]
-    with Image.open(builder.figures[0]) as image:
-        assert 500 < image.width < 2500
-    assert "640 sequences of grasps of 80 unseen objects" in blocks[-1].text
-
-
-def test_a_perfect_model_has_a_plot_without_curves(found, tmp_path):
-    """The probit of 0 is infinite."""
-    for by_grasps in found.values():
-        for one in by_grasps.values():
-            one["det"] = [[far, 0.0, enough] for far, _, enough in one["det"]]
-    assert build(found, tmp_path)[0].figures[0].is_file()
 
 
 def test_an_evaluation_without_late_fusion_has_no_verification(tmp_path):
