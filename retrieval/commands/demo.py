@@ -17,7 +17,7 @@ import typer
 
 from retrieval.commands.build_index import build_index
 from retrieval.commands.collect import collect
-from retrieval.commands.options import Jobs, Objects, OptionValues
+from retrieval.commands.options import Objects, OptionValues
 from retrieval.commands.query import query
 from retrieval.commands.serve import serve as serve_index
 from retrieval.console.output import say
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 SEED = 20_000
 """Seed of the demo's objects; the shipped checkpoint was trained on other seeds."""
+JOBS = 2
+"""Simulated rigs that run in parallel."""
 PHOTOS, TOUCHES = 3, 3
 """Grasps of each object that provide a catalogue photo, and grasps that provide a query touch."""
 
@@ -36,7 +38,6 @@ def demo(
     *,
     out: Annotated[Path, typer.Option(help="folder to write")] = Path("demo"),
     objects: Objects = 20,
-    jobs: Jobs = 2,
     serve: Annotated[
         bool, typer.Option("--serve", help="then serve the index and open its page, until Ctrl-C")
     ] = False,
@@ -50,7 +51,7 @@ def demo(
     with _isolated_state(out / "state"):
         recording, catalogue, index = out / "recording", out / "catalog", out / "index"
         grasps = PHOTOS + TOUCHES
-        _run(collect, rig="sim", objects=objects, grasps=grasps, seed=SEED, jobs=jobs, out=recording, preview=True)
+        _run(collect, rig="sim", objects=objects, grasps=grasps, seed=SEED, jobs=JOBS, out=recording, preview=True)
         queries = _split(load_grasps(recording), catalogue)
         in_hand = example_object(queries)
         _run(build_index, catalogue, out=index)

@@ -13,11 +13,9 @@ from retrieval.commands.options import (
     Index,
     IndexModel,
     Json,
-    NoVerify,
     announce_resume,
     resolve_index,
 )
-from retrieval.console.files import require_output, text_bytes, write_output
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput, RetrievalError
 
@@ -61,8 +59,6 @@ def identify(
     index: Index = None,
     model: IndexModel = None,
     json: Json = False,
-    html: Annotated[Path | None, typer.Option(help="also write an HTML page with photos and gel images")] = None,
-    no_verify: NoVerify = False,
 ) -> int:
     """Grasp the object with a rig until the answer is clear; stay next to a real rig. Resumes a stopped run.
 
@@ -71,10 +67,6 @@ def identify(
     """
     if far is not None and expect is None:
         raise BadInput("--far is the false-accept rate of --expect; give both, or neither")
-    if html is not None:
-        if expect is not None:
-            raise BadInput("--html shows a ranking, and --expect ranks nothing; leave one of them out")
-        require_output(html, ".html")
     path = resolve_index(index)
     from retrieval.search.query.answer import EXIT_CODES
     from retrieval.search.query.searcher import Searcher
@@ -83,7 +75,7 @@ def identify(
     from robot.grasping.spread import SpreadPlanner
     from robot.rig import load_rig
 
-    with Searcher.open(path, model=model, verify=not no_verify) as searcher:
+    with Searcher.open(path, model=model) as searcher:
         run = _Run(searcher, out, expect, 0.01 if far is None else far, confidence, grasps)
         if expect is not None:  # refuse it before the rig moves
             searcher.expected_object(expect, run.far)
@@ -120,11 +112,6 @@ def identify(
             )
         if len(attempts) == 1:  # no new attempt: the hand may hold another object now
             raise BadInput(f"{out} holds a finished run: {run.sentence}. Give another --out for the next object")
-        if html is not None:
-            from retrieval.report.query import query_html
-
-            write_output(html, text_bytes(query_html(run.answer, searcher.catalogue)))
-            say(f"page: {html}")
     if json:
         print_json(run.answer.to_dict())
     say(run.sentence)

@@ -13,7 +13,6 @@ from retrieval.commands.options import (
     Index,
     IndexModel,
     Json,
-    NoVerify,
     resolve_index,
 )
 from retrieval.console.files import require_output, text_bytes, write_output
@@ -27,17 +26,12 @@ def query(
     index: Index = None,
     model: IndexModel = None,
     top: Annotated[int, typer.Option(parser=COUNT, help="number of objects to return")] = 10,
-    candidates: Annotated[
-        int | None,
-        typer.Option(parser=COUNT, help="number of photos to rerank (default: that of the index)"),
-    ] = None,
     none_prior: Annotated[
         float,
         typer.Option(metavar="P", parser=FRACTION, help="prior probability that the object is not in the catalogue"),
     ] = 0.5,
     json: Json = False,
     html: Annotated[Path | None, typer.Option(help="also write an HTML page with photos and gel images")] = None,
-    no_verify: NoVerify = False,
 ) -> int:
     """Find the catalogue photo of the object in the hand."""
     path = resolve_index(index)
@@ -46,12 +40,11 @@ def query(
 
     if html:
         require_output(html, ".html")
-    searcher = Searcher.open(path, model=model, verify=not no_verify)
+    searcher = Searcher.open(path, model=model)
     result = searcher.query(
         [[Path(image) for image in grasp] for grasp in gelsight],
         background=None if background is None else [Path(image) for image in background],
         top=top,
-        candidates=candidates,
         none_prior=none_prior,
     )
     if html:

@@ -1,14 +1,13 @@
 """`retrieve rig`: check the devices of a rig, and calibrate its camera."""
 
-import dataclasses
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from retrieval.commands.options import Command, Json
+from retrieval.commands.options import Command
 from retrieval.console.files import require_output
-from retrieval.console.output import print_json, say, show
+from retrieval.console.output import say, show
 from retrieval.errors import RetrievalError
 
 HELP = "Check the devices of a rig, and calibrate its camera."
@@ -21,7 +20,6 @@ def check(
     *,
     rig: Annotated[str | None, typer.Option(help="rig by name or TOML file (default: list connected devices)")] = None,
     no_motion: Annotated[bool, typer.Option("--no-motion", help="do not move the arm or the jaws")] = False,
-    json: Json = False,
 ) -> None:
     """List connected devices, or test each device of a rig with small motions."""
     from robot.drivers.discover import discover
@@ -30,9 +28,6 @@ def check(
 
     if rig is None:
         found = discover()
-        if json:
-            print_json({"found": [dataclasses.asdict(device) for device in found]})
-            return
         for device in found:
             for line in (f"# {device.kind}: {device.label}", *device.toml.splitlines(), ""):
                 show(line)
@@ -41,10 +36,7 @@ def check(
     rows = []
     for row in check_rig(load_rig(rig, seed=0), motion=not no_motion):
         rows.append(row)
-        if not json:
-            show(row.line())
-    if json:
-        print_json({"devices": [dataclasses.asdict(row) for row in rows]})
+        show(row.line())
     if failed := sum(row.failure is not None for row in rows):
         raise RetrievalError(f"{failed} of {len(rows)} checks failed; see above")
 

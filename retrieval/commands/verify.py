@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from retrieval.commands.options import FRACTION, Background, GelSight, Index, IndexModel, Json, NoVerify, resolve_index
+from retrieval.commands.options import FRACTION, Background, GelSight, Index, IndexModel, Json, resolve_index
 from retrieval.console.output import print_json, say
 
 
@@ -21,14 +21,13 @@ def verify(
     index: Index = None,
     model: IndexModel = None,
     json: Json = False,
-    no_verify: NoVerify = False,
 ) -> int:
     """Accept or reject the object in the hand as the expected one, at a stated false-accept rate."""
     path = resolve_index(index)
     from retrieval.search.query.searcher import Searcher
     from retrieval.search.query.verification import VERIFY_EXIT_CODES
 
-    with Searcher.open(path, model=model, verify=not no_verify) as searcher:
+    with Searcher.open(path, model=model) as searcher:
         result = searcher.verify(
             [[Path(image) for image in grasp] for grasp in gelsight],
             expect,

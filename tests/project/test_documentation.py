@@ -33,7 +33,7 @@ from tests.replay_rig import replay_file
 from tests.retrieval.commands.test_rig import POINTS
 
 SHORTER = {
-    "demo": ["--objects", "4", "--jobs", "1"],
+    "demo": ["--objects", "4"],
     "collect": ["--objects", "8", "--grasps", "2", "--jobs", "1"],
     "rig": [],
     "import": [],

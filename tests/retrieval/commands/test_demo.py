@@ -14,7 +14,7 @@ from robot.recording.folder import read_recording
 def finished_demo(tmp_path_factory):
     """The folder of a finished demo with four objects."""
     folder = tmp_path_factory.mktemp("demo")
-    assert main(["demo", "--objects", "4", "--jobs", "1", "--out", str(folder / "demo")]) == 0
+    assert main(["demo", "--objects", "4", "--out", str(folder / "demo")]) == 0
     return folder / "demo"
 
 
@@ -44,7 +44,7 @@ def test_no_grasp_provides_both_a_photo_and_a_touch(finished_demo):
 
 def test_a_second_demo_collects_and_embeds_nothing_and_keeps_the_users_defaults(finished_demo, capsys):
     lines = (finished_demo / "recording" / "metadata.jsonl").read_bytes()
-    assert main(["demo", "--objects", "4", "--jobs", "1", "--out", str(finished_demo)]) == 0
+    assert main(["demo", "--objects", "4", "--out", str(finished_demo)]) == 0
     output = capsys.readouterr()
     assert (finished_demo / "recording" / "metadata.jsonl").read_bytes() == lines
     assert f"0 embedded, {4 * PHOTOS} unchanged" in output.err
@@ -67,7 +67,7 @@ def test_a_demo_with_serve_opens_the_page_of_its_index(finished_demo, capsys, mo
 
     monkeypatch.setattr("retrieval.serve.server.serve", serve)
     monkeypatch.setattr("webbrowser.open", opened.append)
-    assert main(["demo", "--objects", "4", "--jobs", "1", "--out", str(finished_demo), "--serve"]) == 0
+    assert main(["demo", "--objects", "4", "--out", str(finished_demo), "--serve"]) == 0
     assert opened == ["http://127.0.0.1:1234"]
     assert served[0].settings.index == finished_demo / "index"
     assert served[0].trials.folder == finished_demo / "recording"

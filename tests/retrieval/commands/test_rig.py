@@ -29,11 +29,10 @@ def test_a_check_with_a_failing_device_exits_with_1_and_names_it(capsys, monkeyp
         raise OSError(2, "No such file or directory")
 
     monkeypatch.setattr("tests.fake_rig.FakeCamera._connect", missing)
-    assert main(["rig", "check", "--rig", "tests.fake_rig:FakeRig", "--json"]) == 1
+    assert main(["rig", "check", "--rig", "tests.fake_rig:FakeRig"]) == 1
     output = capsys.readouterr()
-    rows = json.loads(output.out)["devices"]
-    assert rows[4]["failure"] == "fake camera cannot be connected: No such file or directory"
-    assert [row["failure"] for row in rows].count(None) == 5
+    assert [line.split()[0] for line in output.out.splitlines()] == ["ok", "ok", "ok", "ok", "FAIL", "ok"]
+    assert "fake camera cannot be connected: No such file or directory" in output.out
     assert "1 of 6 checks failed" in output.err
 
 
@@ -46,8 +45,6 @@ def test_without_a_rig_connected_devices_are_listed_as_lines_for_a_rig_file(caps
     output = capsys.readouterr()
     assert output.out == '# camera: GelSight Mini R0B\n[sensors.a]\ndriver = "gelsight_mini"\n\n'
     assert "1 device(s) found" in output.err
-    assert main(["rig", "check", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["found"][0]["device"] == "/dev/v4l/by-id/x"
     monkeypatch.setattr("robot.drivers.discover.discover", list)
     assert main(["rig", "check"]) == 0
     assert capsys.readouterr().err == "no device was found\n"
