@@ -1,7 +1,7 @@
 """Features of the distinct images of pairs, from towers in training or from frozen towers with cached features."""
 
 import signal
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, ImageCache
 from retrieval.data.loading import map_in_order, worker_count, worker_pool
 from retrieval.data.pairs import PairBatch
-from retrieval.errors import DatasetError, JobInterrupted, RetrievalError
+from retrieval.errors import DatasetError, RetrievalError
 from retrieval.model.config import Config
 from retrieval.model.encode import (
     Image,
@@ -242,22 +242,16 @@ def recorded_features(
     *,
     what: str,
     quiet: bool = False,
-    should_stop: Callable[[], bool] = lambda: False,
 ) -> tuple[Tensor, dict[Path, Tensor]]:
     """Return features of the touches of grasps (G, fingers * F) and of each of their photo files (F,).
 
-    `what` names their purpose, for the progress bar and messages.
-
-    Raises:
-        JobInterrupted: `should_stop()` returned True.
+    `what` names their purpose, for the progress bar.
     """
     none = np.zeros(0, dtype=np.int64)
     touches: list[Tensor] = []
     photos: dict[Path, Tensor] = {}
     with Bar(f"encode for {what}", len(grasps), "grasps", quiet=quiet) as bar:
         for start in range(0, len(grasps), _CHUNK):
-            if should_stop():
-                raise JobInterrupted(f"stopped before the {what} was fitted")
             part = list(grasps[start : start + _CHUNK])
             files = list(dict.fromkeys(grasp.photo for grasp in part))
             batch = PairBatch(part, files, none, none, np.zeros(0, dtype=np.float32), none, none)

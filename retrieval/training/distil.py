@@ -14,7 +14,7 @@ pool of blends: those nearest to its touches by the embeddings of the current st
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -25,7 +25,6 @@ from torch.nn import functional
 
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp
-from retrieval.errors import JobInterrupted
 from retrieval.model.candidate_encoder import CandidateEncoder, PartialStatistics
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
@@ -67,7 +66,6 @@ def distil(
     seed: int,
     linear: int = 0,
     quiet: bool = False,
-    should_stop: Callable[[], bool] = lambda: False,
 ) -> None:
     """Train a candidate encoder from `matcher.head`, and add it and its sizes (`matcher.config`) to `matcher`.
 
@@ -76,7 +74,6 @@ def distil(
     the same candidate encoder. The other weights do not change. The matcher is unchanged if an error is raised.
 
     Raises:
-        JobInterrupted: `should_stop()` returned True.
         NumericalError: The loss is not finite.
     """
     config = dataclasses.replace(matcher.config, candidate_width=width, candidate_linear=linear)
@@ -102,8 +99,7 @@ def distil(
 
     optimizer, plan = torch.optim.Adam(candidate_encoder.parameters()), Plan(steps, LEARNING_RATE)
     with Bar("distil candidate encoder", steps, "steps", quiet=quiet) as bar:
-        if fit(optimizer, plan, range(steps), loss, bar=bar, should_stop=should_stop) < steps:
-            raise JobInterrupted("stopped before the candidate encoder was trained")
+        fit(optimizer, plan, range(steps), loss, bar=bar)
     candidate_encoder.fold_statistics(touch_statistics, photo_statistics)
     matcher.config, matcher.candidate_encoder = config, candidate_encoder.eval()
 
@@ -189,13 +185,6 @@ def blend(partials: Tensor, count: int, generator: torch.Generator) -> Tensor:
     return Blends.sample(partials, count, generator).of(partials, torch.arange(count, device=partials.device))
 
 
-def agreement_metrics(matcher: Matcher, touch_partials: Tensor, photo_partials: Tensor) -> dict[str, float]:
-    """Return the fraction of touches whose exhaustive top-1 is among the candidate encoder's nearest 1 % of photos."""
-    candidates = max(1, round(CANDIDATE_FRACTION * len(photo_partials)))
-    ranks = exhaustive_top1_ranks(matcher, touch_partials, photo_partials)
-    return {"candidate_agreement_at_1_percent": float((ranks < candidates).mean())}
-
-
 def exhaustive_top1_ranks(matcher: Matcher, touch_partials: Tensor, photo_partials: Tensor) -> NDArray[np.int64]:
     """Return the rank (T,), from 0, of each touch's exhaustive top-1 photo in the candidate encoder's order."""
     assert matcher.candidate_encoder is not None
@@ -206,33 +195,6 @@ def exhaustive_top1_ranks(matcher: Matcher, touch_partials: Tensor, photo_partia
         similarity = encoder.touch(touch_partials[:, :pooled]) @ encoder.photo(photo_partials[:, :pooled]).T
         nearer = similarity > similarity.gather(1, logits.argmax(1)[:, None])
     return nearer.sum(1).cpu().numpy()
-
-
-def recorded_partials(
-    matcher: Matcher,
-    source: FeatureSource,
-    grasps: Sequence[Grasp],
-    seed: int,
-    *,
-    quiet: bool = False,
-    should_stop: Callable[[], bool] = lambda: False,
-) -> tuple[Tensor, Tensor]:
-    """Return partial activations (N, P) of the touches of N grasps, and (M, P) of their M photo files.
-
-    At most `MAX_GRASPS` random grasps are used. Grasps may share a photo, so M <= N.
-
-    Raises:
-        JobInterrupted: `should_stop()` returned True.
-    """
-    order = torch.randperm(len(grasps), generator=torch.Generator().manual_seed(seed))[:MAX_GRASPS]
-    sample = [grasps[row] for row in order.tolist()]
-    touches, photos = recorded_features(
-        matcher, source, sample, what="candidate encoder", quiet=quiet, should_stop=should_stop
-    )
-    with torch.inference_mode():
-        return matcher.touch_encoding(touches).partial, matcher.photo_encoding(
-            torch.stack(list(photos.values()))
-        ).partial
 
 
 @torch.inference_mode()
@@ -260,7 +222,6 @@ def with_candidate_encoder(
     validation: tuple[Tensor, Tensor] | None = None,
     *,
     quiet: bool = False,
-    should_stop: Callable[[], bool] = lambda: False,
 ) -> Checkpoint:
     """Return `checkpoint` with a distilled candidate encoder, its metric, and validation touches (`queries`).
 
@@ -270,20 +231,20 @@ def with_candidate_encoder(
         train: Partial activations of touches (N, P) and of photos (M, P) of training objects.
         validation: The same of validation objects, if any. The metric ranks all photos by these touches.
         quiet: No progress on stderr.
-        should_stop: Called after each step.
 
     Raises:
-        JobInterrupted: `should_stop()` returned True.
         NumericalError: The loss is not finite.
     """
     settings, matcher, metrics = config.training, checkpoint.matcher, checkpoint.provenance["metrics"]
     width, linear, steps = config.matcher.candidate_width, config.matcher.candidate_linear, settings.distil_steps
     seed = settings.seed
-    distil(matcher, *train, width=width, linear=linear, steps=steps, seed=seed, quiet=quiet, should_stop=should_stop)
+    distil(matcher, *train, width=width, linear=linear, steps=steps, seed=seed, quiet=quiet)
     queries = None if validation is None else select_queries(validation[0], settings.seed)
     if validation is not None and queries is not None:
         touches = torch.from_numpy(queries).to(validation[1].device).float()
-        metrics = metrics | agreement_metrics(matcher, touches, torch.cat([train[1], validation[1]]))
+        photos = torch.cat([train[1], validation[1]])
+        is_candidate = exhaustive_top1_ranks(matcher, touches, photos) < max(1, round(CANDIDATE_FRACTION * len(photos)))
+        metrics = metrics | {"candidate_agreement_at_1_percent": float(is_candidate.mean())}
     about = checkpoint.provenance | {"metrics": metrics}
     return dataclasses.replace(checkpoint, matcher=matcher, config=config, provenance=about, queries=queries)
 
@@ -296,18 +257,19 @@ def add_candidate_encoder(
     validation: Sequence[Grasp],
     *,
     quiet: bool = False,
-    should_stop: Callable[[], bool] = lambda: False,
 ) -> Checkpoint:
     """Return `checkpoint` with a candidate encoder distilled on recorded grasps, as by `with_candidate_encoder`.
 
-    Its matcher must be on the device of `source`. `validation` may be empty.
+    At most `MAX_GRASPS` random grasps of each part are used. The matcher must be on the device of `source`. `train` has
+    grasps, `validation` may be empty.
     """
-    partials = [
-        recorded_partials(
-            checkpoint.matcher, source, grasps, config.training.seed, quiet=quiet, should_stop=should_stop
-        )
-        for grasps in (train, validation)
-        if grasps
-    ]
+    matcher, partials = checkpoint.matcher, []
+    for grasps in filter(None, (train, validation)):
+        order = torch.randperm(len(grasps), generator=torch.Generator().manual_seed(config.training.seed))[:MAX_GRASPS]
+        sample = [grasps[row] for row in order.tolist()]
+        touches, photos = recorded_features(matcher, source, sample, what="candidate encoder", quiet=quiet)
+        with torch.inference_mode():
+            photo_partials = matcher.photo_encoding(torch.stack(list(photos.values()))).partial
+            partials.append((matcher.touch_encoding(touches).partial, photo_partials))
     with source.step_context():
-        return with_candidate_encoder(checkpoint, config, *partials, quiet=quiet, should_stop=should_stop)
+        return with_candidate_encoder(checkpoint, config, *partials, quiet=quiet)

@@ -17,7 +17,7 @@ A gate selects the touches that a matcher later trains on, so it makes them easi
 
 import dataclasses
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +31,6 @@ from retrieval.console.progress import Bar
 from retrieval.data.dataset import (
     Attempt,
     ImageCache,
-    Split,
     data_digest,
     load_attempts,
     make_split,
@@ -149,7 +148,17 @@ def train_gate(
                 logits += [max(fingers) for fingers in gate.score(differences(part))]
                 bar.advance(len(part))
     report = _report(out, settings.frame, train, validation, np.array(logits))
-    _save(out, gate, split, attempts, recording, report, {"iterations": iterations, "seed": seed})
+    provenance = {
+        "iterations": iterations,
+        "seed": seed,
+        "source": recording_source(recording),
+        LICENCES: [dataclasses.asdict(recording_licence(recording))],
+        "data_digest": data_digest(attempt.grasp for attempt in attempts),
+        "outcomes": dict(Counter(attempt.outcome for attempt in attempts)),
+        "metrics": {key: value for key, value in dataclasses.asdict(report).items() if key != "path"},
+    }
+    header = {"task": TASK, "gate": dataclasses.asdict(settings), "split": split.to_dict(), "provenance": provenance}
+    write_tensors(out, gate.net.state_dict(), header)
     return report
 
 
@@ -274,24 +283,3 @@ def _group_flags(names: Sequence[str], flags: NDArray[np.bool_]) -> dict[str, li
     for name, flag in zip(names, flags.tolist(), strict=True):
         groups[name].append(flag)
     return dict(sorted(groups.items()))
-
-
-def _save(
-    out: Path,
-    gate: GraspSuccessGate,
-    split: Split,
-    attempts: Sequence[Attempt],
-    recording: Path,
-    report: GateReport,
-    training: Mapping[str, int],
-) -> None:
-    provenance = {
-        **training,
-        "source": recording_source(recording),
-        LICENCES: [dataclasses.asdict(recording_licence(recording))],
-        "data_digest": data_digest(attempt.grasp for attempt in attempts),
-        "outcomes": dict(Counter(attempt.outcome for attempt in attempts)),
-        "metrics": {key: value for key, value in dataclasses.asdict(report).items() if key != "path"},
-    }
-    header = {"task": TASK, "gate": dataclasses.asdict(gate.settings), "split": split.to_dict()}
-    write_tensors(out, gate.net.state_dict(), {**header, "provenance": provenance})

@@ -179,10 +179,10 @@ class Trainer:
         """Train from the current step to the last."""
         total = self.config.training.iterations
         quiet = quiet or distributed.rank() > 0
-        with interruption() as stop:
-            if self.step < total:
+        if self.step < total:
+            with interruption() as stop:
                 self._steps(stop, quiet)
-            self._finish(stop, quiet)
+        self._finish(quiet)
 
     def _steps(self, stop: threading.Event, quiet: bool) -> None:
         settings = self.config.training
@@ -237,33 +237,33 @@ class Trainer:
         best = "" if math.isinf(self.best) else f"  validation AUC {self.best:.3f}"
         return f"  accuracy {pair_accuracy(logits.cpu().numpy(), labels):.2f}{best}"
 
-    def _finish(self, stop: threading.Event, quiet: bool) -> None:
+    def _finish(self, quiet: bool) -> None:
         """Complete the best checkpoint on the first rank; after Ctrl-C all ranks stop."""
-        should_stop = False
+        interrupted = False
         if not distributed.rank():
             try:
-                self._complete(stop, quiet)
+                self._complete(quiet)
                 state_path(self.out).unlink(missing_ok=True)
-            except JobInterrupted:
-                should_stop = True
-        if distributed.any_rank(should_stop, self.device):  # all ranks wait here until the files are written
+            except KeyboardInterrupt:
+                interrupted = True
+        with interruption():
+            interrupted = distributed.any_rank(interrupted, self.device)  # all ranks wait here until the files exist
+        if interrupted:
             raise JobInterrupted(
                 f"stopped before the last parts were fitted; {self.out} can rank photos but is not complete. Run the "
                 "same command with --resume to add these parts"
             )
 
-    def _complete(self, stop: threading.Event, quiet: bool) -> None:
+    def _complete(self, quiet: bool) -> None:
         """Add the parts that are fitted after training: candidate encoder, calibrations and gel check."""
         train = [grasp for part in self.sampler.grasps for grasp in part]
         held_out = self.validation.grasps if self.validation else []
         made = load_checkpoint(self.out)
         made.matcher.to(self.device)
         if self.config.matcher.candidate_width:
-            made = add_candidate_encoder(
-                made, self.config, self.features, train, held_out, quiet=quiet, should_stop=stop.is_set
-            )
+            made = add_candidate_encoder(made, self.config, self.features, train, held_out, quiet=quiet)
         if self.has_images:
-            made = with_verdicts(made, self.features, train, held_out, quiet=quiet, should_stop=stop.is_set)
+            made = with_verdicts(made, self.features, train, held_out, quiet=quiet)
         store_checkpoint(made, self.out)
 
     def _validate_and_save(self) -> None:

@@ -8,7 +8,7 @@ validation objects.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -58,7 +58,6 @@ there are more foreign pictures."""
 _MAX_PHOTOS, _PHOTO_PX = 400, 256
 """Largest number of photos, and of gel images, for foreign pictures; shorter side of these photos in pixels."""
 
-StopRequested = Callable[[], bool]
 Readings = NDArray[np.float32]
 
 
@@ -71,22 +70,18 @@ def with_verdicts(
     foreign: int = FOREIGN_COUNT,
     max_grasps: int = MAX_GRASPS,
     quiet: bool = False,
-    should_stop: StopRequested = lambda: False,
 ) -> Checkpoint:
     """Return the checkpoint `made` with calibrations and a gel check, if there are enough validation grasps.
 
     A posterior needs three validation objects, and a touch with a second photo of its object. A gel check needs
     `MIN_GRASPS` validation grasps. At most `max_grasps` grasps of each part are used, and `foreign` foreign pictures
     for fitting. The matcher of `made` is reused and modified.
-
-    Raises:
-        JobInterrupted: `should_stop()` returned True.
     """
     seed, matcher = made.config.training.seed, made.matcher
     grasps = _sample_grasps(validation, seed)[:max_grasps]
     if not train or not grasps:
         return made
-    touches, photos = recorded_features(matcher, source, grasps, what="posterior", quiet=quiet, should_stop=should_stop)
+    touches, photos = recorded_features(matcher, source, grasps, what="posterior", quiet=quiet)
     queries = calibration_touches(matcher, grasps, touches, photos)
     posterior, references = fit_calibrations([queries], seed) if queries else (None, None)
     made = dataclasses.replace(made, posterior=posterior, references=references)
@@ -104,7 +99,6 @@ def with_verdicts(
         foreign=foreign,
         max_grasps=max_grasps,
         quiet=quiet,
-        should_stop=should_stop,
     )
 
 
@@ -117,7 +111,6 @@ def with_gel_check(
     foreign: int = FOREIGN_COUNT,
     max_grasps: int = MAX_GRASPS,
     quiet: bool = False,
-    should_stop: StopRequested = lambda: False,
 ) -> Checkpoint:
     """Return the checkpoint `made` with a gel check, if there are enough validation grasps; see `with_verdicts`."""
     seed, matcher, settings = made.config.training.seed, made.matcher, made.config.preprocessing
@@ -129,7 +122,7 @@ def with_gel_check(
             matcher,
             settings,
             grasps,
-            recorded_features(matcher, source, grasps, what="gel check", quiet=quiet, should_stop=should_stop)[0],
+            recorded_features(matcher, source, grasps, what="gel check", quiet=quiet)[0],
             count,
             seed + number,
         )

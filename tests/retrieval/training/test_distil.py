@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from retrieval.data.dataset import load_grasps, make_split
-from retrieval.errors import JobInterrupted, NumericalError
+from retrieval.errors import NumericalError
 from retrieval.methods.late_fusion import LateFusion
 from retrieval.methods.method import MethodSettings
 from retrieval.methods.retrieve_rerank import RetrieveRerank
@@ -198,13 +198,6 @@ def test_with_a_cosine_in_the_logit_linear_values_rank_the_exhaustive_top1_highe
         assert matcher.config == dataclasses.replace(config, candidate_width=32, candidate_linear=linear)
         ranks.append(distil.exhaustive_top1_ranks(matcher, touches, photos).mean())
     assert ranks[1] < ranks[0] / 2
-
-
-def test_a_stop_leaves_the_matcher_unchanged(matcher, partials):
-    stops = iter([False, False, True])
-    with pytest.raises(JobInterrupted):
-        distilled(matcher, partials, should_stop=lambda: next(stops))
-    assert matcher.candidate_encoder is None
 
 
 # Into a checkpoint -----------------------------------------------------------------------------------------
