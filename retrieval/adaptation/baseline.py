@@ -69,7 +69,8 @@ class UnadaptedBaseline:
         """Return the touches of each fold, at most `max_touches` of an object; `pooled`: without late interaction."""
         parts = []
         for fold in map(self.features.of_objects, folds):
-            features = fold.select(first_rows(fold, max_touches))
+            rows = [np.flatnonzero(fold.owner == name)[:max_touches] for name in range(fold.owner.max() + 1)]
+            features = fold.select(np.concatenate(rows))
             own = np.eye(len(features), dtype=np.bool_)
             touches, photos = self._encoded(features)
             logits = self._logits(touches, photos, pooled=pooled)
@@ -77,9 +78,3 @@ class UnadaptedBaseline:
             scored = ScoredTouches(logits, features.owner, features.owner, own)
             parts.append(CalibrationTouches(scored, embeddings, photos.embedding.numpy()))
         return parts
-
-
-def first_rows(features: Features, max_grasps: int) -> NDArray[np.int64]:
-    """Return the rows of the first grasps of each object, at most `max_grasps`."""
-    owner = features.owner
-    return np.concatenate([np.flatnonzero(owner == name)[:max_grasps] for name in range(owner.max() + 1)])

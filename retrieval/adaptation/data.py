@@ -17,7 +17,7 @@ from retrieval.errors import BadInput
 from retrieval.evaluation.real.protocol import read_recording_facts
 from retrieval.methods.cca_towers import TowerWidths
 from retrieval.model.checkpoint import Checkpoint
-from retrieval.model.config import Config, MatcherConfig, load_config
+from retrieval.model.config import Config, load_config
 from retrieval.model.fusion import Matcher
 from retrieval.model.towers import TOWER_SEPARATOR
 from retrieval.model.towers.concatenated import feature_counts_of, parts_of
@@ -103,7 +103,7 @@ def config_for(start: Checkpoint, fingers: int, init: str, *, seed: int) -> Conf
     preset, source = load_config(PRESET), start.config.matcher
     touch, photo = [source.tower], [source.photo_tower or source.tower]
     if init != NO_TOWER:
-        touch += [*([PUBLISHED_TOWER] if has_gel_tower(source) else []), PUBLISHED_TOWER]
+        touch += [PUBLISHED_TOWER] * (1 + _has_gel_tower(start))
         photo = [PUBLISHED_TOWER] if is_shipped(start.path) else [*photo, PUBLISHED_TOWER]
     matcher = dataclasses.replace(
         preset.matcher,
@@ -116,15 +116,10 @@ def config_for(start: Checkpoint, fingers: int, init: str, *, seed: int) -> Conf
     return dataclasses.replace(preset, matcher=matcher, training=training)
 
 
-def has_gel_tower(start: MatcherConfig) -> bool:
-    """Return whether the gel tower is used with the towers of this model: its features are statistics of stages."""
-    return start.tower_output == "stages"
-
-
 def load_towers(matcher: Matcher, start: Checkpoint, init: str) -> None:
     """Load the weights of the towers of `config_for`; `init` are those of the published tower, or "none"."""
     own, published = start.matcher, [] if init == NO_TOWER else [init]
-    gel = [GEL] if published and has_gel_tower(start.config.matcher) else []
+    gel = [GEL] if published and _has_gel_tower(start) else []
     _load_parts(matcher.touch_tower, parts_of(own.touch_tower), [*gel, *published])
     only_published = published and is_shipped(start.path)
     _load_parts(matcher.photo_tower, [] if only_published else parts_of(own.photo_tower), published)
@@ -137,3 +132,8 @@ def _load_parts(tower: Tower, start: Sequence[Tower], inits: Sequence[str]) -> N
         part.load_state_dict(source.state_dict())
     for part, init in zip(parts[len(start) :], inits, strict=True):
         initialise_tower(part, init)
+
+
+def _has_gel_tower(start: Checkpoint) -> bool:
+    """Return whether the gel tower is used with the towers of this model: its features are statistics of stages."""
+    return start.config.matcher.tower_output == "stages"

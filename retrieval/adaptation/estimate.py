@@ -6,7 +6,7 @@ from typing import Any
 
 from retrieval.adaptation.baseline import UnadaptedBaseline
 from retrieval.adaptation.data import AdaptationData
-from retrieval.adaptation.folds import Fold, choose_settings, draw_folds, fit_folds, fold_accuracy, measure
+from retrieval.adaptation.folds import Fold, choose_settings, draw_folds, fit_folds, measure
 from retrieval.console.output import say
 from retrieval.errors import BadInput
 from retrieval.methods.cca_towers import CcaSelection
@@ -117,7 +117,7 @@ def estimate_accuracy(
         for features, label in ((data.features, "touches"), (data.low_pass, "low-pass touches"))
     )
     choice = choose_settings(data.features, data, seed)
-    fold_accuracies, control = list(map(fold_accuracy, folds)), list(map(fold_accuracy, low_pass))
+    fold_accuracies, control = ([fold.accuracy() for fold in each] for each in (folds, low_pass))
     baseline = UnadaptedBaseline.of(start, data.grasps, cache, quiet)
     rows = (fold_accuracies, control, baseline.fold_accuracies(drawn))
     measures = (measure(parts, column) for parts in rows for column in ("top1", "pair_accuracy"))

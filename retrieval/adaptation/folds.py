@@ -36,9 +36,10 @@ class Fold:
     projections: CcaProjections
     settings: CcaSettings
 
-    def cosines(self) -> NDArray[np.float32]:
-        """Return cosines (n, n) of the touch of every held-out grasp with the photo of every held-out grasp."""
-        return self.projections.cosines(self.left_out.touch.reshape(len(self.left_out), -1), self.left_out.photo)
+    def accuracy(self) -> "FoldAccuracy":
+        """Return the accuracy of each touch of the held-out objects."""
+        touches = self.left_out.touch.reshape(len(self.left_out), -1)
+        return score_accuracy(self.projections.cosines(touches, self.left_out.photo), self.left_out)
 
 
 def draw_folds(grasps: Sequence[Grasp], seed: int) -> list[tuple[str, ...]]:
@@ -98,17 +99,9 @@ class FoldAccuracy:
         return Measure(getattr(self, column)[:, None], owner, np.array([chance]), f"{self.objects} held-out objects")
 
 
-def fold_accuracy(fold: Fold, seed: int = 0) -> FoldAccuracy:
-    """Return the accuracy of each touch of a fold with one random photo of each object of the fold.
-
-    The photo of the touched object is of another grasp if there is one.
-    """
-    return score_accuracy(fold.cosines(), fold.left_out, seed)
-
-
-def score_accuracy(scores: NDArray[np.float32], features: Features, seed: int = 0) -> FoldAccuracy:
+def score_accuracy(scores: NDArray[np.float32], features: Features) -> FoldAccuracy:
     """Return the accuracy of each touch with one random photo of each object, from scores (n, n) with every photo."""
-    rng, owner = np.random.default_rng([seed, 8]), features.owner
+    rng, owner = np.random.default_rng([0, 8]), features.owner
     rows = [np.flatnonzero(owner == name) for name in range(owner.max() + 1)]
     higher, equal = np.empty((2, len(features)), np.int64)
     for touch, name in enumerate(owner):
@@ -118,11 +111,6 @@ def score_accuracy(scores: NDArray[np.float32], features: Features, seed: int = 
     rivals = len(rows) - 1
     top1 = k_way_accuracies(higher, equal, rivals, len(rows))[:, 0]
     return FoldAccuracy(features.object_ids, top1, 1 - (higher + equal / 2) / rivals, len(rows))
-
-
-def pair_accuracy(parts: Sequence[FoldAccuracy]) -> float:
-    """Return how often the photo of the touched object outscores that of another object; objects have equal weight."""
-    return float(measure(parts, "pair_accuracy").by_object()[1].mean())
 
 
 def measure(parts: Sequence[FoldAccuracy], column: str) -> Measure:

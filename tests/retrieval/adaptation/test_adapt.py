@@ -11,7 +11,7 @@ import retrieval
 from retrieval.adaptation import folds
 from retrieval.adaptation.data import config_for, load_towers
 from retrieval.adaptation.estimate import Estimate
-from retrieval.adaptation.folds import draw_folds, measure, pair_accuracy, score_accuracy
+from retrieval.adaptation.folds import draw_folds, measure, score_accuracy
 from retrieval.adaptation.recipe import adapt
 from retrieval.commands.main import main
 from retrieval.commands.options import training_config
@@ -159,7 +159,7 @@ def test_accuracy_of_hand_made_scores():
     assert found.pair_accuracy.tolist()[:2] == [1.0, 0.75]
     assert measure([found], "top1").chance.tolist() == [pytest.approx(1 / 3)]
     by_object = [np.mean([1.0, 0.75]), 0.75, found.pair_accuracy[2]]
-    assert pair_accuracy([found]) == pytest.approx(np.mean(by_object))
+    assert measure([found], "pair_accuracy").by_object()[1].mean() == pytest.approx(np.mean(by_object))
 
 
 def test_the_preset_builds_the_same_towers_as_adapt_with_the_shipped_model(published):
