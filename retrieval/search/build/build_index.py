@@ -173,7 +173,7 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
         cells=options.cells,
         photo_bytes={name: array.dtype.itemsize * array.shape[1] for name, array in generation.arrays.items()},
         seconds=seconds,
-        references=references.summary(manifest.about[REFERENCE_CALIBRATION]["by"]) if references.rows else None,
+        references=references.summary,
     )
 
 
@@ -314,6 +314,6 @@ class _Build:
         if candidates is None:
             candidates = measure_candidates(self.checkpoint, index, StoredPartials(arrays), quiet=self.options.quiet)
         measured = {"candidates": candidates, "partial_error": largest_rounding(arrays[PARTIALS])}
-        if self.references.rows:
-            measured[REFERENCE_CALIBRATION] = self.references.calibrate(self.checkpoint, self.rows, arrays)
+        if self.references.rows and self.checkpoint.references is not None:
+            measured[REFERENCE_CALIBRATION] = {"calibration": self.checkpoint.references.to_dict()}
         return measured

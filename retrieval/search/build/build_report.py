@@ -45,8 +45,7 @@ class BuildReport:
         seconds: Time of decoding and encoding.
         shards: Shards of a sharded index, as in its manifest (`indexes.store.sharded`); None for an index folder.
         references: Numbers of reference touches (`touches`), their objects (`objects`), objects without photos
-            (`touch_only`) and touches that were encoded now (`encoded`), and the source of their calibration (`by`);
-            None without references.
+            (`touch_only`) and touches that were encoded now (`encoded`); None without references.
 
     >>> checkpoint = retrieval.load_checkpoint("model.safetensors")
     >>> report = retrieval.build_index("catalog", checkpoint, "new-index", quiet=True)
@@ -113,8 +112,7 @@ class BuildReport:
         if references := self.references:
             yield (
                 f"{references['touches']} reference touches of {references['objects']} objects, "
-                f"{references['touch_only']} of them without a photo; {references['encoded']} embedded; "
-                f"calibrated on {references['by']}"
+                f"{references['touch_only']} of them without a photo; {references['encoded']} embedded"
             )
         measured = ""
         if self.recall["queries"]:  # else exact by construction

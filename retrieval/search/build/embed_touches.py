@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,34 +12,22 @@ import torch
 from numpy.typing import NDArray
 
 from indexes.store.codes import CodeCache
-from indexes.store.generation import Arrays
-from indexes.store.rows import Row
 from retrieval.console.progress import Bar
 from retrieval.data.catalogue import Catalogue, CataloguePhoto, PhotoTable
 from retrieval.data.catalogue_touches import CatalogueTouch
 from retrieval.data.folder_walk import SkippedPhoto
 from retrieval.data.images import decode_rgb
 from retrieval.errors import BadInput, ImageError
-from retrieval.model.calibration_touches import CalibrationTouches
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, batches, touch_features
-from retrieval.model.fusion import scorer_of
 from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL
-from retrieval.model.posterior import ScoredTouches
 from retrieval.model.reference_calibration import (
     REFERENCE_PARTIALS,
     REFERENCE_ROWS,
-    fit_reference_calibration,
-    unit_embeddings,
 )
-from retrieval.model.stored_partials import StoredPartials
 from retrieval.search.build.codes import code_model
 
 Partials = NDArray[np.float16]
-MIN_OBJECTS = 10
-"""Smallest number of objects with two touches that calibrates references, if the model has no such calibration."""
-MAX_REFERENCE_QUERIES = 600
-"""Largest number of touches of the catalogue for that calibration."""
 BATCH = 32
 _SHOWS = (CONTACT, NO_CONTACT, NOT_A_GEL)
 """Results of the gel check, by their number in a code."""
@@ -86,9 +74,10 @@ class ReferenceBuild:
     def _counts(self) -> dict[str, int]:
         return {"touches": len(self.rows), "objects": len({row["object_id"] for row in self.rows})}
 
-    def summary(self, by: str) -> dict[str, Any]:
-        """Return the entry of the report; `by` is the source of the calibration."""
-        return {**self._counts, "touch_only": len(self.touch_only), "encoded": self.encoded, "by": by}
+    @property
+    def summary(self) -> dict[str, Any] | None:
+        """The entry of the report; None without references."""
+        return {**self._counts, "touch_only": len(self.touch_only), "encoded": self.encoded} if self.rows else None
 
     def with_gel_images(self, catalogue: Catalogue) -> Catalogue:
         """Return the catalogue with a gel image of each object without photos in place of its photo."""
@@ -101,47 +90,6 @@ class ReferenceBuild:
         pictures = [CataloguePhoto(touch.paths[0], touch.object_id, touch.metadata) for touch in first.values()]
         photos = sorted([*catalogue.photos, *pictures], key=lambda photo: photo.path)
         return replace(catalogue, photos=PhotoTable.of(photos))
-
-    def calibrate(self, checkpoint: Checkpoint, photos: Sequence[Row], arrays: Arrays) -> dict[str, Any]:
-        """Return the calibration of the references and its source, for the manifest.
-
-        The calibration is that of the checkpoint. If it has none, it is fitted to the catalogue's own touches: the
-        last touches of each object are queries, its first ones references.
-
-        Args:
-            checkpoint: The model.
-            photos: The N rows of the new generation.
-            arrays: Its per-row arrays (N, ...).
-
-        Raises:
-            BadInput: There are too few touches.
-        """
-        if checkpoint.references is not None:
-            return {"by": "objects that the model was not fitted to", "calibration": checkpoint.references.to_dict()}
-        names = np.array([row["object_id"] for row in self.rows])
-        sample = _sample_objects(names)
-        codes = unit_embeddings(self.partials[sample], checkpoint.config.matcher.cosine_columns)
-        touched, owner = np.unique(names[sample], return_inverse=True)
-        number_of = {name: number for number, name in enumerate(touched.tolist()) if name not in self.touch_only}
-        rows = np.array([row for row, photo in enumerate(photos) if photo.object_id in number_of], dtype=np.int64)
-        photo_owner = np.array([number_of[photos[row].object_id] for row in rows], dtype=np.int64)
-        scorer = scorer_of(checkpoint.matcher.head)
-        touch_partials, photo_partials = self.partials[sample].astype(np.float32), StoredPartials(arrays)[rows]
-        logits = np.stack([scorer.logits(partial[None], photo_partials) for partial in touch_partials])
-        scored = ScoredTouches(logits, owner, photo_owner, np.zeros(logits.shape, np.bool_))
-        photo_codes = unit_embeddings(photo_partials, checkpoint.config.matcher.cosine_columns)
-        fitted = fit_reference_calibration(CalibrationTouches(scored, codes, photo_codes))
-        if fitted is None or (fitted.with_photos is None and len(set(names) - set(self.touch_only))):
-            raise self.too_few_error()
-        return {"by": "the catalogue's own touches", "calibration": fitted.to_dict()}
-
-    def too_few_error(self) -> BadInput:
-        """Return the error for too few touches to calibrate."""
-        return BadInput(
-            f"the catalogue's {len(self.rows)} reference touches cannot be calibrated: the model has no calibration "
-            f"for them, and fitting one needs {MIN_OBJECTS} objects with two touches each, and with photos if objects "
-            "have photos. Touch some objects twice, or fit a model to a recording with `retrieve adapt`"
-        )
 
 
 def embed_references(
@@ -159,11 +107,11 @@ def embed_references(
         quiet: Show no progress.
 
     Raises:
-        BadInput: The model cannot compare touches, or there are too few touches to calibrate.
+        BadInput: The model cannot compare touches.
     """
     if not catalogue.touches:
         return ReferenceBuild()
-    _require_fit(checkpoint)
+    require_reference_calibration(checkpoint)
     layout = touch_layout(checkpoint)
     model = code_model(checkpoint, layout)
     stored = cache.known(model)
@@ -199,14 +147,9 @@ def embed_references(
         else:
             skipped.append(SkippedPhoto(touch.paths[0], f"{_SHOWS[shows]}: not usable as a reference touch"))
     photographed, counts = set(catalogue.photos.objects), Counter(row["object_id"] for row in rows)
-    references = ReferenceBuild(
+    return ReferenceBuild(
         rows, records["partial"][is_used], sorted(counts.keys() - photographed), skipped, encoded, digests, keys
     )
-    if rows and checkpoint.references is None:  # count objects with photos, if any touched object has photos
-        both = counts.keys() & photographed
-        if sum(count > 1 and (name in both or not both) for name, count in counts.items()) < MIN_OBJECTS:
-            raise references.too_few_error()
-    return references
 
 
 def touch_layout(checkpoint: Checkpoint) -> np.dtype[Any]:
@@ -219,12 +162,13 @@ def touch_code_digest(digests: Iterable[str]) -> str:
     return hashlib.sha256("".join(digests).encode()).hexdigest()
 
 
-def _require_fit(checkpoint: Checkpoint) -> None:
-    if not checkpoint.config.matcher.cosine or checkpoint.posterior is None:
+def require_reference_calibration(checkpoint: Checkpoint) -> None:
+    """Raise BadInput for a model that cannot compare the touches of a catalogue with those of a query."""
+    if checkpoint.references is None or checkpoint.posterior is None:
         raise BadInput(
-            "the catalogue has touches (touch_* files next to photos), but this model cannot compare touches: its "
-            "match logit has no cosine term, or it is not calibrated. Use a shipped model, or one of `retrieve adapt` "
-            "or `retrieve train` (preset relief, with validation objects), or rename the files"
+            "the catalogue has touches (touch_* files next to photos), but this model has no calibration of reference "
+            "touches. Use a shipped model, or one of `retrieve adapt` or `retrieve train` (preset relief, with enough "
+            "validation objects), or rename the files"
         )
     if checkpoint.config.preprocessing.background != "none":
         raise BadInput(
@@ -275,11 +219,3 @@ def _encode_touches(checkpoint: Checkpoint, layout: np.dtype[Any], touches: list
     if check is not None and readings is not None:
         records["shows"] = [_SHOWS.index(shows) for shows in check.classify(readings.cpu().numpy())]
     return [record.tobytes() for record in records]
-
-
-def _sample_objects(names: NDArray[np.str_]) -> NDArray[np.int64]:
-    """Return rows of random objects with two or more touches, about `MAX_REFERENCE_QUERIES` at most, in their order."""
-    _, owner, counts = np.unique(names, return_inverse=True, return_counts=True)
-    drawn = np.random.default_rng(0).permutation(np.flatnonzero(counts > 1))
-    chosen = drawn[: max(MIN_OBJECTS, int(np.searchsorted(np.cumsum(counts[drawn]), MAX_REFERENCE_QUERIES)))]
-    return np.flatnonzero(np.isin(owner, chosen))

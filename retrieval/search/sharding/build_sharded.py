@@ -44,6 +44,7 @@ from retrieval.model.stored_partials import CELLS
 from retrieval.search.build.build_index import BuildOptions, build_listed, naming_by, stores_cells
 from retrieval.search.build.build_report import BuildReport
 from retrieval.search.build.codes import no_photo
+from retrieval.search.build.embed_touches import require_reference_calibration
 from retrieval.version import __version__
 
 _KEEP_ALL = 10**6
@@ -145,12 +146,8 @@ def build_sharded(
         if cells is False:
             checkpoint = checkpoint.without_cells()
         catalogue = list_catalogue(folder, naming)
-        if catalogue.touches and checkpoint.references is None:
-            raise BadInput(
-                "this model has no calibration of reference touches. A sharded index needs one in the model, because "
-                "each shard would otherwise fit its own. Use a shipped model, or one of `retrieve adapt` or `retrieve "
-                "train` with enough validation objects"
-            )
+        if catalogue.touches:
+            require_reference_calibration(checkpoint)
         _delete_old_shards(own, before, shards)
         options = BuildOptions(naming, name, quiet, keep=_KEEP_ALL, cells=cells)
         jobs = [
@@ -258,7 +255,7 @@ def _report(
         candidates=None,
         partial_error=max(report.partial_error for report in reports),
         shards=[asdict(one.entry) for one in built if one.entry is not None],
-        references={**sums, "by": references[0]["by"]} if references else None,
+        references=sums if references else None,
     )
 
 
@@ -280,7 +277,7 @@ def _manifest(
     }
     if report.references is not None and checkpoint.references is not None:
         about[REFERENCE_ROWS] = {key: report.references[key] for key in ("touches", "objects")}
-        about[REFERENCE_CALIBRATION] = {"by": report.references["by"], "calibration": checkpoint.references.to_dict()}
+        about[REFERENCE_CALIBRATION] = {"calibration": checkpoint.references.to_dict()}
     made = ShardedManifest(
         generation=sharded_generation_name(1 if before is None else generation_number(before.generation) + 1),
         created=datetime.now(UTC).isoformat(timespec="seconds"),

@@ -123,11 +123,7 @@ def test_the_result_has_the_reference_calibration_and_reads_back(
 ):
     result = query_new_index(catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[0]][2])
     references = result.posterior["references"]
-    assert (references["touches"], references["objects"], references["by"]) == (
-        8,
-        4,
-        "objects that the model was not fitted to",
-    )
+    assert (references["touches"], references["objects"]) == (8, 4)
     assert ReferenceCalibration.from_dict(references["calibration"]) == REFERENCE_CALIBRATION
     document = json.loads(json.dumps(result.to_dict()))
     assert QueryResult.from_dict(document).to_dict() == result.to_dict()
@@ -183,7 +179,6 @@ def test_only_new_touches_are_encoded_again(catalogue_with_touches, calibrated_m
         "objects": 4,
         "touch_only": 1,
         "encoded": 8,
-        "by": "objects that the model was not fitted to",
     }
     again = build_index(catalogue_with_touches, calibrated_model, index, quiet=True)
     assert (again.written, again.references["encoded"]) == (False, 0)
@@ -218,33 +213,17 @@ def test_unusable_touches_are_left_out_with_a_reason(catalogue_with_touches, cal
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"cosine": False}, "this model cannot compare touches"),
-        ({"posterior": None}, "this model cannot compare touches"),
-        ({}, "8 reference touches cannot be calibrated"),
+        ({"posterior": None}, "no calibration of reference touches"),
+        ({}, "no calibration of reference touches"),
     ],
 )
 def test_a_model_without_reference_calibration_builds_nothing(catalogue_with_touches, tmp_path, changed, message):
     model = write_reference_model(tmp_path / "other.safetensors", references=None, **changed)
     with pytest.raises(BadInput, match=message):
         build_index(catalogue_with_touches, model, tmp_path / "index", quiet=True)
-    with pytest.raises(BadInput, match="this model has no calibration of reference touches"):
+    with pytest.raises(BadInput, match="no calibration of reference touches"):
         build_sharded(catalogue_with_touches, model, tmp_path / "sharded", 2, quiet=True)
     assert not (tmp_path / "index" / "CURRENT").exists()
-
-
-def test_references_are_calibrated_on_the_catalogue_if_the_model_is_not(tmp_path):
-    model = write_reference_model(tmp_path / "uncalibrated.safetensors", references=None)
-    objects = synthetic.make_objects(11, seed=4)
-    catalogue = synthetic.write_catalogue(tmp_path / "catalog", objects, 1)
-    for name, grasps in synthetic.write_queries(tmp_path / "touches", objects, 2).items():
-        for number, files in enumerate(grasps):
-            synthetic.put_touch(catalogue, name, number, files)
-    report = build_index(catalogue, model, tmp_path / "index", quiet=True)
-    assert report.references["by"] == "the catalogue's own touches"
-    document = IndexStore(tmp_path / "index").open().manifest.about["reference_calibration"]["calibration"]
-    calibration = ReferenceCalibration.from_dict(document)
-    assert (calibration.objects, calibration.touches) == (11, 11)
-    assert calibration.with_photos is not None
 
 
 # Several shards, and forged documents -------------------------------------------------------------------------------
@@ -296,7 +275,7 @@ TOUCH = {"object_id": NAMES[0], "touch": ["a.png"], "digests": ["0"]}
         {"touches": np.zeros((8, 48), np.int16)},
         {"touches": {"not": "an array"}},
         {"reference_calibration": None},
-        {"reference_calibration": {"by": "hand", "calibration": {"weight": 1}}},
+        {"reference_calibration": {"calibration": {"weight": 1}}},
         {"reference_calibration": [1]},
     ],
 )
