@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.console.progress import Bar
-from retrieval.data.dataset import recorded_objects
+from robot.recording.folder import read_info
 from robot.rig import load_rig
 from robot.sim.rig import SimRig
 from robot.storage import append_line, file_content, sync_threads, write_files
@@ -78,7 +78,7 @@ class LabelledPicture:
 
 def load_object_labels(recording: Path) -> dict[str, ObjectLabels]:
     """Return the labels of the objects of a simulated recording, from its recording.json."""
-    return {name: ObjectLabels.from_dict(row) for name, row in recorded_objects(recording).items()}
+    return {name: ObjectLabels.from_dict(row) for name, row in read_info(recording).get("objects", {}).items()}
 
 
 def collect_pictures(

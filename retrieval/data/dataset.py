@@ -147,11 +147,6 @@ def recording_licence(folder: Path) -> DataLicence:
     return DataLicence(str(info["source"]), str(info.get("licence") or NOT_STATED), str(info.get("terms") or ""))
 
 
-def recorded_objects(folder: Path) -> dict[str, Any]:
-    """Return the facts of each object in the recording.json of a recording, by object id; empty if it has none."""
-    return dict(read_info(folder).get("objects", {}))
-
-
 def finger_count(grasps: Sequence[Grasp]) -> int:
     """Return the number of gel images of each touch. Raises DatasetError if it differs between grasps."""
     first = grasps[0]

@@ -40,17 +40,6 @@ def to_unit(image: Samples) -> RgbImage:
     return unit
 
 
-def shrink(image: RgbImage, factor: float) -> RgbImage:
-    """Resize both axes of `image` (H, W, 3) by a factor. An image is not enlarged, and each side keeps one pixel.
-
-    Raises:
-        BadInput: The image has the wrong shape or type.
-    """
-    factor = min(1.0, factor)
-    height, width = (max(1, round(factor * side)) for side in image.shape[:2])
-    return resize(image, (height, width))
-
-
 def resize_unchecked(samples: Samples, size: tuple[int, int]) -> RgbImage:
     """Resize like `resize`, without checks, for pictures (H, W, C) of any number of channels."""
     image = samples

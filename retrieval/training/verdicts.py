@@ -21,7 +21,7 @@ from torch import Tensor
 from retrieval.data.dataset import Grasp
 from retrieval.data.images import read_rgb
 from retrieval.data.preprocessing import Preprocessing
-from retrieval.data.resize import RgbImage, shrink
+from retrieval.data.resize import RgbImage, resize
 from retrieval.model.calibration_touches import CalibrationTouches
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, touch_features
@@ -241,7 +241,9 @@ class GelCheckFeatures:
 
 def _small_photo(path: Path) -> RgbImage:
     photo = read_rgb(path)
-    return shrink(photo, _PHOTO_PX / min(photo.shape[:2]))
+    factor = min(1.0, _PHOTO_PX / min(photo.shape[:2]))
+    height, width = (round(factor * side) for side in photo.shape[:2])
+    return resize(photo, (height, width))
 
 
 def _no_contact_images(settings: Preprocessing, grasps: Sequence[Grasp], fingers: int) -> Iterator[list[Image]]:

@@ -10,7 +10,7 @@ from retrieval.data import images, preprocessing
 from retrieval.data import resize as resizing
 from retrieval.data.images import to_float
 from retrieval.data.preprocessing import BACKGROUNDS, Preprocessing, subtract_background
-from retrieval.data.resize import resize, shrink
+from retrieval.data.resize import resize
 from retrieval.errors import BadInput, ConfigError, NumericalError
 from tests.retrieval.data.test_images import sample_files, saved
 
@@ -245,8 +245,3 @@ def test_another_version_gives_another_digest(monkeypatch):
     before = Preprocessing().digest()
     monkeypatch.setattr(preprocessing, "PREPROCESSING_VERSION", 1)
     assert Preprocessing().digest() != before
-
-
-@pytest.mark.parametrize(("factor", "size"), [(0.5, (20, 40)), (1.5, (40, 80)), (0.01, (1, 1))])
-def test_both_axes_shrink_by_a_factor_and_never_grow_or_vanish(factor, size):
-    assert shrink(np.full((40, 80, 3), 0.5, dtype=np.float32), factor).shape == (*size, 3)
