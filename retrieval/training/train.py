@@ -314,6 +314,7 @@ class Trainer:
 
     def resume(self) -> None:
         """Continue from the state next to `out`. Raises CheckpointError if it belongs to another run."""
+        header = load_state(self.out, self.modules, self.optimizer, self._identity())
         stored = load_checkpoint(self.out)  # the best checkpoint so far is part of the state
         mine = (stored.split, stored.provenance.get("data_digest")) == (self.split, self.data_digest)
         # The configuration changes when the candidate encoder is added.
@@ -321,7 +322,6 @@ class Trainer:
             raise CheckpointError(
                 f"{self.out} does not belong to the training run to resume; restore its checkpoint or start a new run"
             )
-        header = load_state(self.out, self.modules, self.optimizer, self._identity())
         self.step, self.best = header["step"], -math.inf if header["best"] is None else header["best"]
 
 
