@@ -1,6 +1,6 @@
 """`retrieve benchmark`: accuracy of the matcher on public real data, by protocols with controls."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -66,6 +66,15 @@ def real(
             parser=OptionValues.parse, metavar="NAME=FILE...", help="checkpoints to score without fitting, one row each"
         ),
     ] = None,
+    towers: Annotated[
+        OptionValues | None,
+        typer.Option(
+            parser=OptionValues.parse,
+            metavar="NAME=CONFIG...",
+            help="more touch towers for touch to touch (physiclear), one row each: a preset or a TOML file, such as "
+            "adapt=adapt",
+        ),
+    ] = None,
     seeds: Annotated[
         int, typer.Option(parser=COUNT, help="repetitions: each draws new folds and fits the methods again")
     ] = 3,
@@ -100,6 +109,10 @@ def real(
             protocols=[name for name in requested if name not in skipped],
             methods=[name for name in (methods or PRESET_METHODS.get(preset, METHODS)).split(",") if name],
             models=_parse_models(model or ()),
+            towers={
+                name: training_config(choice, None, init=init)
+                for name, choice in _parse_pairs(towers or (), "--towers", "CONFIG")
+            },
             seeds=seeds,
             skipped=skipped,
             cache=cache,
@@ -143,12 +156,17 @@ def _recordings(data: Path, names: Iterable[str], imported: Path) -> tuple[dict[
     return found, missing
 
 
-def _parse_models(words: Iterable[str]) -> Mapping[str, Path]:
-    """Return the file of each NAME=FILE of `--model`. Raises BadInput if a word has another form."""
-    found = {}
+def _parse_models(pairs: Iterable[str]) -> Mapping[str, Path]:
+    return {
+        name: shipped_model(SHIPPED_NAMES[file]) if file in SHIPPED_NAMES else Path(file)
+        for name, file in _parse_pairs(pairs, "--model", "FILE")
+    }
+
+
+def _parse_pairs(words: Iterable[str], option: str, value: str) -> Iterator[tuple[str, str]]:
+    """Yield the name and the value of each NAME=VALUE of an option. Raises BadInput if a word has another form."""
     for word in words:
-        name, equals, file = word.partition("=")
+        name, equals, chosen = word.partition("=")
         if not equals or not name or "/" in name:
-            raise BadInput(f"--model must have the form NAME=FILE, got {word!r}")
-        found[name] = shipped_model(SHIPPED_NAMES[file]) if file in SHIPPED_NAMES else Path(file)
-    return found
+            raise BadInput(f"{option} must have the form NAME={value}, got {word!r}")
+        yield name, chosen

@@ -115,7 +115,7 @@ SECTIONS: dict[str, Callable[[Builder], Iterator[Block | None]]] = {
     "Comparison of methods": method_comparison.method_overview,
     "Top-N accuracy": method_comparison.topn_curves,
     "Several grasps": method_comparison.grasps,
-    "Time": method_comparison.time,
+    "Accuracy and time": method_comparison.time,
     "Full gallery": method_comparison.gallery,
     "Differences between methods": method_comparison.comparisons,
     "Controls": method_comparison.controls,

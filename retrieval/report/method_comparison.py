@@ -63,8 +63,16 @@ def grasps(builder: Builder) -> Iterator[Block | None]:
 
 
 def time(builder: Builder) -> Iterator[Block | None]:
-    """Yield all run times."""
+    """Yield accuracy against run time, and all run times."""
     if builder.results.timings.get("methods"):
+        if builder.any("topn_k5"):
+            yield builder.picture(
+                "time.png",
+                f"Accuracy against time on a logarithmic scale. {builder.values('topn_k5')}. Times in the table.",
+                "Upper left is better. The grey steps join the methods on the Pareto front; dashed: chance.",
+                plots.accuracy_and_time,
+                builder.results,
+            )
         yield tables.times(builder.results)
 
 

@@ -9,7 +9,16 @@ from numpy.typing import NDArray
 
 from retrieval.methods import CHANCE
 from retrieval.metrics.registry import SET_SIZES, grasps_metric_name
-from retrieval.report.canvas import MUTED_COLOUR, PART_COLOURS, Axes, Figure, canvas, percent_axis, style_of
+from retrieval.report.canvas import (
+    MUTED_COLOUR,
+    PART_COLOURS,
+    Axes,
+    Figure,
+    canvas,
+    logarithmic,
+    percent_axis,
+    style_of,
+)
 from retrieval.report.results import Results, measure_label, method_label, percent, shortened
 
 OVERVIEW = ("pair_accuracy", "topn_k5", "topn_k10", grasps_metric_name(5), "map")
@@ -195,3 +204,40 @@ def _decisions(panel: Axes, name: str, corners: Sequence[Sequence[float]]) -> No
     panel.plot(points[:, 0], points[:, 1], color=style.colour, ls=style.line)
     step = max(1, len(points) // 6)
     panel.plot(points[step:-1:step, 0], points[step:-1:step, 1], style.marker, color=style.colour, ms=5)
+
+
+# Time ------------------------------------------------------------------------------------------------
+
+
+def accuracy_and_time(results: Results) -> Figure:
+    """Plot top-1 accuracy of five against the time of a query, and against the time of fitting."""
+    figure = canvas(10.5, 4.4)
+    panels = figure.subplots(1, 2, sharey=True)
+    titles = {"query_ms": "one query against the whole gallery, ms", "fit_s": "fitting, s"}
+    for panel, (key, title) in zip(panels, titles.items(), strict=True):
+        front: list[tuple[float, float]] = []
+        for name in results.methods:
+            time, summary = results.time(name, key), results.summary(name, "topn_k5")
+            if not (time and summary):
+                continue
+            value, low, high = _first(summary)
+            front.append((time, value))
+            panel.errorbar(
+                time, value, [[value - low], [high - value]], fmt=style_of(name).marker, color=style_of(name).colour
+            )
+            panel.axhline(100 * summary["chance"][0], color=MUTED_COLOUR, ls="--", lw=1.2, zorder=0)
+        # The Pareto front of time and accuracy.
+        front = [
+            (time, value)
+            for time, value in sorted(front)
+            if not any(other != (time, value) and other[0] <= time and other[1] >= value for other in front)
+        ]
+        if front:
+            panel.step(*zip(*front, strict=True), where="post", color="#222222", lw=1, alpha=0.45, zorder=0)
+        panel.set_xscale("log")
+        low, high = panel.get_xlim()
+        logarithmic(panel.xaxis, (1, 2, 5) if high < 1000 * low else (1,))
+        panel.set_xlabel(title)
+    percent_axis(panels[0], "top-1 accuracy among 5 objects, %")
+    _legend(figure, results.methods)
+    return figure

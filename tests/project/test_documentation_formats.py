@@ -16,6 +16,7 @@ from retrieval.serve.store import HistoryStore
 from robot.recording.folder import RecordingWriter, read_recording
 from tests import real_data_sets
 from tests.documents import ROOT, text_of
+from tests.miniatures import physiclear
 
 PAGE = ROOT / "docs" / "formats.md"
 
@@ -98,7 +99,8 @@ def test_the_results_of_an_evaluation(tmp_path, recording):
 @pytest.mark.slow
 def test_the_results_of_the_benchmark_of_real_data(tmp_path):
     real_data_sets.write_billets(tmp_path / "billets")
-    quick = ["--preset", "tiny", "--seeds", "1", "--methods", "cca", "--protocols", "billets-places,rct"]
+    physiclear.write(tmp_path / "physiclear")
+    quick = ["--preset", "tiny", "--seeds", "1", "--methods", "cca", "--protocols", "billets-places,physiclear,rct"]
     assert main(["benchmark", "real", str(tmp_path), "--out", str(tmp_path / "out"), *quick]) == 0
     results = json.loads((tmp_path / "out" / "results.json").read_text())
     check(10, results)
@@ -108,7 +110,8 @@ def test_the_results_of_the_benchmark_of_real_data(tmp_path):
     row, control = entry["rows"]["cca"], entry["controls"]["permuted"]
     page = text_of(PAGE).partition("### `results.json` of the benchmark")[2]
     documented = {key: re.search(rf"^\| `{key}` .*$", page, re.M)[0] for key in ("rows", "controls")}
-    keys = {*row, *row["verdict"], *row["low_pass_differences"]["pair_auc"]}
+    touch_to_touch = next(iter(results["protocols"]["physiclear"]["rows"].values()))
+    keys = {*row, *row["verdict"], *row["low_pass_differences"]["pair_auc"], *touch_to_touch}
     assert keys == set(re.findall(r"`(\w+)`", documented["rows"])) - {"rows"}
     assert set(control) == set(re.findall(r"`(\w+)`", documented["controls"])) - {"controls"}
 

@@ -22,6 +22,7 @@ PROTOCOLS: "Registry[Protocol]" = Registry(
         "billets-places": "retrieval.evaluation.real.billets:PLACES",
         "objectfolder": "retrieval.evaluation.real.objectfolder:PUBLISHED",
         "rct": "retrieval.evaluation.real.rct:MATERIALS",
+        "physiclear": "retrieval.evaluation.real.physiclear:LEAVE_ONE_VIDEO_OUT",
         "feeling-of-success": "retrieval.evaluation.real.feeling_of_success:PAPER",
     },
     error=ConfigError,

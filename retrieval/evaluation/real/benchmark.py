@@ -32,6 +32,7 @@ from retrieval.evaluation.real.fold_measures import (
     write_fold_measures,
 )
 from retrieval.evaluation.real.protocol import Protocol, RecordingFacts, read_recording_facts
+from retrieval.evaluation.real.touch_to_touch import FROZEN, TouchToTouch, touch_to_touch_entry
 from retrieval.evaluation.real.verdict import Aggregation, MeasuresBySeed, control_entry, row_entry
 from retrieval.evaluation.scoring import MethodScores
 from retrieval.methods import CHANCE, METHODS
@@ -55,6 +56,7 @@ def benchmark(
     preset: str | None = None,
     methods: Sequence[str | type[Method]] = DEFAULT_METHODS,
     models: Mapping[str, Path] = MappingProxyType({}),
+    towers: Mapping[str, Config] = MappingProxyType({}),
     seeds: int = 3,
     skipped: Mapping[str, str] = MappingProxyType({}),
     cache: Path | None = None,
@@ -73,6 +75,7 @@ def benchmark(
         preset: Name of the configuration in the report. Default: the configuration's name.
         methods: Names, or your own classes.
         models: Checkpoints by name. Each is a separate row and is not fitted.
+        towers: Configurations by name. The frozen touch tower of each is a separate row of touch-to-touch protocols.
         seeds: Number of seeds. Each seed draws the folds again and fits the methods again.
         skipped: Why a protocol is left out, by its name. The report states these reasons.
         cache: Folder of features and measures. Default: `out`/cache.
@@ -106,6 +109,12 @@ def benchmark(
     config, preset_name = named_config(config, preset)
     cache = cache or out / "cache"
     selected = dict(map(_named, protocols))
+    if equal := set(towers) & {FROZEN, *models}:
+        raise BadInput(f"Another row is already named {min(equal)}. Give this entry of `towers` a different name.")
+    if towers and not any(isinstance(protocol, TouchToTouch) for protocol in selected.values()):
+        raise BadInput(
+            f"Only touch-to-touch protocols compare towers, got {', '.join(selected)}. Add one, such as physiclear."
+        )
     if not isinstance(recordings, Mapping):
         recordings = dict.fromkeys((protocol.data_set for protocol in selected.values()), recordings)
     facts = {name: read_recording_facts(folder_of(recording)) for name, recording in recordings.items()}
@@ -117,6 +126,14 @@ def benchmark(
             data_set = protocol.data_set
             if data_set not in rows:
                 rows[data_set] = _rows(facts[data_set], config, names, models, cache / "features", quiet)
+            if isinstance(protocol, TouchToTouch):
+                compared = {row.name if row.towers.checkpoint else FROZEN: row.towers for row in rows[data_set]}
+                for row_name, each in towers.items():
+                    compared[row_name] = TowerEncoder.of_config(facts[data_set].grasps, each, cache / "features", quiet)
+                tables[name] = touch_to_touch_entry(
+                    protocol, facts[data_set], compared, list(range(seeds)), cache, DRAWS, quiet
+                )
+                continue
             tables[name] = _ProtocolRun(
                 name, protocol, facts[data_set], rows[data_set], list(range(seeds)), cache, quiet
             ).entry()
@@ -132,6 +149,7 @@ def benchmark(
             "seeds": list(range(seeds)),
             "draws": DRAWS,
             "max_grasps": MAX_GRASPS,
+            "towers": {name: each.without_paths() for name, each in towers.items()},
         },
         "protocols": tables,
         "skipped": left_out,

@@ -11,12 +11,14 @@ from retrieval.metrics.resampled_splits import compare_splits, summarise_splits
 
 RULE = (
     "A result counts as touch only if it is evidence that the relief in the gel identifies the object: its main "
-    "measure must be higher than that of both controls, with the whole interval of the paired difference above 0. The "
-    "controls are the same method on low-pass touches, and the order of capture as input instead of the touch."
+    "measure must be higher than that of each control, with the whole interval of the paired difference above 0. Two "
+    "controls always apply: the same method on low-pass touches, and the order of capture as input instead of the "
+    "touch. If touches are compared with touches, a third one applies: the no-contact frame as input."
 )
 CONTROL_NAMES = {
     "low_pass_differences": "the low-pass control",
     "order_differences": "the order of capture",
+    "no_contact_differences": "the no-contact frame as input",
 }
 """Key of a row's paired differences -> name of the control."""
 
@@ -64,6 +66,7 @@ def row_entry(
     low_pass: MeasuresBySeed,
     order: MeasuresBySeed,
     aggregation: Aggregation,
+    no_contact: MeasuresBySeed = (),
 ) -> dict[str, Any]:
     """Return the numbers of a row: measures, low-pass measures, paired differences from the controls, verdict.
 
@@ -73,15 +76,20 @@ def row_entry(
         low_pass: Measures of low-pass touches; empty for a trivial baseline, which has no verdict.
         order: Measures of the control "order of capture".
         aggregation: How measures are aggregated.
+        no_contact: Measures with the no-contact frames as input, if the verdict uses this control.
     """
     measures = aggregation.summaries(touch)
     entry: dict[str, Any] = {"measures": measures, "low_pass": None, "verdict": None, **dict.fromkeys(CONTROL_NAMES)}
     if low_pass:
         entry["low_pass"] = aggregation.summaries(low_pass)
         entry |= {
-            key: aggregation.differences(touch, one) for key, one in zip(CONTROL_NAMES, (low_pass, order), strict=True)
+            key: aggregation.differences(touch, one)
+            for key, one in zip(CONTROL_NAMES, (low_pass, order, no_contact), strict=True)
+            if one
         }
-        entry["verdict"] = verdict(measures[protocol.main], *(entry[key][protocol.main] for key in CONTROL_NAMES))
+        entry["verdict"] = verdict(
+            measures[protocol.main], *(entry[key][protocol.main] for key in CONTROL_NAMES if entry[key])
+        )
     return entry
 
 
@@ -105,7 +113,7 @@ def verdict(summary: Mapping[str, Any], *differences: Mapping[str, Any]) -> dict
             must be above 0.
     """
     counts_as_touch = all(one["low"] > 0 for one in differences)
-    found = [_against(one, name) for one, name in zip(differences, CONTROL_NAMES.values(), strict=True)]
+    found = [_against(one, name) for one, name in zip(differences, CONTROL_NAMES.values(), strict=False)]
     words = f"{'counts' if counts_as_touch else 'does not count'} as touch: {'; '.join(found)}"
     above = summary["low"][0] > summary["chance"][0]
     return {"counts_as_touch": counts_as_touch, "above_chance": bool(above), "words": words}

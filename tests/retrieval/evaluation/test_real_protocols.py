@@ -11,6 +11,7 @@ from retrieval.errors import BadInput, ConfigError, DatasetError
 from retrieval.evaluation.real import PROTOCOLS
 from retrieval.evaluation.real.conditions import clock_features, missing_no_contact_reason
 from retrieval.evaluation.real.protocol import RecordingFacts
+from retrieval.evaluation.real.touch_to_touch import TouchToTouch
 from retrieval.evaluation.real.verdict import verdict
 from retrieval.metrics.measure import Measure, pooled
 from retrieval.metrics.resampled_splits import compare_splits, summarise_splits
@@ -49,6 +50,8 @@ RECORDINGS = {
     "rct": facts(dict.fromkeys(f"m{n}" for n in range(60))),
     "feeling-of-success": facts(dict.fromkeys(f"o{n}" for n in range(105))),
 }
+WITHOUT_SPLIT = {"physiclear"}
+"""Protocols without training; test_touch_to_touch tests them."""
 
 
 def folds(name, seed=0):
@@ -56,7 +59,8 @@ def folds(name, seed=0):
 
 
 def test_every_protocol_has_a_recording_here():
-    assert set(RECORDINGS) == set(PROTOCOLS)
+    assert set(RECORDINGS) | WITHOUT_SPLIT == set(PROTOCOLS)
+    assert all(isinstance(PROTOCOLS.load(name), TouchToTouch) == (name in WITHOUT_SPLIT) for name in PROTOCOLS)
 
 
 @pytest.mark.parametrize("name", RECORDINGS)

@@ -59,7 +59,7 @@ def test_returned_files_exist_and_every_figure_opens(report):
     figures = set(files[2:])
     assert figures == set((out / "figures").iterdir())
     names = {path.name for path in figures}
-    assert {"overview.png", "guess-curves.png", "grasps.png", "reject.png"} <= names
+    assert {"overview.png", "guess-curves.png", "grasps.png", "time.png", "reject.png"} <= names
     for method in ("late_fusion", "cca"):
         assert {f"objects-test-{method}.png", f"objects-all-{method}.png", f"reliability-{method}.png"} <= names
     for path in figures:
@@ -196,7 +196,7 @@ def test_missing_measures_are_left_out(report, tmp_path):
         "Ceilings",
         "Accuracy by object",
         "Calibration",
-        "Time",
+        "Accuracy and time",
     ):
         assert f"## {heading}" not in text
     assert "## Comparison of methods" in text

@@ -1,0 +1,339 @@
+"""Touch to touch: identify an object from other touches of it, leaving out one sequence (such as a press video).
+
+A sequence is one vector: the mean of its touches' tower features, in one of two representations:
+
+    difference      features of the touches, minus those of the no-contact frame
+    common-frame    features of the contact difference (touch minus no-contact frame) on ONE common no-contact frame
+
+If objects are touched one after the other, drift makes the no-contact frame of a sequence identify its object. The
+first representation retains part of that leak; the second one removes additive effects in the image. The score of two
+sequences is the cosine of their first principal components; scaling and components are fitted without the query.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from _touch_retrieval.files import write_atomically
+from retrieval.console.progress import Bar
+from retrieval.data.dataset import Grasp, Split, data_digest
+from retrieval.data.images import encode_image, read_rgb
+from retrieval.errors import DatasetError
+from retrieval.evaluation.real.conditions import (
+    CONTROLS,
+    TowerEncoder,
+    clock_features,
+    missing_no_contact_reason,
+)
+from retrieval.evaluation.real.protocol import Protocol, RecordingFacts
+from retrieval.evaluation.real.verdict import Aggregation, control_entry, row_entry
+from retrieval.metrics import protocols
+from retrieval.metrics.measure import Measure, pooled
+from retrieval.metrics.registry import MethodScoreTables, Metric
+from retrieval.metrics.table import ScoreTable
+from retrieval.training.features import Features, encode_recording
+
+COMPONENTS = 60
+REPRESENTATIONS = ("difference", "common-frame")
+FROZEN = "frozen"
+"""Row name of the configuration's own towers."""
+PERMUTED = "the objects of the sequences are permuted: the level of chance"
+
+Vectors = NDArray[np.float64]
+
+MEASURES = {
+    "recall_1": Metric("top-1", "real", lambda of: protocols.recall(of.test, 1)),
+    "recall_5": Metric("R@5", "real", lambda of: protocols.recall(of.test, 5)),
+    "map": Metric("mAP", "real", lambda of: protocols.average_precision(of.test)),
+}
+"""Measures of sequence-to-sequence retrieval; the first one decides."""
+
+
+def _no_folds(facts: RecordingFacts, seed: int) -> list[Split]:
+    return []
+
+
+@dataclass(frozen=True)
+class TouchToTouch(Protocol):
+    """A protocol without training: each sequence of touches is a query, the other sequences are the gallery.
+
+    It needs a no-contact frame for each touch. Methods are not fitted; a row is a tower with one of `REPRESENTATIONS`.
+    """
+
+    folds: Any = _no_folds
+    measures: Mapping[str, Metric] = dataclasses.field(default_factory=lambda: MEASURES)
+
+
+def leave_one_out_scores(vectors: Vectors, components: int = COMPONENTS) -> NDArray[np.float32]:
+    """Return the cosine of each vector with every other one, after principal components fitted without it.
+
+    Args:
+        vectors: (S, F), a vector for each sequence.
+        components: Number of principal components, at most S - 2.
+
+    Returns:
+        (S, S) float32, 0 on the diagonal. Row q uses mean, standard deviation and components of all vectors but q.
+    """
+    count = len(vectors)
+    scores = np.zeros((count, count), np.float32)
+    for row in range(count):
+        others = np.arange(count) != row
+        mean, deviation = vectors[others].mean(0), vectors[others].std(0)
+        scaled = (vectors - mean) / np.where(deviation > 1e-9 * max(1.0, np.abs(mean).max()), deviation, np.inf)
+        # Use the Gram matrix: there are fewer sequences than features.
+        gallery = scaled[others]
+        values, directions = np.linalg.eigh(gallery @ gallery.T)
+        used = np.flatnonzero(values > 1e-9 * max(values[-1], 1e-12))[::-1][: min(components, count - 2)]
+        codes = scaled @ (gallery.T @ (directions[:, used] / np.sqrt(values[used])))
+        norms = np.maximum(np.linalg.norm(codes, axis=1), 1e-12)
+        scores[row, others] = (codes[others] @ codes[row]) / (norms[others] * norms[row])
+    return scores
+
+
+@dataclass(frozen=True, eq=False)
+class Sequences:
+    """The sequences of a recording, in the order of capture.
+
+    Attributes:
+        grasps: All grasps.
+        names: Name of each sequence.
+        objects: Object of each sequence.
+        rows: Places of the grasps of each sequence.
+    """
+
+    grasps: Sequence[Grasp]
+    names: tuple[str, ...]
+    objects: tuple[str, ...]
+    rows: tuple[NDArray[np.int64], ...]
+
+    @classmethod
+    def of(cls, grasps: Sequence[Grasp]) -> "Sequences":
+        """Group grasps by object and sequence.
+
+        Raises:
+            DatasetError: There are fewer than two objects, or an object has fewer than two sequences.
+        """
+        places: dict[tuple[str, str], list[int]] = {}
+        for place, grasp in enumerate(grasps):
+            places.setdefault((grasp.object_id, grasp.sequence_id or grasp.grasp_id), []).append(place)
+        objects = [name for name, _ in places]
+        single = sorted({name for name in objects if objects.count(name) < 2})
+        if single or len(set(objects)) < 2:
+            raise DatasetError(
+                "Touch to touch needs at least 2 objects with 2 sequences each, but "
+                + (f"{single[0]} has 1 sequence." if single else f"the recording has {len(set(objects))} object(s).")
+            )
+        rows = tuple(np.array(each, np.int64) for each in places.values())
+        return cls(grasps, tuple(name for _, name in places), tuple(objects), rows)
+
+    @cached_property
+    def owner(self) -> NDArray[np.int64]:
+        """(S,) object number of each sequence, in the order of the sorted names."""
+        return np.unique(np.array(self.objects), return_inverse=True)[1].astype(np.int64)
+
+    def mean(self, features: NDArray[np.float32]) -> Vectors:
+        """Return the mean (S, F) of features (G, F) over the grasps of each sequence."""
+        return np.stack([features[rows].mean(0, dtype=np.float64) for rows in self.rows])
+
+    def table(self, scores: NDArray[np.float32], owner: NDArray[np.int64] | None = None) -> ScoreTable:
+        """Return scores (S, S) as a table: each sequence is a query, and is not compared with itself."""
+        owner = self.owner if owner is None else owner
+        words = {"row_words": "sequences", "column_words": "sequences"}
+        return ScoreTable(scores, owner, owner, np.eye(len(owner), dtype=np.bool_), **words)
+
+
+def with_common_frame(grasps: Sequence[Grasp], folder: Path, *, quiet: bool = True) -> list[Grasp]:
+    """Add the contact difference of each grasp to one common no-contact frame; write the images to `folder`.
+
+    The common frame is that of the first grasp. An image is common + touch - no-contact frame, clipped to 8 bits.
+
+    Args:
+        grasps: Grasps with no-contact frames.
+        folder: Folder of the images; existing images are reused.
+        quiet: No progress on stderr.
+
+    Returns:
+        The grasps with the new images as touches, and the common frame as no-contact frame.
+
+    Raises:
+        DatasetError: The frames differ in size.
+    """
+    common = [read_rgb(path) for path in grasps[0].backgrounds]
+    folder.mkdir(parents=True, exist_ok=True)
+    found = []
+    with Bar("one common frame", len(grasps), "grasps", quiet=quiet) as bar:
+        for grasp in grasps:
+            files = []
+            for finger, (touch, before) in enumerate(zip(grasp.touches, grasp.backgrounds, strict=True)):
+                path = folder / f"{grasp.grasp_id}-{finger}.png"
+                if not path.is_file():
+                    write_atomically(path, _png(_on_common_frame(touch, before, common[finger])))
+                files.append(path)
+            found.append(dataclasses.replace(grasp, touches=tuple(files), backgrounds=grasps[0].backgrounds))
+            bar.advance()
+    return found
+
+
+def _on_common_frame(touch: Path, before: Path, common: NDArray[np.float32]) -> NDArray[np.float32]:
+    pressed, no_contact = read_rgb(touch), read_rgb(before)
+    if not pressed.shape == no_contact.shape == common.shape:
+        raise DatasetError(
+            f"{touch}, its no-contact frame and the first no-contact frame of the recording must have the same size, "
+            f"got {pressed.shape}, {no_contact.shape} and {common.shape}."
+        )
+    return common + pressed - no_contact
+
+
+def _png(image: NDArray[np.float32]) -> bytes:
+    """Return an RGB image (H, W, 3) in 0..1 as the bytes of a PNG file."""
+    return encode_image(np.clip(np.rint(255 * image), 0, 255).astype(np.uint8))
+
+
+@dataclass(frozen=True, eq=False)
+class _SequenceEncoder:
+    """Encodes the sequences of a recording with the towers of one row; each kind of image is encoded once."""
+
+    sequences: Sequences
+    towers: TowerEncoder
+    common: Sequence[Grasp]
+
+    def vectors(self, representation: str, touch_variant: str) -> Vectors:
+        """Return vectors (S, F) of a representation; `touch_variant` is "touch" or, for the control, "low_pass"."""
+        if representation == "common-frame":
+            return self.sequences.mean(self._features(self.common, touch_variant))
+        return self.sequences.mean(self._features(self.sequences.grasps, touch_variant)) - self.no_contact(
+            touch_variant
+        )
+
+    def no_contact(self, touch_variant: str = "touch") -> Vectors:
+        """Return the features (S, F) of each sequence's no-contact frame, that of its first grasp."""
+        first = [self.sequences.grasps[rows[0]] for rows in self.sequences.rows]
+        frames = [dataclasses.replace(grasp, touches=grasp.backgrounds) for grasp in first]
+        return self._features(frames, touch_variant).astype(np.float64)
+
+    def _features(self, grasps: Sequence[Grasp], touch_variant: str) -> NDArray[np.float32]:
+        """Return the features (G, fingers * F) of these touches without cells, whose place in the image would count."""
+        fingers = self.towers.config.matcher.fingers
+        if fingers > 1 and len(grasps[0].touches) == 1:  # both fingers of the model get the same touch
+            grasps = [
+                dataclasses.replace(one, touches=one.touches * fingers, backgrounds=one.backgrounds * fingers)
+                for one in grasps
+            ]
+        ids = tuple(grasp.grasp_id for grasp in grasps)
+        no_photos = Features(ids, ids, np.zeros((len(ids), 1, 1), np.float32), np.zeros((len(ids), 1), np.float32))
+        towers = self.towers
+        found = encode_recording(
+            grasps,
+            towers.matcher,
+            towers.config,
+            towers.cache,
+            touch_variant=touch_variant,
+            photo_features_from=no_photos,
+            quiet=towers.quiet,
+        )
+        return found.pooled(towers.matcher).touch.reshape(len(ids), -1)
+
+
+def touch_to_touch_entry(
+    protocol: TouchToTouch,
+    facts: RecordingFacts,
+    towers_of: Mapping[str, TowerEncoder],
+    seeds: Sequence[int],
+    cache: Path,
+    draws: int,
+    quiet: bool,
+) -> dict[str, Any]:
+    """Return the protocol's entry of results.json.
+
+    Args:
+        protocol: The protocol.
+        facts: The recording. Each touch must have a no-contact frame, and each object two sequences.
+        towers_of: Towers by name of their row; the others are compared with the first.
+        seeds: Seeds of the permutations of the objects.
+        cache: Folder of features and of images on the common frame.
+        draws: Resamples of an interval.
+        quiet: No progress on stderr.
+
+    Raises:
+        DatasetError: No-contact frames or second sequences are missing.
+    """
+    sequences = Sequences.of(facts.grasps)
+    if reason := missing_no_contact_reason(facts.grasps):
+        raise DatasetError(f"Touch to touch needs the no-contact frame of each sequence: {reason}.")
+    digest = data_digest(facts.grasps)
+    common = with_common_frame(facts.grasps, cache / "common-frame" / digest[:32], quiet=quiet)
+    aggregation = Aggregation(draws, seeds[0])
+    order = _measures(protocol, sequences, clock_features(len(sequences.names)).astype(np.float64))
+    entries: dict[str, Any] = {}
+    controls: dict[str, list[dict[str, Measure]]] = {"order": [order]}
+    frozen: dict[str, dict[str, Measure]] = {}
+    for label, towers in towers_of.items():
+        encoder = _SequenceEncoder(sequences, towers, common)
+        no_contact = _measures(protocol, sequences, encoder.no_contact())
+        controls.setdefault("no_contact", [no_contact])
+        for representation in REPRESENTATIONS:
+            name = f"{label}-{representation}"
+            table = sequences.table(leave_one_out_scores(encoder.vectors(representation, "touch")))
+            low_pass = _measures(protocol, sequences, encoder.vectors(representation, "low_pass"))
+            measured = _measure_table(protocol, table)
+            model = towers.checkpoint
+            first = frozen.setdefault(representation, measured)
+            entries[name] = {
+                "method": "nearest",
+                "model": model.digest if model else None,
+                **row_entry(protocol, [measured], [low_pass], [order], aggregation, [no_contact]),
+                "tower_differences": None if first is measured else aggregation.differences([measured], [first]),
+                "best_params": [],
+            }
+            controls.setdefault("permuted", list(_permuted_measures(protocol, sequences, table.scores, seeds)))
+    objects = sorted(set(sequences.objects))
+    return {
+        "title": protocol.title,
+        "rule": protocol.rule,
+        "published_results": list(protocol.published_results),
+        "main": protocol.main,
+        "labels": [[name, metric.label] for name, metric in protocol.measures.items()],
+        "unit": "object",
+        "recording": {
+            "data_set": protocol.data_set,
+            "source": facts.source,
+            "digest": digest,
+            "objects": len(objects),
+            "grasps": len(facts.grasps),
+        },
+        "folds": [[{"test": [name]} for name in sequences.names]],
+        "rows": entries,
+        "controls": {
+            name: control_entry(
+                protocol, PERMUTED if name == "permuted" else CONTROLS[name], None, by_seed, aggregation
+            )
+            for name, by_seed in controls.items()
+        },
+    }
+
+
+def _measures(protocol: Protocol, sequences: Sequences, vectors: Vectors) -> dict[str, Measure]:
+    return _measure_table(protocol, sequences.table(leave_one_out_scores(vectors)))
+
+
+def _measure_table(protocol: Protocol, table: ScoreTable) -> dict[str, Measure]:
+    """Return the measures of a table, queries in the order of their objects."""
+    found = {
+        name: metric.compute(MethodScoreTables(table, table, {}, None, 0)) for name, metric in protocol.measures.items()
+    }
+    same = {int(name): int(name) for name in table.objects}
+    return {name: pooled([one], [same]) for name, one in found.items() if one is not None}
+
+
+def _permuted_measures(
+    protocol: Protocol, sequences: Sequences, scores: NDArray[np.float32], seeds: Sequence[int]
+) -> Iterator[dict[str, Measure]]:
+    for seed in seeds:
+        owner = np.random.default_rng([seed, 41]).permutation(sequences.owner)
+        yield _measure_table(protocol, sequences.table(scores, owner))

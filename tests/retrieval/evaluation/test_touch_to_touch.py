@@ -1,0 +1,201 @@
+"""Touch to touch: nothing uses the left-out sequence, the common frame removes the leak, controls are measured."""
+
+import json
+from importlib import resources
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from retrieval.commands.main import main
+from retrieval.data.dataset import Grasp, load_grasps
+from retrieval.data.images import read_rgb
+from retrieval.errors import DatasetError
+from retrieval.evaluation.real.touch_to_touch import (
+    Sequences,
+    leave_one_out_scores,
+    with_common_frame,
+)
+from robot.importers.physiclear import import_physiclear
+from tests.miniatures import physiclear
+
+RNG = np.random.default_rng(3)
+
+
+# Scores ----------------------------------------------------------------------------------------------------
+
+
+def by_plain_loops(vectors, components):
+    """Standardise and fit components by an SVD without row q; then compute each cosine."""
+    scores = np.zeros((len(vectors), len(vectors)))
+    for q in range(len(vectors)):
+        others = np.delete(vectors, q, axis=0)
+        mean, deviation = others.mean(0), others.std(0)
+        axes = np.linalg.svd((others - mean) / deviation, full_matrices=False)[2][:components]
+        codes = (vectors - mean) / deviation @ axes.T
+        for other in range(len(vectors)):
+            if other != q:
+                length = np.linalg.norm(codes[q]) * np.linalg.norm(codes[other])
+                scores[q, other] = codes[q] @ codes[other] / length
+    return scores
+
+
+@pytest.mark.parametrize("components", [1, 3, 8])
+def test_scores_are_cosines_of_principal_components_without_the_query(components):
+    vectors = RNG.normal(size=(11, 20)) * np.linspace(0.1, 30, 20) + 5
+    np.testing.assert_allclose(
+        leave_one_out_scores(vectors, components), by_plain_loops(vectors, components), atol=1e-5
+    )
+
+
+def test_components_of_all_rows_depend_on_the_query():
+    """Naive: with 30 sequences of noise, components fitted with the query change its scores."""
+    vectors = RNG.normal(size=(30, 200))
+    scaled = (vectors - vectors.mean(0)) / vectors.std(0)
+    codes = scaled @ np.linalg.svd(scaled, full_matrices=False)[2][:20].T
+    codes /= np.linalg.norm(codes, axis=1, keepdims=True)
+    naive = codes @ codes.T
+    strict = leave_one_out_scores(vectors, 20)
+    off = ~np.eye(30, dtype=bool)
+    assert np.abs(naive - strict)[off].max() > 0.1
+
+
+# Sequences -------------------------------------------------------------------------------------------------
+
+
+def grasps(counts, frames=2):
+    return [
+        Grasp(
+            f"{name}-{video}-{frame}",
+            name,
+            f"{name}-{video}",
+            Path("p"),
+            (Path(f"{name}{video}{frame}"),),
+            (Path("u"),),
+        )
+        for name, count in counts.items()
+        for video in range(count)
+        for frame in range(frames)
+    ]
+
+
+def test_a_sequence_is_the_mean_of_its_own_grasps():
+    sequences = Sequences.of(grasps({"a": 2, "b": 2}))
+    assert sequences.names == ("a-0", "a-1", "b-0", "b-1")
+    assert sequences.owner.tolist() == [0, 0, 1, 1]
+    features = np.arange(8, dtype=np.float32)[:, None]
+    assert sequences.mean(features).ravel().tolist() == [0.5, 2.5, 4.5, 6.5]
+
+
+@pytest.mark.parametrize(
+    ("counts", "message"), [({"a": 2, "b": 1}, "b has 1 sequence"), ({"a": 3}, r"the recording has 1 object\(s\)")]
+)
+def test_one_sequence_of_an_object_or_one_object_is_refused(counts, message):
+    with pytest.raises(DatasetError, match=message):
+        Sequences.of(grasps(counts))
+
+
+# The common no-contact frame -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """The miniature as a recording: 2 parts with 3 videos each; the colour of the gel identifies the part."""
+    folder = tmp_path_factory.mktemp("physiclear")
+    physiclear.write(folder / "data" / "physiclear")
+    import_physiclear(folder / "data" / "physiclear", folder / "recording")
+    return folder
+
+
+def test_images_on_the_common_frame_contain_only_the_contact_difference(recording, tmp_path):
+    own = load_grasps(recording / "recording")
+    moved = with_common_frame(own, tmp_path / "common")
+    common = np.rint(255 * read_rgb(own[0].backgrounds[0]))
+    for before, after in zip(own, moved, strict=True):
+        touch, rest = (np.rint(255 * read_rgb(path)) for path in (before.touches[0], before.backgrounds[0]))
+        expected = np.clip(common + touch - rest, 0, 255)
+        np.testing.assert_array_equal(np.rint(255 * read_rgb(after.touches[0])), expected)
+        assert after.backgrounds == own[0].backgrounds
+
+
+def test_drift_that_identifies_the_object_is_removed_on_the_common_frame(tmp_path):
+    """Planted: touches without contact on gels of each object's own colour. Each image becomes the common frame."""
+    made = []
+    for number in range(3):
+        for video in range(2):
+            path = tmp_path / f"{number}-{video}.png"
+            cv2.imwrite(str(path), np.full((6, 8, 3), 60 + 40 * number, np.uint8))
+            made.append(Grasp(f"{number}-{video}", f"o{number}", f"{number}-{video}", path, (path,), (path,)))
+    moved = with_common_frame(made, tmp_path / "common")
+    assert {read_rgb(one.touches[0]).tobytes() for one in moved} == {read_rgb(made[0].touches[0]).tobytes()}
+
+
+# The protocol ----------------------------------------------------------------------------------------------
+
+
+def benchmark(recording, out, *more):
+    options = ["--preset", "tiny", "--protocols", "physiclear", "--seeds", "2", "--methods", "chance", *more]
+    return main(["benchmark", "real", str(recording / "data"), "--out", str(out), *options])
+
+
+@pytest.fixture(scope="module")
+def out(recording, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("made") / "report"
+    assert benchmark(recording, folder) == 0
+    return folder
+
+
+def test_each_representation_is_compared_with_three_controls(out):
+    entry = json.loads((out / "results.json").read_text())["protocols"]["physiclear"]
+    assert set(entry["rows"]) == {"frozen-difference", "frozen-common-frame"}
+    for row in entry["rows"].values():
+        assert (row["measures"]["recall_1"]["queries"], row["measures"]["recall_1"]["objects"]) == (6, 2)
+        assert row["measures"]["recall_1"]["chance"][0] == pytest.approx(2 / 5)  # two of five other videos
+        lows = [
+            row[key]["recall_1"]["low"]
+            for key in ("low_pass_differences", "order_differences", "no_contact_differences")
+        ]
+        assert row["verdict"]["counts_as_touch"] == all(low > 0 for low in lows)
+        assert "the no-contact frame as input" in row["verdict"]["words"]
+        assert row["tower_differences"] is None
+    assert set(entry["controls"]) == {"no_contact", "order", "permuted"}
+    assert len(entry["controls"]["permuted"]["measures"]["recall_1"]["by_seed"]) == 2
+    # The gels have a colour for each part: the no-contact frame identifies the part, and so does the order.
+    assert entry["controls"]["no_contact"]["measures"]["recall_1"]["value"][0] == 1.0
+    assert entry["controls"]["order"]["measures"]["recall_1"]["value"][0] >= 2 / 3
+
+
+def test_the_report_shows_touch_to_touch_results(out):
+    text = (out / "report.md").read_text().replace("\\", "")
+    for words in ("one video left out", "control: permuted", "frozen-common-frame"):
+        assert words in text
+
+
+def test_the_towers_of_other_configurations_are_rows_compared_with_the_first(recording, tmp_path):
+    larger = tmp_path / "larger.toml"
+    tiny = (resources.files("retrieval") / "configs" / "tiny.toml").read_text()
+    larger.write_text(tiny.replace("touch_px = 32", "touch_px = 48"))
+    assert benchmark(recording, tmp_path / "report", "--towers", "same=tiny", f"larger={larger}") == 0
+    rows = json.loads((tmp_path / "report" / "results.json").read_text())["protocols"]["physiclear"]["rows"]
+    assert set(rows) == {
+        f"{name}-{representation}"
+        for name in ("frozen", "same", "larger")
+        for representation in ("difference", "common-frame")
+    }
+    same, first = rows["same-difference"], rows["frozen-difference"]
+    assert same["measures"] == first["measures"]
+    assert [same["tower_differences"]["map"][key] for key in ("low", "difference", "high")] == [0, 0, 0]
+    assert rows["larger-difference"]["tower_differences"] is not None
+
+
+@pytest.mark.parametrize(
+    ("choice", "message"),
+    [
+        ("tiny", "--towers must have the form NAME=CONFIG, got 'tiny'"),
+        ("frozen=tiny", "Another row is already named frozen"),
+    ],
+)
+def test_a_tower_without_a_name_of_its_own_is_refused(recording, tmp_path, capsys, choice, message):
+    assert benchmark(recording, tmp_path / "report", "--towers", choice) == 2
+    assert message in capsys.readouterr().err
