@@ -35,31 +35,6 @@ class DiscoveredDevice:
     toml: str
 
 
-@dataclass(frozen=True)
-class UsbPort:
-    """The USB socket of a camera.
-
-    Attributes:
-        bus: Number of the bus; the devices of a bus share its speed.
-        port: Numbers of the ports from the bus to the device, such as "2.3" for port 3 of a hub at port 2.
-        mbit_s: Speed at which the device is connected: 480 for USB 2, 5000 and more for USB 3.
-    """
-
-    bus: int
-    port: str
-    mbit_s: int
-
-    def __str__(self) -> str:
-        return f"bus {self.bus}, port {self.port}, {self.mbit_s} Mbit/s"
-
-
-def usb_port(device: str, sys: Path = SYS) -> UsbPort | None:
-    """Return the USB socket of a camera, from the path of its device; None if it is unknown."""
-    interface = (sys / "class" / "video4linux" / Path(device).resolve().name / "device").resolve()
-    bus, port, mbit_s = (_text(interface.parent / name) for name in ("busnum", "devpath", "speed"))
-    return UsbPort(int(bus), port, int(mbit_s)) if bus.isdigit() and port and mbit_s.isdigit() else None
-
-
 def discover(dev: Path = DEV, sys: Path = SYS) -> list[DiscoveredDevice]:
     """Return all connected devices, cameras first; `dev` and `sys` are the system's device folders."""
     vendors = [*_list_safely("RealSense", _realsenses), *_list_safely("Kinect 2", _kinects)]

@@ -117,17 +117,3 @@ def test_a_failing_package_gives_a_warning_and_hides_nothing_else(roots, monkeyp
     monkeypatch.setitem(sys.modules, "pylibfreenect2", FakeFreenect2())
     assert [each.kind for each in discover.discover(*roots)] == ["kinect2"]
     assert "RealSense cameras could not be listed: no udev rules" in caplog.text
-
-
-def test_the_usb_socket_of_a_camera_is_read_from_its_device(roots):
-    plug_camera(roots, "usb-DIGIT_D20-video-index0", 4, "DIGIT")
-    device = roots[1] / "devices/pci0000:00/usb3/3-1/3-1.2"
-    (device / "3-1.2:1.0").mkdir(parents=True)
-    (roots[1] / "class/video4linux/video4/device").symlink_to(device / "3-1.2:1.0")
-    name = str(roots[0] / "v4l/by-id/usb-DIGIT_D20-video-index0")
-    assert discover.usb_port(name, roots[1]) is None  # a device that is not on USB has no such files
-    for entry, text in (("busnum", "3"), ("devpath", "1.2"), ("speed", "480")):
-        (device / entry).write_text(text + "\n")
-    assert discover.usb_port(name, roots[1]) == discover.UsbPort(3, "1.2", 480)
-    assert str(discover.usb_port(name, roots[1])) == "bus 3, port 1.2, 480 Mbit/s"
-    assert discover.usb_port("", roots[1]) is None
