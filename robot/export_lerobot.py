@@ -12,14 +12,14 @@ Written with pyarrow and PyAV according to the source of lerobot 0.4.4; lerobot 
 A grasp is an episode. Its steps are the moments before, during and after the touch that every grasp has. `moment` of a
 step is 0 before, 1 during, 2 after the touch; all steps of an episode have the same photo. Videos are H.264 with key
 frames only and colours at full resolution, but not lossless: on 144 touches of a GelSight Mini the root mean square
-error is 0.86 grey levels, at most 1.2. Only the current grasp is in memory.
+error is 0.86 grey levels, at most 1.2. Only the pictures of the current grasp are in memory.
 """
 
 import contextlib
 import json
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -36,13 +36,18 @@ from robot.storage import decode_picture, storage_errors
 
 FPS = 1
 """Nominal, because steps have no fixed rate; readers require an integer."""
-EPISODES_A_FILE = 500
-FILES_A_CHUNK = 1000
 _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 _DATA, _VIDEO = f"data/{_FILE}.parquet", "videos/{video_key}/" + f"{_FILE}.mp4"
-_EPISODES = f"meta/episodes/{_FILE}.parquet"
+_NUMBERS = {"chunk_index": 0, "file_index": 0}
 _CODEC = {"crf": "10", "g": "1", "bf": "0", "preset": "fast"}
 _STEP_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index", "moment")
+_FIELDS = {
+    **dict.fromkeys(("grasp_id", "object_id", "sequence_id", "outcome"), "string"),
+    "grasped": "bool",
+    **dict.fromkeys(("force_n", "opening_mm", "touch_skew_s", "time_s"), "double"),
+    "pose": "list",
+}
+"""Recorded fields of an episode, with their types in Parquet."""
 _FACTS = ("source", "sensor", "rig", "licence", "terms", "citation", "background")
 """Keys of recording.json that info.json repeats."""
 _WHAT = "LeRobot's format"
@@ -64,21 +69,67 @@ def export_lerobot(recording: Recording, out: Path, progress: Progress | None = 
         ImporterError: pyarrow or av is missing.
         StorageError: The folder cannot be written.
     """
-    import_extra("pyarrow", _WHAT), import_extra("av", _WHAT)
-    grasps, steps = recording.grasps, _EpisodeSteps(recording)
+    pa, av = import_extra("pyarrow", _WHAT), import_extra("av", _WHAT)
+    if not (grasps := recording.grasps):
+        raise RecordingError(f"{recording.folder} must contain grasps, but contains none")
+    fingers = sorted(grasps[0].touches)
+    for grasp in grasps:
+        if sorted(grasp.touches) != fingers:
+            raise RecordingError(
+                f"every grasp must have the same fingers; {grasps[0].grasp_id} has {', '.join(fingers)}, "
+                f"{grasp.grasp_id} has {', '.join(sorted(grasp.touches))}"
+            )
+    counts = {moment: sum(_has(grasp, fingers, moment) for grasp in grasps) for moment in MOMENT_SUFFIXES}
+    moments = [moment for moment, count in counts.items() if count == len(grasps)]
+    columns = {"photo": ["photo"] * len(moments)}
+    columns |= {f"touch_{each}": [f"touch_{each}{MOMENT_SUFFIXES[moment]}" for moment in moments] for each in fingers}
+    sizes = {
+        camera: _read_picture(recording.folder / grasps[0].images()[names[0]]).shape[:2]
+        for camera, names in columns.items()
+    }
     tasks = {name: number for number, name in enumerate(dict.fromkeys(grasp.object_id for grasp in grasps))}
+    stats = {name: _Stats() for name in (*_STEP_COLUMNS, *map(_key, columns))}
+    steps: list[dict[str, Any]] = []
+    episodes: list[dict[str, Any]] = []
     with _new_folder(out) as folder:
-        stats = {name: _Stats() for name in (*_STEP_COLUMNS, *map(_key, steps.sizes))}
-        for start in range(0, len(grasps), EPISODES_A_FILE):
-            with _FileWriter(folder, start, steps, tasks, stats) as file:
-                for episode, grasp in enumerate(grasps[start : start + EPISODES_A_FILE], start):
-                    file.append(episode, grasp)
-                    if progress is not None:
-                        progress(episode + 1, len(grasps))
+        with contextlib.ExitStack() as stack:
+            videos = {
+                camera: stack.enter_context(
+                    _video(av, folder / _VIDEO.format(video_key=_key(camera), **_NUMBERS), size)
+                )
+                for camera, size in sizes.items()
+            }
+            for episode, grasp in enumerate(grasps):
+                task = tasks[grasp.object_id]
+                for step, moment in enumerate(moments):
+                    values = (step / FPS, step, episode, len(steps), task, list(MOMENT_SUFFIXES).index(moment))
+                    steps.append(dict(zip(_STEP_COLUMNS, values, strict=True)))
+                    for name, value in steps[-1].items():
+                        stats[name].add(np.array([[value]], dtype=np.float64))
+                for camera, names in columns.items():
+                    for name in names:
+                        frame = letterbox(_read_picture(recording.folder / grasp.images()[name]), sizes[camera])
+                        videos[camera](frame)
+                        stats[_key(camera)].add(frame.reshape(-1, 3) / 255.0)
+                episodes.append(_episode(episode, grasp, len(moments), list(columns)))
+                if progress is not None:
+                    progress(episode + 1, len(grasps))
+        kinds = {"string": pa.string(), "bool": pa.bool_(), "double": pa.float64(), "list": pa.list_(pa.float64())}
+        _write_table(folder / _DATA.format(**_NUMBERS), steps, {"timestamp": pa.float32()})
+        types = {key: kinds[kind] for key, kind in _FIELDS.items()}
+        _write_table(folder / f"meta/episodes/{_FILE}.parquet".format(**_NUMBERS), episodes, types)
         _write_tasks(folder / "meta" / "tasks.parquet", tasks)
         _write_json(folder / "meta" / "stats.json", {name: values.to_dict() for name, values in stats.items()})
-        _write_json(folder / "meta" / "info.json", _info(recording, steps, len(tasks)))
-    return steps.remarks()
+        _write_json(folder / "meta" / "info.json", _info(recording, moments, sizes, len(tasks)))
+    return tuple(
+        f"the frames {moment} the touch are left out because some grasps do not have them"
+        for moment, count in counts.items()
+        if 0 < count < len(grasps)
+    )
+
+
+def _has(grasp: RecordedGrasp, fingers: Sequence[str], moment: str) -> bool:
+    return grasp.images().keys() >= {f"touch_{finger}{MOMENT_SUFFIXES[moment]}" for finger in fingers}
 
 
 @contextlib.contextmanager
@@ -94,76 +145,7 @@ def _new_folder(out: Path) -> Iterator[Path]:
             os.replace(part, out)
 
 
-# Steps -----------------------------------------------------------------------------------------------------
-
-
-class _EpisodeSteps:
-    """The pictures of grasps as steps in time. Each camera has one size, that of the first grasp.
-
-    Attributes:
-        moments: Moments that every grasp has.
-        sizes: (height, width) of `photo`, `touch_a`, ...
-    """
-
-    def __init__(self, recording: Recording) -> None:
-        """Read the first grasp; raise RecordingError if there is none, or grasps differ in their fingers."""
-        if not (grasps := recording.grasps):
-            raise RecordingError(f"{recording.folder} must contain grasps, but contains none")
-        self._folder = recording.folder
-        self._fingers = sorted(grasps[0].touches)
-        for grasp in grasps:
-            if sorted(grasp.touches) != self._fingers:
-                raise RecordingError(
-                    f"every grasp must have the same fingers; {grasps[0].grasp_id} has {', '.join(self._fingers)}, "
-                    f"{grasp.grasp_id} has {', '.join(sorted(grasp.touches))}"
-                )
-        self.moments = [moment for moment in MOMENT_SUFFIXES if all(map(self._has(moment), grasps))]
-        self._left_out = [
-            moment for moment in MOMENT_SUFFIXES if moment not in self.moments and any(map(self._has(moment), grasps))
-        ]
-        self.sizes = {name: pictures[0].shape[:2] for name, pictures in self._read(grasps[0]).items()}
-        self._resized: dict[str, int] = {}
-
-    def _has(self, moment: str) -> Callable[[RecordedGrasp], bool]:
-        columns = {f"touch_{finger}{MOMENT_SUFFIXES[moment]}" for finger in self._fingers}
-        return lambda grasp: grasp.images().keys() >= columns
-
-    def pictures_of(self, grasp: RecordedGrasp) -> dict[str, list[Picture]]:
-        """Return the pictures of each camera (photo, touch_a, ...), one per step.
-
-        Raises:
-            RecordingError: A picture is damaged.
-        """
-        pictures = self._read(grasp)
-        for name, size in self.sizes.items():
-            if any(picture.shape[:2] != size for picture in pictures[name]):
-                self._resized[name] = self._resized.get(name, 0) + 1
-                pictures[name] = [letterbox(picture, size) for picture in pictures[name]]
-        return pictures
-
-    def _read(self, grasp: RecordedGrasp) -> dict[str, list[Picture]]:
-        files = grasp.images()
-        touches = {
-            f"touch_{finger}": [
-                _read_picture(self._folder / files[f"touch_{finger}{MOMENT_SUFFIXES[moment]}"])
-                for moment in self.moments
-            ]
-            for finger in self._fingers
-        }
-        return {"photo": [_read_picture(self._folder / files["photo"])] * len(self.moments), **touches}
-
-    def remarks(self) -> tuple[str, ...]:
-        """Return remarks on moments that are left out and on pictures that were resized so far."""
-        left_out = [
-            f"the frames {moment} the touch are left out because some grasps do not have them"
-            for moment in self._left_out
-        ]
-        resized = [
-            f"{name}: {count} grasp(s) had another size and were resized to {self.sizes[name][1]} x "
-            f"{self.sizes[name][0]} with black borders"
-            for name, count in self._resized.items()
-        ]
-        return (*left_out, *resized)
+# Pictures --------------------------------------------------------------------------------------------------
 
 
 def _read_picture(path: Path) -> Picture:
@@ -178,7 +160,9 @@ def _read_picture(path: Path) -> Picture:
 
 
 def letterbox(picture: Picture, size: tuple[int, int]) -> Picture:
-    """Scale a picture to fit into (height, width), centred on black."""
+    """Scale a picture to fit into (height, width), centred on black; a picture of this size stays as it is."""
+    if picture.shape[:2] == size:
+        return picture
     scale = min(size[0] / picture.shape[0], size[1] / picture.shape[1])
     height, width = (max(round(scale * side), 1) for side in picture.shape[:2])
     small = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
@@ -188,94 +172,25 @@ def letterbox(picture: Picture, size: tuple[int, int]) -> Picture:
     return canvas
 
 
-# Files -----------------------------------------------------------------------------------------------------
+@contextlib.contextmanager
+def _video(av: Any, path: Path, size: tuple[int, int]) -> Iterator[Any]:
+    """Open a new video of pictures (height, width) with key frames only; yield the function that adds a picture."""
+    path.parent.mkdir(parents=True)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=FPS, options=_CODEC)
+        stream.height, stream.width = size
+        stream.pix_fmt = "yuv444p"
+        count = 0
 
+        def add(picture: Picture) -> None:
+            nonlocal count
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            frame.pts, frame.time_base = count, Fraction(1, FPS)
+            count += 1
+            container.mux(stream.encode(frame))
 
-def _key(camera: str) -> str:
-    return f"observation.images.{camera}"
-
-
-class _FileWriter:
-    """The data, videos and episodes of one file number. `with` closes it, also after an error."""
-
-    def __init__(
-        self, folder: Path, start: int, steps: _EpisodeSteps, tasks: Mapping[str, int], stats: Mapping[str, "_Stats"]
-    ) -> None:
-        chunk, file = divmod(start // EPISODES_A_FILE, FILES_A_CHUNK)
-        self._numbers = {"chunk_index": chunk, "file_index": file}
-        self._folder, self._start, self._steps, self._tasks, self._stats = folder, start, steps, tasks, stats
-        self._rows: list[dict[str, Any]] = []
-        self._episodes: list[dict[str, Any]] = []
-        self._videos: dict[str, _VideoWriter] = {}
-
-    def __enter__(self) -> "_FileWriter":
-        for camera, size in self._steps.sizes.items():
-            path = self._folder / _VIDEO.format(video_key=_key(camera), **self._numbers)
-            self._videos[camera] = _VideoWriter(path, size)
-        return self
-
-    def append(self, episode: int, grasp: RecordedGrasp) -> None:
-        """Write one grasp as an episode."""
-        pictures, length = self._steps.pictures_of(grasp), len(self._steps.moments)
-        first, task = episode * length, self._tasks[grasp.object_id]
-        for step, moment in enumerate(self._steps.moments):
-            values = (step / FPS, step, episode, first + step, task, list(MOMENT_SUFFIXES).index(moment))
-            self._rows.append(dict(zip(_STEP_COLUMNS, values, strict=True)))
-            for name, value in zip(_STEP_COLUMNS, values, strict=True):
-                self._stats[name].add(np.array([[value]], dtype=np.float64))
-        for camera, frames in pictures.items():
-            for frame in frames:
-                self._videos[camera].append(frame)
-                self._stats[_key(camera)].add(frame.reshape(-1, 3) / 255.0)
-        self._episodes.append(self._episode(episode, grasp, first, length))
-
-    def _episode(self, episode: int, grasp: RecordedGrasp, first: int, length: int) -> dict[str, Any]:
-        row: dict[str, Any] = {"episode_index": episode, "tasks": [grasp.object_id], "length": length}
-        row |= {f"data/{key}": value for key, value in self._numbers.items()}
-        row |= {"dataset_from_index": first, "dataset_to_index": first + length}
-        start = (episode - self._start) * length / FPS
-        for camera in self._steps.sizes:
-            row |= {f"videos/{_key(camera)}/{key}": value for key, value in self._numbers.items()}
-            row[f"videos/{_key(camera)}/from_timestamp"] = float(start)
-            row[f"videos/{_key(camera)}/to_timestamp"] = float(start + length / FPS)
-        row |= {f"meta/episodes/{key}": value for key, value in self._numbers.items()}
-        fields = grasp.to_row()
-        return row | {key: fields.get(key) for key in _PLAIN}
-
-    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
-        for video in self._videos.values():
-            video.close()
-        if kind is None:
-            pa = import_extra("pyarrow", _WHAT)
-            kinds = {"string": pa.string(), "bool": pa.bool_(), "double": pa.float64(), "list": pa.list_(pa.float64())}
-            plain = {key: kinds[kind] for key, kind in _PLAIN.items()}
-            _write_table(self._folder / _DATA.format(**self._numbers), self._rows, {"timestamp": pa.float32()})
-            _write_table(self._folder / _EPISODES.format(**self._numbers), self._episodes, plain)
-
-
-class _VideoWriter:
-    """A video of pictures of one size, with key frames only."""
-
-    def __init__(self, path: Path, size: tuple[int, int]) -> None:
-        av = import_extra("av", _WHAT)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._av, self._count = av, 0
-        self._container = av.open(str(path), "w")
-        self._stream = self._container.add_stream("libx264", rate=FPS, options=_CODEC)
-        self._stream.height, self._stream.width = size
-        self._stream.pix_fmt = "yuv444p"
-
-    def append(self, picture: Picture) -> None:
-        """Add the next frame."""
-        frame = self._av.VideoFrame.from_ndarray(picture, format="rgb24")
-        frame.pts, frame.time_base = self._count, Fraction(1, FPS)
-        self._count += 1
-        self._container.mux(self._stream.encode(frame))
-
-    def close(self) -> None:
-        """Write the buffered frames and close the file."""
-        self._container.mux(self._stream.encode())
-        self._container.close()
+        yield add
+        container.mux(stream.encode())
 
 
 class _Stats:
@@ -301,20 +216,23 @@ class _Stats:
         return {name: value.reshape(shape).tolist() for name, value in statistics.items()} | {"count": [self._count]}
 
 
-# Files of meta/ --------------------------------------------------------------------------------------------
+# Tables ----------------------------------------------------------------------------------------------------
 
-_PLAIN = {
-    "grasp_id": "string",
-    "object_id": "string",
-    "sequence_id": "string",
-    "grasped": "bool",
-    "outcome": "string",
-    "force_n": "double",
-    "opening_mm": "double",
-    "touch_skew_s": "double",
-    "time_s": "double",
-    "pose": "list",
-}
+
+def _key(camera: str) -> str:
+    return f"observation.images.{camera}"
+
+
+def _episode(episode: int, grasp: RecordedGrasp, length: int, cameras: Sequence[str]) -> dict[str, Any]:
+    row: dict[str, Any] = {"episode_index": episode, "tasks": [grasp.object_id], "length": length}
+    row |= {"dataset_from_index": episode * length, "dataset_to_index": (episode + 1) * length}
+    for table in ("data", "meta/episodes", *(f"videos/{_key(camera)}" for camera in cameras)):
+        row |= {f"{table}/{key}": value for key, value in _NUMBERS.items()}
+    for camera in cameras:
+        row[f"videos/{_key(camera)}/from_timestamp"] = float(episode * length / FPS)
+        row[f"videos/{_key(camera)}/to_timestamp"] = float((episode + 1) * length / FPS)
+    fields = grasp.to_row()
+    return row | {key: fields.get(key) for key in _FIELDS}
 
 
 def _write_table(path: Path, rows: Sequence[Mapping[str, Any]], types: Mapping[str, Any]) -> None:
@@ -348,32 +266,33 @@ def _write_json(path: Path, value: Any) -> None:
     path.write_text(json.dumps(value, indent=4) + "\n", "utf-8")
 
 
-def _info(recording: Recording, steps: _EpisodeSteps, tasks: int) -> dict[str, Any]:
+def _info(
+    recording: Recording, moments: Sequence[str], sizes: Mapping[str, tuple[int, int]], tasks: int
+) -> dict[str, Any]:
     episodes = len(recording.grasps)
     return {
         "codebase_version": "v3.0",
         "robot_type": None,
         "total_episodes": episodes,
-        "total_frames": episodes * len(steps.moments),
+        "total_frames": episodes * len(moments),
         "total_tasks": tasks,
-        "chunks_size": FILES_A_CHUNK,
+        "chunks_size": 1000,
         "data_files_size_in_mb": 100,
         "video_files_size_in_mb": 200,
         "fps": FPS,
         "splits": {"train": f"0:{episodes}"},
         "data_path": _DATA,
         "video_path": _VIDEO,
-        "features": {_key(camera): _video_feature(size) for camera, size in steps.sizes.items()}
+        "features": {_key(camera): _video_feature(*size) for camera, size in sizes.items()}
         | {
             name: {"dtype": "float32" if name == "timestamp" else "int64", "shape": [1], "names": None}
             for name in _STEP_COLUMNS
         },
-        "recording": {key: recording.info.get(key) for key in _FACTS} | {"moments": steps.moments},
+        "recording": {key: recording.info.get(key) for key in _FACTS} | {"moments": list(moments)},
     }
 
 
-def _video_feature(size: tuple[int, int]) -> dict[str, Any]:
-    height, width = size
+def _video_feature(height: int, width: int) -> dict[str, Any]:
     info = {
         "video.height": height,
         "video.width": width,

@@ -5,11 +5,10 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait
-from multiprocessing.process import BaseProcess
 from typing import Any, Generic, Self, TypeVar
 
 import cv2
@@ -21,6 +20,10 @@ Work = Callable[[str, int], T]
 """A function of object id and attempt number."""
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_DIED = (
+    "a worker process died: it was killed, or memory ran out. The recorded grasps are complete; run the command again "
+    "to continue, with fewer jobs if memory is short"
+)
 
 
 class WorkerPool(Generic[T]):
@@ -42,17 +45,9 @@ class WorkerPool(Generic[T]):
     def __init__(self, jobs: int, local_work: Work[T], make: Callable[[], Work[T]]) -> None:
         self._local_work, self._pool = local_work, None
         self.window = 1 if jobs == 1 else 4 * jobs
-        self._environment: dict[str, str | None] = {}
-        self._threads = cv2.getNumThreads()
-        self._before = set(multiprocessing.active_children())
         if jobs > 1:
-            self._environment = {name: os.environ.get(name) for name in _THREADS}
-            self._pool = ProcessPoolExecutor(
-                jobs,
-                mp_context=multiprocessing.get_context("spawn"),
-                initializer=_start_worker,
-                initargs=(make,),
-            )
+            spawn = multiprocessing.get_context("spawn")
+            self._pool = ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_start_worker, initargs=(make,))
 
     def submit(self, object_id: str, number: int) -> Callable[[], T]:
         """Start a piece of work; return a callable that waits for its result.
@@ -66,51 +61,31 @@ class WorkerPool(Generic[T]):
         """
         if self._pool is None:
             return functools.partial(self._local_work, object_id, number)
-        os.environ.update(dict.fromkeys(_THREADS, "1"))  # inherited by processes that `submit` may start
         try:
-            future = self._pool.submit(_run_work, object_id, number)
+            return functools.partial(_result, self._pool.submit(_run_work, object_id, number), object_id, number)
         except BrokenProcessPool as error:
-            raise _worker_died() from error
-        finally:
-            _restore(self._environment)
-        return functools.partial(_result, future, object_id, number)
+            raise RobotError(_DIED) from error
 
     def __enter__(self) -> Self:
+        self._cv2_threads, self._environment = cv2.getNumThreads(), {name: os.environ.get(name) for name in _THREADS}
         cv2.setNumThreads(1)
+        os.environ.update(dict.fromkeys(_THREADS, "1"))  # inherited by the workers
         return self
 
     def __exit__(self, *_: object) -> None:
         """Wait for the work in progress and cancel the rest."""
-        cv2.setNumThreads(self._threads)
-        if self._pool is not None:
-            _shut_down(self._pool, set(multiprocessing.active_children()) - self._before)
-
-
-def _shut_down(pool: ProcessPoolExecutor, workers: Iterable[BaseProcess]) -> None:
-    """Stop the workers and wait until they have exited; raise a KeyboardInterrupt only afterwards.
-
-    An interrupted `shutdown(wait=True)` makes Python hang at exit. The interrupted join marks the pool's thread as
-    finished (CPython issue 90882), so Python does not wait until that thread has stopped the workers.
-    """
-    again: KeyboardInterrupt | None = None
-    while True:
-        try:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for worker in workers:
-                wait([worker.sentinel])
-            break
-        except KeyboardInterrupt as error:
-            again = error
-    if again is not None:
-        raise again
-
-
-def _restore(environment: dict[str, str | None]) -> None:
-    for name, value in environment.items():
-        if value is None:
-            os.environ.pop(name, None)
-        else:
-            os.environ[name] = value
+        cv2.setNumThreads(self._cv2_threads)
+        for name, value in self._environment.items():
+            del os.environ[name]
+            os.environ.update({} if value is None else {name: value})
+        if self._pool is None:
+            return
+        # A second Ctrl-C would interrupt the join, and Python would then hang at exit (CPython issue 90882).
+        is_main = threading.current_thread() is threading.main_thread()
+        handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if is_main else None
+        self._pool.shutdown(cancel_futures=True)
+        if is_main:
+            signal.signal(signal.SIGINT, handler)
 
 
 def _result(future: Future[T], object_id: str, number: int) -> T:
@@ -119,31 +94,24 @@ def _result(future: Future[T], object_id: str, number: int) -> T:
     except RobotError:
         raise
     except BrokenProcessPool as error:
-        raise _worker_died() from error
+        raise RobotError(_DIED) from error
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"
         raise RobotError(f"attempt {number} at {object_id} failed in a worker process: {reason}") from error
 
 
-def _worker_died() -> RobotError:
-    return RobotError(
-        "a worker process died: it was killed, or memory ran out. The recorded grasps are complete; run the command "
-        "again to continue, with fewer jobs if memory is short"
-    )
-
-
 # In the worker ----------------------------------------------------------------------------------------------
 
-_work: list[Work[Any]] = []
-_make_work: list[Callable[[], Work[Any]]] = []
+_make_work: Callable[[], Work[Any]]
 
 
 def _start_worker(make: Callable[[], Work[Any]]) -> None:
     """Initialise a worker; must not fail, because the pool hides the reason. Ctrl-C is left to the parent."""
+    global _make_work
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     cv2.setNumThreads(1)
-    _make_work.append(make)
+    _make_work = functools.cache(make)
 
 
 def _exit_with_parent() -> None:
@@ -155,6 +123,4 @@ def _exit_with_parent() -> None:
 
 
 def _run_work(object_id: str, number: int) -> Any:
-    if not _work:
-        _work.append(_make_work[0]())
-    return _work[0](object_id, number)
+    return _make_work()(object_id, number)

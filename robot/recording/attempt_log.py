@@ -11,7 +11,7 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
 from typing import Any, Self
@@ -131,14 +131,12 @@ class Tally:
         object_id: The object.
         attempts: Attempts so far.
         accepted: Accepted grasps.
-        outcomes: Number of attempts by outcome.
         skipped: Reason why the object is ungraspable; None if it is graspable.
     """
 
     object_id: str
     attempts: int = 0
     accepted: int = 0
-    outcomes: Counter[str] = field(default_factory=Counter)
     skipped: str | None = None
 
     def add(self, attempt: LoggedAttempt) -> None:
@@ -148,7 +146,6 @@ class Tally:
             return
         self.attempts += 1
         self.accepted += attempt.accepted
-        self.outcomes[attempt.outcome] += 1
 
 
 def tally(attempts: Iterable[LoggedAttempt]) -> dict[str, Tally]:
@@ -159,25 +156,17 @@ def tally(attempts: Iterable[LoggedAttempt]) -> dict[str, Tally]:
     return tallies
 
 
-def acceptance_table(tallies: Sequence[Tally], grasps_target: int | None = None) -> str:
-    """Return a plain-text table with a line for each object and one for all.
+def acceptance_table(tallies: Sequence[Tally], grasps_target: int) -> str:
+    """Return a plain-text table with a line for each object.
 
     Args:
         tallies: Counts by object.
-        grasps_target: Objects with fewer accepted grasps are marked "gave up"; None for no marks. Ungraspable objects
-            show their reason.
+        grasps_target: Objects with fewer accepted grasps are marked "gave up", or show why they are ungraspable.
     """
     width = max([len(each.object_id) for each in tallies] + [6])
-    lines = [f"{'object':{width}}  accepted  of  {'  '.join(OUTCOMES)}"]
-    total = Tally("all")
+    lines = [f"{'object':{width}}  accepted  of"]
     for each in tallies:
-        gave_up = "  gave up" if grasps_target is not None and each.accepted < grasps_target else ""
-        lines.append(_line(each, width) + (f"  skipped: {each.skipped}" if each.skipped else gave_up))
-        total.attempts, total.accepted = total.attempts + each.attempts, total.accepted + each.accepted
-        total.outcomes += each.outcomes
-    return "\n".join([*lines, _line(total, width)])
-
-
-def _line(each: Tally, width: int) -> str:
-    outcomes = "  ".join(f"{each.outcomes[name]:>{len(name)}}" for name in OUTCOMES)
-    return f"{each.object_id:{width}}  {each.accepted:>8}  {each.attempts:>2}  {outcomes}"
+        gave_up = "  gave up" if each.accepted < grasps_target else ""
+        remark = f"  skipped: {each.skipped}" if each.skipped else gave_up
+        lines.append(f"{each.object_id:{width}}  {each.accepted:>8}  {each.attempts:>2}{remark}")
+    return "\n".join(lines)

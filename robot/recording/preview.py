@@ -10,12 +10,11 @@ import numpy.typing as npt
 from _touch_retrieval.files import write_atomically
 from robot.errors import RecordingError
 from robot.recording.folder import RecordedGrasp, read_recording
-from robot.storage import file_content, storage_errors
+from robot.storage import storage_errors
 
 Picture = npt.NDArray[np.uint8]
 TILE_PX = 160
-_HEADER_PX = 24
-_CAPTION_PX = 20
+_CAPTION_PX = 24
 
 
 def write_preview(folder: str | Path, out: str | Path, rows: int = 12) -> Path:
@@ -33,79 +32,49 @@ def write_preview(folder: str | Path, out: str | Path, rows: int = 12) -> Path:
         RecordingError: The recording is invalid or empty.
         StorageError: The file cannot be written.
     """
-    recording = read_recording(folder)
-    chosen = _pick_grasps(recording.grasps, rows)
-    fingers = sorted({finger for grasp in chosen for finger in grasp.touches})
-    titles = ["photo", "depth", *(f"gel {finger} {moment}" for finger in fingers for moment in ("before", "during"))]
-    header = np.hstack([_caption(title, TILE_PX, _HEADER_PX) for title in titles])
-    sheet = np.vstack([header, *(_row(recording.folder, grasp, fingers) for grasp in chosen)])
-    data, _ = file_content("preview", sheet)
-    with storage_errors(Path(out)):
-        Path(out).parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(Path(out), data)
-    return Path(out)
-
-
-def _pick_grasps(grasps: Sequence[RecordedGrasp], rows: int) -> list[RecordedGrasp]:
-    """Return the first accepted grasp of each of up to `rows` objects, or the first grasp if none was accepted."""
-    accepted = [grasp for grasp in grasps if grasp.grasped is not False] or list(grasps)
+    recording, out = read_recording(folder), Path(out)
     first: dict[str, RecordedGrasp] = {}
-    for grasp in accepted:
+    for grasp in sorted(recording.grasps, key=lambda grasp: grasp.grasped is False):  # accepted ones first
         first.setdefault(grasp.object_id, grasp)
-    names = list(first)
-    if not names:
+    if not first:
         raise RecordingError("a preview needs a recording with at least one grasp; this one has none")
-    picked = np.linspace(0, len(names) - 1, min(rows, len(names))).round().astype(int)
-    return [first[names[index]] for index in picked]
+    picked = np.linspace(0, len(first) - 1, min(rows, len(first))).round().astype(int)
+    grasps = [list(first.values())[index] for index in picked]
+    columns = list(dict.fromkeys(column for grasp in grasps for column in grasp.images() if "after" not in column))
+    header = np.hstack([_caption(column, TILE_PX) for column in columns])
+    sheet = np.vstack([header, *(_row(recording.folder, grasp, columns) for grasp in grasps)])
+    with storage_errors(out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(out, cv2.imencode(".png", sheet)[1].tobytes())
+    return out
 
 
-def _row(folder: Path, grasp: RecordedGrasp, fingers: Sequence[str]) -> Picture:
-    """Return the tiles of one grasp, with its name and force below."""
-    tiles = [_tile(_read(folder, grasp.photo)), _tile(_depth(folder, grasp))]
-    for finger in fingers:
-        tiles += [_tile(_read(folder, images.get(finger))) for images in (grasp.touches_before, grasp.touches)]
-    row = np.hstack(tiles)
-    text = (
-        f"{grasp.object_id}   {grasp.force_n or 0:.1f} N   jaws {grasp.opening_mm or 0:.1f} mm   {grasp.outcome or ''}"
-    )
-    return np.vstack([row, _caption(text, row.shape[1], _CAPTION_PX)])
+def _row(folder: Path, grasp: RecordedGrasp, columns: Sequence[str]) -> Picture:
+    """Return the tiles of one grasp, BGR, with its name and force below."""
+    images = grasp.images()
+    row = np.hstack([_tile(folder / images[column] if column in images else None) for column in columns])
+    text = f"{grasp.object_id}   {grasp.force_n or 0:.1f} N   jaws {grasp.opening_mm or 0:.1f} mm"
+    return np.vstack([row, _caption(f"{text}   {grasp.outcome or ''}", row.shape[1])])
 
 
-def _read(folder: Path, path: str | None) -> Picture | None:
-    """Return the RGB pixels of an image of the recording; None if it was not recorded."""
-    image = None if path is None else cv2.imread(str(folder / path), cv2.IMREAD_COLOR)
-    return None if image is None else np.asarray(image[..., ::-1], np.uint8)
-
-
-def _depth(folder: Path, grasp: RecordedGrasp) -> Picture | None:
-    """Return the depth image as colours over its own range; holes are black."""
-    if grasp.depth is None:
-        return None
-    image = cv2.imread(str(folder / grasp.depth), cv2.IMREAD_UNCHANGED)
-    if image is None or not image.any():
-        return None
-    depth = image.astype(np.float64)
-    known = depth > 0
-    near, far = depth[known].min(), depth[known].max()
-    level = 255 * (1 - np.clip((depth - near) / max(far - near, 1.0), 0, 1))
-    colours = cv2.applyColorMap(level.astype(np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1]
-    return np.where(known[..., None], colours, 0).astype(np.uint8)
-
-
-def _tile(image: Picture | None) -> Picture:
-    """Fit the image into a square tile; without an image the tile is grey."""
+def _tile(path: Path | None) -> Picture:
+    """Fit an image into a square tile, depth as colours over its own range; without an image the tile is grey."""
     tile = np.full((TILE_PX, TILE_PX, 3), 238, np.uint8)
-    if image is not None:
-        scale = (TILE_PX - 4) / max(image.shape[:2])
-        size = round(image.shape[1] * scale), round(image.shape[0] * scale)
-        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        top, left = (TILE_PX - size[1]) // 2, (TILE_PX - size[0]) // 2
-        tile[top : top + size[1], left : left + size[0]] = small
+    image = None if path is None else cv2.imread(str(path), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
+    if image is None:
+        return tile
+    if image.dtype == np.uint16:
+        level = cv2.normalize(image, np.empty(0), 255, 0, cv2.NORM_MINMAX, cv2.CV_8U, (image > 0).astype(np.uint8))
+        image = cv2.applyColorMap(level, cv2.COLORMAP_VIRIDIS) * (image > 0)[..., None]
+    elif image.ndim == 2:
+        image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    scale = (TILE_PX - 4) / max(image.shape[:2])
+    width, height = round(image.shape[1] * scale), round(image.shape[0] * scale)
+    top, left = (TILE_PX - height) // 2, (TILE_PX - width) // 2
+    tile[top : top + height, left : left + width] = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     return tile
 
 
-def _caption(text: str, width: int, height: int) -> Picture:
-    strip = np.full((height, width, 3), 255, np.uint8)
-    return np.asarray(
-        cv2.putText(strip, text, (4, height - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (30, 30, 30), 1, cv2.LINE_AA)
-    )
+def _caption(text: str, width: int) -> Picture:
+    strip = np.full((_CAPTION_PX, width, 3), 255, np.uint8)
+    return np.asarray(cv2.putText(strip, text, (4, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (30, 30, 30), 1, cv2.LINE_AA))
