@@ -3,7 +3,6 @@
 import os
 import shutil
 import signal
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -46,39 +45,22 @@ TINY = Config(
     Preprocessing(touch_px=32, photo_px=48),
 )
 
-# Models and indexes that fixtures create outside of a test go to a temporary state folder. Otherwise they would become
-# the defaults of the user's commands in this folder, and of fixtures in the next run.
-_SESSION_STATE = tempfile.TemporaryDirectory(prefix="touch-retrieval-state-")
-os.environ["XDG_STATE_HOME"] = _SESSION_STATE.name
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _state_of_module(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Keep models and indexes of one file's fixtures from becoming defaults of another file."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
-        yield
-
 
 @pytest.fixture(scope="session")
-def _state_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("state")
+def _cache_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
 
 
 @pytest.fixture(autouse=True)
-def _own_state(_state_folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Separate the state and the cache of each test from those of the user and of other tests.
+def _own_cache(_cache_folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Separate the cache of each test from those of the user and of other tests.
 
     All tests use one folder, which is emptied after each: creating one per test takes half a minute in total.
     """
-    cache = _state_folder.with_name(f"{_state_folder.name}-cache")
-    monkeypatch.setenv("XDG_STATE_HOME", str(_state_folder))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(_cache_folder))
     yield
-    for path in _state_folder.iterdir():
-        shutil.rmtree(path)
-    if cache.is_dir():
-        shutil.rmtree(cache)
+    shutil.rmtree(_cache_folder)
+    _cache_folder.mkdir()
 
 
 @pytest.fixture

@@ -32,11 +32,9 @@ def adapt(
     """Fit a model to a new sensor and your own objects. Takes minutes on two cores."""
     from retrieval.adaptation.recipe import adapt as fit
     from retrieval.data.check.recording import check_gel_layout
-    from retrieval.search import defaults
 
     for finding in check_gel_layout(recording):
         say(f"{finding.severity}: {finding.message}")
     result = fit(recording, out, model, init=init, split=read_split(split), cache=cache, seed=seed)
-    defaults.remember("model", out)
     for line in result.lines():
         say(line)

@@ -96,7 +96,6 @@ def build_index(
             report = build.build_index(catalogue, checkpoint, out, **options)
         else:
             report = build_sharded.build_sharded(catalogue, checkpoint, out, shards, run=run, **options)
-    defaults.remember("index", out)
     if defaults.is_shipped(path) and (exported := export_to_cache(checkpoint)):
         say(f"exported once, for queries without PyTorch: {exported}")
     for line in report.lines():

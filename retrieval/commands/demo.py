@@ -4,12 +4,10 @@ The rig collects grasps of objects that the shipped checkpoint was not trained o
 grasps make up the catalogue, the touches of its last grasps are the queries. No grasp provides both.
 """
 
-import os
 import shlex
 import shutil
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -45,40 +43,25 @@ def demo(
     """Run all steps on the simulated rig, from collection to query, and write an HTML page."""
     from retrieval.data.dataset import load_grasps
 
-    demo_files = {"recording", "recording-preview.png", "catalog", "index", "index-history", "state", "query.html"}
+    demo_files = {"recording", "recording-preview.png", "catalog", "index", "index-history", "query.html"}
     if out.exists() and (others := {path.name for path in out.iterdir()} - demo_files):
         raise BadInput(f"{out} must be a new folder or that of an earlier demo, but it contains {sorted(others)[0]}")
-    with _isolated_state(out / "state"):
-        recording, catalogue, index = out / "recording", out / "catalog", out / "index"
-        grasps = PHOTOS + TOUCHES
-        _run(collect, rig="sim", objects=objects, grasps=grasps, seed=SEED, jobs=JOBS, out=recording, preview=True)
-        queries = _split(load_grasps(recording), catalogue)
-        in_hand = example_object(queries)
-        _run(build_index, catalogue, out=index)
-        gelsight = [OptionValues(map(str, grasp.touches)) for grasp in queries[in_hand]]
-        _run(query, gelsight=gelsight, index=str(index), html=out / "query.html", top=8)
-        say(
-            f"in the hand: {in_hand}. The model was not trained on it. It is the first object of the catalogue with "
-            f"{len(gelsight)} query grasps"
-        )
-        say(f"{TOUCHES} grasps of each object: {_accuracy_summary(index, queries)}")
-        say(f"open {out / 'query.html'} and {out / 'recording-preview.png'}")
-        if serve:
-            _run(serve_index, index=str(index), trials=recording, open_page=True)
-
-
-@contextmanager
-def _isolated_state(folder: Path) -> Iterator[None]:
-    """Keep the demo's model and index from becoming the defaults of the user's own commands."""
-    before = os.environ.get("XDG_STATE_HOME")
-    os.environ["XDG_STATE_HOME"] = str(folder)
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ["XDG_STATE_HOME"]
-        else:
-            os.environ["XDG_STATE_HOME"] = before
+    recording, catalogue, index = out / "recording", out / "catalog", out / "index"
+    grasps = PHOTOS + TOUCHES
+    _run(collect, rig="sim", objects=objects, grasps=grasps, seed=SEED, jobs=JOBS, out=recording, preview=True)
+    queries = _split(load_grasps(recording), catalogue)
+    in_hand = example_object(queries)
+    _run(build_index, catalogue, out=index)
+    gelsight = [OptionValues(map(str, grasp.touches)) for grasp in queries[in_hand]]
+    _run(query, gelsight=gelsight, index=str(index), html=out / "query.html", top=8)
+    say(
+        f"in the hand: {in_hand}. The model was not trained on it. It is the first object of the catalogue with "
+        f"{len(gelsight)} query grasps"
+    )
+    say(f"{TOUCHES} grasps of each object: {_accuracy_summary(index, queries)}")
+    say(f"open {out / 'query.html'} and {out / 'recording-preview.png'}")
+    if serve:
+        _run(serve_index, index=str(index), trials=recording, open_page=True)
 
 
 def _run(command: Callable[..., object], *arguments: Path, **options: object) -> None:

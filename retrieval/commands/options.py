@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from retrieval.model.config import Config
 
 DEFAULT_PRESET = "small"
-DEFAULT_MODEL = "that of the index, else the last one trained in this folder, else the shipped one"
+DEFAULT_MODEL = "that of the index, else the shipped one"
 SPLIT = "JSON file with train, validation and test objects"
 
 Json = Annotated[bool, typer.Option("--json", help="print one JSON document on stdout")]
 Index = Annotated[
     str | None,
-    typer.Option(help="index folder (default: ./index, else the last one built in this folder)"),
+    typer.Option(help="index folder (default: ./index)"),
 ]
 IndexModel = Annotated[str | None, typer.Option(help="checkpoint (default: that of the index)")]
 NoVerify = Annotated[

@@ -78,7 +78,6 @@ def train(
             say(line)
         return
     from retrieval.model.checkpoint import require_writable
-    from retrieval.search import defaults
     from retrieval.training import distributed
     from retrieval.training.licences import training_licences
     from retrieval.training.train import train as train_matcher
@@ -98,7 +97,6 @@ def train(
             return
     finally:
         distributed.stop()
-    defaults.remember("model", out)
     metrics = checkpoint.provenance["metrics"]
     figures = ", ".join(f"{name.replace('_', ' ')} {value:.3f}" for name, value in metrics.items())
     say(f"{out}: best step {checkpoint.provenance['step']}{', ' if figures else ''}{figures}")

@@ -1,18 +1,11 @@
-"""The default model and index of a command: those of the working folder, else the shipped model.
+"""The default model and index of a command: those of the working folder, else the shipped model."""
 
-The last trained model and the last built index are remembered separately for each working folder, in
-`$XDG_STATE_HOME/touch-retrieval/last.json` (`~/.local/state` if it is not set). A training run in one folder does not
-change the defaults in another one.
-"""
-
-import json
-import os
 from contextlib import suppress
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from _touch_retrieval.files import file_digest, read_json, write_atomically
+from _touch_retrieval.files import file_digest
 from retrieval.errors import BadInput, CheckpointError
 
 if TYPE_CHECKING:
@@ -25,9 +18,6 @@ SHIPPED_NAMES = {"shipped": 2, "shipped-one-finger": 1}
 """Names of the shipped checkpoints in options that take a checkpoint."""
 INDEX = Path("index")
 """Default index folder of `build-index` and `query`."""
-
-MAX_FOLDERS = 100
-"""Number of working folders that are remembered."""
 
 
 def shipped_model(fingers: int = 2) -> Path:
@@ -56,8 +46,7 @@ def find_model(choice: str | None, index: str | Path = INDEX) -> tuple[Path, str
     """Return the checkpoint to use, and the reason.
 
     Args:
-        choice: A path or one of `SHIPPED_NAMES`; None for the checkpoint of `index`, else the last one trained in this
-            folder, else the shipped one.
+        choice: A path or one of `SHIPPED_NAMES`; None for the checkpoint of `index`, else the shipped one.
         index: Index folder or sharded index.
 
     Raises:
@@ -69,16 +58,11 @@ def find_model(choice: str | None, index: str | Path = INDEX) -> tuple[Path, str
         return Path(choice), "given"
     from indexes.errors import IndexesError
 
-    here = _last_model()
     manifest: Manifest | ShardedManifest | None = None
     with suppress(IndexesError):  # an unusable index is ignored
         manifest = manifest_of(index)
     if manifest is not None:
-        own = model_of(manifest)
-        newer = f"; {here} was trained in this folder too: use --model to select it" if here not in (None, own) else ""
-        return own, f"the one that {index} was built with{newer}"
-    if here is not None:
-        return here, "the last one trained in this folder"
+        return model_of(manifest), f"the one that {index} was built with"
     if shipped_model().is_file():
         return shipped_model(), "shipped; trained on the simulated rig: train your own for real sensors"
     raise CheckpointError("there is no trained model; make one with `retrieve train`, or name it with --model")
@@ -102,20 +86,20 @@ def manifest_of(index: str | Path) -> "Manifest | ShardedManifest":
 
 
 def model_of(manifest: "Manifest | ShardedManifest") -> Path:
-    """Return the checkpoint that built an index: at its old path, else an equal last trained or shipped one.
+    """Return the checkpoint that built an index: at its old path, else an equal shipped one.
 
     Args:
         manifest: Manifest of the index.
 
     Raises:
-        CheckpointError: None of these exists.
+        CheckpointError: Neither exists.
     """
     path = Path(str(manifest.about.get("checkpoint")))
     if path.is_file():
         return path
-    for other in (_last_model(), shipped_model()):
-        if other is not None and other.is_file() and file_digest(other) == manifest.fingerprint.get("checkpoint"):
-            return other
+    shipped = shipped_model()
+    if shipped.is_file() and file_digest(shipped) == manifest.fingerprint.get("checkpoint"):
+        return shipped
     raise CheckpointError(
         f"the model of this index is no longer at {path}; name it with --model, or build the index again with another"
     )
@@ -125,7 +109,7 @@ def find_index(choice: str | None) -> tuple[Path, str]:
     """Return the index folder to use, and the reason.
 
     Args:
-        choice: A folder; None for ./index, else the last index built from this folder.
+        choice: A folder; None for ./index.
 
     Raises:
         BadInput: There is no index.
@@ -136,60 +120,11 @@ def find_index(choice: str | None) -> tuple[Path, str]:
         return Path(choice), "given"
     if _is_index(INDEX):
         return INDEX, "in this folder"
-    if (last := _last_of_folder().get("index")) and _is_index(Path(last)):
-        return Path(last), "the last one built from this folder"
     raise BadInput(
-        "there is no index in this folder and none was built from it; run `retrieve build-index CATALOGUE` first, "
-        "or name one with --index"
+        "there is no index in this folder; run `retrieve build-index CATALOGUE` first, or name one with --index"
     )
 
 
 def _is_index(folder: Path) -> bool:
     """Whether the folder is an index or a sharded index."""
     return any((folder / name).is_file() for name in ("CURRENT", "SHARDS.json"))
-
-
-def remember(kind: str, path: str | Path) -> None:
-    """Remember `path` as the last "model" or "index" of the working folder, if the state file is writable."""
-    try:
-        here = str(Path.cwd())
-        state = _read_state()
-        mine = {**state.pop(here, {}), kind: str(Path(path).resolve())}
-        state = {**dict(list(state.items())[-MAX_FOLDERS + 1 :]), here: mine}
-        _state_file().parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(_state_file(), json.dumps(state).encode())
-    except (OSError, RuntimeError):  # RuntimeError: the user has no home folder
-        return
-
-
-def _last_model() -> Path | None:
-    """Return the last model trained from the working folder; None if it is missing."""
-    path = Path(_last_of_folder().get("model", ""))
-    return path if path.is_file() else None
-
-
-def _last_of_folder() -> dict[str, str]:
-    """Return the absolute paths of the last "model" and "index" of the working folder."""
-    try:
-        return _read_state().get(str(Path.cwd()), {})
-    except OSError:  # the working folder was removed
-        return {}
-
-
-def _read_state() -> dict[str, dict[str, str]]:
-    """Return {working folder: {kind: path}}, the most recent folder last."""
-    try:
-        state = read_json(_state_file())
-    except (OSError, RuntimeError, ValueError):
-        return {}
-    folders = state.items() if isinstance(state, dict) else ()
-    return {
-        folder: {kind: path for kind, path in paths.items() if isinstance(path, str)}
-        for folder, paths in folders
-        if isinstance(paths, dict)
-    }
-
-
-def _state_file() -> Path:
-    home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
-    return Path(home) / "touch-retrieval" / "last.json"

@@ -47,7 +47,7 @@ def installed(workplace):
         [*pip, "--target", target, workplace / "touch-extras"], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (target, ROOT))), "XDG_STATE_HOME": str(workplace)}
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (target, ROOT)))}
 
 
 def run(command, folder, environment):
@@ -87,7 +87,7 @@ def test_the_program_of_the_page_prints_its_method_and_the_weight_of_its_loss(wo
     folder = workplace / "alone"
     shutil.copytree(workplace / "made", folder / "tiny")
     shutil.copy(workplace / "try_parts.py", folder)
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_STATE_HOME": str(workplace)}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     code, output, error = run([sys.executable, "try_parts.py"], folder, environment)
     assert code == 0, error
     assert [line.split()[0] for line in output.splitlines()] == ["late_fusion", "__main__:Brightness", "chance", "0.5"]

@@ -82,30 +82,6 @@ def test_the_exit_code_distinguishes_none_of_these_from_a_match(built, capsys):
     assert output.err.splitlines()[-1] == last
 
 
-def test_an_index_outside_the_folder_is_found_only_from_the_folder_where_it_was_built(
-    workplace, model, capsys, monkeypatch
-):
-    assert main(["build-index", "catalog/", "--model", str(model), "--out", "away/index"]) == 0
-    assert main([*QUERY, *NO_UNKNOWN_OBJECTS]) == 0
-    assert f"index: {workplace / 'away/index'} (the last one built from this folder)" in capsys.readouterr().err
-    monkeypatch.chdir(workplace / "away" / "index")
-    assert main(["query", "--gelsight", "../../a.png", "../../b.png"]) == 2
-    assert "there is no index in this folder" in capsys.readouterr().err
-
-
-def test_the_first_line_names_the_model_and_a_training_in_another_folder_changes_nothing(
-    workplace, model, capsys, monkeypatch
-):
-    defaults.remember("model", model)
-    (workplace / "elsewhere").mkdir()
-    monkeypatch.chdir(workplace / "elsewhere")
-    assert main(["build-index", "../catalog"]) == 0
-    assert capsys.readouterr().err.startswith(f"model: {defaults.shipped_model()} (shipped; ")
-    monkeypatch.chdir(workplace)
-    assert main(["build-index", "catalog/"]) == 0
-    assert capsys.readouterr().err.startswith(f"model: {model} (the last one trained in this folder)\n")
-
-
 def test_an_index_is_rebuilt_with_its_own_model(workplace, model, capsys):
     assert main(["build-index", "catalog/", "--model", str(model)]) == 0
     capsys.readouterr()
@@ -372,8 +348,8 @@ def test_the_whole_job_from_recording_to_ranking(recording, workplace, capsys):
     )
     assert main(["train", str(recording), "--out", "m.safetensors", "--config", "tiny.toml", "--seed", "3"]) == 0
     assert "best step 2" in capsys.readouterr().err
-    assert main(["build-index", "catalog"]) == 0
-    assert f"model: {workplace / 'm.safetensors'} (the last one trained in this folder)" in capsys.readouterr().err
+    assert main(["build-index", "catalog", "--model", "m.safetensors"]) == 0
+    assert "model: m.safetensors (given)" in capsys.readouterr().err
     assert main([*QUERY, "--json", *NO_UNKNOWN_OBJECTS]) == 0
     assert len(json.loads(capsys.readouterr().out)["results"]) == 8
 

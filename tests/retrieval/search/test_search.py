@@ -17,7 +17,6 @@ from retrieval.errors import BadInput, CheckpointError, ImageError
 from retrieval.model.checkpoint import load_checkpoint, save_checkpoint
 from retrieval.model.encode import to_batch, touch_batch
 from retrieval.model.posterior import Posterior
-from retrieval.search import defaults
 from retrieval.search.build.build_index import build_index
 from retrieval.search.query.objects import ScoredObjects
 from retrieval.search.query.searcher import Searcher
@@ -469,24 +468,11 @@ def moved(catalogue, model, tmp_path):
     return tmp_path / "index", there
 
 
-def test_a_moved_model_must_be_given_unless_it_is_the_default(moved, touch):
+def test_a_moved_model_must_be_given(moved, touch):
     index, there = moved
     with pytest.raises(CheckpointError, match=r"no longer at .*here\.safetensors; name it with --model"):
         Searcher.open(index)
     assert len(Searcher.open(index, model=there).query([touch]).results) == 8
-    defaults.remember("model", there)
-    assert Searcher.open(index).checkpoint.path == there
-
-
-@pytest.mark.parametrize("default", ["none", "damaged"])
-def test_a_moved_model_must_be_given_if_the_default_is_unusable(default, moved, tmp_path, monkeypatch):
-    index, there = moved
-    monkeypatch.setattr(defaults, "shipped_model", lambda: tmp_path / "absent")
-    if default == "damaged":
-        there.write_bytes(there.read_bytes()[:100])
-        defaults.remember("model", there)
-    with pytest.raises(CheckpointError, match="name it with --model"):
-        Searcher.open(index)
 
 
 # The best of each object -----------------------------------------------------------------------------------------
