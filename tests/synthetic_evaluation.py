@@ -118,7 +118,6 @@ def method(rng, name, split):
             "balanced_accuracy": summary(rng, 0.5 + 0.12 * skill, 0.5),
             "roc": roc(skill),
             "risk_coverage": risk_coverage(skill),
-            "by_grasps": {str(count): decision(rng, skill * (1 + 0.35 * np.log(count))) for count in (1, 3)},
         },
     }
 

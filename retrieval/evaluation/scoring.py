@@ -19,7 +19,7 @@ from retrieval.evaluation.calibrate import (
 )
 from retrieval.evaluation.predictions import Predictions
 from retrieval.evaluation.queries import Queries
-from retrieval.evaluation.reject import Rejection, reject
+from retrieval.evaluation.reject import reject
 from retrieval.metrics import protocols
 from retrieval.metrics.intervals import summarise
 from retrieval.metrics.measure import Measure
@@ -186,32 +186,20 @@ def _confusions(queries: Queries, scored: Sequence[MethodScores], seed: int) -> 
 def _reject(
     scored: Sequence[MethodScores], calibrations: Sequence[Calibrations], draws: int, seed: int
 ) -> dict[str, Any] | None:
-    """Return "reject" of results.json: all measures for single grasps, the main ones for each number of grasps."""
-    found = [_rejections(one, fitted, seed) for one, fitted in zip(scored, calibrations, strict=True)]
-    if not found[0]:
+    """Return "reject" of results.json, for single grasps; None without a posterior or with too few test objects."""
+    found = []
+    for one, fitted in zip(scored, calibrations, strict=True):
+        table = one.touches("test", "test")
+        if 1 in fitted.posteriors and has_enough_objects(table):
+            found.append(reject(fitted.posteriors[1], table, seed=seed))
+    if not found:
         return None
 
-    def summary(name: str, grasps: int = 1) -> dict[str, Any]:
-        return summarise([getattr(one[grasps], name) for one in found], draws=draws, seed=seed)
+    def summary(name: str) -> dict[str, Any]:
+        return summarise([getattr(one, name) for one in found], draws=draws, seed=seed)
 
-    main = ("auroc", "false_accepts_at_95")
     return {
-        **{name: summary(name) for name in (*main, "balanced_accuracy")},
-        "roc": found[0][1].roc,
-        "risk_coverage": found[0][1].risk_coverage,
-        "by_grasps": {str(grasps): {name: summary(name, grasps) for name in main} for grasps in found[0]},
-    }
-
-
-def _rejections(method_scores: MethodScores, calibrations: Calibrations, seed: int) -> dict[int, Rejection]:
-    """Return the rejection performance by number of grasps.
-
-    A number of grasps needs a posterior from validation objects, and enough test objects.
-    """
-    tables = method_scores.by_grasps("test").items()
-    fitted = calibrations.posteriors
-    return {
-        grasps: reject(fitted[grasps], table, seed=seed)
-        for grasps, table in tables
-        if grasps in fitted and has_enough_objects(table)
+        **{name: summary(name) for name in ("auroc", "false_accepts_at_95", "balanced_accuracy")},
+        "roc": found[0].roc,
+        "risk_coverage": found[0].risk_coverage,
     }

@@ -139,10 +139,3 @@ def confusions(table: ScoreTable, *, photos: int = 1, draws: int = 16, seed: int
     names = queries.objects
     found = [(int(objects[row]), int(names[column]), float(means[row, column])) for row, column in np.argwhere(means)]
     return sorted((item for item in found if item[0] != item[1]), key=lambda item: (-item[2], *item[:2]))
-
-
-def true_ranks(table: ScoreTable) -> NDArray[np.float64]:
-    """Return for each row the rank (T,) of the first photo of its object, from 1, without own photos; NaN if none."""
-    ranks = np.full(len(table.has_target), np.nan)
-    ranks[table.has_target] = ranking.first_rank(table.with_targets.first)
-    return ranks

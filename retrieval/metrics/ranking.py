@@ -105,11 +105,6 @@ def _expected_reciprocal(before: int, tied: int, right: int) -> float:
     return float((chance / (before + 1 + j)).sum())
 
 
-def first_rank(first: FirstRelevant) -> NDArray[np.float64]:
-    """Return the expected rank (Q,), from 1, of the first relevant item."""
-    return np.asarray(first.before + 1 + (first.tied - first.right) / (first.right + 1))
-
-
 def average_precision(scores: Scores, relevant: Mask, in_gallery: Mask) -> NDArray[np.float64]:
     """Return the expected average precision (Q,) over the FULL ranking (McSherry and Najork 2008, section 2.5).
 

@@ -99,7 +99,6 @@ def reject(builder: Builder) -> Iterator[Block | None]:
             builder.results,
         )
         yield tables.rejects(builder.results)
-        yield tables.rejects_by_grasps(builder.results)
     elif any("reject" in one for one in builder.results.data["methods"].values()):
         yield Text(TOO_FEW)
 

@@ -27,7 +27,6 @@ def method_overview(builder: Builder) -> Iterator[Block | None]:
             builder.results,
         )
     yield tables.section(builder.results, "main")
-    yield Text("Bold: the highest value of a column, even if it does not differ significantly from the next one.")
     yield Text(INTERVALS)
 
 

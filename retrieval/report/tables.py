@@ -68,7 +68,6 @@ def _table(results: Results, columns: Sequence[Column]) -> Table | None:
             ("method, %", *(heading for heading, _, _ in columns)),
             (*rows, tuple(chance)),
             (*_basis(results, list(dict.fromkeys(key for _, key, _ in columns))), *notes),
-            bold=frozenset(_best(results, columns)),
         )
     )
 
@@ -80,21 +79,6 @@ def _without_threshold(results: Results) -> list[str]:
         if why := (results.data["methods"][name].get("pair_threshold") or {}).get("reason"):
             reasons.setdefault(why, []).append(method_label(name))
     return [f"No pair accuracy of {', '.join(names)}: {why}." for why, names in reasons.items()]
-
-
-def _best(results: Results, columns: Sequence[Column]) -> list[tuple[int, int]]:
-    """Return the cell of the unique highest value of each column."""
-    found = []
-    for at, (_, key, place) in enumerate(columns, start=1):
-        values = {
-            row: summary["value"][place]
-            for row, name in enumerate(results.methods)
-            if (summary := results.summary(name, key)) and summary["value"][place] is not None
-        }
-        highest = [row for row, value in values.items() if value == max(values.values())]
-        if len(highest) == 1 < len(values):
-            found.append((highest[0], at))
-    return found
 
 
 def _basis(results: Results, keys: Sequence[str]) -> list[str]:
@@ -186,27 +170,6 @@ def rejects(results: Results) -> Table:
         f"for the gallery as for none of its objects: {FORMULA}.",
     )
     return _with_notes(Table(header, tuple(rows), notes))
-
-
-def rejects_by_grasps(results: Results) -> Table | None:
-    """Return the measures of that decision by the number of grasps; None if all queries have one grasp."""
-    found = {
-        name: results.data["methods"][name]["reject"]["by_grasps"]
-        for name in results.methods
-        if _has_entry(results, name, "reject")
-    }
-    sizes = sorted({int(grasps) for one in found.values() for grasps in one})
-    if len(sizes) < 2:
-        return None
-    measures = {"auroc": "AUROC", "false_accepts_at_95": "false accepts at 95 %"}
-    rows = [
-        (f"{method_label(name)}, {label}", *(with_interval(one.get(str(size), {}).get(key)) for size in sizes))
-        for name, one in found.items()
-        for key, label in measures.items()
-    ]
-    header = ("%, by grasps in a query", *map(str, sizes))
-    note = "A set of grasps is one query; each number of grasps has its own posterior."
-    return _with_notes(Table(header, tuple(rows), (note,)))
 
 
 def verification(results: Results) -> Table:

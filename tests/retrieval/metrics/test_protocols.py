@@ -14,7 +14,6 @@ from retrieval.metrics.protocols import (
     pair_auc,
     recall,
     reciprocal_rank,
-    true_ranks,
 )
 from retrieval.metrics.registry import (
     METRICS,
@@ -170,7 +169,6 @@ def full_by_loops(table, row, own_shown=False):
         "recall_10": np.mean([places[0] <= 10 for places in cases]),
         "mrr": np.mean([1 / places[0] for places in cases]),
         "map": np.mean([np.mean([count / place for count, place in enumerate(places, 1)]) for places in cases]),
-        "rank": np.mean([places[0] for places in cases]),
     }
 
 
@@ -179,12 +177,10 @@ def test_measures_of_the_full_gallery_equal_those_of_two_loops(transposed):
     table = uneven(values=3)
     table = table.transposed() if transposed else table
     found = full_gallery(table)
-    ranks = true_ranks(table)
     for row in range(14):
         expected = full_by_loops(table, row)
         for name in ("recall_1", "recall_5", "recall_10", "mrr", "map"):
             assert found[name].values[row, 0] == pytest.approx(expected[name], abs=0.055), name
-        assert ranks[row] == pytest.approx(expected["rank"], abs=0.2)
 
 
 def test_with_the_own_photo_a_scorer_that_only_recognises_each_grasps_lighting_would_beat_chance():
@@ -258,7 +254,6 @@ def test_rows_without_another_photo_of_their_object_are_counted_and_neither_hidd
     for name, measure in measures.items():
         assert measure.owner.tolist() == [0, 0], name
         assert measure.gallery.endswith("; 2 touches left out, which have no other"), name
-    assert np.isnan(true_ranks(table)).tolist() == [False, False, True, True]
     with pytest.raises(BadInput, match="from another grasp; none has"):
         pair_auc(table_of(np.zeros((2, 2)), [0, 1]))
 

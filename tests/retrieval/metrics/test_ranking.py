@@ -15,7 +15,6 @@ from retrieval.metrics.ranking import (
     chance_of_average_precision,
     chance_of_recall,
     chance_of_reciprocal_rank,
-    first_rank,
     first_relevant,
     recall_at,
     reciprocal_rank,
@@ -29,7 +28,6 @@ def measures(scores, relevant, shown=None):
     first = first_relevant(scores, relevant, shown)
     found = {k: float(recall_at(k, first)[0]) for k in (1, 2, 3, 5)}
     found["mrr"] = float(reciprocal_rank(first)[0])
-    found["rank"] = float(first_rank(first)[0])
     found["map"] = float(average_precision(scores, relevant, shown)[0])
     return found
 
@@ -43,7 +41,7 @@ def measures_of_order(relevant_in_order):
         if good:
             precisions.append(count / place)
     found = {k: float(first <= k) for k in (1, 2, 3, 5)}
-    return found | {"mrr": 1 / first, "rank": float(first), "map": sum(precisions) / len(precisions)}
+    return found | {"mrr": 1 / first, "map": sum(precisions) / len(precisions)}
 
 
 def measures_by_enumeration(scores, relevant):
@@ -124,5 +122,4 @@ def test_many_ties_neither_overflow_nor_lose_precision():
     rng = np.random.default_rng(0)
     drawn = np.array([rng.choice(4000, 44, replace=False).min() for _ in range(20_000)])
     assert reciprocal_rank(first)[0] == pytest.approx((1 / (6 + drawn)).mean(), rel=0.02)  # standard error 0.4 %
-    assert first_rank(first)[0] == pytest.approx((6 + drawn).mean(), rel=0.03)
     assert recall_at(10, first)[0] == pytest.approx((drawn < 5).mean(), abs=0.006)
