@@ -203,22 +203,15 @@ class PictureSet:
         farthest, nearest = distortion_limits.max(axis=1), distortion_limits.min(axis=1)
         limit = np.where(farthest < maximum, farthest, np.minimum(nearest, maximum))
         found = NearestPictures(row, distance, checked, np.asarray(distance <= limit))
-        return self._add_shifted_copies(
-            queries, [one for block in blocks for one in self._candidates(block, among)], found
-        )
+        self._add_shifted_copies(queries, [one for block in blocks for one in self._candidates(block, among)], found)
+        return found
 
     def _add_shifted_copies(
         self, queries: NDArray[np.int64], candidates: Sequence[list[int]], found: NearestPictures
-    ) -> NearestPictures:
-        """Return `found` with the candidates added that are shifted copies of their query."""
-        row, distance, checked, copy = (
-            found.row.copy(),
-            found.distance.copy(),
-            found.checked.copy(),
-            found.copy.copy(),
-        )
+    ) -> None:
+        """Replace results in `found` by candidates that are shifted copies of their query."""
         for at, (query, others) in enumerate(zip(queries.tolist(), candidates, strict=True)):
-            if not others or copy[at]:
+            if not others or found.copy[at]:
                 continue
             distances = self._aligned.distances(query, others)
             objects = self.objects[others]
@@ -227,10 +220,9 @@ class PictureSet:
             maximum = min(MAX_DISTANCE, RELATIVE_LIMIT * third)
             nearest = int(distances.argmin())
             own, its = (SLACK * self._aligned.half_pixel_distance(one) for one in (query, others[nearest]))
-            checked[at] |= max(own, MIN_LIMIT) <= maximum
+            found.checked[at] |= max(own, MIN_LIMIT) <= maximum
             if distances[nearest] <= min(max(own, its, MIN_LIMIT), maximum):  # either picture may be the copy
-                row[at], distance[at], copy[at] = others[nearest], distances[nearest], True
-        return NearestPictures(row, distance, checked, copy)
+                found.row[at], found.distance[at], found.copy[at] = others[nearest], distances[nearest], True
 
     def _nearest(
         self, queries: NDArray[np.int64], among: NDArray[np.int64]
@@ -242,13 +234,11 @@ class PictureSet:
         distance = self._min_distances(queries, among, [flip_thumbnails(self.greys[queries], flip) for flip in _FLIPS])
         first = np.flatnonzero(np.diff(self.objects[among], prepend=-1))
         by_object = np.sort(np.minimum.reduceat(distance, first, axis=1), axis=1)
-        third = (
-            by_object[:, _NEIGHBOUR_RANK - 1]
-            if by_object.shape[1] >= _NEIGHBOUR_RANK
-            else np.full(len(queries), np.inf)
-        )
+        third = np.ones(len(queries))
+        if by_object.shape[1] >= _NEIGHBOUR_RANK:
+            third = np.minimum(by_object[:, _NEIGHBOUR_RANK - 1], 1.0)
         at = distance.argmin(axis=1)
-        return among[at], distance[np.arange(len(queries)), at], np.minimum(third, 1.0)
+        return among[at], distance[np.arange(len(queries)), at], third
 
     def _candidates(self, queries: NDArray[np.int64], among: NDArray[np.int64]) -> list[list[int]]:
         """Return candidates for each query, nearest under coarse shifts: a few pictures of each of a few objects."""
