@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from robot.errors import SceneError
 from robot.sim.light import GAMMA, Floats, GBuffer, Lamps, develop, radiance
 from robot.sim.objects.body import Body
 from robot.sim.objects.draw import SimObject
@@ -28,7 +27,7 @@ NOISE = 1.5
 """Standard deviation of the sensor noise in grey levels."""
 _LENS_BLUR_PX = 0.45
 _SHADOW_BLUR_PX = 0.8
-SKY_STEPS, _SKY_WIDTH = 4, 0.03
+_SKY_STEPS, _SKY_WIDTH = 4, 0.03
 """The object hides sky from the table near it. Standard deviation of this blur, relative to the image side."""
 
 _TABLE_GLOSS = 0.03
@@ -113,13 +112,7 @@ class PinholeCamera:
 
     @cached_property
     def table_distance_mm(self) -> Array:
-        """Distance (px * px,) to the table along each ray.
-
-        Raises:
-            SceneError: A ray does not meet the table.
-        """
-        if not self.rays[:, 2].max() < 0:
-            raise SceneError(f"every pixel of the camera must meet the table, got {self}; tilt it further down")
+        """Distance (px * px,) to the table along each ray."""
         return -self.position_mm[2] / self.rays[:, 2]
 
     @cached_property
@@ -286,8 +279,6 @@ def _lamp_visibility(view: CameraView, own: Array, light: Array) -> Floats:
 
 def shadow_pixels(view: CameraView, light: Array) -> Pixels:
     """Return the table pixels in the upright rectangle around the shadow of the object's bounding box."""
-    if not light[2] > 0:
-        return np.zeros(0, np.intp)
     corners, table = view.placement.corners(view.obj.body), view.camera.table
     fallen = corners - light * ((corners[:, 2:] - _SHADOW_BIAS_MM) / light[2])
     inside = ~view.is_object
@@ -296,18 +287,14 @@ def shadow_pixels(view: CameraView, light: Array) -> Pixels:
     return np.flatnonzero(inside)
 
 
-def sky_occlusion(is_object: npt.NDArray[np.bool_], steps: int = SKY_STEPS) -> Floats:
+def sky_occlusion(is_object: npt.NDArray[np.bool_]) -> Floats:
     """Return how much of the sky the object hides from the table near it, 0..1, (px, px).
 
-    This is the object's mask, blurred on a coarse grid.
-
-    Args:
-        is_object: (px, px) mask of the object.
-        steps: grid points per width of the blur.
+    This is the object's mask (px, px), blurred on a coarse grid.
     """
     px = len(is_object)
     width = _SKY_WIDTH * px
-    coarse = min(px, max(1, round(px * steps / width)))
+    coarse = min(px, max(1, round(px * _SKY_STEPS / width)))
     coverage = cv2.resize(is_object.astype(np.float32), (coarse, coarse), interpolation=cv2.INTER_AREA)
     blurred = cv2.GaussianBlur(coverage, (0, 0), width * coarse / px)
     return np.asarray(cv2.resize(blurred, (px, px), interpolation=cv2.INTER_CUBIC))

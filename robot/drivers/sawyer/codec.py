@@ -147,30 +147,6 @@ def joints_of(message: Mapping[str, Any]) -> Joints | None:
     return np.array([_finite(angles[name], name) for name in JOINTS])
 
 
-def stamp_of(message: Mapping[str, Any]) -> Any:
-    """Return the time stamp of a message, for comparison only; None if it has none."""
-    header = message.get("header")
-    return header.get("stamp") if isinstance(header, dict) else None
-
-
-def newest_joints(arrivals: Sequence[ReceivedMessage]) -> tuple[Joints, float] | None:
-    """Return the newest joints and their time of arrival, or None if there are none.
-
-    A message repeated with its old time stamp is as old as its first copy.
-    """
-    found, since_s = None, -math.inf
-    for arrival in reversed(arrivals):
-        if found is None:
-            found = joints_of(arrival.message)
-            stamp = stamp_of(arrival.message)
-            since_s = arrival.time_s
-        elif stamp is not None and stamp_of(arrival.message) == stamp:
-            since_s = arrival.time_s
-        else:
-            break
-    return None if found is None else (found, since_s)
-
-
 def is_still(arrivals: Sequence[ReceivedMessage], since_s: float, now_s: float) -> bool:
     """Return whether the arm was still for the last STILL_S, by joint states that arrived after `since_s`."""
     recent = [

@@ -25,7 +25,7 @@ import numpy as np
 
 from robot.devices import Arm, Clock
 from robot.drivers.sawyer import codec
-from robot.drivers.sawyer.codec import Joints, JointTrajectory, Mount, is_still, newest_joints, waypoints
+from robot.drivers.sawyer.codec import Joints, JointTrajectory, Mount, is_still, joints_of, waypoints
 from robot.drivers.sawyer.link import ReceivedMessage, RosbridgeLink
 from robot.errors import DeviceError
 from robot.readings import Pose, Region
@@ -114,11 +114,6 @@ class Sawyer(Arm):
     def _connect(self) -> None:
         self._sees_collisions = False
         self._open_link()
-        self._check_collision_topic()
-        self._make_ready()
-
-    def _check_collision_topic(self) -> None:
-        """Note in `refused` if the robot reports no collision state."""
         self.refused.pop(_COLLISIONS, None)
         try:
             self._link.wait_for(codec.COLLISION[0])
@@ -127,6 +122,7 @@ class Sawyer(Arm):
             self._link.check()
             self.refused[_COLLISIONS] = "no messages: collisions are not detected"
             _LOG.warning("%s: no messages on %s: collisions are not detected", self.name, codec.COLLISION[0])
+        self._make_ready()
 
     def _open_link(self) -> None:
         """Open a new link and wait for each state once, also the collision state if it was available on connecting."""
@@ -227,7 +223,14 @@ class Sawyer(Arm):
         if self._has_collided_since(began, newest=True):
             raise DeviceError(f"{self.name}: {codec.COLLIDED}")
         start = self._fresh_joints()
-        poses = waypoints(self._check_inside(self._pose()), pose)
+        here = self._pose()
+        if not self.workspace.contains(here, _MARGIN_MM):  # else the line to the goal might leave it
+            lower, upper = self.workspace.lower, self.workspace.upper
+            raise DeviceError(
+                f"{self.name}: the hand must be in the workspace {lower} to {upper} first, but is at {here}; "
+                "bring it there by hand, or check base_xyz_mm and tool_mm"
+            )
+        poses = waypoints(here, pose)
         joints = self._solve(poses, start)
         schedule = JointTrajectory.from_waypoints(
             poses, joints, speed_mm_s, self._options.joint_speed_rad_s, self._options.ramp_s
@@ -239,16 +242,6 @@ class Sawyer(Arm):
         finally:
             self._is_moving = False
         return self._pose_since(self.clock())
-
-    def _check_inside(self, pose: Pose) -> Pose:
-        """Raise DeviceError unless the pose is in the workspace, so that the line to the goal stays in it too."""
-        if not self.workspace.contains(pose, _MARGIN_MM):
-            lower, upper = self.workspace.lower, self.workspace.upper
-            raise DeviceError(
-                f"{self.name}: the hand must be in the workspace {lower} to {upper} first, but is at {pose}; "
-                "bring it there by hand, or check base_xyz_mm and tool_mm"
-            )
-        return pose
 
     def _solve(self, poses: Sequence[Pose], start: Joints) -> Joints:
         """Return the joint angles (N, 7) of way-points; the first is the arm's pose."""
@@ -342,14 +335,16 @@ class Sawyer(Arm):
         self._link.publish(codec.JOINT_COMMAND[0], codec.joint_command(joints))
 
     def _fresh_joints(self) -> Joints:
-        """Return the newest joints; raise DeviceError if they are too old, by their first copy."""
-        found, age_s = newest_joints(self._link.history(codec.JOINT_STATES[0])), math.inf
-        if found is not None:
-            joints, since_s = found
-            if (age_s := self.clock() - since_s) <= self._options.max_state_age_s:
-                return joints
+        """Return the newest joints; raise DeviceError if they are too old."""
+        age = "none"
+        for arrival in reversed(self._link.history(codec.JOINT_STATES[0])):
+            if (joints := joints_of(arrival.message)) is not None:
+                age_s = self.clock() - arrival.time_s
+                if age_s <= self._options.max_state_age_s:
+                    return joints
+                age = f"{age_s:.2f} s"
+                break
         self._link.check()
-        age = "none" if found is None else f"{age_s:.2f} s"
         raise DeviceError(
             f"{self.name}: the joint state must be at most {self._options.max_state_age_s:g} s old, got {age}; without "
             f"new commands the robot ends its motion after {self._options.command_timeout_s:g} s"

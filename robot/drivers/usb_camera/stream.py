@@ -67,7 +67,6 @@ class CaptureSettings(TypedSettings):
         auto_white_balance: Whether the white balance is automatic.
         white_balance_k: Colour temperature, if not automatic.
         gain: Gain in the camera's own unit.
-        buffer: Number of pictures that the system buffers, 1 to 10.
         led: Red, green and blue of a DIGIT, each 0 to 15.
     """
 
@@ -80,7 +79,6 @@ class CaptureSettings(TypedSettings):
     auto_white_balance: bool = False
     white_balance_k: float | None = bounded(0, 1e9, None)
     gain: float | None = bounded(0, 1e9, None)
-    buffer: int = bounded(0, 10, 0, unit="pictures")
     led: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
@@ -165,7 +163,6 @@ _PROPERTIES: Mapping[str, _Property] = {
     "width": _Property(cv2.CAP_PROP_FRAME_WIDTH, from_camera=round),
     "height": _Property(cv2.CAP_PROP_FRAME_HEIGHT, from_camera=round),
     "fps": _Property(cv2.CAP_PROP_FPS, slack=0.5),
-    "buffer": _Property(cv2.CAP_PROP_BUFFERSIZE, from_camera=round),
     "auto_exposure": _Property(cv2.CAP_PROP_AUTO_EXPOSURE, lambda on: 3.0 if on else 1.0, lambda value: value != 1),
     "exposure_ms": _Property(cv2.CAP_PROP_EXPOSURE, lambda ms: 10.0 * ms, lambda value: value / 10, slack=0.05),
     "auto_white_balance": _Property(cv2.CAP_PROP_AUTO_WB, from_camera=bool),

@@ -175,7 +175,6 @@ class Operator:
         table: influence; a quadrant at least as large as `shape`, or of the size of `shape` if `periodic`.
         shape: rows and columns of the pressure.
         periodic: whether the surface wraps around at the border of `shape`.
-        workers: threads of the FFT.
         single_precision: whether the FFT is in float32, accurate to about 1e-7 of the largest displacement.
 
     Attributes:
@@ -190,15 +189,14 @@ class Operator:
         shape: Quadrant,
         *,
         periodic: bool = False,
-        workers: int = 1,
         single_precision: bool = False,
     ) -> None:
-        self.shape, self.workers, self.single_precision = shape, workers, single_precision
+        self.shape, self.single_precision = shape, single_precision
         self.rounding = 1e-6 if single_precision else 1e-12
         self._size = shape if periodic else tuple(scipy.fft.next_fast_len(2 * n - 1, real=True) for n in shape)
         whole = table if periodic else _mirrored(table, shape, self._size)
         # The influence is even, so its transform is real.
-        transform = np.ascontiguousarray(scipy.fft.rfft2(whole, workers=workers).real)
+        transform = np.ascontiguousarray(scipy.fft.rfft2(whole).real)
         self._transform = transform.astype(np.float32) if single_precision else transform
         self.bound, self.peak = _largest(transform), float(table[0, 0])
 
@@ -213,11 +211,11 @@ class Operator:
         """Return the displacement (rows, cols), float64, of a pressure (rows, cols)."""
         (rows, cols), (high, wide) = self.shape, self._size
         values = pressure.astype(np.float32) if self.single_precision else pressure
-        wave = scipy.fft.rfft(values, wide, axis=1, workers=self.workers)
-        wave = scipy.fft.fft(wave, high, axis=0, overwrite_x=True, workers=self.workers)
+        wave = scipy.fft.rfft(values, wide, axis=1)
+        wave = scipy.fft.fft(wave, high, axis=0, overwrite_x=True)
         wave *= self._transform
-        wave = scipy.fft.ifft(wave, axis=0, overwrite_x=True, workers=self.workers)[:rows]
-        displacement = scipy.fft.irfft(wave, wide, axis=1, workers=self.workers)[:, :cols]
+        wave = scipy.fft.ifft(wave, axis=0, overwrite_x=True)[:rows]
+        displacement = scipy.fft.irfft(wave, wide, axis=1)[:, :cols]
         return np.ascontiguousarray(displacement, np.float64)
 
 

@@ -7,7 +7,6 @@ import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,7 +110,7 @@ class SdfBody(Body):
 
     @cached_property
     def wall(self) -> ReliefLevels | None:
-        """The baked relief; None for a smooth shape. Computed on first use, not pickled."""
+        """The baked relief; None for a smooth shape. Computed on first use."""
         return bake(self.shape, self.relief)
 
     @cached_property
@@ -122,9 +121,6 @@ class SdfBody(Body):
         """Return the chart coordinates of a point, and the weight of relief there."""
         mask = self.shape.mask(x, y, z)
         return *self.shape.chart.locate(x, y, z), np.full_like(x, 1.0) if mask is None else mask
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key not in ("wall", "_chart_formula")}
 
     def volumes_mm3(self, shell_mm: float) -> tuple[float, float]:
         """Count cells on a 28^3 grid, without relief: within about 3 % of the true volume."""

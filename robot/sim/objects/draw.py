@@ -57,9 +57,6 @@ class SimObject:
             "engraved": relief.engraved,
         }
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key != "mass_kg"}
-
 
 def draw_object(seed: int, index: int, *, family: str | None = None, relief: str | None = None) -> SimObject:
     """Draw object `index` of the object set `seed`.

@@ -132,9 +132,6 @@ class MeshBody(Body):
         radius = float(np.mean(self.upper[:2] - self.lower[:2])) / 2
         self.chart = CylindricalChart(radius, float(self.upper[2]))
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key not in ("wall", "_caster", "_samples")}
-
     @cached_property
     def wall(self) -> ReliefLevels | None:
         """The relief on a cylinder around the mesh."""

@@ -114,14 +114,13 @@ def test_the_real_opencv_cannot_open_a_file_that_is_not_a_camera(dev):
 
 def test_format_is_written_first_then_size_and_rate_and_then_the_rest(plug):
     camera = FakeVideoDevice()
-    requested = {"exposure_ms": 5.0, "white_balance_k": 4600.0, "gain": 0.0, "buffer": 2}
+    requested = {"exposure_ms": 5.0, "white_balance_k": 4600.0, "gain": 0.0}
     with GelSight(finger="a", device=plug(camera), **requested, **QUICK) as gel:
         assert camera.written == [
             (cv2.CAP_PROP_FOURCC, 0x47504A4D),  # "MJPG", first letter lowest
             (cv2.CAP_PROP_FRAME_WIDTH, 1280),
             (cv2.CAP_PROP_FRAME_HEIGHT, 960),
             (cv2.CAP_PROP_FPS, 30),
-            (cv2.CAP_PROP_BUFFERSIZE, 2),
             (cv2.CAP_PROP_AUTO_EXPOSURE, 1),  # manual
             (cv2.CAP_PROP_EXPOSURE, 50),  # 0.1 ms each
             (cv2.CAP_PROP_AUTO_WB, 0),
@@ -173,7 +172,6 @@ def test_the_zoom_control_of_a_digit_sets_its_brightness(plug):
         ({"exposure_ms": 5.0, "auto_exposure": True}, "exposure_ms must be left out"),
         ({"white_balance_k": 5000.0, "auto_white_balance": True}, "white_balance_k must be left out"),
         ({"gain": math.inf}, "gain"),
-        ({"buffer": 11}, "buffer"),
         ({"led": [1, 2]}, "led"),
         ({"led": [1, 2, 16]}, "led"),
         ({"crop": [0.5, 0.0, 0.5, 0.0]}, "crop"),

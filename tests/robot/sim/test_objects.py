@@ -1,7 +1,5 @@
 """Objects: reproducible, evenly distributed, small enough, with paint independent of tactile properties."""
 
-import pickle
-
 import numpy as np
 import pytest
 
@@ -66,17 +64,6 @@ def test_all_of_them_fit_between_the_fingers():
 def test_impossible_draws_are_refused(settings, error, message):
     with pytest.raises(error, match=message):
         draw_object(**{"seed": 0, "index": 0, **settings})
-
-
-def test_relief_is_baked_for_the_first_ray_and_pickles_stay_small():
-    item = draw_object(0, 14)
-    assert "wall" not in item.body.__dict__
-    assert len(pickle.dumps(item)) < 20_000
-    item.body.cast(np.array([[0.0, -300, 20]]), np.array([[0.0, 1, 0]]))
-    assert "wall" in item.body.__dict__
-    again = pickle.loads(pickle.dumps(item))  # noqa: S301
-    assert "wall" not in again.body.__dict__
-    assert len(pickle.dumps(item)) < 20_000
 
 
 # Paint is independent of touch -----------------------------------------------------------------------------

@@ -7,7 +7,6 @@ A shape is the smooth solid, in mm, on z = 0 with its axis on x = y = 0. Its dis
 
 from abc import ABC, abstractmethod
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,9 +68,6 @@ class Shape(ABC):
     def formula(self) -> Formula:
         """Formula of `distance_xyz`, for compiled code."""
         return trace_formula(self.distance_xyz, 3)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key != "formula"}
 
     def distance(self, points: Points) -> Floats:
         """Return the signed distance in mm of points (N, 3), negative inside; never more than the true one."""
