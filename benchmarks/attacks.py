@@ -84,9 +84,10 @@ def nested(target: Target) -> str:
     )
 
 
-def empty_objects(target: Target) -> str:
-    """A batch of millions of empty objects."""
-    return _post_in_parallel(target, "/v1/query/batch", b'{"objects": [' + b"[]," * (BODY_BYTES // 3 - 10) + b"[]]}", 3)
+def empty_verification(target: Target) -> str:
+    """A verification of millions of empty grasps."""
+    body = b'{"expect": "mug", "touches": [' + b"[]," * (BODY_BYTES // 3 - 20) + b"[]]}"
+    return _post_in_parallel(target, "/v1/verify", body, 3)
 
 
 def many_parts(target: Target) -> str:
@@ -190,7 +191,7 @@ ATTACKS: tuple[Attack, ...] = (
     many_keys,
     empty_grasps,
     nested,
-    empty_objects,
+    empty_verification,
     many_parts,
     jpeg_scans,
     png_column,

@@ -46,8 +46,6 @@ if TYPE_CHECKING:
     from retrieval.search.embeddings import embed_photos as embed_photos
     from retrieval.search.query.answer import Match as Match
     from retrieval.search.query.answer import QueryResult as QueryResult
-    from retrieval.search.query.neighbours import Neighbour as Neighbour
-    from retrieval.search.query.neighbours import nearest_photos as nearest_photos
     from retrieval.search.query.searcher import Searcher as Searcher
     from retrieval.search.query.verification import Verification as Verification
     from retrieval.serve.client import Client as Client
@@ -66,7 +64,6 @@ _MODULES = {
     "Loss": "model.losses.loss:Loss",
     "Match": "search.query.answer:Match",
     "Method": "methods.method:Method",
-    "Neighbour": "search.query.neighbours:Neighbour",
     "Protocol": "evaluation.real.protocol:Protocol",
     "QueryResult": "search.query.answer:QueryResult",
     "RetrievalError": "errors:RetrievalError",
@@ -87,7 +84,6 @@ _MODULES = {
     "load_grasps": "data.dataset:load_grasps",
     "make_split": "data.dataset:make_split",
     "measure_frontier": "frontier.measure:measure_frontier",
-    "nearest_photos": "search.query.neighbours:nearest_photos",
     "open": "search.query.searcher:Searcher.open",
     "shipped_model": "search.defaults:shipped_model",
     "train": "training.train:train",

@@ -21,8 +21,6 @@ from retrieval.version import __version__
 
 THREADS = 4
 """Number of threads that read files and make thumbnails; the model and the rig have other threads."""
-_CLOSING_S = 1.0
-"""Time for each queue to close; work that hangs is abandoned."""
 
 
 def create_app(
@@ -71,9 +69,6 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     if not parts.generations.ready:
         await asyncio.to_thread(parts.generations.open)
     await parts.decoders.start()
-    queues = (parts.queue, parts.grasps, *parts.frames.values())
-    for queue in queues:
-        queue.start()
     if parts.history_writer:
         await asyncio.to_thread(parts.history_writer.record_pending)
     watching = asyncio.ensure_future(parts.generations.watch())
@@ -84,6 +79,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         parts.stopping.set()
         watching.cancel()
         await parts.decoders.close()
-        await asyncio.gather(*(asyncio.to_thread(queue.close, _CLOSING_S) for queue in queues))
+        for queue in (parts.queue, parts.grasps, *parts.frames.values()):
+            queue.close()
         if parts.history_writer:
             await asyncio.to_thread(parts.history_writer.close)

@@ -1,4 +1,4 @@
-"""Routes of the catalogue: pages of photos, search, similar photos, images, and the index.
+"""Routes of the catalogue: pages of photos, search, images, and the index.
 
 The index maps an id to its file. No text of a request becomes part of a file path.
 """
@@ -14,13 +14,10 @@ from retrieval.data.images import read_bytes
 from retrieval.data.text import replace_surrogates
 from retrieval.errors import ImageError
 from retrieval.report.pages import jpeg, thumbnail
-from retrieval.search.query.neighbours import nearest_photos
 from retrieval.search.query.objects import ListedPhoto
 from retrieval.serve.documents import (
     CatalogueDocument,
     IndexDocument,
-    NearPhoto,
-    NearPhotosDocument,
     PhotoDocument,
 )
 from retrieval.serve.errors import HttpProblem
@@ -120,19 +117,6 @@ def image_response(data: bytes, headers: Mapping[str, str] | None = None) -> Res
     data = as_png_or_jpeg(data)
     kind = next(kind for magic, kind in BROWSER_IMAGE_TYPES.items() if data.startswith(magic))
     return Response(data, media_type=kind, headers=headers)
-
-
-@router.get("/v1/nearest/{photo:path}")
-def nearest(photo: str, parts: Parts, count: Annotated[int, Query(ge=1, le=100)] = 12) -> NearPhotosDocument:
-    """Return visually similar photos, by the model's embeddings."""
-    generation = parts.generations.current
-    if _listed(generation, photo).is_touch:
-        raise HttpProblem("unknown", f"{photo!r} is a gel image of a reference touch, not a photo.")
-    items = [
-        NearPhoto(**_document(near.photo).model_dump(), score=near.score)
-        for near in nearest_photos(generation.searcher, photo, count)
-    ]
-    return NearPhotosDocument(generation=generation.name, photo=photo, items=items)
 
 
 @router.get("/v1/index")

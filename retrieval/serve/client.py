@@ -91,13 +91,8 @@ class Client:
         return _result(_document(self._send("POST", "query", json=body)), grasps)
 
     def query_many(self, objects: Sequence[AnyTouches], **options: Unpack[QueryOptions]) -> list[QueryResult]:
-        """Run `Searcher.query_many` on the service; see `query`."""
-        if not objects:
-            return []
-        queries = [self._grasps(one, f"object {number}, ") for number, one in enumerate(objects, start=1)]
-        body = {"objects": [_encoded(grasps) for grasps in queries], **_request_options(options)}
-        answers = _document(self._send("POST", "query/batch", json=body), "answers")["answers"]
-        return [_result(answer, grasps) for answer, grasps in zip(answers, queries, strict=True)]
+        """Run `query` for each object."""
+        return [self.query(touches, **options) for touches in objects]
 
     def photo(self, match: Match) -> bytes:
         """Return the file of a match's photo.
@@ -107,10 +102,10 @@ class Client:
         """
         return self._send("GET", f"photos/{quote(match.photo)}").content
 
-    def _grasps(self, touches: AnyTouches, of: str = "") -> list[list[InputImage]]:
+    def _grasps(self, touches: AnyTouches) -> list[list[InputImage]]:
         if self._fingers is None:
             self._fingers = int(_document(self._send("GET", "index"), "fingers")["fingers"])
-        return parse_grasps(touches, self._fingers, of=of)
+        return parse_grasps(touches, self._fingers)
 
     def _send(self, method: str, path: str, **request: Any) -> httpx.Response:
         """Send a request; while the service is busy, retry after its `Retry-After` until the time limit."""

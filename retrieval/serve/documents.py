@@ -49,12 +49,6 @@ class QueryDocument(BaseModel):
     results: list[MatchDocument]
 
 
-class BatchDocument(BaseModel):
-    """One answer for each object, in the order of the request."""
-
-    answers: list[QueryDocument]
-
-
 class PhotoDocument(BaseModel):
     """A photo of the catalogue. All routes use its `id`. metadata: the user's own."""
 
@@ -71,20 +65,6 @@ class CatalogueDocument(BaseModel):
     offset: int
     next: int | None
     items: list[PhotoDocument]
-
-
-class NearPhoto(PhotoDocument):
-    """A similar photo. score: inner product of the two unit embeddings, 1 for equal pictures."""
-
-    score: float
-
-
-class NearPhotosDocument(BaseModel):
-    """Photos similar to a photo, the most similar first, without the photo itself."""
-
-    generation: str
-    photo: str
-    items: list[NearPhoto]
 
 
 class VerificationDocument(BaseModel):

@@ -57,13 +57,13 @@ class HistoryWriter:
         self._writer, self._pending = ThreadPoolExecutor(1, "history"), 0
 
     async def add_query(self, pictures: RequestPictures, result: QueryResult) -> str | None:
-        """Store a query with one object; return its id, or None if it cannot be stored within `STORE_S`."""
+        """Store a query; return its id, or None if it cannot be stored within `STORE_S`."""
         query_id = new_id()
         try:
             if self._pending >= MAX_PENDING_WRITES:
                 raise TimeoutError
             self._pending += 1
-            row = query_id, pictures.files[0], pictures.background, result
+            row = query_id, pictures.files, pictures.background, result
             writing = asyncio.wrap_future(self._writer.submit(self.store.add_query, *row))
             writing.add_done_callback(self._count_down)
             await asyncio.wait_for(asyncio.shield(writing), STORE_S)

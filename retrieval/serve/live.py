@@ -1,24 +1,19 @@
-"""Routes of a live rig: sensor pictures, MJPEG streams, and grasps."""
+"""Routes of a live rig: sensor pictures, and grasps."""
 
-import asyncio
 import base64
-from collections.abc import AsyncIterator
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.responses import StreamingResponse
 
 from retrieval.serve.documents import GraspDocument
 from retrieval.serve.errors import HttpProblem
 from retrieval.serve.generations import ServedGeneration
-from retrieval.serve.service import Parts, Service
+from retrieval.serve.service import Parts
 
 router = APIRouter(tags=["live"])
 MAX_OBJECT_NAMES = 1000
 """Maximum number of objects among which a random one is chosen for a grasp."""
-BOUNDARY = "picture"
 ObjectParameter = Annotated[str | None, Query(max_length=1000, alias="object", description="Object to grasp.")]
-Rate = Annotated[float, Query(gt=0, le=30, description="Maximum pictures per second.")]
 
 
 @router.post("/v1/grasp")
@@ -58,57 +53,16 @@ def _object_ids(generation: ServedGeneration, name: str | None) -> list[str]:
 @router.get(
     "/v1/sensors/{name}/frame",
     response_class=Response,
-    responses={
-        200: {"content": {"image/jpeg": {}}, "description": "The picture."},
-    },
+    responses={200: {"content": {"image/jpeg": {}}, "description": "The picture."}},
 )
 async def frame(name: str, request: Request, parts: Parts) -> Response:
     """Return the newest picture of a sensor."""
-    return Response(await _read(parts, name, request), media_type="image/jpeg")
-
-
-@router.get(
-    "/v1/sensors/{name}/stream",
-    response_class=StreamingResponse,
-    responses={
-        200: {"content": {"multipart/x-mixed-replace": {}}, "description": "Endless stream of pictures (MJPEG)."},
-    },
-)
-async def stream(name: str, request: Request, parts: Parts, rate: Rate = 10.0) -> StreamingResponse:
-    """Stream the pictures of a sensor; an `<img>` element shows them."""
-    if parts.streams.locked():
-        raise HttpProblem("busy", f"{parts.settings.streams} streams are running already.", {"retry-after": "5"})
-    first = await _read(parts, name, request)  # errors are raised before the stream begins
-    return StreamingResponse(
-        _pictures(parts, name, request, first, 1 / rate), media_type=f"multipart/x-mixed-replace; boundary={BOUNDARY}"
-    )
-
-
-async def _pictures(parts: Service, name: str, request: Request, first: bytes, pause_s: float) -> AsyncIterator[bytes]:
-    """Yield the parts of an MJPEG stream until the sensor fails or the service stops."""
-    async with parts.streams:
-        data: bytes | None = first
-        while data is not None and not parts.stopping.is_set():
-            yield b"--%b\r\ncontent-type: image/jpeg\r\ncontent-length: %d\r\n\r\n%b\r\n" % (
-                BOUNDARY.encode(),
-                len(data),
-                data,
-            )
-            await asyncio.sleep(pause_s)
-            try:
-                data = await _read(parts, name, request)
-            except HttpProblem as problem:
-                if problem.kind != "busy":
-                    data = None  # the sensor failed: end the stream
-
-
-async def _read(parts: Service, name: str, request: Request) -> bytes:
     read = parts.rig.sensors.get(name)
     if read is None:
         known = ", ".join(sorted(parts.rig.sensors)) or "none; connect a rig with --rig"
         raise HttpProblem("unknown", f"There is no sensor {name[:100]!r}. Known sensors: {known}.")
     try:
-        return await parts.frames[name].submit(lambda _: read(), request)
+        return Response(await parts.frames[name].submit(lambda _: read(), request), media_type="image/jpeg")
     except HttpProblem:
         raise
     except Exception as error:  # of any driver

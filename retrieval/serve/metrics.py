@@ -5,7 +5,6 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, gene
 from retrieval.search.query.answer import QueryResult
 
 _SECONDS = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
-_SIZES = (1, 2, 4, 8, 16, 32)
 
 
 class Metrics:
@@ -18,9 +17,6 @@ class Metrics:
         )
         self.waiting = Histogram(
             "retrieve_wait_seconds", "Time in the queue before work", buckets=_SECONDS, registry=self.registry
-        )
-        self.batches = Histogram(
-            "retrieve_batch_queries", "Queries answered together", buckets=_SIZES, registry=self.registry
         )
         self.in_flight = Gauge(
             "retrieve_requests_in_flight", "Requests that wait or are being processed", registry=self.registry

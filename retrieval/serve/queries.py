@@ -1,17 +1,16 @@
-"""Routes of queries: one object, several objects, and verification."""
+"""Routes of queries and verification."""
 
 from fastapi import APIRouter, Request
 from pydantic import Field
 
-from retrieval.serve.documents import BatchDocument, QueryDocument, VerificationDocument
+from retrieval.serve.documents import QueryDocument, VerificationDocument
 from retrieval.serve.errors import DocumentResponse
 from retrieval.serve.service import Parts
 from retrieval.serve.uploads import (
     QUERY_BODY,
     Base64Image,
-    BatchBody,
     Grasps,
-    ParsedQuery,
+    Options,
     RequestBody,
     RequestPictures,
     json_body,
@@ -31,36 +30,17 @@ router = APIRouter(tags=["queries"])
 async def query(request: Request, parts: Parts) -> DocumentResponse:
     """Return the document of `retrieve query --json` for one or several grasps of one object."""
     parts.queue.require_capacity()
-    parsed_query = await read_query(request, parts.generations.current.fingers)
+    pictures, options = await read_query(request, parts.generations.current.fingers)
     result = await parts.queue.submit(
-        lambda generation: generation.searcher.query(parsed_query.pictures.images[0], **parsed_query.keywords),
+        lambda generation: generation.searcher.query(
+            pictures.images, background=pictures.frames, **options.model_dump(include=set(Options.model_fields))
+        ),
         request,
-        parsed_query.options.deadline_ms,
-        parsed_query.pictures,
-        parsed_query,
+        pictures,
     )
     parts.metrics.count_answer(result)
-    query_id = None
-    if parts.history_writer is not None:
-        query_id = await parts.history_writer.add_query(parsed_query.pictures, result)
+    query_id = await parts.history_writer.add_query(pictures, result) if parts.history_writer else None
     return DocumentResponse(result.to_dict(), headers={"x-query-id": query_id} if query_id else None)
-
-
-@router.post("/v1/query/batch", response_model=BatchDocument, openapi_extra=json_body(BatchBody))
-async def query_batch(request: Request, parts: Parts) -> DocumentResponse:
-    """Return one answer for each of several objects, in their order; their touches are encoded together."""
-    parts.queue.require_capacity()
-    body = await read_json(request, BatchBody)
-    parsed_query = ParsedQuery(RequestPictures(body.objects, body.background, is_batch=True), body)
-    results = await parts.queue.submit(
-        lambda generation: generation.searcher.query_many(parsed_query.pictures.images, **parsed_query.keywords),
-        request,
-        body.deadline_ms,
-        parsed_query.pictures,
-    )
-    for result in results:
-        parts.metrics.count_answer(result)
-    return DocumentResponse({"answers": [result.to_dict() for result in results]})
 
 
 class VerifyBody(RequestBody):
@@ -82,12 +62,12 @@ async def verify(request: Request, parts: Parts) -> DocumentResponse:
     """Return the document of `retrieve verify --json`."""
     parts.queue.require_capacity()
     body = await read_json(request, VerifyBody)
-    pictures = RequestPictures([body.touches], body.background)
+    pictures = RequestPictures(body.touches, body.background)
     found = await parts.queue.submit(
         lambda generation: generation.searcher.verify(
-            pictures.images[0], body.expect, far=body.far, background=pictures.frames
+            pictures.images, body.expect, far=body.far, background=pictures.frames
         ),
         request,
-        pictures=pictures,
+        pictures,
     )
     return DocumentResponse(found.to_dict())

@@ -24,7 +24,7 @@ MAX_SHUTDOWN_S = 7.5
 
 
 class Server(uvicorn.Server):
-    """A uvicorn server that ends the streams of the service on a signal.
+    """A uvicorn server that says when it listens, and when it ends.
 
     Args:
         config: Configuration of uvicorn.
@@ -48,7 +48,7 @@ class Server(uvicorn.Server):
         await super().shutdown(sockets)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """End the streams, which otherwise never end, and the server."""
+        """End the server; from now on it is not ready."""
         self._parts.stopping.set()
         super().handle_exit(sig, frame)
 

@@ -1,6 +1,5 @@
 """The parts of one service, which all routes share through the application's state."""
 
-from asyncio import Semaphore
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,8 +19,8 @@ from retrieval.serve.trials import Trials
 
 MAX_RIG_GRASPS = 4
 """Maximum number of pending rig grasps, including the one in progress."""
-MAX_FRAMES = 8
-"""Maximum number of pending requests for single sensor pictures, in addition to streams."""
+MAX_FRAMES = 16
+"""Maximum number of pending requests for the pictures of one sensor."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +67,7 @@ class Service:
         frames: Queue of each sensor, by name.
         history_writer: Writer of the history; None if no history is stored.
         trials: Trials of the human baseline; None if there is no recording for them.
-        streams: Limits the number of live streams.
-        stopping: Set at shutdown, to end streams.
+        stopping: Set at shutdown.
     """
 
     def __init__(
@@ -82,16 +80,16 @@ class Service:
     ) -> None:
         self.settings, self.rig, self.metrics = settings, rig or LiveRig(), Metrics()
         self.generations, self.decoders = Generations(settings, self.metrics, shards), Decoders()
-        single = replace(settings, workers=1, max_batch=1)
+        single = replace(settings, workers=1)
         self.queue = self._queue(settings)
         self.grasps = self._queue(replace(single, queue=MAX_RIG_GRASPS))
-        frames = replace(single, queue=settings.streams + MAX_FRAMES)
+        frames = replace(single, queue=MAX_FRAMES)
         self.frames = {name: self._queue(frames) for name in self.rig.sensors}
         self.history_writer = None
         if settings.history and recorder:
             self.history_writer = HistoryWriter(settings.history, recorder, settings, self.metrics)
         self.trials = Trials(trials) if trials else None
-        self.streams, self.stopping = Semaphore(settings.streams), Event()
+        self.stopping = Event()
 
     def _queue(self, settings: ServiceSettings) -> Queue:
         return Queue(self.generations, settings, self.metrics, self.decoders)

@@ -32,14 +32,12 @@ class ServiceSettings:
         token: Access token of at least 16 ASCII characters; None for a service without one.
         queue: Maximum number of requests in flight.
         workers: Threads that answer queries.
-        max_batch: Maximum number of queries with equal options in one batch.
         deadline_s: Time limit for an answer.
         body_s: Time limit for the body of a request to arrive.
         poll_s: Interval of the checks for a new generation of the index.
         history: Folder for queries and feedback; None to store nothing.
         history_max_queries: Maximum number of stored queries without feedback.
         history_max_bytes: Maximum total size of the gel images of queries without feedback.
-        streams: Maximum number of concurrent sensor streams.
 
     Raises:
         ConfigError: An option is out of its range.
@@ -53,18 +51,16 @@ class ServiceSettings:
     token: str | None = None
     queue: int = 8
     workers: int = 1
-    max_batch: int = 4
     deadline_s: float = 30.0
     body_s: float = 10.0
     poll_s: float = 1.0
     history: Path | None = None
     history_max_queries: int = 10_000
     history_max_bytes: int = 4 * 2**30
-    streams: int = 8
 
     def __post_init__(self) -> None:
         """Check the ranges of the options."""
-        for name in ("queue", "workers", "max_batch", "history_max_queries", "history_max_bytes", "streams"):
+        for name in ("queue", "workers", "history_max_queries", "history_max_bytes"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be at least 1, got {getattr(self, name)}.")
         for name in ("deadline_s", "body_s", "poll_s"):

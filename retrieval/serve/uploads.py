@@ -22,7 +22,7 @@ from retrieval.model.posterior import NONE_PRIOR
 from retrieval.serve.errors import HttpProblem, validation_message
 from retrieval.serve.settings import MAX_BODY_BYTES, MAX_PICTURES, MAX_SMALL_BODY_BYTES
 
-PICTURE_PATHS = frozenset({"/v1/query", "/v1/query/batch", "/v1/verify"})
+PICTURE_PATHS = frozenset({"/v1/query", "/v1/verify"})
 """Routes whose bodies contain pictures: up to `MAX_BODY_BYTES`. All others: up to `MAX_SMALL_BODY_BYTES`."""
 LARGE_BYTES = 1_000_000
 """Size in bytes above which a body is treated as large."""
@@ -34,7 +34,7 @@ options has fewer than 800 values."""
 MAX_FIELDS, MAX_FIELD_BYTES = 8, 1024
 """Maximum number of the options in a form, and maximum size of each."""
 Body = TypeVar("Body", bound=BaseModel)
-MAX_GRASPS, MAX_OBJECTS = 32, 32
+MAX_GRASPS = 32
 _CLOSE = {"connection": "close"}  # the rest of the body is not read
 
 
@@ -129,9 +129,6 @@ class Options(RequestBody):
     none_prior: float = Field(
         NONE_PRIOR, gt=0, lt=1, description="Prior probability that the catalogue lacks the object."
     )
-    deadline_ms: float | None = Field(
-        None, gt=0, le=3_600_000, description="Deadline in milliseconds; the service's own deadline also applies."
-    )
 
 
 class QueryBody(Options):
@@ -140,15 +137,6 @@ class QueryBody(Options):
     model_config = {"json_schema_extra": {"examples": [{"touches": [[_PIXEL, _PIXEL]], "top": 3}]}}
 
     touches: Grasps = Field(description="Grasps, each with one image for each finger.")
-    background: list[Base64Image] | None = Field(None, description="No-contact frames, one for each finger.")
-
-
-class BatchBody(Options):
-    """The touches of several objects."""
-
-    model_config = {"json_schema_extra": {"examples": [{"objects": [[[_PIXEL, _PIXEL]], [[_PIXEL, _PIXEL]]]}]}}
-
-    objects: Annotated[list[Grasps], Field(min_length=1, max_length=MAX_OBJECTS)]
     background: list[Base64Image] | None = Field(None, description="No-contact frames, one for each finger.")
 
 
@@ -187,9 +175,8 @@ class RequestPictures:
     """The image files of a request, and the decoded images after `Queue.submit`.
 
     Attributes:
-        files: One file for each finger of each grasp of each object.
+        files: One file for each finger of each grasp.
         background: One no-contact frame for each finger; None without them.
-        is_batch: Whether messages name the object.
         images: The decoded `files`.
         frames: The decoded `background`.
 
@@ -197,10 +184,9 @@ class RequestPictures:
         HttpProblem: There are more than `MAX_PICTURES`.
     """
 
-    files: Sequence[Sequence[Sequence[bytes]]]
+    files: Sequence[Sequence[bytes]]
     background: Sequence[bytes] | None
-    is_batch: bool = False
-    images: list[list[list[GelImage]]] = field(default_factory=list)
+    images: list[list[GelImage]] = field(default_factory=list)
     frames: list[GelImage] | None = None
 
     def __post_init__(self) -> None:
@@ -211,9 +197,8 @@ class RequestPictures:
     def named_files(self) -> list[tuple[str, bytes]]:
         """Return each file with its name for messages and answers."""
         found = [
-            (f"{f'object {at}, ' if self.is_batch else ''}grasp {number}, finger {_letter(place)}", data)
-            for at, grasps in enumerate(self.files, start=1)
-            for number, grasp in enumerate(grasps, start=1)
+            (f"grasp {number}, finger {_letter(place)}", data)
+            for number, grasp in enumerate(self.files, start=1)
             for place, data in enumerate(grasp)
         ]
         return found + [
@@ -222,30 +207,11 @@ class RequestPictures:
 
     def set_images(self, images: Iterator[GelImage]) -> None:
         """Set the decoded images, in the order of `named_files`."""
-        self.images = [[[next(images) for _ in grasp] for grasp in grasps] for grasps in self.files]
+        self.images = [[next(images) for _ in grasp] for grasp in self.files]
         self.frames = None if self.background is None else list(images)
 
 
-@dataclass(frozen=True)
-class ParsedQuery:
-    """A valid query whose pictures are not decoded yet."""
-
-    pictures: RequestPictures
-    options: Options
-
-    @property
-    def keywords(self) -> dict[str, Any]:
-        """The keyword arguments of `Searcher.query` without the touches; requires decoded pictures."""
-        options = self.options.model_dump(include={"top", "candidates", "none_prior"})
-        return {"background": self.pictures.frames, **options}
-
-    def can_batch_with(self, other: "ParsedQuery") -> bool:
-        """Return whether both queries can be answered in one batch."""
-        background = self.pictures.background == other.pictures.background
-        return background and {**self.keywords, "background": None} == {**other.keywords, "background": None}
-
-
-async def read_query(request: Request, fingers: int) -> ParsedQuery:
+async def read_query(request: Request, fingers: int) -> tuple[RequestPictures, Options]:
     """Return the query in a request's body; `fingers` is the number of gel images of one grasp.
 
     Raises:
@@ -254,7 +220,7 @@ async def read_query(request: Request, fingers: int) -> ParsedQuery:
     if _content_type(request) == "multipart/form-data":
         return await _read_form(request, fingers)
     body = await read_json(request, QueryBody)
-    return ParsedQuery(RequestPictures([body.touches], body.background), body)
+    return RequestPictures(body.touches, body.background), body
 
 
 async def read_json(request: Request, model: type[Body]) -> Body:
@@ -298,7 +264,7 @@ def _invalid(error: ValidationError) -> HttpProblem:
     return HttpProblem("malformed" if is_malformed else "bad-input", validation_message(errors))
 
 
-async def _read_form(request: Request, fingers: int) -> ParsedQuery:
+async def _read_form(request: Request, fingers: int) -> tuple[RequestPictures, Options]:
     files: dict[str, list[bytes]] = {"gelsight": [], "background": []}
     fields: dict[str, str] = {}
     limits = {"max_files": MAX_PICTURES, "max_fields": MAX_FIELDS, "max_part_size": MAX_FIELD_BYTES}
@@ -326,7 +292,7 @@ async def _read_form(request: Request, fingers: int) -> ParsedQuery:
     touches = [images[start : start + fingers] for start in range(0, len(images), fingers)]
     if len(touches) > MAX_GRASPS:
         raise HttpProblem("bad-input", f"A query may have at most {MAX_GRASPS} grasps, got {len(touches)}.")
-    return ParsedQuery(RequestPictures([touches], files["background"] or None), options)
+    return RequestPictures(touches, files["background"] or None), options
 
 
 def _letter(place: int) -> str:

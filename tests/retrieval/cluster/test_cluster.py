@@ -334,7 +334,6 @@ def test_the_service_on_a_cluster_gives_the_results_of_the_folder_and_restarts_a
             found = httpx.get(f"{address}/v1/catalogue", params={"limit": 500}).json()
             assert {item["id"] for item in found["items"]} == {row.path for row in searcher.generation.rows}
             assert httpx.get(f"{address}/v1/photos/{answer.top.photo}").status_code == 200
-            assert httpx.get(f"{address}/v1/nearest/{answer.top.photo}").status_code == 422
             below = ray_processes.descendants(process.pid)
             assert ray_processes.listening_addresses(process.pid) <= LOOPBACK
             process.send_signal(how)

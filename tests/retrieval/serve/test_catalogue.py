@@ -42,25 +42,12 @@ def test_a_photo_is_its_file_and_a_thumbnail_is_small(client, catalogue, searche
         assert (again.status_code, again.content) == (304, b"")
 
 
-@pytest.mark.parametrize("path", ["photos", "nearest"])
 @pytest.mark.parametrize(
     "name", ["nobody/1.jpg", "../index/CURRENT", "..%2F..%2Fetc%2Fpasswd", "%2Fetc%2Fpasswd", "%00", "%FF", "."]
 )
-def test_names_outside_the_index_are_unknown(client, path, name):
-    response = client.get(f"/v1/{path}/{name}")
+def test_names_outside_the_index_are_unknown(client, name):
+    response = client.get(f"/v1/photos/{name}")
     assert problem(response, 404, "unknown")
-
-
-def test_nearest_photos_equal_those_of_the_searcher(client, searcher):
-    from retrieval import nearest_photos
-
-    name = searcher.generation.rows[0].path
-    items = client.get(f"/v1/nearest/{name}", params={"count": 5}).json()["items"]
-    expected = nearest_photos(searcher, name, 5)
-    assert [item["id"] for item in items] == [near.photo.path for near in expected]
-    assert [item["score"] for item in items] == pytest.approx([near.score for near in expected])
-    assert name not in [item["id"] for item in items]
-    assert [item["score"] for item in items] == sorted((item["score"] for item in items), reverse=True)
 
 
 def test_index_route_describes_the_index(client, searcher):

@@ -139,7 +139,7 @@ with RecordingWriter(Path(folder) / "recording", {"source": "s", "sensor": "t"})
     def on_started(port):
         generation = parts.generations.current
         if where == "query":
-            generation.searcher.query = generation.searcher.query_many = hang
+            generation.searcher.query = hang
         if where == "page":
             generation.shard.page = hang
         if where == "write":
@@ -153,14 +153,13 @@ with RecordingWriter(Path(folder) / "recording", {"source": "s", "sensor": "t"})
 REQUESTS = {
     "grasp": ("POST", "/v1/grasp"),
     "sensor": ("GET", "/v1/sensors/a/frame"),
-    "stream": ("GET", "/v1/sensors/a/stream"),
     "query": ("POST", "/v1/query"),
     "page": ("GET", "/v1/catalogue"),
     "write": ("POST", "/v1/query"),
     "generation": ("GET", "/healthz"),
     "headers": None,
 }
-ENDED = {"stream": {200, None}, "write": {200}, "generation": {200}, "headers": set()}
+ENDED = {"write": {200}, "generation": {200}, "headers": set()}
 """Statuses of the requests in flight; 503 if the work hangs."""
 
 

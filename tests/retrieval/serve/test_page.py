@@ -244,6 +244,6 @@ def test_axe_finds_nothing_serious_and_nothing_is_wider_than_the_screen(browser,
         assert serious(opened) == []
         assert opened.evaluate("document.documentElement.scrollWidth") <= width
         opened.locator(".photo.object button").first.click()
-        opened.locator(".similar-photos li").first.wait_for()
+        opened.locator(".film li").first.wait_for()
         assert serious(opened) == []
         assert opened.locator("dialog").evaluate("one => one.scrollWidth <= one.clientWidth")

@@ -76,7 +76,7 @@ def test_the_history_is_searched(opened, files):
     opened.locator(".query").first.wait_for()
 
 
-def test_the_catalogue_is_searched_and_its_photos_open_similar_photos(opened, catalogue):
+def test_the_catalogue_is_searched_and_its_photos_open(opened, catalogue):
     name = sorted(path.name for path in catalogue.iterdir() if path.is_dir())[0]
     open_view(opened, "Catalogue")
     opened.locator(".grid li").nth(23).wait_for()
@@ -85,8 +85,6 @@ def test_the_catalogue_is_searched_and_its_photos_open_similar_photos(opened, ca
     opened.locator(".grid button").click()
     dialog = opened.get_by_role("dialog", name=name)
     assert dialog.get_by_alt_text(f"Photo {name}/2.jpg").is_visible()
-    dialog.locator(".similar-photos button").first.click()
-    opened.get_by_role("dialog").locator(".similar-photos li").first.wait_for()
     opened.keyboard.press("Escape")
     opened.get_by_role("searchbox", name="Search").fill("no such words")
     opened.get_by_text("No photo of the catalogue matches all these words.").wait_for()

@@ -56,13 +56,6 @@ def test_json_and_multipart_give_the_document_of_the_searcher(client, searcher, 
         assert equal_but_times(by_form.json(), expected), by_form.text
 
 
-def test_a_batch_returns_one_answer_per_object_in_order(client, searcher, grasps):
-    objects = [grasps, grasps[1:]]
-    answers = client.post("/v1/query/batch", json={"objects": [encoded(one) for one in objects]}).json()["answers"]
-    for answer, expected in zip(answers, searcher.query_many(objects), strict=True):
-        assert equal_but_times(answer, expected)
-
-
 def test_verification_returns_the_document_of_the_searcher(grasps, model, catalogue, tmp_path):
     made = dataclasses.replace(load_checkpoint(model), verification=calibration(-1e3, -2e3), posterior=POSTERIOR)
     store_checkpoint(made, tmp_path / "m.safetensors")

@@ -39,15 +39,6 @@ def test_the_reference_gel_images_of_an_answer_are_served(index, catalogue_with_
         assert problem(client.get(f"/v1/photos/{NAMES[5]}/touch_0_a.png"), 404, "unknown")
 
 
-def test_reference_gel_images_have_no_similar_photos(index, touches):
-    """This holds for objects with photos, and for an object whose gel image replaces the missing photo."""
-    with service(index) as client:
-        for name in (NAMES[0], NAMES[2]):
-            answer = client.get(f"/v1/nearest/{name}/touch_0_a.png")
-            assert "not a photo" in problem(answer, 404, "unknown")
-        assert client.get(f"/v1/photos/{NAMES[2]}/touch_0_a.png").status_code == 200
-
-
 def test_feedback_on_an_object_without_photos_adds_no_photo(index, touches, tmp_path):
     with with_history(index, tmp_path) as client:
         for name in (NAMES[0], NAMES[2]):

@@ -51,8 +51,6 @@ def test_the_pictures_of_one_request_have_a_common_limit(client):
     tiny = base64.b64encode(png_file(1, 1, samples=bytes(4))).decode()
     detail = problem(client.post("/v1/query", json={"touches": [[tiny] * 5] * 26}), 422, "bad-input")
     assert detail == "A request may have at most 128 pictures, got 130."
-    batch = {"objects": [[[tiny] * 5] * 13] * 2}
-    assert problem(client.post("/v1/query/batch", json=batch), 422, "bad-input") == detail
     background = {"touches": [[tiny] * 2], "background": [tiny, ""]}
     detail = problem(client.post("/v1/query", json=background), 422, "bad-image")
     assert detail == "background of finger b: the file is empty"
@@ -95,7 +93,7 @@ def test_a_value_of_19_mb_is_refused_soon(client, body):
 
 def test_only_bodies_with_pictures_may_be_large(client):
     paths = client.get("/openapi.json").json()["paths"]
-    schemas = ("QueryBody", "BatchBody", "VerifyBody")
+    schemas = ("QueryBody", "VerifyBody")
     with_pictures = {
         path
         for path, operations in paths.items()

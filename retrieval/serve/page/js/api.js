@@ -72,7 +72,6 @@ function decoded(text) {
 
 export const photoURL = (id) => `/v1/photos/${encodedPath(id)}`;
 export const thumbnailURL = (id, px = 480) => `${photoURL(id)}?px=${px}`;
-export const streamURL = (name, rate = 10) => `/v1/sensors/${encodeURIComponent(name)}/stream?rate=${rate}`;
 
 export const index = () => json("/v1/index");
 export const session = (token) => reply("/v1/session", jsonPost({ token }));
@@ -106,7 +105,6 @@ export const verify = (expect, touches, background, far) =>
   postTouches("/v1/verify", touches, background, { expect, far });
 
 export const catalogue = (parameters, signal = null) => json(withParameters("/v1/catalogue", parameters), { signal });
-export const nearest = (id, count = 12) => json(withParameters(`/v1/nearest/${encodedPath(id)}`, { count }));
 
 export const history = (parameters) => json(withParameters("/v1/history", parameters));
 export const entry = (id) => json(`/v1/history/${encodeURIComponent(id)}`);

@@ -33,13 +33,11 @@ export function openDetail({ index, photo, objectId, query = null, reference = n
     const stage = photoStage(index, query, name === objectId ? reference : null);
     const strip = h("ul", { class: "film", "aria-label": "Photos of this object" });
     const facts = h("div", { class: "facts" });
-    const similar = h("div", { class: "similar-photos" });
-    body.replaceChildren(stage.element, strip, facts, similar);
+    body.replaceChildren(stage.element, strip, facts);
     const select = (each, button) => {
       stage.show(each.id);
       strip.querySelectorAll("button").forEach((other) => other.setAttribute("aria-pressed", String(other === button)));
       facts.replaceChildren(metadata(each));
-      showSimilar(similar, each, showObject);
     };
     stage.show(firstPhoto);
     try {
@@ -147,31 +145,4 @@ function metadata(photo) {
     {},
     rows.map(([term, value]) => [h("dt", {}, term), h("dd", {}, text(value))]),
   );
-}
-
-async function showSimilar(place, photo, showObject) {
-  place.replaceChildren();
-  let found;
-  try {
-    found = await api.nearest(photo.id);
-  } catch {
-    return; // the index has no embeddings
-  }
-  const items = found.items.map((each) =>
-    h(
-      "li",
-      {},
-      h(
-        "button",
-        { type: "button", onclick: () => showObject(each.id, each.object_id) },
-        picture(api.thumbnailURL(each.id, 240), "", { loading: "lazy" }),
-        h("span", {}, each.object_id),
-      ),
-    ),
-  );
-  if (items.length)
-    place.replaceChildren(
-      h("h3", {}, "Visually similar photos"),
-      h("ul", { class: "film named" }, items),
-    );
 }

@@ -4,6 +4,8 @@ import * as api from "./api.js";
 import { h, problemCard } from "./dom.js";
 import { finger } from "./tray.js";
 
+const PAUSE_MS = 100; // between two pictures of a sensor
+
 /** Buttons that open a source, the panel that shows it, and `stop`, which closes it. */
 export function livePanel(index, tray) {
   const element = h("section", { class: "live", hidden: true, "aria-label": "Live pictures" });
@@ -39,17 +41,14 @@ export function livePanel(index, tray) {
   function openSensors() {
     const names = index.sensors;
     const chosen = names.slice(0, index.fingers);
-    const images = chosen.map((name) => h("img", { src: api.streamURL(name), alt: `Live picture of sensor ${name}` }));
+    const images = chosen.map((name) => h("img", { alt: `Live picture of sensor ${name}` }));
     const figures = chosen.map((name, place) => {
       const choose = h(
         "select",
         { "aria-label": `Sensor of finger ${finger(place)}` },
         names.map((each) => h("option", { value: each, selected: each === name }, `Sensor ${each}`)),
       );
-      choose.addEventListener("change", () => {
-        chosen[place] = choose.value;
-        images[place].src = api.streamURL(choose.value);
-      });
+      choose.addEventListener("change", () => (chosen[place] = choose.value));
       return h(
         "figure",
         { class: "slot" },
@@ -57,7 +56,20 @@ export function livePanel(index, tray) {
         h("figcaption", {}, names.length > index.fingers ? choose : `Sensor ${name}`),
       );
     });
-    release = () => images.forEach((image) => image.removeAttribute("src")); // ends the stream
+    let isOpen = true;
+    release = () => (isOpen = false);
+    images.forEach(async (image, place) => {
+      while (isOpen) {
+        const before = image.src;
+        try {
+          image.src = URL.createObjectURL(await api.frame(chosen[place]));
+          if (before) URL.revokeObjectURL(before);
+        } catch {
+          // the next picture may arrive
+        }
+        await new Promise((done) => setTimeout(done, PAUSE_MS));
+      }
+    });
     const frames = (onFrames) => async (event) => {
       const button = event.currentTarget;
       button.disabled = true;
