@@ -51,13 +51,13 @@ def create_app(
         lifespan=_lifespan,
         responses=errors.PROBLEM_RESPONSES,
     )
-    parts = app.state.service = Service(settings, rig, recorder, trials, shards)
+    app.state.service = Service(settings, rig, recorder, trials, shards)
     errors.install_handlers(app)
     for module in (queries, catalogue, live, history, human_baseline, health):
         app.include_router(module.router)
     app.mount("/", StaticFiles(directory=Path(__file__).parent / "page", html=True))
     app.add_middleware(BodyLimit, seconds=settings.body_s)
-    app.add_middleware(Guard, settings=settings, metrics=parts.metrics)
+    app.add_middleware(Guard, settings=settings)
     return app
 
 

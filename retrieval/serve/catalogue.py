@@ -9,17 +9,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
+from pydantic import BaseModel, Field
 
 from retrieval.data.images import read_bytes
 from retrieval.data.text import replace_surrogates
 from retrieval.errors import ImageError
 from retrieval.report.pages import jpeg, thumbnail
 from retrieval.search.query.objects import ListedPhoto
-from retrieval.serve.documents import (
-    CatalogueDocument,
-    IndexDocument,
-    PhotoDocument,
-)
 from retrieval.serve.errors import HttpProblem
 from retrieval.serve.generations import ServedGeneration
 from retrieval.serve.history_writer import as_png_or_jpeg
@@ -34,6 +30,24 @@ IMAGE_RESPONSES: dict[int | str, dict[str, Any]] = {
 }
 MAX_PHOTO_PX = 4096
 """Maximum longer side, in pixels, of a photo that is converted to JPEG."""
+
+
+class PhotoDocument(BaseModel):
+    """A photo of the catalogue. All routes use its `id`. metadata: the user's own."""
+
+    id: str = Field(examples=["mug/1.jpg"])
+    object_id: str = Field(examples=["mug"])
+    metadata: dict[str, Any] = Field(examples=[{"material": "glazed clay"}])
+
+
+class CatalogueDocument(BaseModel):
+    """One page of photos. total: number of matching photos; next: offset of the next page, null at the end."""
+
+    generation: str = Field(examples=["gen-000007"])
+    total: int
+    offset: int
+    next: int | None
+    items: list[PhotoDocument]
 
 
 def _listed(generation: ServedGeneration, photo: str) -> ListedPhoto:
@@ -120,27 +134,31 @@ def image_response(data: bytes, headers: Mapping[str, str] | None = None) -> Res
 
 
 @router.get("/v1/index")
-def index(parts: Parts) -> IndexDocument:
-    """Return a description of the index, its model and the service."""
+def index(parts: Parts) -> dict[str, Any]:
+    """Return a description of the index, its model and the service.
+
+    sensors: names of live sensors; can_grasp, can_verify: whether POST /v1/grasp and POST /v1/verify work;
+    stores_history: whether queries and feedback are stored; trials: number of unseen objects for the human baseline.
+    """
     generation = parts.generations.current
     searcher, info = generation.searcher, generation.searcher.info
     measured = info.about.get("candidates") or {}
-    return IndexDocument(
-        generation=generation.name,
-        kind=info.kind,
-        photos=info.photos,
-        objects=info.objects,
-        model=replace_surrogates(searcher.checkpoint.path.name),
-        trained_on=replace_surrogates(str(searcher.checkpoint.provenance.get("source", "unknown"))),
-        encoder=searcher.encoder.name,
-        fingers=generation.fingers,
-        background=searcher.checkpoint.config.preprocessing.background,
-        calibrated=searcher.posterior is not None,
-        candidates=measured.get("k"),
-        sensors=sorted(parts.rig.sensors),
-        can_grasp=parts.rig.grasp is not None,
-        can_verify=searcher.can_verify,
-        stores_history=parts.history_writer is not None,
-        trials=len(parts.trials.unseen(generation)) if parts.trials else 0,
-        version=__version__,
-    )
+    return {
+        "generation": generation.name,
+        "kind": info.kind,
+        "photos": info.photos,
+        "objects": info.objects,
+        "model": replace_surrogates(searcher.checkpoint.path.name),
+        "trained_on": replace_surrogates(str(searcher.checkpoint.provenance.get("source", "unknown"))),
+        "encoder": searcher.encoder.name,
+        "fingers": generation.fingers,
+        "background": searcher.checkpoint.config.preprocessing.background,
+        "calibrated": searcher.posterior is not None,
+        "candidates": measured.get("k"),
+        "sensors": sorted(parts.rig.sensors),
+        "can_grasp": parts.rig.grasp is not None,
+        "can_verify": searcher.can_verify,
+        "stores_history": parts.history_writer is not None,
+        "trials": len(parts.trials.unseen(generation)) if parts.trials else 0,
+        "version": __version__,
+    }

@@ -33,7 +33,6 @@ class Decoders:
         self._idle: list[_Process] = []
         self._ending: set[asyncio.Task[None]] = set()
         self._small, self._large = asyncio.Semaphore(PROCESSES), asyncio.Semaphore(1)
-        self._running: set[asyncio.Task[GelImage | PictureSize]] = set()
 
     async def start(self) -> None:
         """Start the processes, so that the first query does not wait for them.
@@ -44,10 +43,7 @@ class Decoders:
         self._idle += await asyncio.gather(*(_Process.start() for _ in range(PROCESSES)))
 
     async def close(self) -> None:
-        """End all processes; decoding in progress fails."""
-        for task in self._running:
-            task.cancel()
-        await asyncio.gather(*self._running, return_exceptions=True)
+        """End the processes; those of requests end with them."""
         idle, self._idle = self._idle, []
         await asyncio.gather(*self._ending, *(process.end() for process in idle))
 
@@ -94,19 +90,9 @@ class Decoders:
         return images
 
     async def _read_small(self, name: str, data: bytes, px: int, compares_contact: bool) -> GelImage | PictureSize:
-        """Decode a small picture, or return the size of a large one.
-
-        If the request is cancelled, the process continues: this is faster than starting a new one.
-        """
-        await self._small.acquire()
-        task = asyncio.ensure_future(self._run(name, data, px, compares_contact, SMALL_PIXELS))
-        self._running.add(task)
-        task.add_done_callback(self._release_slot)
-        return await asyncio.shield(task)
-
-    def _release_slot(self, task: asyncio.Task[GelImage | PictureSize]) -> None:
-        self._running.discard(task)
-        self._small.release()
+        """Decode a small picture, or return the size of a large one."""
+        async with self._small:
+            return await self._run(name, data, px, compares_contact, SMALL_PIXELS)
 
     async def _run(
         self, name: str, data: bytes, px: int, compares_contact: bool, max_pixels: int

@@ -14,7 +14,6 @@ from retrieval.search.defaults import manifest_of
 from retrieval.search.query.opening import OpenShards
 from retrieval.search.query.searcher import Searcher
 from retrieval.serve.errors import HttpProblem
-from retrieval.serve.metrics import Metrics
 from retrieval.serve.settings import ServiceSettings
 
 log = logging.getLogger(__name__)
@@ -51,12 +50,11 @@ class Generations:
 
     Args:
         settings: Options of the service.
-        metrics: Metrics of the service.
         shards: Opens the shards of a sharded index; None to open them in this process.
     """
 
-    def __init__(self, settings: ServiceSettings, metrics: Metrics, shards: OpenShards | None = None) -> None:
-        self._settings, self._metrics, self._shards = settings, metrics, shards
+    def __init__(self, settings: ServiceSettings, shards: OpenShards | None = None) -> None:
+        self._settings, self._shards = settings, shards
         self._current: ServedGeneration | None = None
 
     @property
@@ -84,7 +82,6 @@ class Generations:
             )
         )
         self._current = generation
-        self._metrics.set_generation(generation.name)
         gc.collect()  # free reference cycles of the previous generation
 
     async def watch(self) -> None:
@@ -104,5 +101,4 @@ class Generations:
                     log.warning("Generation %s is now served.", self.current.name)
             except Exception as error:
                 pause_s = _RETRY_S
-                self._metrics.reload_failures.inc()
                 log.warning("A new generation cannot be opened; %s is still served: %s", self.current.name, error)

@@ -1,4 +1,4 @@
-"""Routes for liveness, readiness and metrics, and for the session cookie of the page."""
+"""Routes for liveness and readiness, and for the session cookie of the page."""
 
 from fastapi import APIRouter, Response
 from pydantic import BaseModel, Field
@@ -29,12 +29,6 @@ async def ready(parts: Parts) -> Health:
     if parts.stopping.is_set():
         raise HttpProblem("not-ready", "The service is shutting down.")
     return Health(status=f"ok: {parts.generations.current.name}")
-
-
-@router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
-async def metrics(parts: Parts) -> Response:
-    """Return the metrics for Prometheus."""
-    return Response(parts.metrics.render(), media_type="text/plain; version=0.0.4; charset=utf-8")
 
 
 class SessionBody(RequestBody):

@@ -12,7 +12,6 @@ from retrieval.data.images import read_bytes
 from retrieval.errors import BadInput, ImageError
 from retrieval.search.query.answer import MATCH, NONE_OF_THESE, UNCALIBRATED
 from retrieval.serve.catalogue import IMAGE_RESPONSES, image_response
-from retrieval.serve.documents import QueryDocument
 from retrieval.serve.errors import HttpProblem
 from retrieval.serve.generations import ServedGeneration
 from retrieval.serve.history_writer import HistoryWriter
@@ -51,9 +50,9 @@ class HistoryDocument(BaseModel):
 
 
 class HistoryEntry(HistoryItem):
-    """A query with its whole answer."""
+    """A query with its whole answer, the document of `retrieve query --json`."""
 
-    answer: QueryDocument
+    answer: dict[str, Any]
 
 
 class FeedbackBody(RequestBody):
@@ -135,12 +134,11 @@ def history(
     return HistoryDocument(total=total, offset=offset, next=end if offset < end < total else None, items=items)
 
 
-# Fields that the original answer lacks, such as a reference touch, stay absent.
-@router.get("/v1/history/{name}", response_model_exclude_unset=True)
+@router.get("/v1/history/{name}")
 def entry(name: str, parts: Parts) -> HistoryEntry:
     """Return a query with its whole answer."""
     stored = _entry(parts, name)
-    return HistoryEntry(**_item(stored), answer=QueryDocument(**stored.answer))
+    return HistoryEntry(**_item(stored), answer=stored.answer)
 
 
 @router.get("/v1/history/{name}/touches/{grasp}/{finger}", response_class=Response, responses=IMAGE_RESPONSES)

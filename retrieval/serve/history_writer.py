@@ -17,7 +17,6 @@ import numpy as np
 from retrieval.data.images import decode, encode_image
 from retrieval.model.fusion_scorer import CONTACT
 from retrieval.search.query.answer import QueryResult
-from retrieval.serve.metrics import Metrics
 from retrieval.serve.settings import ServiceSettings
 from retrieval.serve.store import BACKGROUND, HistoryStore, new_id
 from retrieval.serve.uploads import RequestPictures
@@ -48,12 +47,11 @@ class HistoryWriter:
         folder: Folder of the history.
         recorder: Writer of the recording in that folder.
         settings: Options of the service.
-        metrics: Metrics of the service.
     """
 
-    def __init__(self, folder: Path, recorder: Recorder, settings: ServiceSettings, metrics: Metrics) -> None:
+    def __init__(self, folder: Path, recorder: Recorder, settings: ServiceSettings) -> None:
         self.store = HistoryStore(folder / "history.sqlite", settings.history_max_queries, settings.history_max_bytes)
-        self._recorder, self._metrics, self._lock = recorder, metrics, Lock()
+        self._recorder, self._lock = recorder, Lock()
         self._writer, self._pending = ThreadPoolExecutor(1, "history"), 0
 
     async def add_query(self, pictures: RequestPictures, result: QueryResult) -> str | None:
@@ -68,7 +66,6 @@ class HistoryWriter:
             writing.add_done_callback(self._count_down)
             await asyncio.wait_for(asyncio.shield(writing), STORE_S)
         except Exception as error:
-            self._metrics.history_failures.labels("query").inc()
             log.warning("A query is not stored: %s", str(error) or "the disk takes too long")
             return None
         return query_id
@@ -89,7 +86,6 @@ class HistoryWriter:
                     try:
                         self._record(query_id, object_id)
                     except Exception:
-                        self._metrics.history_failures.labels("feedback").inc()
                         log.exception("The stored feedback on query %s cannot be recorded yet.", query_id)
 
     def is_recorded(self, query_id: str) -> bool:

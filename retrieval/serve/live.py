@@ -4,8 +4,8 @@ import base64
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
+from pydantic import BaseModel
 
-from retrieval.serve.documents import GraspDocument
 from retrieval.serve.errors import HttpProblem
 from retrieval.serve.generations import ServedGeneration
 from retrieval.serve.service import Parts
@@ -14,6 +14,14 @@ router = APIRouter(tags=["live"])
 MAX_OBJECT_NAMES = 1000
 """Maximum number of objects among which a random one is chosen for a grasp."""
 ObjectParameter = Annotated[str | None, Query(max_length=1000, alias="object", description="Object to grasp.")]
+
+
+class GraspDocument(BaseModel):
+    """Gel images of one grasp of the simulated rig, as PNG files in base64, and the grasped object."""
+
+    object_id: str
+    touches: list[str]
+    background: list[str] | None
 
 
 @router.post("/v1/grasp")

@@ -5,7 +5,6 @@ before its work begins if its client disconnects or the deadline passes.
 """
 
 import asyncio
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
@@ -15,7 +14,6 @@ from starlette.requests import Request
 from retrieval.serve.decoders import Decoders
 from retrieval.serve.errors import HttpProblem
 from retrieval.serve.generations import Generations, ServedGeneration
-from retrieval.serve.metrics import Metrics
 from retrieval.serve.settings import ServiceSettings
 from retrieval.serve.uploads import RequestPictures
 
@@ -29,11 +27,9 @@ class Queue:
         in_flight: Number of requests that wait or are being processed.
     """
 
-    def __init__(
-        self, generations: Generations, settings: ServiceSettings, metrics: Metrics, decoders: Decoders
-    ) -> None:
-        self._generations, self._settings, self._metrics = generations, settings, metrics
-        self._decoders, self._threads = decoders, ThreadPoolExecutor(settings.workers)
+    def __init__(self, generations: Generations, settings: ServiceSettings, decoders: Decoders) -> None:
+        self._generations, self._settings, self._decoders = generations, settings, decoders
+        self._threads = ThreadPoolExecutor(settings.workers)
         self.in_flight = 0
 
     def close(self) -> None:
@@ -43,7 +39,6 @@ class Queue:
     def require_capacity(self) -> None:
         """Raise HttpProblem if the queue is full; called before the body of a request is read."""
         if self.in_flight >= self._settings.queue:
-            self._metrics.dropped.labels("busy").inc()
             raise HttpProblem(
                 "busy",
                 f"{self.in_flight} requests are in flight already. Try again.",
@@ -67,7 +62,6 @@ class Queue:
         """
         self.require_capacity()
         self.in_flight += 1
-        self._metrics.in_flight.inc()
         answer = asyncio.ensure_future(self._answer(work, pictures))
         answer.add_done_callback(self._release)
         disconnected: asyncio.Future[None] = asyncio.ensure_future(_wait_for_disconnect(request))
@@ -76,11 +70,7 @@ class Queue:
         try:
             await asyncio.wait(either, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
             if not answer.done():
-                client_left = disconnected.done()
-                self._metrics.dropped.labels("disconnected" if client_left else "late").inc()
-                raise HttpProblem(
-                    "late", "The client disconnected." if client_left else f"No answer within {1e3 * seconds:g} ms."
-                )
+                raise HttpProblem("late", f"No answer within {1e3 * seconds:g} ms.")
             return answer.result()
         finally:
             disconnected.cancel()
@@ -88,15 +78,12 @@ class Queue:
 
     async def _answer(self, work: Callable[[ServedGeneration], Result], pictures: RequestPictures | None) -> Result:
         """Decode the pictures, then wait for the model; cancelling stops both."""
-        began = time.monotonic()
         if pictures is not None:
             px = self._generations.current.searcher.checkpoint.config.preprocessing.touch_px
             images = await self._decoders.read(pictures.named_files(), px, pictures.background is not None)
             pictures.set_images(iter(images))
-            self._metrics.stages.labels("pictures").observe(time.monotonic() - began)
 
         def run() -> Result:
-            self._metrics.waiting.observe(time.monotonic() - began)
             try:
                 return work(self._generations.current)
             except BaseException as error:
@@ -108,7 +95,6 @@ class Queue:
 
     def _release(self, answer: asyncio.Future[Any]) -> None:
         self.in_flight -= 1
-        self._metrics.in_flight.dec()
         if not answer.cancelled():
             answer.exception()  # mark as retrieved: the client may have disconnected
 

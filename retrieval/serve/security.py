@@ -15,7 +15,6 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from retrieval.serve.errors import HttpProblem, problem_of
-from retrieval.serve.metrics import Metrics
 from retrieval.serve.settings import ServiceSettings
 
 log = logging.getLogger(__name__)
@@ -56,10 +55,10 @@ def same_token(candidate: str, token: str) -> bool:
 
 
 class Guard:
-    """Middleware that refuses unauthorised requests unread, and adds HEADERS to every response and counts it."""
+    """Middleware that refuses unauthorised requests unread, and adds HEADERS to every response."""
 
-    def __init__(self, app: ASGIApp, settings: ServiceSettings, metrics: Metrics) -> None:
-        self.app, self.settings, self.metrics = app, settings, metrics
+    def __init__(self, app: ASGIApp, settings: ServiceSettings) -> None:
+        self.app, self.settings = app, settings
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, or refuse it (ASGI)."""
@@ -73,7 +72,6 @@ class Guard:
             nonlocal begun
             if message["type"] == "http.response.start":
                 begun = True
-                self.metrics.responses.labels(message["status"]).inc()
                 headers = MutableHeaders(scope=message)
                 for name, value in HEADERS.items():
                     headers.setdefault(name, value)
@@ -111,7 +109,7 @@ class Guard:
         if headers.get("sec-fetch-site") in ("cross-site", "same-site") and headers.get("sec-fetch-mode") != "navigate":
             return HttpProblem("refused", "Pages of another site may not use this service.")
         token = self.settings.token
-        if token is None or path in _OPEN_PATHS or not path.startswith(("/v1/", "/metrics")):
+        if token is None or path in _OPEN_PATHS or not path.startswith("/v1/"):
             return None
         if any(same_token(candidate, token) for candidate in _request_tokens(headers)):
             return None

@@ -12,7 +12,6 @@ from retrieval.search.query.opening import OpenShards
 from retrieval.serve.decoders import Decoders
 from retrieval.serve.generations import Generations
 from retrieval.serve.history_writer import HistoryWriter, Recorder
-from retrieval.serve.metrics import Metrics
 from retrieval.serve.queue import Queue
 from retrieval.serve.settings import ServiceSettings
 from retrieval.serve.trials import Trials
@@ -59,7 +58,6 @@ class Service:
     Attributes:
         settings: Options of the operator.
         rig: Functions of the live rig.
-        metrics: Prometheus metrics.
         generations: The served generation of the index.
         decoders: Processes that decode pictures.
         queue: Queue of the model.
@@ -78,8 +76,8 @@ class Service:
         trials: Path | None,
         shards: OpenShards | None,
     ) -> None:
-        self.settings, self.rig, self.metrics = settings, rig or LiveRig(), Metrics()
-        self.generations, self.decoders = Generations(settings, self.metrics, shards), Decoders()
+        self.settings, self.rig = settings, rig or LiveRig()
+        self.generations, self.decoders = Generations(settings, shards), Decoders()
         single = replace(settings, workers=1)
         self.queue = self._queue(settings)
         self.grasps = self._queue(replace(single, queue=MAX_RIG_GRASPS))
@@ -87,12 +85,12 @@ class Service:
         self.frames = {name: self._queue(frames) for name in self.rig.sensors}
         self.history_writer = None
         if settings.history and recorder:
-            self.history_writer = HistoryWriter(settings.history, recorder, settings, self.metrics)
+            self.history_writer = HistoryWriter(settings.history, recorder, settings)
         self.trials = Trials(trials) if trials else None
         self.stopping = Event()
 
     def _queue(self, settings: ServiceSettings) -> Queue:
-        return Queue(self.generations, settings, self.metrics, self.decoders)
+        return Queue(self.generations, settings, self.decoders)
 
 
 async def _service(request: Request) -> Service:  # async, because FastAPI calls plain functions in a thread

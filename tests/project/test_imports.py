@@ -133,7 +133,7 @@ def run_blocked(code, blocked):
     )
 
 
-SERVE = ("fastapi", "starlette", "uvicorn", "pydantic", "prometheus_client", "httpx")
+SERVE = ("fastapi", "starlette", "uvicorn", "pydantic", "httpx")
 HEAVY = ("torch", "faiss", "cv2", "sklearn", "matplotlib", "serial", "numpy", "PIL", "scipy", "rich", "jinja2", *SERVE)
 
 

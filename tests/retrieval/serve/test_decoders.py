@@ -117,26 +117,6 @@ def test_a_large_picture_does_not_delay_small_ones_and_its_process_ends_on_cance
     asyncio.run(run())
 
 
-def test_cancelled_small_pictures_keep_their_processes():
-    async def run():
-        async with running_decoders() as pool:
-            await pool.start()
-            before = {process._process.pid for process in pool._idle}
-            for _ in range(3):
-                request = asyncio.ensure_future(pool.read([("a", SMALL)] * 50, 32, False))
-                await asyncio.sleep(0.01)
-                request.cancel()
-                await asyncio.wait([request])
-            assert len(pool._running) <= 2
-            assert len(await pool.read([("a", SMALL)] * 2, 32, False)) == 2
-            await asyncio.gather(*pool._running)
-            assert {process._process.pid for process in pool._idle} == before
-        for process in before:
-            assert not is_running(process)
-
-    asyncio.run(run())
-
-
 def test_a_process_that_cannot_start_is_not_reported_as_a_bad_picture(monkeypatch):
     monkeypatch.setattr(decoders, "PROGRAM", decoding.FAIL)
     with pytest.raises(RetrievalError, match="ended during its start") as error:

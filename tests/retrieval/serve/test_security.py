@@ -48,7 +48,7 @@ def test_requests_without_the_token_are_refused(guarded):
         {"authorization": TOKEN},
         {"cookie": "retrieve-token=wrong"},
     ):
-        for path in ("/v1/index", "/metrics", "/v1/photos/x", "/v1/nothing"):
+        for path in ("/v1/index", "/v1/photos/x", "/v1/nothing"):
             response = guarded.get(path, headers=headers)
             problem(response, 401, "no-token")
             assert response.headers["www-authenticate"] == "Bearer"
@@ -83,9 +83,8 @@ def test_the_page_has_no_inline_script_or_style(client):
 
 
 def test_an_unexpected_error_reveals_no_internals(client, monkeypatch):
-    parts = client.app.state.service
-    monkeypatch.setattr(parts.metrics, "render", lambda: 1 / 0)
-    response = client.get("/metrics")
+    monkeypatch.setattr("retrieval.serve.catalogue.CatalogueDocument", lambda **_: 1 / 0)
+    response = client.get("/v1/catalogue")
     detail = problem(response, 500, "failed")
     assert detail == "Unexpected ZeroDivisionError. See the log of the service."
     assert response.headers["x-content-type-options"] == "nosniff"
