@@ -6,7 +6,7 @@ from string import ascii_lowercase
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query, Response
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from retrieval.data.images import read_bytes
 from retrieval.errors import BadInput, ImageError
@@ -23,38 +23,6 @@ router = APIRouter(tags=["history"])
 FeedbackValue = Literal["right", "object", "none"]
 
 
-class HistoryItem(BaseModel):
-    """An answered query.
-
-    touches: paths of the gel images of each grasp; feedback, object_id: feedback of a person, null if there is none.
-    """
-
-    id: str
-    time: str
-    verdict: str
-    best: str | None
-    probability: float | None
-    generation: str
-    touches: list[list[str]]
-    feedback: FeedbackValue | None
-    object_id: str | None
-
-
-class HistoryDocument(BaseModel):
-    """One page of the history, the newest query first."""
-
-    total: int
-    offset: int
-    next: int | None
-    items: list[HistoryItem]
-
-
-class HistoryEntry(HistoryItem):
-    """A query with its whole answer, the document of `retrieve query --json`."""
-
-    answer: dict[str, Any]
-
-
 class FeedbackBody(RequestBody):
     """Feedback on an answer.
 
@@ -65,19 +33,6 @@ class FeedbackBody(RequestBody):
     query: str = Field(min_length=1, max_length=64, description="The X-Query-Id of the answer.")
     feedback: FeedbackValue
     object_id: str | None = Field(None, min_length=1, max_length=1000)
-
-
-class FeedbackDocument(BaseModel):
-    """The stored feedback.
-
-    recorded: whether the grasps are in the recording. This requires a photo of the object, a grasp with contact, and
-    room on the disk. If the disk is full, the grasps are recorded after a later feedback or at the next start.
-    """
-
-    query: str
-    feedback: FeedbackValue
-    object_id: str | None
-    recorded: bool
 
 
 def _require_history(parts: Service) -> HistoryWriter:
@@ -98,6 +53,7 @@ def _entry(parts: Service, name: str) -> StoredQuery:
 
 
 def _item(stored: StoredQuery) -> dict[str, Any]:
+    """Return a query without its answer. touches: paths of the gel images of each grasp."""
     best = (stored.answer["results"] or [{}])[0]
     touches = [
         [f"/v1/history/{stored.id}/touches/{grasp}/{ascii_lowercase[finger]}" for finger in range(len(images))]
@@ -125,20 +81,20 @@ def history(
         str, Query(max_length=200, description="Words of the verdict, the object and the feedback.")
     ] = "",
     feedback: Annotated[Literal["right", "object", "none", "missing"] | None, Query()] = None,
-) -> HistoryDocument:
-    """Return one page of the answered queries, the newest first."""
+) -> dict[str, Any]:
+    """Return one page of the answered queries, the newest first. next: offset of the next page, null at the end."""
     store = _require_history(parts).store
     total, found = store.history(words=search.split()[:20], feedback=feedback, offset=offset, limit=limit)
     end = offset + len(found)
-    items = [HistoryItem(**_item(stored)) for stored in found]
-    return HistoryDocument(total=total, offset=offset, next=end if offset < end < total else None, items=items)
+    following = end if offset < end < total else None
+    return {"total": total, "offset": offset, "next": following, "items": [_item(stored) for stored in found]}
 
 
 @router.get("/v1/history/{name}")
-def entry(name: str, parts: Parts) -> HistoryEntry:
-    """Return a query with its whole answer."""
+def entry(name: str, parts: Parts) -> dict[str, Any]:
+    """Return a query with its whole answer, the document of `retrieve query --json`."""
     stored = _entry(parts, name)
-    return HistoryEntry(**_item(stored), answer=stored.answer)
+    return {**_item(stored), "answer": stored.answer}
 
 
 @router.get("/v1/history/{name}/touches/{grasp}/{finger}", response_class=Response, responses=IMAGE_RESPONSES)
@@ -157,11 +113,12 @@ def touch(name: str, grasp: int, finger: str, parts: Parts) -> Response:
 
 
 @router.post("/v1/feedback", status_code=201)
-def post_feedback(body: FeedbackBody, parts: Parts, response: Response) -> FeedbackDocument:
+def post_feedback(body: FeedbackBody, parts: Parts, response: Response) -> dict[str, Any]:
     """Store whether an answer is right.
 
     The response is sent after the feedback is on the disk. Repeating the same feedback returns 200; different feedback
-    on the same query is refused.
+    on the same query is refused. recorded: whether the grasps are in the recording. This requires a photo of the
+    object, a grasp with contact, and room on the disk.
     """
     history_writer = _require_history(parts)
     feedback, name, photo = _resolve_feedback(body, _entry(parts, body.query), parts.generations.current)
@@ -172,7 +129,7 @@ def post_feedback(body: FeedbackBody, parts: Parts, response: Response) -> Feedb
         raise HttpProblem("conflict", str(error)) from error
     history_writer.record_pending()
     recorded = history_writer.is_recorded(body.query)
-    return FeedbackDocument(query=body.query, feedback=body.feedback, object_id=name, recorded=recorded)
+    return {"query": body.query, "feedback": body.feedback, "object_id": name, "recorded": recorded}
 
 
 def _resolve_feedback(

@@ -50,7 +50,7 @@ class HistoryWriter:
     """
 
     def __init__(self, folder: Path, recorder: Recorder, settings: ServiceSettings) -> None:
-        self.store = HistoryStore(folder / "history.sqlite", settings.history_max_queries, settings.history_max_bytes)
+        self.store = HistoryStore(folder / "history.sqlite", settings.history_max_queries)
         self._recorder, self._lock = recorder, Lock()
         self._writer, self._pending = ThreadPoolExecutor(1, "history"), 0
 

@@ -3,11 +3,11 @@
 import secrets
 import time
 from string import ascii_lowercase
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Request, Response
 from fastapi import Path as InPath
-from pydantic import BaseModel, Field
+from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
 from retrieval.data.images import read_bytes
@@ -16,7 +16,7 @@ from retrieval.serve.errors import HttpProblem
 from retrieval.serve.history_writer import HistoryWriter
 from retrieval.serve.service import Parts, Service
 from retrieval.serve.store import HistoryStore, TrialChoice, TrialRun, new_id
-from retrieval.serve.trials import CHOICES, Trial, TrialAccuracy, Trials, trial_accuracy
+from retrieval.serve.trials import CHOICES, Trial, Trials, trial_accuracy
 from retrieval.serve.uploads import RequestBody
 
 router = APIRouter(tags=["human baseline"])
@@ -32,41 +32,6 @@ class RunBody(RequestBody):
     count: int = Field(20, ge=1, le=10_000)
     participant: str = Field("", max_length=200)
     seed: int | None = Field(None, ge=0, lt=2**31)
-
-
-class RunDocument(BaseModel):
-    """A series and its results so far. next: the first open trial, null at the end."""
-
-    id: str
-    participant: str
-    seed: int
-    count: int
-    choices: int
-    completed: int
-    next: int | None
-    human_baseline: TrialAccuracy
-    model: TrialAccuracy
-    chance: float
-
-
-class TrialsDocument(BaseModel):
-    """The available objects, and all series of the recording."""
-
-    recording: str
-    objects: int
-    choices: int
-    runs: list[RunDocument]
-
-
-class TrialDocument(BaseModel):
-    """One trial. choice, truth, model: photo numbers counted from 1, null until the trial is done."""
-
-    number: int
-    touches: list[str]
-    photos: list[str]
-    choice: int | None = None
-    truth: int | None = None
-    model: int | None = None
 
 
 class ChoiceBody(RequestBody):
@@ -88,18 +53,19 @@ def _require_trials(parts: Service) -> tuple[Trials, HistoryStore]:
     return parts.trials, history_writer.store
 
 
-def _document(run: TrialRun, store: HistoryStore) -> RunDocument:
+def _document(run: TrialRun, store: HistoryStore) -> dict[str, Any]:
+    """Return a series and its results so far. next: the first open trial, null at the end."""
     choices = store.choices(run.id)
     remaining = set(range(1, run.count + 1)) - {one.number for one in choices}
-    return RunDocument(
+    return {
         **vars(run),
-        choices=CHOICES,
-        completed=len(choices),
-        next=min(remaining, default=None),
-        human_baseline=trial_accuracy([one.choice == one.truth for one in choices]),
-        model=trial_accuracy([one.model == one.truth for one in choices]),
-        chance=1 / CHOICES,
-    )
+        "choices": CHOICES,
+        "completed": len(choices),
+        "next": min(remaining, default=None),
+        "human_baseline": trial_accuracy([one.choice == one.truth for one in choices]),
+        "model": trial_accuracy([one.model == one.truth for one in choices]),
+        "chance": 1 / CHOICES,
+    }
 
 
 def _run(parts: Service, name: str) -> TrialRun:
@@ -117,19 +83,19 @@ def _trial(parts: Service, run: TrialRun, number: int) -> Trial:
 
 
 @router.get("/v1/trials")
-def trials(parts: Parts) -> TrialsDocument:
+def trials(parts: Parts) -> dict[str, Any]:
     """Return the number of unseen objects, and all series of the recording."""
     known, store = _require_trials(parts)
-    return TrialsDocument(
-        recording=known.folder.name,
-        objects=len(known.unseen(parts.generations.current)),
-        choices=CHOICES,
-        runs=[_document(run, store) for run in store.runs(known.folder.name)],
-    )
+    return {
+        "recording": known.folder.name,
+        "objects": len(known.unseen(parts.generations.current)),
+        "choices": CHOICES,
+        "runs": [_document(run, store) for run in store.runs(known.folder.name)],
+    }
 
 
 @router.post("/v1/trials", status_code=201)
-def begin_run(body: RunBody, parts: Parts) -> RunDocument:
+def begin_run(body: RunBody, parts: Parts) -> dict[str, Any]:
     """Begin a series of trials."""
     known, store = _require_trials(parts)
     seed = secrets.randbelow(2**31) if body.seed is None else body.seed
@@ -140,28 +106,30 @@ def begin_run(body: RunBody, parts: Parts) -> RunDocument:
 
 
 @router.get("/v1/trials/{name}")
-def get_run(name: str, parts: Parts) -> RunDocument:
+def get_run(name: str, parts: Parts) -> dict[str, Any]:
     """Return a series with the accuracy of the person and of the model in the same trials."""
     return _document(_run(parts, name), _require_trials(parts)[1])
 
 
 @router.get("/v1/trials/{name}/{number}")
-def trial(name: str, number: Number, parts: Parts) -> TrialDocument:
-    """Return a trial; the right photo is included only after the trial is done."""
+def trial(name: str, number: Number, parts: Parts) -> dict[str, Any]:
+    """Return a trial. choice, truth, model: photo numbers counted from 1, null until the trial is done."""
     run = _run(parts, name)
     sampled_trial = _trial(parts, run, number)
     done = next((one for one in _require_trials(parts)[1].choices(name) if one.number == number), None)
     where = f"/v1/trials/{name}/{number}"
-    return TrialDocument(
-        number=number,
-        touches=[f"{where}/touches/{finger}" for finger in ascii_lowercase[: len(sampled_trial.grasp.touches)]],
-        photos=[f"{where}/photos/{place}" for place in range(1, CHOICES + 1)],
-        **({"choice": done.choice, "truth": done.truth, "model": done.model} if done else {}),
-    )
+    return {
+        "number": number,
+        "touches": [f"{where}/touches/{finger}" for finger in ascii_lowercase[: len(sampled_trial.grasp.touches)]],
+        "photos": [f"{where}/photos/{place}" for place in range(1, CHOICES + 1)],
+        "choice": done and done.choice,
+        "truth": done and done.truth,
+        "model": done and done.model,
+    }
 
 
 @router.post("/v1/trials/{name}/{number}")
-async def choose(body: ChoiceBody, request: Request, name: str, number: Number, parts: Parts) -> TrialDocument:
+async def choose(body: ChoiceBody, request: Request, name: str, number: Number, parts: Parts) -> dict[str, Any]:
     """Store the choice of a trial, once; the response contains the right photo and the model's choice."""
     known, store = _require_trials(parts)
     sampled_trial = await run_in_threadpool(lambda: _trial(parts, _run(parts, name), number))

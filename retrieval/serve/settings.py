@@ -37,7 +37,6 @@ class ServiceSettings:
         poll_s: Interval of the checks for a new generation of the index.
         history: Folder for queries and feedback; None to store nothing.
         history_max_queries: Maximum number of stored queries without feedback.
-        history_max_bytes: Maximum total size of the gel images of queries without feedback.
 
     Raises:
         ConfigError: An option is out of its range.
@@ -55,12 +54,11 @@ class ServiceSettings:
     body_s: float = 10.0
     poll_s: float = 1.0
     history: Path | None = None
-    history_max_queries: int = 10_000
-    history_max_bytes: int = 4 * 2**30
+    history_max_queries: int = 5_000
 
     def __post_init__(self) -> None:
         """Check the ranges of the options."""
-        for name in ("queue", "workers", "history_max_queries", "history_max_bytes"):
+        for name in ("queue", "workers", "history_max_queries"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be at least 1, got {getattr(self, name)}.")
         for name in ("deadline_s", "body_s", "poll_s"):

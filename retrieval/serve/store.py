@@ -23,12 +23,10 @@ from retrieval.search.query.answer import QueryResult
 RIGHT, OBJECT, NONE = "right", "object", "none"
 """Values of the feedback: the answer is right, it is another object, the catalogue lacks the object."""
 _VERSION = 3
-_TRIM_EVERY = 32
 _SCHEMA = f"""
 BEGIN;
 CREATE TABLE queries (
-    id TEXT PRIMARY KEY, time REAL NOT NULL, verdict TEXT NOT NULL, best TEXT NOT NULL, answer TEXT NOT NULL,
-    bytes INTEGER NOT NULL
+    id TEXT PRIMARY KEY, time REAL NOT NULL, verdict TEXT NOT NULL, best TEXT NOT NULL, answer TEXT NOT NULL
 ) STRICT;
 CREATE TABLE pictures (
     query TEXT NOT NULL REFERENCES queries ON DELETE CASCADE, grasp INTEGER NOT NULL, finger TEXT NOT NULL,
@@ -101,15 +99,13 @@ class HistoryStore:
     Args:
         path: File of the database.
         max_queries: Maximum number of stored queries without feedback.
-        max_bytes: Maximum total size of the gel images of queries without feedback.
 
     Raises:
         BadInput: The file is not a database of this version.
     """
 
-    def __init__(self, path: Path, max_queries: int, max_bytes: int) -> None:
-        self.path, self._max_queries, self._max_bytes = path, max_queries, max_bytes
-        self._lock, self._since_trim = Lock(), 0
+    def __init__(self, path: Path, max_queries: int) -> None:
+        self.path, self._max_queries, self._lock = path, max_queries, Lock()
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             self._database = sqlite3.connect(path, check_same_thread=False)
@@ -155,32 +151,22 @@ class HistoryStore:
     def add_query(
         self, name: str, touches: Sequence[Sequence[bytes]], background: Sequence[bytes] | None, result: QueryResult
     ) -> None:
-        """Store a query with its image files and its answer."""
+        """Store a query with its image files and its answer; delete the oldest queries without feedback."""
         pictures = [
             (name, number, ascii_lowercase[finger], data)
             for number, images in enumerate([background or (), *touches])
             for finger, data in enumerate(images)
         ]
         best = replace_surrogates(result.results[0].object_id) if result.results else ""
-        size = sum(len(data) for *_, data in pictures)
-        row = (name, time.time(), result.verdict, best, json.dumps(result.to_dict()), size)
+        row = (name, time.time(), result.verdict, best, json.dumps(result.to_dict()))
         with self._writing("NORMAL") as database:
-            database.execute("INSERT INTO queries VALUES (?, ?, ?, ?, ?, ?)", row)
+            database.execute("INSERT INTO queries VALUES (?, ?, ?, ?, ?)", row)
             database.executemany("INSERT INTO pictures VALUES (?, ?, ?, ?)", pictures)
-            self._since_trim += 1
-            if self._since_trim >= _TRIM_EVERY:
-                self._since_trim = 0
-                self._trim(database)
-
-    def _trim(self, database: sqlite3.Connection) -> None:
-        """Delete the oldest queries without feedback beyond the limits."""
-        database.execute(
-            """DELETE FROM queries WHERE id IN (SELECT id FROM (
-                SELECT id, ROW_NUMBER() OVER newest AS number, SUM(bytes) OVER newest AS total FROM queries
-                WHERE id NOT IN (SELECT query FROM feedback) WINDOW newest AS (ORDER BY id DESC)
-            ) WHERE number > ? OR total > ?)""",
-            (self._max_queries, self._max_bytes),
-        )
+            database.execute(
+                """DELETE FROM queries WHERE id IN (SELECT id FROM queries
+                WHERE id NOT IN (SELECT query FROM feedback) ORDER BY id DESC LIMIT -1 OFFSET ?)""",
+                [self._max_queries],
+            )
 
     def history(
         self, *, words: Sequence[str] = (), feedback: str | None = None, offset: int = 0, limit: int = 100

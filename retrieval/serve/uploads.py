@@ -107,7 +107,6 @@ def _decoded(text: Any) -> bytes:
 _SCHEMA = {"type": "string", "contentEncoding": "base64", "description": "An image file in base64."}
 Base64Image = Annotated[bytes, PlainValidator(_decoded), WithJsonSchema(_SCHEMA)]
 Grasps = Annotated[list[Annotated[list[Base64Image], Field(min_length=1)]], Field(min_length=1, max_length=MAX_GRASPS)]
-_PIXEL = "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAIAAACQd1PeAAAADElEQVR4nGNgYGAAAAAEAAH2FzhVAAAAAElFTkSuQmCC"
 
 
 class RequestBody(BaseModel):
@@ -121,10 +120,7 @@ class Options(RequestBody):
 
     top: int = Field(10, ge=1, le=1000, description="Number of objects to return.")
     candidates: int | None = Field(
-        None,
-        ge=1,
-        le=10_000_000,
-        description="Photos that the fusion head scores; null for the index's own number.",
+        None, ge=1, le=10_000_000, description="Photos that the fusion head scores; null for the index's own number."
     )
     none_prior: float = Field(
         NONE_PRIOR, gt=0, lt=1, description="Prior probability that the catalogue lacks the object."
@@ -133,8 +129,6 @@ class Options(RequestBody):
 
 class QueryBody(Options):
     """The touches of one object."""
-
-    model_config = {"json_schema_extra": {"examples": [{"touches": [[_PIXEL, _PIXEL]], "top": 3}]}}
 
     touches: Grasps = Field(description="Grasps, each with one image for each finger.")
     background: list[Base64Image] | None = Field(None, description="No-contact frames, one for each finger.")

@@ -7,8 +7,8 @@ from contextlib import ExitStack, contextmanager
 import httpx
 import pytest
 
-from retrieval.serve import connections, server
-from retrieval.serve.connections import MAX_CONNECTIONS, MAX_HEADER_BYTES
+from retrieval.serve import server
+from retrieval.serve.server import MAX_CONNECTIONS, MAX_HEADER_BYTES
 from tests.serving import listening
 
 BEGIN = b"GET /healthz HTTP/1.1\r\nhost: 127.0.0.1\r\n"
@@ -104,7 +104,7 @@ def test_a_flood_of_pipelined_requests_is_answered_one_by_one(service_at):
 
 
 def test_a_client_that_does_not_read_its_response_is_cut_off(index, monkeypatch):
-    monkeypatch.setattr(connections, "UNREAD_S", 0.5)
+    monkeypatch.setattr(server, "UNREAD_S", 0.5)
     with listening(index) as (url, _), socket.socket() as line:
         host, port = url.removeprefix("http://").split(":")
         line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
