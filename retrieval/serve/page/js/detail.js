@@ -1,4 +1,4 @@
-// Details of an object: large photos next to the touch, metadata, and similar photos.
+// Details of an object: large photos next to the touch, and metadata.
 
 import * as api from "./api.js";
 import { announce, h, picture, problemCard } from "./dom.js";
@@ -25,12 +25,12 @@ export function openDetail({ index, photo, objectId, query = null, reference = n
   dialog.addEventListener("click", (event) => event.target === dialog && close());
   document.body.append(dialog);
   dialog.showModal();
-  showObject(photo, objectId);
+  showObject();
   title.focus();
 
-  async function showObject(firstPhoto, name) {
-    title.textContent = name;
-    const stage = photoStage(index, query, name === objectId ? reference : null);
+  async function showObject() {
+    title.textContent = objectId;
+    const stage = photoStage(index, query, reference);
     const strip = h("ul", { class: "film", "aria-label": "Photos of this object" });
     const facts = h("div", { class: "facts" });
     body.replaceChildren(stage.element, strip, facts);
@@ -39,9 +39,9 @@ export function openDetail({ index, photo, objectId, query = null, reference = n
       strip.querySelectorAll("button").forEach((other) => other.setAttribute("aria-pressed", String(other === button)));
       facts.replaceChildren(metadata(each));
     };
-    stage.show(firstPhoto);
+    stage.show(photo);
     try {
-      const found = await api.catalogue({ object: name, limit: MAX_PHOTOS });
+      const found = await api.catalogue({ object: objectId, limit: MAX_PHOTOS });
       const buttons = found.items.map((each, place) => {
         const button = h(
           "button",
@@ -54,10 +54,10 @@ export function openDetail({ index, photo, objectId, query = null, reference = n
       strip.replaceChildren(...buttons);
       const place = Math.max(
         0,
-        found.items.findIndex((each) => each.id === firstPhoto),
+        found.items.findIndex((each) => each.id === photo),
       );
       if (found.items.length) select(found.items[place], buttons[place].firstChild);
-      announce(`${name}, ${count(found.total, "photo")}`);
+      announce(`${objectId}, ${count(found.total, "photo")}`);
     } catch (error) {
       strip.replaceWith(problemCard(error));
     }
