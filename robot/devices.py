@@ -254,7 +254,7 @@ class Gripper(Actuator):
         clock: Clock = time.monotonic,
     ) -> None:
         super().__init__(name, max_speed_mm_s=max_speed_mm_s, clock=clock)
-        self.min_opening_mm, self.min_speed_mm_s = 0.0, 1e-3
+        self.min_speed_mm_s = 1e-3
         self.stroke_mm = stroke_mm
         self.min_force_n, self.max_force_n = min_force_n, max_force_n
 
@@ -265,7 +265,7 @@ class Gripper(Actuator):
 
     def open(self, opening_mm: float) -> GripperState:
         """Open or narrow the jaws to `opening_mm`; a held object is released. Return the state or raise DeviceError."""
-        self._check("opening", opening_mm, self.min_opening_mm, self.stroke_mm, "mm")
+        self._check("opening", opening_mm, 0.0, self.stroke_mm, "mm")
         with self._moving("cannot open"):
             return self._open(float(opening_mm))
 

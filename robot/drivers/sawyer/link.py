@@ -131,14 +131,14 @@ class RosbridgeLink:
         """Send a message now; raise DeviceError if this fails."""
         self._send({"op": "publish", "topic": topic, "msg": message})
 
-    def call(self, service: str, arguments: Message, timeout_s: float | None = None) -> Message:
+    def call(self, service: str, arguments: Message) -> Message:
         """Call a ROS service once and return its values; raise DeviceError if it fails or does not answer in time."""
         identity = f"{service}#{next(self._numbers)}"
         with self._changed:
             self._awaited[identity] = service
         try:
             self._send({"op": "call_service", "id": identity, "service": service, "args": arguments})
-            reply = self._wait(lambda: self._replies.get(identity), timeout_s, f"answer of {service}")
+            reply = self._wait(lambda: self._replies.get(identity), f"answer of {service}")
         finally:
             with self._changed:
                 del self._awaited[identity]
@@ -153,25 +153,24 @@ class RosbridgeLink:
         with self._changed:
             return list(self._topics.get(topic, ()))
 
-    def wait_for(
-        self, topic: str, *, since_s: float = float("-inf"), timeout_s: float | None = None
-    ) -> ReceivedMessage:
+    def wait_for(self, topic: str, *, since_s: float = float("-inf")) -> ReceivedMessage:
         """Wait for a message of a topic after `since_s` and return the newest; raise DeviceError if none arrives."""
 
         def fresh() -> ReceivedMessage | None:
             arrivals = self._topics.get(topic)
             return arrivals[-1] if arrivals and arrivals[-1].time_s > since_s else None
 
-        return self._wait(fresh, timeout_s, f"message on {topic}")
+        return self._wait(fresh, f"message on {topic}")
 
-    def _wait(self, found: Callable[[], T | None], timeout_s: float | None, what: str) -> T:
-        limit = self.timeout_s if timeout_s is None else timeout_s
+    def _wait(self, found: Callable[[], T | None], what: str) -> T:
         with self._changed:
-            self._changed.wait_for(lambda: self._closed_reason or found() is not None, limit)
+            self._changed.wait_for(lambda: self._closed_reason or found() is not None, self.timeout_s)
             answer = found()
         if answer is None:
             self.check()
-            raise DeviceError(f"rosbridge at {self.url}: no {what} within {limit:g} s; is the robot's node running?")
+            raise DeviceError(
+                f"rosbridge at {self.url}: no {what} within {self.timeout_s:g} s; is the robot's node running?"
+            )
         return answer
 
     def _send(self, operation: Message) -> None:

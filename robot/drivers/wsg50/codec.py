@@ -120,7 +120,6 @@ class CommandId(enum.IntEnum):
     GET_ACCELERATION = 0x31
     SET_FORCE_LIMIT = 0x32
     GET_FORCE_LIMIT = 0x33
-    GET_SOFT_LIMITS = 0x35
     SYSTEM_STATE = 0x40
     GRASPING_STATE = 0x41
     OPENING = 0x43
@@ -249,12 +248,6 @@ def reply(packet: Packet) -> tuple[Status, bytes]:
 def number(parameters: bytes) -> float:
     """Parse a length, speed, force or acceleration; raise WireError if it is not a finite number."""
     return float(_unpack("<f", parameters)[0])
-
-
-def soft_limits(parameters: bytes) -> tuple[float, float]:
-    """Parse the lower and upper opening (mm)."""
-    minus, plus = _unpack("<2f", parameters)
-    return minus, plus
 
 
 def limits(parameters: bytes) -> GripperLimits:

@@ -220,7 +220,6 @@ class WSG50(Gripper):
             "acceleration_mm_s2": self._query(CommandId.GET_ACCELERATION, codec.number),
             "force_limit_n": self._options.to_finger_force(force),
             "finger_share": self._options.finger_share,
-            "soft_limits_mm": self._soft_limits(),
         }
 
     def _recover(self) -> None:
@@ -270,7 +269,7 @@ class WSG50(Gripper):
         if reading.grasping in _CLOSED_STATES:
             self._release(self._wider_opening(reading))
         self._set_force(force_n)
-        packet = codec.command(CommandId.GRASP, max(self._options.grasp_width_mm, self.min_opening_mm), speed_mm_s)
+        packet = codec.command(CommandId.GRASP, self._options.grasp_width_mm, speed_mm_s)
         return self._as_state(self._run(packet, speed_mm_s, lambda reading, _: reading.grasping in _CLOSED_STATES))
 
     def home(self) -> GripperState:
@@ -517,8 +516,7 @@ class WSG50(Gripper):
             self._home()
         if self._read().grasping is not GraspingState.HOLDING:  # with a smaller force, the held object would fall
             self._set_force(self.min_force_n)
-        lowest, highest = self._soft_limits() or (0.0, limits.stroke_mm)
-        self.min_opening_mm, self.stroke_mm = max(0.0, lowest), min(highest, limits.stroke_mm)
+        self.stroke_mm = limits.stroke_mm
         self._check("grasp_width_mm", options.grasp_width_mm, 0.0, self.stroke_mm, "mm")
 
     def _end_fast_stop(self) -> None:
@@ -560,13 +558,6 @@ class WSG50(Gripper):
                 f"{self.name}: the force limit (both fingers) must be {limit_n:g} N, but the gripper has "
                 f"{has:g} N; the jaws do not close"
             )
-
-    def _soft_limits(self) -> tuple[float, float] | None:
-        try:
-            minus, plus = self._query(CommandId.GET_SOFT_LIMITS, codec.soft_limits)
-        except CommandFailed:
-            return None
-        return (minus, plus) if minus < plus else None
 
 
 def _is_moving(system: SystemState, grasping: GraspingState) -> bool:

@@ -9,7 +9,6 @@ from types import MappingProxyType
 
 import numpy as np
 
-from robot.errors import UnknownName
 from robot.settings import TypedSettings, bounded
 
 
@@ -45,12 +44,9 @@ _TABLE = (
 MATERIALS: Mapping[str, ObjectMaterial] = MappingProxyType({material.name: material for material in _TABLE})
 
 
-def draw_material(rng: np.random.Generator, name: str | None = None) -> ObjectMaterial:
-    """Draw a material of the table (or the named one) with jittered values. Raise UnknownName."""
-    chosen = str(rng.choice(list(MATERIALS))) if name is None else name
-    if chosen not in MATERIALS:
-        raise UnknownName(f"material must be one of {', '.join(MATERIALS)}; got {chosen!r}")
-    typical = MATERIALS[chosen]
+def draw_material(rng: np.random.Generator) -> ObjectMaterial:
+    """Draw a material of the table, with jittered values."""
+    typical = MATERIALS[str(rng.choice(list(MATERIALS)))]
     spread, shift = np.exp(rng.normal(0, [0.25, 0.08])), rng.normal(0, [0.08, 0.08, 0.08])
     return replace(
         typical,

@@ -259,9 +259,7 @@ def read_mesh(path: str | Path) -> Mesh:
     return _place_on_table(_read(file), file)
 
 
-def mesh_object(
-    file: Path, mesh: Mesh, seed: int, *, up: Vectors = UP, relief: str | None = None, material: str | None = None
-) -> SimObject:
+def mesh_object(file: Path, mesh: Mesh, seed: int, *, up: Vectors = UP, relief: str | None = None) -> SimObject:
     """Draw relief, material and appearance for a mesh from `seed` and the file's name.
 
     Args:
@@ -270,10 +268,9 @@ def mesh_object(
         seed: seed of the draws.
         up: (3,) unit direction of the mesh that points up.
         relief: relief family; drawn if None.
-        material: material; drawn if None.
 
     Raises:
-        UnknownName: There is no such relief or material.
+        UnknownName: There is no such relief.
     """
     stream = [seed, zlib.crc32(file.stem.encode())]
     relief_name = str(np.random.default_rng([*stream, 0]).choice(list(RELIEFS))) if relief is None else relief
@@ -283,7 +280,7 @@ def mesh_object(
         object_id=f"{object_prefix(file)}{relief_name}-{seed:04d}",
         family="mesh",
         relief=pattern,
-        material=draw_material(np.random.default_rng([*stream, 2]), material),
+        material=draw_material(np.random.default_rng([*stream, 2])),
         appearance=draw_appearance(np.random.default_rng([*stream, 3])),
         body=MeshBody(mesh.rest_on_table(up), pattern),
     )

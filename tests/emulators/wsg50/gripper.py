@@ -55,7 +55,6 @@ class EmulatedWSG50:
         received: Ids of the last commands.
         grasping: Grasping state of the protocol.
         force_limit_n: Force limit.
-        soft_limits: Soft limits of the opening (mm), or None.
     """
 
     def __init__(
@@ -76,7 +75,6 @@ class EmulatedWSG50:
         self.received: list[int] = []
         self.grasping, self._bits = IDLE, {REFERENCED_BIT} if referenced else set()
         self.force_limit_n = 40.0
-        self.soft_limits: tuple[float, float] | None = None
         self._running: tuple[int, Callable[[], int | None]] | None = None
         self._updates: dict[int, tuple[float, float]] = {}
         """Period and next time (s) of each automatic update."""
@@ -250,8 +248,7 @@ class EmulatedWSG50:
             return NOT_INITIALIZED
         if self.grasping not in states:
             return DENIED
-        low, high = self.soft_limits or (0.0, STROKE_MM)
-        return None if low <= width <= high and SPEEDS[0] <= speed <= SPEEDS[1] else RANGE
+        return None if 0.0 <= width <= STROKE_MM and SPEEDS[0] <= speed <= SPEEDS[1] else RANGE
 
     def _home(self, payload: bytes) -> Answer:
         if payload[0] > 2:
@@ -360,7 +357,6 @@ _ACTIONS: dict[int, Callable[[EmulatedWSG50, bytes], Answer]] = {
     0x31: lambda gripper, _: struct.pack("<f", gripper._jaws.acceleration_mm_s2),
     0x32: EmulatedWSG50._set_force,
     0x33: lambda gripper, _: struct.pack("<f", gripper.force_limit_n),
-    0x35: lambda gripper, _: struct.pack("<ff", *gripper.soft_limits) if gripper.soft_limits else NOT_AVAILABLE,
     0x50: lambda _, payload: struct.pack("<BBHI", 1, 6, 0x4000, 20260101),
     0x53: lambda _, payload: struct.pack("<8f", STROKE_MM, *SPEEDS, *ACCELERATIONS, *FORCES, 120.0),
 }

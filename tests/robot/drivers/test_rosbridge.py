@@ -107,8 +107,10 @@ def test_a_late_answer_is_never_that_of_the_next_call():
         return [] if len(calls) == 1 else [reply_to(calls[0], values={"x": "old"}), reply_to(operation)]
 
     with linked(answer) as link:
+        link.timeout_s = 0.05
         with pytest.raises(DeviceError, match=r"no answer of /s within 0\.05 s"):
-            link.call("/s", {}, timeout_s=0.05)
+            link.call("/s", {})
+        link.timeout_s = 5.0
         assert link.call("/s", {}) == {"x": 1}
 
 
@@ -151,8 +153,9 @@ def test_messages_of_a_topic_are_buffered_with_their_times():
         assert [arrival.message["data"] for arrival in history] == [0, 1, 2]
         assert before <= history[0].time_s <= history[-1].time_s <= time.monotonic()
         assert link.wait_for("/t", since_s=before) == history[-1]
+        link.timeout_s = 0.02
         with pytest.raises(DeviceError, match=r"no message on /t within 0\.02 s"):
-            link.wait_for("/t", since_s=time.monotonic(), timeout_s=0.02)
+            link.wait_for("/t", since_s=time.monotonic())
 
 
 def test_an_error_message_is_truncated_and_escaped(caplog):

@@ -114,7 +114,6 @@ def test_a_gripper_that_would_clamp_harder_than_requested_does_not_grasp():
 
 def test_values_out_of_range_never_reach_the_gripper():
     emulator = EmulatedWSG50(referenced=True, speed_up=20.0)
-    emulator.soft_limits = (5.0, 100.0)
     with gripper_with_emulator(emulator=emulator, max_force_n=30.0, max_speed_mm_s=300.0) as (gripper, _):
         emulator.object_mm = 40.0
         gripper.grasp(10.0)
@@ -125,8 +124,8 @@ def test_values_out_of_range_never_reach_the_gripper():
             lambda: gripper.grasp(math.nan),
             lambda: gripper.grasp(10.0, 4.9),
             lambda: gripper.grasp(10.0, 301.0),
-            lambda: gripper.open(4.9),
-            lambda: gripper.open(100.1),
+            lambda: gripper.open(-0.1),
+            lambda: gripper.open(110.1),
         ):
             with pytest.raises(DeviceError, match="must be from"):
                 misuse()
@@ -161,11 +160,7 @@ def test_settings_are_read_back_as_plain_json():
         assert (gripper._link._port.baudrate, gripper._link._port.stopbits) == (57600, 2)
         settings = json.loads(json.dumps(gripper.settings()))
     assert settings["info"] == {"kind": 1, "hardware": 6, "firmware": 0x4000, "serial": 20260101}
-    assert (settings["limits"]["max_speed_mm_s"], settings["force_limit_n"], settings["soft_limits_mm"]) == (
-        420,
-        2.5,
-        None,
-    )
+    assert (settings["limits"]["max_speed_mm_s"], settings["force_limit_n"]) == (420, 2.5)
 
 
 @PORTS

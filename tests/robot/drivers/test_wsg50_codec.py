@@ -38,7 +38,7 @@ BUILT = {
     "loop abc": Packet(CommandId.LOOP, b"abc"),
     "move to 34 mm at 56 mm/s, stop on block": codec.move(34.0, 56.0),
 }
-PARSERS = (codec.number, codec.soft_limits, codec.limits, codec.info, codec.system_state, codec.grasping_state)
+PARSERS = (codec.number, codec.limits, codec.info, codec.system_state, codec.grasping_state)
 
 
 def fed(chunks):
@@ -103,7 +103,6 @@ def test_replies_and_their_parameters_are_parsed_as_documented():
         SystemState.REFERENCED | SystemState.MOVING | SystemState.FAST_STOP
     )
     assert codec.grasping_state(b"\x04") is GraspingState.HOLDING
-    assert codec.soft_limits(struct.pack("<ff", 5, 100)) == (5.0, 100.0)
     assert codec.info(struct.pack("<BBHI", 1, 6, 0x4000, 123456)) == GripperInfo(1, 6, 0x4000, 123456)
     limits = codec.limits(struct.pack("<8f", 110, 5, 420, 100, 5000, 5, 80, 120))
     assert (limits.stroke_mm, limits.min_speed_mm_s, limits.max_force_n) == (110.0, 5.0, 80.0)
