@@ -96,7 +96,6 @@ class Catalogue:
         ignored: Names of files that are not pictures.
         skipped: Pictures that are left out, with reasons.
         notes: Remarks for the user.
-        unsupported_objects: Objects of pictures that are left out because of their extension.
         touches: Touches of the objects, with or without photos.
     """
 
@@ -105,7 +104,6 @@ class Catalogue:
     ignored: tuple[str, ...] = ()
     skipped: tuple[SkippedPhoto, ...] = ()
     notes: tuple[str, ...] = ()
-    unsupported_objects: tuple[str, ...] = ()
     touches: tuple[CatalogueTouch, ...] = ()
 
     @property
@@ -124,9 +122,7 @@ class Catalogue:
     @property
     def object_ids(self) -> tuple[str, ...]:
         """The distinct objects, sorted; some may have no readable photo."""
-        return tuple(
-            sorted({*self.photos.objects, *(touch.object_id for touch in self.touches), *self.unsupported_objects})
-        )
+        return tuple(sorted({*self.photos.objects, *(touch.object_id for touch in self.touches)}))
 
 
 def require_separate_folders(catalogue: str | Path, index: str | Path) -> None:
@@ -195,7 +191,6 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
         tuple(found.ignored),
         tuple(found.skipped),
         tuple(f"{METADATA_FILE} names {name}, which is not in the catalogue" for name in unknown),
-        tuple(sorted(found.unsupported_objects)),
         tuple(
             replace(touch, metadata={**by_object.get(touch.object_id, {}), **by_photo.get(touch.paths[0], {})})
             for touch in touches
@@ -214,7 +209,6 @@ class _FileGroups:
         ignored: Files that are not pictures.
         skipped: Pictures that are left out, with reasons.
         unfit: Paths among `skipped` that do not fit the naming.
-        unsupported_objects: Objects of pictures in unsupported formats.
     """
 
     photos: list[str] = field(default_factory=list)
@@ -223,7 +217,6 @@ class _FileGroups:
     ignored: list[str] = field(default_factory=list)
     skipped: list[SkippedPhoto] = field(default_factory=list)
     unfit: list[str] = field(default_factory=list)
-    unsupported_objects: set[str] = field(default_factory=set)
 
 
 def _classify_files(names: Iterable[str], naming: Naming) -> _FileGroups:
@@ -238,7 +231,6 @@ def _classify_files(names: Iterable[str], naming: Naming) -> _FileGroups:
         name = naming.object_of(path)
         if extension in UNSUPPORTED_EXTENSIONS:
             found.skipped.append(SkippedPhoto(path, f"{extension} pictures are not read: save it as PNG or JPEG"))
-            found.unsupported_objects |= {name} if name else set()
         elif name is None:
             why = ": the name is only a number" if naming.text == STEM else ""
             found.skipped.append(SkippedPhoto(path, f"does not fit --objects-from {naming.text}{why}"))

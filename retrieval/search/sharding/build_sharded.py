@@ -209,7 +209,7 @@ def _split_catalogue(catalogue: Catalogue, shards: int) -> list[tuple[str, Catal
         photos[shard_number(photo.object_id, shards)].append(photo)
     for touch in catalogue.touches:
         touches[shard_number(touch.object_id, shards)].append(touch)
-    none = replace(catalogue, ignored=(), skipped=(), notes=(), unsupported_objects=())
+    none = replace(catalogue, ignored=(), skipped=(), notes=())
     return [
         (
             shard_folder(number, shards),
@@ -230,7 +230,7 @@ def _report(
     counts = [count for one in built for count in one.counts]
     lost = {name for report in reports for name in report.without_photo}
     bad = {item.path for one in built if one.report is None for item in one.skipped}
-    lost |= {photo.object_id for photo in catalogue.photos if photo.path in bad} | set(catalogue.unsupported_objects)
+    lost |= {photo.object_id for photo in catalogue.photos if photo.path in bad}
     reason, same = Counter(report.reason for report in reports).most_common(1)[0]
     references = [report.references for report in reports if report.references]
     sums = {key: sum(one[key] for one in references) for key in ("touches", "objects", "touch_only", "encoded")}

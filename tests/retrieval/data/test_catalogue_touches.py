@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from retrieval.data.catalogue import list_catalogue, make_catalogue
+from retrieval.data.catalogue import list_catalogue
 from retrieval.data.catalogue_touches import CatalogueTouch, group_touches, touch_name
 from retrieval.data.naming import Naming
 from retrieval.errors import DatasetError
@@ -13,7 +13,11 @@ FOLDER = Naming()
 
 
 def listed(tmp_path, *names, metadata=b"", naming=FOLDER):
-    return make_catalogue(tmp_path, "catalog", list(names), [], naming, metadata)
+    for name in names:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    (tmp_path / "metadata.jsonl").write_bytes(metadata)
+    return list_catalogue(tmp_path, naming)
 
 
 def test_gel_images_next_to_photos_are_touches_and_not_photos(tmp_path):
