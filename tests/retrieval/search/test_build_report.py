@@ -113,7 +113,7 @@ def test_objects_without_a_readable_photo_are_listed_and_give_exit_code_1(tmp_pa
     (own / "cup" / "0.jpg").write_bytes(b"broken")
     assert main(command) == 0  # the cup has another photo
     (own / "cup" / "1.jpg").write_bytes(b"broken")
-    (own / "ball" / "0.jpg").rename(own / "ball" / "0.gif")
+    (own / "ball" / "0.jpg").write_bytes(b"broken")
     capsys.readouterr()
     assert main([*command, "--json"]) == 1
     printed = capsys.readouterr()
