@@ -6,7 +6,6 @@ weight), and settings chosen by ranking on validation objects. The fit is in flo
 decomposition of the centred data. Only `leading_svd` uses X'X, which squares the condition number.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -207,16 +206,6 @@ def cosine(touch_encodings: Array, photo_encodings: Array) -> Array:
     return touch_encodings @ photo_encodings.T
 
 
-@dataclass(frozen=True)
-class CcaGridPoint:
-    """One cell of the grid, and the AUC of its ranking of photos of validation objects."""
-
-    ridge: float
-    components: int
-    power: int
-    auc: float
-
-
 class Cca(Method):
     """Cosine of canonical variates weighted by rho^p; ranking on validation objects chooses ridge, components and p.
 
@@ -232,42 +221,42 @@ class Cca(Method):
         touch, photo = (decompose(part, self.max_directions) for part in (train.touch, train.photo))
         self._standardise = touch.standardise, photo.standardise
         # The decompositions are made once; a ridge only damps them.
-        found = ((ridge, canonical_correlations(touch, photo, train.owner, ridge)) for ridge in RIDGES)
-        cells = (cell for ridge, one in found for cell in self._cells(ridge, one, Validator.of(validation)))
-        choice, correlations = max(cells, key=lambda cell: cell[0].auc)
+        found = {ridge: canonical_correlations(touch, photo, train.owner, ridge) for ridge in RIDGES}
+        validator = Validator.of(validation)
+        cells = {
+            (ridge, *cell): auc for ridge, one in found.items() for cell, auc in self._cells(one, validator).items()
+        }
+        ridge, components, power = choice = max(cells, key=cells.__getitem__)
+        correlations = found[ridge]
         if self.settings.fit_on_validation:
             known = train.concatenate(validation)
             touch, photo = (decompose(part, self.max_directions) for part in (known.touch, known.photo))
             self._standardise = touch.standardise, photo.standardise
-            correlations = canonical_correlations(touch, photo, known.owner, choice.ridge)
-        self._store(choice, correlations)
-        self.best_params["rank"] = {"touch": touch.rank, "photo": photo.rank}
+            correlations = canonical_correlations(touch, photo, known.owner, ridge)
+        weights = correlations.correlations[:components] ** power
+        self._maps = tuple(
+            each[:, :components] * weights for each in (correlations.touch_weights, correlations.photo_weights)
+        )
+        self.best_params = {
+            "ridge": ridge,
+            "components": components,
+            "max_components": len(correlations.correlations),
+            "power": power,
+            "validation_auc": cells[choice],
+            "rank": {"touch": touch.rank, "photo": photo.rank},
+        }
 
-    def _cells(
-        self, ridge: float, found: CanonicalCorrelations, validator: Validator
-    ) -> Iterator[tuple[CcaGridPoint, CanonicalCorrelations]]:
+    def _cells(self, found: CanonicalCorrelations, validator: Validator) -> dict[tuple[int, int], float]:
+        """Return the AUC on validation objects of each number of components and power."""
         touch = self._standardise[0](validator.features.touch) @ found.touch_weights
         photo = self._standardise[1](validator.features.photo) @ found.photo_weights
-        limit = len(found.correlations)
+        limit, aucs = len(found.correlations), {}
         for components in sorted({min(count, limit) for count in COMPONENTS}):
             for power in POWERS:
                 weights = found.correlations[:components] ** power
                 encodings = unit_rows(touch[:, :components] * weights), unit_rows(photo[:, :components] * weights)
-                yield CcaGridPoint(ridge, components, power, validator.touch_auc(cosine(*encodings))), found
-
-    def _store(self, choice: CcaGridPoint, found: CanonicalCorrelations) -> None:
-        weights = found.correlations[: choice.components] ** choice.power
-        self._maps = (
-            found.touch_weights[:, : choice.components] * weights,
-            found.photo_weights[:, : choice.components] * weights,
-        )
-        self.best_params = {
-            "ridge": choice.ridge,
-            "components": choice.components,
-            "max_components": len(found.correlations),
-            "power": choice.power,
-            "validation_auc": choice.auc,
-        }
+                aucs[components, power] = validator.touch_auc(cosine(*encodings))
+        return aucs
 
     def _encode_touch(self, touch: Array) -> Array:
         return unit_rows(self._standardise[0](touch) @ self._maps[0])

@@ -1,4 +1,4 @@
-"""The report of the real-data benchmark: Markdown, HTML and figures, from results.json."""
+"""The report of the real-data benchmark: Markdown and HTML, from results.json."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -7,8 +7,7 @@ from typing import Any
 from retrieval.console.output import show
 from retrieval.evaluation.real import PROTOCOLS, SCHEMA_VERSION
 from retrieval.evaluation.real.verdict import CONTROL_NAMES, RULE
-from retrieval.report.canvas import MUTED_COLOUR, Figure, canvas, draw, style_of
-from retrieval.report.document import Block, Details, Document, Listing, Picture, Section, Table, Text, write_document
+from retrieval.report.document import Block, Details, Document, Listing, Section, Table, Text, write_document
 from retrieval.report.results import (
     FEW_OBJECTS_MARK,
     FEW_OBJECTS_NOTE,
@@ -37,7 +36,7 @@ LOW_PASS_LABEL = "low-pass control (8 x 6)"
 
 
 def write_report(out: Path) -> list[Path]:
-    """Write report.md, report.html and figures/ from results.json.
+    """Write report.md and report.html from results.json.
 
     Args:
         out: Folder of results.json, to which the report is written.
@@ -47,22 +46,17 @@ def write_report(out: Path) -> list[Path]:
 
     Raises:
         BadInput: The results cannot be read.
-        RetrievalError: matplotlib is not installed.
     """
     results = read_results_file(out / "results.json", SCHEMA_VERSION, "benchmark real")
     entries = _ordered(results)
-    figures = [out / "figures" / "overview.png"]
-    draw(figures[0], overview, entries)
     sections = [Section(entry["title"], tuple(_section(entry))) for entry in entries.values()]
-    words = " ".join(line for entry in entries.values() for line in (entry["title"] + ":", *verdicts(entry)))
     lead: tuple[Block, ...] = (
         Text(RULE),
-        Picture("figures/overview.png", words, OVERVIEW),
         *(Text(f"{name} was skipped: {why}.") for name, why in results["skipped"].items()),
     )
     settings = Section("Settings", (Details("Settings", (Listing.of_json(results["setting"]),)),))
     document = Document("Identification by touch on real data", lead, (*sections, settings))
-    return [*write_document(document, out), *figures]
+    return write_document(document, out)
 
 
 def _ordered(results: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -216,42 +210,3 @@ def choices(entry: Entry) -> Table | None:
 def _spread(summary: Mapping[str, Any]) -> list[str]:
     values = (summary[key][0] for key in ("value", "min", "max"))
     return [*map(percent, values), str(len(summary["by_split"]))]
-
-
-# Figure ------------------------------------------------------------------------------------------------
-
-OVERVIEW = (
-    "The main measure of each protocol with 95 % intervals. Filled: touches; hollow: low-pass control; dashed: chance."
-)
-
-
-def overview(entries: Mapping[str, Entry]) -> Figure:
-    """Plot a panel for each protocol with each row and its low-pass control."""
-    max_rows = max(len(entry["rows"]) for entry in entries.values())
-    columns = min(2, len(entries))
-    lines = -(-len(entries) // columns)
-    figure = canvas(5.2 * columns, lines * (1.1 + 0.42 * max_rows))
-    panels = figure.subplots(lines, columns, squeeze=False).ravel()
-    for panel, entry in zip(panels, entries.values(), strict=False):
-        names = list(entry["rows"])
-        for place, name in enumerate(names):
-            row, style = entry["rows"][name], style_of(name)
-            for measures, shift, fill in ((row["measures"], -0.13, style.colour), (row["low_pass"], 0.13, "white")):
-                if measures is None:
-                    continue
-                found = measures[entry["main"]]
-                low, value, high = (100 * found[key][0] for key in ("low", "value", "high"))
-                panel.plot([low, high], [place + shift] * 2, color=style.colour, lw=2, solid_capstyle="butt")
-                panel.plot(value, place + shift, "o", ms=6, mec=style.colour, mfc=fill)
-        chance = entry["rows"][names[0]]["measures"][entry["main"]]["chance"][0]
-        panel.axvline(100 * chance, color=MUTED_COLOUR, ls="--", lw=1, zorder=0)
-        panel.set_yticks(range(len(names)), [_label(name, entry["rows"][name]) for name in names])
-        panel.set_ylim(len(names) - 0.5, -0.5)
-        panel.set_title(entry["title"], fontsize=9, loc="left", wrap=True)
-        panel.set_xlabel(f"{entry['labels'][entry['main']]}, %")
-        panel.set_xlim(0, None)
-        panel.tick_params(axis="y", length=0)
-        panel.grid(axis="y", visible=False)
-    for panel in panels[len(entries) :]:
-        panel.set_axis_off()
-    return figure

@@ -24,32 +24,12 @@ class FoldMeasures:
     """Results of one fold.
 
     Attributes:
-        measures: Measures by name; their owners are numbers in `ResamplingUnits`.
+        measures: Measures by name; owners are the units that intervals resample: objects, or their sequences.
         best_params: Parameters that the method selected.
     """
 
     measures: Mapping[str, Measure]
     best_params: Mapping[str, Any]
-
-
-@dataclass(frozen=True)
-class ResamplingUnits:
-    """Units that intervals resample: objects, or their sequences.
-
-    Attributes:
-        names: Names of the units, sorted.
-        number_of: object_id -> place in `names`.
-    """
-
-    names: tuple[str, ...]
-    number_of: Mapping[str, int]
-
-    @classmethod
-    def of(cls, facts: RecordingFacts, protocol: Protocol) -> "ResamplingUnits":
-        """Return the units of a recording under a protocol."""
-        unit_of = facts.sequence_of if protocol.is_by_sequence else {name: name for name in facts.names}
-        names = tuple(sorted(set(unit_of.values())))
-        return cls(names, {name: names.index(unit) for name, unit in unit_of.items()})
 
 
 def measure_fold(
@@ -69,7 +49,9 @@ def measure_fold(
     Raises:
         BadInput: The gallery is too small for the main measure.
     """
-    objects, units = method_scores.queries.objects, ResamplingUnits.of(facts, protocol)
+    objects = method_scores.queries.objects
+    unit_of = facts.sequence_of if protocol.is_by_sequence else {name: name for name in facts.names}
+    units = sorted(set(unit_of.values()))
 
     def allowed(table: ScoreTable) -> ScoreTable:
         return table.with_own() if protocol.allows_own_photos else table
@@ -94,7 +76,7 @@ def measure_fold(
             f"{protocol.title}: a gallery has {len(whole.objects)} objects, too few for "
             f"{protocol.measures[protocol.main].label}. Give more of the data set."
         )
-    number = {place: units.number_of[name] for place, name in enumerate(objects)}
+    number = {place: units.index(unit_of[name]) for place, name in enumerate(objects)}
     return FoldMeasures(
         {name: pooled(parts, [number] * len(parts)) for name, parts in found.items()},
         method_scores.predictions.best_params,

@@ -91,8 +91,6 @@ def test_the_report_has_verdicts_and_tables(out, results):
         assert words in page
     assert "counts as touch only if" in text
     assert "control: order" in text
-    assert (out / "figures" / "overview.png").is_file()
-    assert "figures/overview.png" in text
 
 
 def test_choices_report_each_fold(tmp_path, monkeypatch):
