@@ -1,7 +1,7 @@
 """Driver of a Sawyer behind rosbridge: straight lines by the robot's inverse kinematics, checked at every step.
 
 A motion is planned completely before it begins. IKService solves the way-points of the line, each seeded with the
-solution before, with a limited number of tries. Then joint commands in position mode are sent at `rate_hz`, along a
+solution before, with a limited number of tries. Then joint commands in position mode are sent every _TICK_S, along a
 trajectory within the requested speed of the hand and `joint_speed_rad_s`; after a pause of the program it continues
 where it was. The robot's speed ratio limits it further. Position mode bypasses the robot's collision avoidance (not
 detection), so the workspace must be free.
@@ -9,7 +9,7 @@ detection), so the workspace must be free.
 At every step the joint state must be fresh (`max_state_age_s`), the robot enabled, no collision reported and the arm
 near its commands; else the arm holds its position. /robot/state and the collision state are slower: they may be 2 s
 old. A robot without a collision state can be used; `refused` then reports that collisions are not detected. If
-commands stop (the program or the network failed), the robot ends the motion after `command_timeout_s`. This driver
+commands stop (the program or the network failed), the robot ends the motion after _COMMAND_TIMEOUT_S. This driver
 never resets an emergency stop.
 """
 
@@ -42,6 +42,13 @@ _MAX_TURN_RAD = 0.5
 """A larger joint step between two way-points means another branch of the inverse kinematics."""
 _STOP_S = 2.0
 """Time in which the arm must become still after a hold command."""
+_TICK_S, _COMMAND_TIMEOUT_S = 0.01, 0.2
+"""Time between two commands; time without commands after which the robot ends the motion."""
+_RAMP_S = 0.3
+"""Duration of the acceleration to full speed."""
+_ARRIVAL_RAD, _SETTLE_S = 0.01, 5.0
+"""Tolerance of every joint at the goal, and time to arrive after the last command."""
+_IK_TRIES = 3
 _BACK_OFF_S, _LONGEST_BACK_OFF_S = 0.25, 5.0
 """First and longest wait between two tries to connect; without the limit, doubling 20 times would take days."""
 _MARGIN_MM = 20.0
@@ -57,10 +64,6 @@ class SawyerSettings(TypedSettings):
         base_yaw_deg: Yaw of the rig's frame in the robot's base frame.
         tool_mm: Distance from the origin of `tip` along its z axis to the point between the fingertips.
         tool_yaw_deg: Angle about z from the tip's x axis to the closing direction of finger a.
-        ramp_s: Duration of the acceleration to full speed.
-        arrival_rad: Tolerance of every joint at the goal.
-        settle_s: Time to arrive after the last command.
-        command_timeout_s: Time without commands after which the robot ends the motion.
         enable: Whether this driver may enable the motors (never during an emergency stop).
         max_state_age_s: An older joint state stops the arm; an older robot or collision state too, but only above 2 s.
     """
@@ -74,13 +77,7 @@ class SawyerSettings(TypedSettings):
     tool_yaw_deg: float = bounded(-360, 360, 0.0)
     speed_ratio: float = bounded(0.01, 1, 0.3)
     joint_speed_rad_s: float = bounded(0.01, 1.5, 0.5)
-    rate_hz: float = bounded(20, 1000, 100.0)
-    ramp_s: float = bounded(0, 5, 0.3)
-    arrival_rad: float = bounded(1e-3, 0.1, 0.01)
-    settle_s: float = bounded(0.1, 60, 5.0)
-    command_timeout_s: float = bounded(0.05, 1, 0.2)
     timeout_s: float = bounded(0.05, 60, 2.0)
-    ik_retries: int = bounded(0, 20, 2)
     reconnect_tries: int = bounded(1, 20, 5)
     enable: bool = False
     max_speed_mm_s: float = 200.0
@@ -104,7 +101,7 @@ class Sawyer(Arm):
         super().__init__("sawyer", workspace, max_speed_mm_s=options.max_speed_mm_s, clock=clock)
         yaw, tool_yaw = math.radians(options.base_yaw_deg), math.radians(options.tool_yaw_deg)
         self._mount = Mount(options.base_xyz_mm, yaw, options.tool_mm, tool_yaw)
-        self._url, self._tick_s = f"ws://{options.host}:{options.port}", 1.0 / options.rate_hz
+        self._url = f"ws://{options.host}:{options.port}"
         self._is_moving = self._sees_collisions = False
         self._link = self._new_link()
 
@@ -134,7 +131,7 @@ class Sawyer(Arm):
         for topic, _ in _STATE_TOPICS if self._sees_collisions else _STATE_TOPICS[:-1]:
             self._link.wait_for(topic)
         self._set("speed_ratio", codec.SPEED_RATIO, self._options.speed_ratio)
-        self._set("command_timeout_s", codec.COMMAND_TIMEOUT, self._options.command_timeout_s)
+        self._set("command_timeout_s", codec.COMMAND_TIMEOUT, _COMMAND_TIMEOUT_S)
 
     def _set(self, name: str, topic: tuple[str, str], value: float) -> None:
         """Publish a setting and read it back from its topic; note a difference in `refused`."""
@@ -160,7 +157,7 @@ class Sawyer(Arm):
             self._link.publish(codec.ENABLE[0], {"data": True})
             deadline = self.clock() + self._options.timeout_s
             while not self._robot_state().enabled and self.clock() < deadline:
-                time.sleep(self._tick_s)
+                time.sleep(_TICK_S)
         self._check_free()
 
     def _close(self) -> None:
@@ -232,9 +229,7 @@ class Sawyer(Arm):
             )
         poses = waypoints(here, pose)
         joints = self._solve(poses, start)
-        schedule = JointTrajectory.from_waypoints(
-            poses, joints, speed_mm_s, self._options.joint_speed_rad_s, self._options.ramp_s
-        )
+        schedule = JointTrajectory.from_waypoints(poses, joints, speed_mm_s, self._options.joint_speed_rad_s, _RAMP_S)
         self._is_moving = True
         try:
             self._follow(schedule, began)
@@ -251,9 +246,9 @@ class Sawyer(Arm):
         return np.array(solved)
 
     def _solve_one(self, pose: Pose, before: Joints, start: Joints) -> Joints:
-        """Solve one way-point; after a failure, try other seeds up to `ik_retries` times."""
+        """Solve one way-point; after a failure, try other seeds up to _IK_TRIES tries in all."""
         tip, seeds = self._mount.tip_of(pose), (before, start, None)
-        for number in range(self._options.ik_retries + 1):
+        for number in range(_IK_TRIES):
             request = codec.ik_request(tip, self._options.tip, seeds[number % len(seeds)])
             try:
                 joints = codec.ik_answer(self._link.call(codec.IK_SERVICE, request))
@@ -265,9 +260,8 @@ class Sawyer(Arm):
             if turn <= _MAX_TURN_RAD:
                 return joints
             problem = f"its solution turns a joint by {turn:.2f} rad at once"
-        tries = self._options.ik_retries + 1
         raise DeviceError(
-            f"{self.name}: no solution for {pose} after {tries} tries: {problem}; the arm has not moved. "
+            f"{self.name}: no solution for {pose} after {_IK_TRIES} tries: {problem}; the arm has not moved. "
             "Choose a smaller workspace or check base_xyz_mm and tool_mm"
         )
 
@@ -280,28 +274,28 @@ class Sawyer(Arm):
             self._command(commanded)
             if at >= schedule.duration_s:
                 return
-            time.sleep(max(0.0, last + self._tick_s - self.clock()))
+            time.sleep(max(0.0, last + _TICK_S - self.clock()))
             now = self.clock()
-            at, last = at + min(now - last, 2 * self._tick_s), now
+            at, last = at + min(now - last, 2 * _TICK_S), now
 
     def _settle(self, goal: Joints, began: float) -> None:
-        """Wait until every joint is within `arrival_rad` of its goal and still; raise DeviceError after `settle_s`.
+        """Wait until every joint is within _ARRIVAL_RAD of its goal and still; raise DeviceError after _SETTLE_S.
 
-        A joint at its goal that still trembles after `settle_s` is accepted.
+        A joint at its goal that still trembles after _SETTLE_S is accepted.
         """
-        deadline = self.clock() + self._options.settle_s
+        deadline = self.clock() + _SETTLE_S
         while True:
             off = float(np.abs(self._watch(goal, began) - goal).max())
             late = self.clock() > deadline
-            if off <= self._options.arrival_rad and (late or self._is_still(began)):
+            if off <= _ARRIVAL_RAD and (late or self._is_still(began)):
                 return
             if late:
                 raise DeviceError(
-                    f"{self.name}: every joint must be within {self._options.arrival_rad:g} rad of its goal after "
-                    f"{self._options.settle_s:g} s, got {off:.3f} rad; is the arm blocked or the load too heavy?"
+                    f"{self.name}: every joint must be within {_ARRIVAL_RAD:g} rad of its goal after "
+                    f"{_SETTLE_S:g} s, got {off:.3f} rad; is the arm blocked or the load too heavy?"
                 )
             self._command(goal)
-            time.sleep(self._tick_s)
+            time.sleep(_TICK_S)
 
     def _is_still(self, since_s: float) -> bool:
         return is_still(self._link.history(codec.JOINT_STATES[0]), since_s, self.clock())
@@ -329,7 +323,7 @@ class Sawyer(Arm):
                 raise DeviceError(f"{self.name}: the arm still moves after a hold command; press the emergency stop")
             self._fresh_joints()
             self._command(hold)
-            time.sleep(self._tick_s)
+            time.sleep(_TICK_S)
 
     def _command(self, joints: Joints) -> None:
         self._link.publish(codec.JOINT_COMMAND[0], codec.joint_command(joints))
@@ -347,7 +341,7 @@ class Sawyer(Arm):
         self._link.check()
         raise DeviceError(
             f"{self.name}: the joint state must be at most {self._options.max_state_age_s:g} s old, got {age}; without "
-            f"new commands the robot ends its motion after {self._options.command_timeout_s:g} s"
+            f"new commands the robot ends its motion after {_COMMAND_TIMEOUT_S:g} s"
         )
 
     def _robot_state(self) -> codec.RobotState:

@@ -385,7 +385,7 @@ def test_ctrl_c_in_a_terminal_leaves_the_arm_still_and_the_program_ends():
 
 
 def test_inverse_kinematics_is_retried_with_other_seeds_a_limited_number_of_times():
-    with connected(ik_retries=2) as (emulator, arm):
+    with connected() as (emulator, arm):
         emulator.refuse_ik = 2
         arm.move_to(HOME, 200.0)
         emulator.refuse_ik, emulator.calls = 1000, 0
@@ -418,17 +418,15 @@ def test_an_arm_outside_the_workspace_is_not_moved():
         arm.move_to(Pose(0.0, 0.0, 5.0, 0.0), 100.0)
 
 
-def test_a_blocked_arm_ends_the_motion():
+def test_a_blocked_arm_ends_the_motion(monkeypatch):
     class Held(SawyerModel):
         def command(self, target):
             pass
 
     with connected(EmulatedSawyer(model=Held())) as (_, arm), pytest.raises(DeviceError, match="must follow within"):
         arm.move_to(Pose(0.0, 0.0, 250.0, 1.5), 200.0)
-    with (
-        connected(EmulatedSawyer(model=Held()), settle_s=0.1) as (_, arm),
-        pytest.raises(DeviceError, match="is the arm blocked"),
-    ):
+    monkeypatch.setattr("robot.drivers.sawyer.driver._SETTLE_S", 0.1)
+    with connected(EmulatedSawyer(model=Held())) as (_, arm), pytest.raises(DeviceError, match="is the arm blocked"):
         arm.move_to(Pose(0.0, 0.0, 45.0, 0.0), 200.0)
 
 
