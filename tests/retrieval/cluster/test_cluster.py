@@ -21,7 +21,7 @@ import retrieval
 from indexes.store.folder import IndexStore
 from indexes.store.sharded import read_sharded_manifest
 from retrieval.data.catalogue import list_catalogue
-from retrieval.errors import BadInput, IncompleteSearch
+from retrieval.errors import IncompleteSearch
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.query.searcher import Searcher
 from retrieval.search.sharding.build_sharded import build_sharded
@@ -182,17 +182,6 @@ def test_a_shard_that_hangs_is_reported(ray, cluster, grasps, stopped):
     stopped()
     with pytest.raises(IncompleteSearch, match=r"no answer within 2 s from shard-0\d-of-04"):
         searcher.query(grasps[0])
-
-
-@pytest.mark.parametrize(
-    "field",
-    [{"replicas": 0}, {"wait_s": 0.0}],
-)
-def test_invalid_settings_raise(field):
-    from retrieval.cluster.serving import ReplicaSettings
-
-    with pytest.raises(BadInput):
-        ReplicaSettings(**field)
 
 
 def test_a_new_generation_is_used_during_running_queries(ray, catalogue, cluster, model, grasps, tmp_path):

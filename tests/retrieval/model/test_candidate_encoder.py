@@ -13,16 +13,6 @@ def random_candidate_encoder(hidden=6, width=8, dim=4, seed=0, linear=0):
     return CandidateEncoder(hidden, width, dim, linear), 3 + 5 * torch.randn(7, hidden), 2 * torch.randn(9, hidden) - 1
 
 
-def test_embeddings_have_norm_1_even_for_a_partial_activation_of_zeros():
-    candidate_encoder, touches, photos = random_candidate_encoder()
-    for embeddings in (
-        candidate_encoder.touch(touches),
-        candidate_encoder.photo(photos),
-        candidate_encoder.photo(torch.zeros(1, 6)),
-    ):
-        torch.testing.assert_close(embeddings.norm(dim=1), torch.ones(len(embeddings)))
-
-
 def test_embeddings_order_photos_like_the_scores_although_they_drop_the_norm():
     candidate_encoder, touches, photos = random_candidate_encoder()
     nearness, scores = (

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from retrieval.errors import BadInput, NumericalError
+from retrieval.errors import NumericalError
 from retrieval.model import fusion_scorer
 from retrieval.model.config import MatcherConfig
 from retrieval.model.fusion import FusionHead, Matcher, Standardise, score_partials
@@ -94,14 +94,6 @@ def test_the_partial_activation_layers_start_like_one_layer_over_the_concatenati
     bound = 1 / math.sqrt(3000)
     for weight in (head.touch_partial.weight, head.photo_partial.weight):
         assert bound * 0.99 < float(weight.detach().abs().max()) <= bound
-
-
-def test_another_number_of_gel_images_is_a_clear_error():
-    matcher = Matcher(MatcherConfig(tower="small", tower_output="pooled", hidden=8))
-    with pytest.raises(BadInput, match=r"takes 2 gel image\(s\) for one touch; got 1 image"):
-        matcher.touch_features(torch.rand(4, 1, 3, 64, 64))
-    with pytest.raises(BadInput, match="array of shape"):
-        matcher.touch_features(torch.rand(4, 3, 64, 64))
 
 
 def small_head(hidden=32, seed=0):

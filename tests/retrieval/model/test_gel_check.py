@@ -33,10 +33,6 @@ def test_one_finger_in_contact_is_a_contact_and_one_foreign_picture_is_not_a_gel
     assert CHECK.classify(readings(*grasps)) == [CONTACT, CONTACT, NO_CONTACT, NOT_A_GEL, NOT_A_GEL]
 
 
-def test_a_reading_at_a_threshold_is_a_gel_in_contact():
-    assert CHECK.classify(readings(((1.0, 0.5), (1.0, 0.5)))) == [CONTACT]
-
-
 def test_a_no_contact_frame_overrides_the_features():
     contact, no_contact = ((-3, 2), (-3, 2)), ((-3, -2), (-3, -2))
     levels = np.array([[0.9, 1.1], [0.8, 30.0]], dtype=np.float32)

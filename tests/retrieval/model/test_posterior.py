@@ -195,14 +195,6 @@ def test_logits_without_errors_have_a_finite_slope():
     assert 0.5 < probabilities(found, [5.0] + [-5.0] * 18).objects[0] < 1
 
 
-def test_logits_without_information_leave_the_prior():
-    owner = np.arange(20)
-    for noise in (0.0, 1.0):
-        scores = noise * np.random.default_rng(0).normal(size=(20, 20))
-        found = fit_posterior(ScoredTouches(scores, owner, owner, np.zeros((20, 20), dtype=bool)))
-        assert probabilities(found, scores[0][:10]).none == pytest.approx(0.5, abs=0.12)
-
-
 def test_a_photo_of_the_touchs_own_grasp_never_counts():
     scored = normal_logits(30, 2, 2, apart=2, alike=0)
     own = np.zeros_like(scored.own)
