@@ -27,7 +27,7 @@ NOISE = 1.5
 """Standard deviation of the sensor noise in grey levels."""
 _LENS_BLUR_PX = 0.45
 _SHADOW_BLUR_PX = 0.8
-_SKY_STEPS, _SKY_WIDTH = 4, 0.03
+SKY_STEPS, _SKY_WIDTH = 4, 0.03
 """The object hides sky from the table near it. Standard deviation of this blur, relative to the image side."""
 
 _TABLE_GLOSS = 0.03
@@ -287,14 +287,14 @@ def shadow_pixels(view: CameraView, light: Array) -> Pixels:
     return np.flatnonzero(inside)
 
 
-def sky_occlusion(is_object: npt.NDArray[np.bool_]) -> Floats:
+def sky_occlusion(is_object: npt.NDArray[np.bool_], steps: int = SKY_STEPS) -> Floats:
     """Return how much of the sky the object hides from the table near it, 0..1, (px, px).
 
-    This is the object's mask (px, px), blurred on a coarse grid.
+    This is the object's mask (px, px), blurred on a coarse grid of `steps` per standard deviation.
     """
     px = len(is_object)
     width = _SKY_WIDTH * px
-    coarse = min(px, max(1, round(px * _SKY_STEPS / width)))
+    coarse = min(px, max(1, round(px * steps / width)))
     coverage = cv2.resize(is_object.astype(np.float32), (coarse, coarse), interpolation=cv2.INTER_AREA)
     blurred = cv2.GaussianBlur(coverage, (0, 0), width * coarse / px)
     return np.asarray(cv2.resize(blurred, (px, px), interpolation=cv2.INTER_CUBIC))
