@@ -3,9 +3,11 @@
 import inspect
 import sys
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
+
+import msgspec
 
 from _touch_retrieval.registry import Registry
 from robot.errors import ImporterError, UnknownName
@@ -81,27 +83,16 @@ def title_of(name: str) -> str:
 
 
 def data_set_of(name: str) -> DataSet:
-    """Return the facts of the data set of an importer.
+    """Return the facts of the data set of an importer, `DATA_SET` of its module.
 
     Raises:
         UnknownName: There is no such importer.
-        ImporterError: Its module has no `DATA_SET`.
     """
-    facts = getattr(sys.modules[load_importer(name).__module__], "DATA_SET", None)
-    if not isinstance(facts, DataSet):
-        raise ImporterError(f"the module of the importer {name!r} must contain DATA_SET, a DataSet, got {facts!r}")
+    facts: DataSet = sys.modules[load_importer(name).__module__].DATA_SET
     return facts
 
 
 # Options ---------------------------------------------------------------------------------------------------
-
-_Value = str | int | float | bool
-_READERS: Mapping[Any, Callable[[str], _Value]] = {
-    str: str,
-    int: int,
-    float: float,
-    bool: {"true": True, "false": False}.__getitem__,
-}
 
 
 def options_of(importer: Importer) -> dict[str, tuple[type, Any]]:
@@ -138,7 +129,7 @@ def read_options(importer: Importer, words: Sequence[str]) -> dict[str, Any]:
             )
         kind = known[name][0]
         try:
-            found[name] = _READERS[kind](value)
-        except (KeyError, ValueError) as error:
+            found[name] = msgspec.convert(value, kind, strict=False)
+        except msgspec.ValidationError as error:
             raise ImporterError(f"option {name} must be of type {kind.__name__}, got {value!r}") from error
     return found

@@ -11,7 +11,7 @@ suffix of the file name is optional. Words that occur in two patterns must have 
 `touch={object}/{n}_{finger}` and `photo={object}/{n}_photo` each touch gets the photo with its number. If several
 photos match, the first touch gets the first photo, the second touch the second photo, and so on, cyclically.
 `background` is a pattern for the no-contact frames: `rest_{finger}.png` for one per finger, `{object}/rest.png` for one
-per object. Links to other folders are followed.
+per object.
 
 Instead of patterns, `pairs` names a CSV file below the folder, with a header. Each line is a grasp with `object`,
 `photo` and `touch` (or `touch_a`, `touch_b`), and optionally `background` (or `touch_a_before`, ...), `sequence`,
@@ -147,7 +147,7 @@ class _PatternMatches:
         for option, pattern in (("touch", self._touch), ("photo", photo_pattern)):
             if "object" not in pattern.words:
                 raise ImporterError(f"the pattern {option} must contain {{object}}, such as {{object}}/touch_*")
-        files = list(_pictures(src))
+        files = _pictures(src)
         touches = [(path, words) for path in files if (words := self._touch.match(path))]
         if both := next((path for path, _ in touches if photo_pattern.match(path)), None):
             raise ImporterError(f"{both} matches both patterns; change touch or photo so that only one matches")
@@ -162,8 +162,6 @@ class _PatternMatches:
                     "change the pattern with --option"
                 )
         names = sorted({words.get("finger", "") for _, words in touches}, key=natural_sort_key)
-        if len(names) > len(ascii_lowercase):
-            raise ImporterError(f"{{finger}} must match at most 26 fingers, got {len(names)}, such as {names[:3]}")
         self.fingers = dict(zip(names, ascii_lowercase, strict=False))
         self._repeated: list[str] = []
         self._grasps: dict[tuple[str, ...], dict[str, str]] = defaultdict(
@@ -219,33 +217,16 @@ class _MatchingFiles:
         return tuple(words[name] for name in self._words)
 
 
-def _pictures(src: Path) -> Iterator[str]:
-    """Yield the pictures below a folder as relative paths, without hidden ones, in natural order.
+def _pictures(src: Path) -> list[str]:
+    """Return the pictures below a folder as relative paths, without hidden ones, in natural order."""
 
-    A link to a folder outside `src` is followed; each target is followed only once.
-    """
-    root, followed = Path(os.path.realpath(src)), set[Path]()
+    def fail(error: OSError) -> NoReturn:  # else an object would be missing without a message
+        raise ImporterError(f"{error.filename} cannot be listed: {error.strerror}") from error
 
-    def is_walked(path: str) -> bool:
-        if not os.path.islink(path):
-            return True
-        target = Path(os.path.realpath(path))
-        if target in followed or target.is_relative_to(root) or root.is_relative_to(target):
-            return False
-        followed.add(target)
-        return True
-
-    for folder, below, files in os.walk(src, onerror=_raise_unlistable, followlinks=True):
-        shown = sorted((name for name in below if not name.startswith(".")), key=natural_sort_key)
-        below[:] = [name for name in shown if is_walked(os.path.join(folder, name))]
-        for name in sorted(files, key=natural_sort_key):
-            if name.lower().endswith(_ENDINGS) and not name.startswith("."):
-                yield (Path(folder) / name).relative_to(src).as_posix()
-
-
-def _raise_unlistable(error: OSError) -> NoReturn:
-    """Raise an error for a folder that cannot be listed, so that no object is missing without a message."""
-    raise ImporterError(f"{error.filename} cannot be listed: {error.strerror}") from error
+    files = (Path(folder, name) for folder, _, names in os.walk(src, onerror=fail) for name in names)
+    paths = (path.relative_to(src) for path in files if path.suffix.lower() in _ENDINGS)
+    shown = [path.as_posix() for path in paths if not any(part.startswith(".") for part in path.parts)]
+    return sorted(shown, key=natural_sort_key)
 
 
 def _shared(src: Path, path: str) -> SharedImage:

@@ -6,13 +6,12 @@ read again, so a stopped import resumes where it stopped.
 
     recording.json        also: licence, terms, citation, fingers, notes (caveats, and unverified parts of the layout),
                           objects (object_id -> metadata of the data set), skipped (reason -> count)
-    splits/<name>.json    a published split: {"seed": 0, "train": [object ids], "validation": [...], "test": [...]}
+    splits/published.json a published split: {"seed": 0, "train": [object ids], "validation": [...], "test": [...]}
 """
 
 import json
 import os
 import re
-from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
@@ -38,9 +37,7 @@ NOT_STATED = "not stated"
 """Licence of a data set whose files and repository state none, or of which we know none."""
 
 SPLITS_FOLDER = "splits"
-_MAX_REASONS, _EXAMPLES = 20, 3
 _END_MARKERS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9"}
-_DIGITS = re.compile(r"[0-9]{1,4000}")
 _TAIL = 65536
 """Bytes that a camera may write after the end of a JPEG."""
 
@@ -124,19 +121,6 @@ class Skip:
     name: str
 
 
-@dataclass(frozen=True)
-class DataSetMetadata:
-    """Metadata of a data set besides its grasps.
-
-    Attributes:
-        objects: object_id -> plain JSON.
-        splits: Name -> part (train, validation, test) -> object ids.
-    """
-
-    objects: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    splits: Mapping[str, Mapping[str, Sequence[str]]] = field(default_factory=dict)
-
-
 def import_items(
     data_set: DataSet,
     items: Iterable[Item | Skip],
@@ -144,7 +128,8 @@ def import_items(
     *,
     total: int,
     progress: Progress | None = None,
-    metadata: DataSetMetadata | None = None,
+    objects: Mapping[str, Mapping[str, Any]] = {},
+    split: Mapping[str, Sequence[str]] | None = None,
 ) -> Recording:
     """Write items to the recording `out`, or continue it.
 
@@ -154,7 +139,8 @@ def import_items(
         out: Recording folder to write or continue.
         total: Number of items, for the progress.
         progress: Called with (done, total) after each item.
-        metadata: Metadata of objects, and published splits.
+        objects: object_id -> metadata, plain JSON.
+        split: The published split: part (train, validation, test) -> object ids.
 
     Returns:
         The recording. Its notes list skipped grasps with reasons, and the caveats of the data set.
@@ -164,30 +150,33 @@ def import_items(
         RecordingError: The recording cannot be continued.
         StorageError: The recording cannot be written.
     """
-    metadata = metadata or DataSetMetadata()
-    skipped = _SkipCounts()
+    skipped: dict[str, list[str]] = {}  # reason -> names
     notes = data_set.notes()
     with RecordingWriter(out, data_set.info()) as writer:
         names: set[str] = set()
         for done, item in enumerate(_readable(items), start=1):
+            skip: Skip | None = None
             if isinstance(item, Skip):
-                skipped.add(item)
+                skip = item
             elif item.grasp_id in names:
-                skipped.add(Skip("another grasp has the same name", item.grasp_id))
-            else:
+                skip = Skip("another grasp has the same name", item.grasp_id)
+            elif item.grasp_id not in writer.grasp_ids:
+                skip = _append(writer, item)
+            if isinstance(item, Item):
                 names.add(item.grasp_id)
-                if item.grasp_id not in writer.grasp_ids:
-                    skipped.add(_append(writer, item))
+            if skip is not None:
+                skipped.setdefault(skip.reason, []).append(skip.name)
             if progress is not None:
                 progress(done, max(total, done))
+        skips = [f"skipped {len(some)}: {reason}, such as {some[0]}" for reason, some in skipped.items()]
         if not writer.grasp_ids:
-            raise ImporterError(
-                f"no grasp could be imported: {'; '.join(skipped.notes()) or 'the source contains none'}"
-            )
-        rejected = _write_splits(out, metadata.splits)
-        writer.update_info(objects=dict(metadata.objects), skipped=dict(skipped.counts), notes=[*notes, *rejected])
+            raise ImporterError(f"no grasp could be imported: {'; '.join(skips) or 'the source contains none'}")
+        if split is not None:
+            notes = [*_write_split(out, split), *notes]
+        counts = {reason: len(some) for reason, some in skipped.items()}
+        writer.update_info(objects=dict(objects), skipped=counts, notes=notes)
     recording = read_recording(out)
-    return replace(recording, notes=(*recording.notes, *skipped.notes(), *rejected, *notes))
+    return replace(recording, notes=(*recording.notes, *skips, *notes))
 
 
 def _readable(items: Iterable[Item | Skip]) -> Iterator[Item | Skip]:
@@ -200,18 +189,16 @@ def _readable(items: Iterable[Item | Skip]) -> Iterator[Item | Skip]:
 def _append(writer: RecordingWriter, item: Item) -> Skip | None:
     """Append one grasp, or return why it was skipped."""
     images: dict[str, ImageSource | SharedImage] = {}
-    for column, source in item.images.items():
-        if isinstance(source, SharedImage) and writer.has_shared(source.name):
-            images[column] = source
-            continue
-        try:
-            data = picture_bytes(column, source.source if isinstance(source, SharedImage) else source)
-        except ImporterError as error:
-            return Skip(str(error), item.grasp_id)
-        images[column] = SharedImage(source.name, data) if isinstance(source, SharedImage) else data
     try:
+        for column, source in item.images.items():
+            if not isinstance(source, SharedImage):
+                images[column] = picture_bytes(column, source)
+            elif writer.has_shared(source.name):
+                images[column] = source
+            else:
+                images[column] = SharedImage(source.name, picture_bytes(column, source.source))
         writer.append(item.grasp_id, item.object_id, images, **item.fields)
-    except RecordingError as error:
+    except (ImporterError, RecordingError) as error:
         return Skip(str(error), item.grasp_id)
     return None
 
@@ -241,41 +228,17 @@ def picture_bytes(column: str, source: Source) -> bytes:
     return data
 
 
-class _SkipCounts:
-    """Counts of skipped grasps by reason, with the first names."""
-
-    def __init__(self) -> None:
-        self.counts: Counter[str] = Counter()
-        self._names: dict[str, list[str]] = defaultdict(list)
-
-    def add(self, skip: Skip | None) -> None:
-        if skip is not None:
-            known = skip.reason in self.counts or len(self.counts) < _MAX_REASONS
-            reason = skip.reason if known else "another reason"
-            self.counts[reason] += 1
-            self._names[reason].append(skip.name)
-            del self._names[reason][_EXAMPLES:]
-
-    def notes(self) -> list[str]:
-        return [f"skipped {n}: {reason}, such as {', '.join(self._names[reason])}" for reason, n in self.counts.items()]
-
-
-def _write_splits(out: Path, splits: Mapping[str, Mapping[str, Sequence[str]]]) -> list[str]:
-    """Write the splits whose parts have different objects; return a sentence on each other split."""
-    rejected = []
-    for name, parts in splits.items():
-        counts = Counter(object_id for objects in parts.values() for object_id in set(objects))
-        if shared := sum(count > 1 for count in counts.values()):
-            rejected.append(
-                f"the published split {name!r} has grasps of {shared} object(s) in two parts, so it does not test "
-                "unseen objects; it is not stored, draw a split by objects"
-            )
-            continue
-        split = {"seed": 0, **{part: sorted(parts.get(part, ())) for part in ("train", "validation", "test")}}
-        with storage_errors(out / SPLITS_FOLDER):
-            (out / SPLITS_FOLDER).mkdir(exist_ok=True)
-            write_atomically(out / SPLITS_FOLDER / f"{name}.json", json.dumps(split, indent=1).encode() + b"\n")
-    return rejected
+def _write_split(out: Path, split: Mapping[str, Sequence[str]]) -> list[str]:
+    """Write the published split if its parts have different objects, else return a sentence for the user."""
+    parts = {part: sorted(split.get(part, ())) for part in ("train", "validation", "test")}
+    names = [name for objects in parts.values() for name in objects]
+    if len(set(names)) < len(names):
+        return ["the published split has objects in two parts, so it does not test unseen objects; it is not stored"]
+    with storage_errors(out / SPLITS_FOLDER):
+        (out / SPLITS_FOLDER).mkdir(exist_ok=True)
+        document = json.dumps({"seed": 0, **parts}, indent=1).encode() + b"\n"
+        write_atomically(out / SPLITS_FOLDER / "published.json", document)
+    return []
 
 
 # Files and names of a source --------------------------------------------------------------------------------
@@ -298,36 +261,20 @@ def safe_name(*parts: str) -> str:
 
 
 def numbered_files(folder: Path, pattern: re.Pattern[str]) -> list[tuple[re.Match[str], Path]]:
-    """Return the files of a folder whose names match, in natural order; none if the folder does not exist.
-
-    Raises:
-        ImporterError: `folder` cannot be read.
-    """
-    names = sorted(_list(folder), key=natural_sort_key) if folder.is_dir() else []
+    """Return the files of a folder whose names match, in natural order; none if the folder does not exist."""
+    names = sorted(os.listdir(folder), key=natural_sort_key) if folder.is_dir() else []
     return [(match, folder / name) for name in names if (match := pattern.fullmatch(name))]
 
 
 def subfolders(parent: Path) -> list[Path]:
-    """Return the folders in `parent` except hidden ones, in natural order.
-
-    Raises:
-        ImporterError: `parent` cannot be read.
-    """
-    names = sorted((name for name in _list(parent) if not name.startswith(".")), key=natural_sort_key)
-    return [parent / name for name in names if (parent / name).is_dir()]
+    """Return the folders in `parent` except hidden ones, in natural order; none if it does not exist."""
+    names = sorted(os.listdir(parent), key=natural_sort_key) if parent.is_dir() else []
+    return [parent / name for name in names if not name.startswith(".") and (parent / name).is_dir()]
 
 
-def _list(folder: Path) -> list[str]:
-    try:
-        return os.listdir(folder)
-    except OSError as error:
-        raise ImporterError(f"{folder} cannot be read: {error.strerror}") from error
-
-
-def natural_sort_key(name: str) -> str:
-    """Return a sort key that compares digits as numbers: each number is preceded by its count of digits."""
-    key = _DIGITS.sub(lambda digits: f"\0{len(number := str(int(digits[0]))):04}{number}", name)
-    return f"{key}\0{name}"
+def natural_sort_key(name: str) -> tuple[list[str | int], str]:
+    """Return a sort key that compares digits as numbers."""
+    return [int(part) if part.isascii() and part.isdigit() else part for part in re.split("([0-9]+)", name)], name
 
 
 def import_extra(name: str, purpose: str) -> Any:

@@ -23,7 +23,6 @@ from robot.errors import ImporterError
 from robot.importers.importing import (
     NOT_STATED,
     DataSet,
-    DataSetMetadata,
     Item,
     Progress,
     Skip,
@@ -68,8 +67,6 @@ def import_objectfolder(src: Path, out: Path, progress: Progress | None = None) 
         ImporterError: `src` contains neither.
     """
     src = Path(src)
-    if not src.is_dir():
-        raise DATA_SET.mismatch_error(src, "it is not a folder")
     is_pack = (src / "vision").is_dir() and (src / "touch").is_dir()
     if is_pack:
         folders = [(folder.name, folder, src / "vision" / folder.name) for folder in subfolders(src / "touch")]
@@ -81,19 +78,20 @@ def import_objectfolder(src: Path, out: Path, progress: Progress | None = None) 
         if name.isdecimal() and (touches := numbered_files(touch, _PICTURE))
     }
     if not objects:
-        is_raw = any((folder / "tactile_data").is_dir() for folder in subfolders(src))
-        raise DATA_SET.mismatch_error(
-            src, "it contains raw videos without photos" if is_raw else "it contains no touch of that kind"
-        )
+        raise DATA_SET.mismatch_error(src, "it contains no touch of that kind")
     facts = DATA_SET
     if _width(next(iter(objects.values()))[0][0][1]) == _SIMULATED_WIDTH:
         facts = replace(facts, sensor=_SIMULATED, licence="CC BY 4.0", terms=_SIMULATED_TERMS)
     names = _names(src / _NAMES)
-    metadata = DataSetMetadata(
-        {name: names.get(name, {}) for name in objects}, _split(src / "split.json") if is_pack else {}
+    return import_items(
+        facts,
+        _items(objects),
+        out,
+        total=sum(len(touches) for touches, _ in objects.values()),
+        progress=progress,
+        objects={name: names.get(name, {}) for name in objects},
+        split=_split(src / "split.json") if is_pack else None,
     )
-    total = sum(len(touches) for touches, _ in objects.values())
-    return import_items(facts, _items(objects), out, total=total, progress=progress, metadata=metadata)
 
 
 _Files = list[tuple[re.Match[str], Path]]
@@ -133,16 +131,15 @@ def _names(path: Path) -> Mapping[str, Mapping[str, Any]]:
         raise ImporterError(f"{path} must be CSV with the columns Index, Name, Material: {error}") from error
 
 
-def _split(path: Path) -> Mapping[str, Mapping[str, Sequence[str]]]:
+def _split(path: Path) -> Mapping[str, Sequence[str]] | None:
     """Return the objects of each part, from {"<object>": [instances]} or [["<object>", instance], ...]."""
     if not path.is_file():
-        return {}
+        return None
     document = read_json_object(path, ImporterError)
-    parts: dict[str, list[str]] = {}
-    for key, part in _PARTS.items():
-        listed = document.get(key, {})
-        if not isinstance(listed, dict | list):
-            raise ImporterError(f"{path} must list objects under {key!r}, got {str(listed)[:40]}")
-        names = listed if isinstance(listed, dict) else [row[0] for row in listed if isinstance(row, list) and row]
-        parts[part] = sorted({str(name) for name in names})
-    return {"published": parts}
+    try:
+        return {
+            part: sorted({str(row if isinstance(row, str) else row[0]) for row in document.get(key, ())})
+            for key, part in _PARTS.items()
+        }
+    except (TypeError, IndexError) as error:
+        raise ImporterError(f"{path} must list the objects of train, val and test: {error}") from error

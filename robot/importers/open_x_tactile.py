@@ -11,6 +11,7 @@ whose gel images differ most from the first is the touch. Published stores do no
 one object. Stores are read one step at a time, without groups and without pickle.
 """
 
+import itertools
 import json
 import math
 import re
@@ -77,9 +78,7 @@ def import_open_x_tactile(
         if path.name.endswith(".zarr" if path.is_dir() else ".zarr.zip")
     )
     if not paths:
-        packed = sorted(src.glob("*.tar*")) if src.is_dir() else []
-        lacking = f"unpack {packed[0].name} first" if packed else "there is no such file or folder"
-        raise DATA_SET.mismatch_error(src, lacking)
+        raise DATA_SET.mismatch_error(src, "there is no such file or folder; unpack .tar files first")
     import_extra("zarr", "Open-X-Tactile")
     tasks = [_Task(path, camera) for path in paths]
     fingers = {task.fingers for task in tasks}
@@ -117,18 +116,17 @@ class _Task:
         self._camera = _Steps(store, f"data/{camera}", 4)
         self._gels = [_Steps(store, name, 5) for name in tactile]
         self.sensors = [text for name in tactile for text in store.texts(name.replace("_data_", "_sensor_"))]
-        self.ends = [int(end) for end in store.small("meta/episode_ends", "iu").ravel()]
-        length = min(len(array) for array in (self._camera, *self._gels))
-        is_increasing = all(start < end for start, end in zip([0, *self.ends], self.ends, strict=False))
-        if not self.ends or not is_increasing or self.ends[-1] > length:
-            raise ImporterError(f"{path}: meta/episode_ends must increase up to at most {length}, the number of steps")
+        self.ends = [int(end) for end in store.values("meta/episode_ends").ravel()]
+        steps = min(array.shape[0] for array in (self._camera, *self._gels))
+        if not self.ends or not all(np.diff([0, *self.ends]) > 0) or self.ends[-1] > steps:
+            raise ImporterError(f"{path}: meta/episode_ends must increase up to at most {steps}, the number of steps")
         self.fingers = sum(array.shape[1] for array in self._gels)
         if not 1 <= self.fingers <= 26:
             raise ImporterError(f"{path}: a touch must have 1 to 26 areas, got {self.fingers}")
 
     def items(self) -> Iterator[Item]:
         """Yield one grasp for each episode."""
-        for episode, (start, end) in enumerate(zip([0, *self.ends], self.ends, strict=False)):
+        for episode, (start, end) in enumerate(itertools.pairwise([0, *self.ends])):
             name = safe_name(self.name, f"{episode:06d}")
             images = episode_images(partial(self._steps, start, end), self.fingers)
             yield Item(name, self.name, images, {"sequence_id": f"{self.name}-{episode:06d}"})
@@ -149,36 +147,28 @@ class _Store:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
-            self._zip = None if path.is_dir() else zipfile.ZipFile(path)
+            root = zipfile.Path(path) if path.is_file() else path
         except (OSError, zipfile.BadZipFile) as error:
             raise ImporterError(f"{path} cannot be read as a zip file: {error}") from error
-        if self._zip and any(file.file_size > _MAX_CHUNK_BYTES for file in self._zip.infolist()):
-            raise ImporterError(f"{path} contains files of more than {_MAX_CHUNK_BYTES} bytes, the maximum of a chunk")
-        # A .zip file can contain the store itself, or the folder of the store.
-        tops = {name.split("/")[0] for name in self._zip.namelist()} if self._zip else set()
-        self._top = f"{tops.pop()}/" if len(tops) == 1 else ""
-        files = (
-            [name.removeprefix(self._top) for name in self._zip.namelist()]
-            if self._zip
-            else [file.relative_to(path).as_posix() for file in path.glob("*/*/.zarray")]
-        )
-        self.names = sorted(name.removesuffix("/.zarray") for name in files if name.endswith("/.zarray"))
+        inside = list(root.iterdir())
+        self._top = f"{inside[0].name}/" if path.is_file() and len(inside) == 1 else ""  # the folder of the store
+        self._root = root / self._top if self._top else root
+        arrays = [array for group in self._root.iterdir() if group.is_dir() for array in group.iterdir()]
+        self.names = sorted(f"{each.parent.name}/{each.name}" for each in arrays if (each / ".zarray").is_file())
 
     def has(self, name: str) -> bool:
         """Whether the store contains a file."""
-        return self._top + name in self._zip.NameToInfo if self._zip else (self.path / name).is_file()
+        return (self._root / name).is_file()
 
     def texts(self, name: str) -> list[str]:
         """Return the distinct texts of a small array, in order; none if the array is missing."""
-        if name not in self.names:
-            return []
-        texts = self.small(name, "US").ravel().tolist()
+        texts = self.values(name).ravel().tolist() if name in self.names else []
         return list(dict.fromkeys(text.decode(errors="replace") if isinstance(text, bytes) else text for text in texts))
 
-    def small(self, name: str, kinds: str) -> NDArray[Any]:
-        """Return all values of a small array, whose type must be one of NumPy's `kinds`."""
+    def values(self, name: str) -> NDArray[Any]:
+        """Return all values of a small array."""
         array, _ = self.open(name)
-        if array.dtype.kind not in kinds or array.size * array.dtype.itemsize > _MAX_CHUNK_BYTES:
+        if array.dtype.kind not in "iuUS" or array.size * array.dtype.itemsize > _MAX_CHUNK_BYTES:
             raise ImporterError(f"{self.path.name}/{name} has type {array.dtype} and {array.size} values, not readable")
         return _read(array, ..., f"{self.path.name}/{name}")
 
@@ -191,47 +181,38 @@ class _Store:
         label = f"{self.path.name}/{name}"
         zarr = import_extra("zarr", "Open-X-Tactile")
         try:
-            file = f"{self._top}{name}/.zarray"
-            metadata = json.loads(self._zip.read(file) if self._zip else (self.path / file).read_bytes())
-            codec, version = metadata.get("compressor"), metadata.get("zarr_format")
-            is_known = codec is None or codec["id"] in _CODECS
-            if version == 2 and is_known and not metadata.get("filters"):
-                store = zarr.storage.ZipStore(self.path, mode="r") if self._zip else str(self.path)
-                array = zarr.open_array(store, path=self._top + name, mode="r", zarr_format=2)
-                if not 0 < math.prod(array.chunks) * array.dtype.itemsize <= _MAX_CHUNK_BYTES:
-                    raise ImporterError(f"{label} has chunks of {array.chunks}: too large, or empty")
-                return array, "/" if metadata.get("dimension_separator") == "/" else "."
-        except ImporterError:
-            raise
+            metadata = json.loads((self._root / name / ".zarray").read_bytes())
+            codec = metadata.get("compressor")
+            is_known = (codec is None or codec["id"] in _CODECS) and not metadata.get("filters")
+            if metadata.get("zarr_format") != 2 or not is_known:
+                raise ImporterError(f"it must be zarr version 2 without filters, with a codec of {', '.join(_CODECS)}")
+            store = zarr.storage.ZipStore(self.path, mode="r") if self.path.is_file() else str(self.path)
+            array = zarr.open_array(store, path=self._top + name, mode="r", zarr_format=2)
+            if not 0 < math.prod(array.chunks) * array.dtype.itemsize <= _MAX_CHUNK_BYTES:
+                raise ImporterError(f"it has chunks of {array.chunks}: too large, or empty")
         except Exception as error:  # zarr, numcodecs and zipfile raise many types for damaged stores
             raise ImporterError(f"{label} cannot be opened: {error}") from error
-        raise ImporterError(
-            f"{label} must be zarr version 2 without filters, with one of these codecs: {', '.join(_CODECS)}"
-        )
+        return array, metadata.get("dimension_separator", ".")
 
 
 class _Steps:
     """A uint8 array along time, read step by step."""
 
     def __init__(self, store: _Store, name: str, ndim: int) -> None:
-        self._store, self._name = store, name
+        self._store, self._label = store, f"{store.path.name}/{name}"
         self._array, separator = store.open(name)
         self.shape: tuple[int, ...] = self._array.shape
         if self._array.dtype != np.uint8 or len(self.shape) != ndim:
             raise ImporterError(
-                f"{store.path.name}/{name} must have type uint8 and {ndim} axes, got {self._array.dtype} and "
-                f"{len(self.shape)} axes"
+                f"{self._label} must have type uint8 and {ndim} axes, got {self._array.dtype}, {len(self.shape)} axes"
             )
         self._chunk = f"{name}/{separator.join(['{}', *['0'] * (ndim - 1)])}"
-
-    def __len__(self) -> int:
-        return self.shape[0]
 
     def __getitem__(self, step: int) -> NDArray[np.uint8]:
         """Return the pictures of a step; raise ImporterError for a missing chunk, which zarr would read as zeros."""
         if not self._store.has(self._chunk.format(step // self._array.chunks[0])):
-            raise ImporterError(f"a chunk of {self._store.path.name}/{self._name} is missing")
-        return _read(self._array, step, f"{self._store.path.name}/{self._name}")
+            raise ImporterError(f"a chunk of {self._label} is missing")
+        return _read(self._array, step, self._label)
 
 
 def _read(array: Any, index: Any, label: str) -> NDArray[Any]:

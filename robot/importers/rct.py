@@ -20,7 +20,6 @@ from robot.errors import ImporterError
 from robot.importers.importing import (
     NOT_STATED,
     DataSet,
-    DataSetMetadata,
     Item,
     Progress,
     Skip,
@@ -107,7 +106,7 @@ def import_rct(
         out,
         total=total,
         progress=progress,
-        metadata=DataSetMetadata({name: {"frames": count} for name, count in counts.items()}),
+        objects={name: {"frames": count} for name, count in counts.items()},
     )
 
 

@@ -22,7 +22,6 @@ from typing import Any
 from robot.importers.importing import (
     NOT_STATED,
     DataSet,
-    DataSetMetadata,
     Images,
     Item,
     Progress,
@@ -98,7 +97,7 @@ def import_vt60(src: Path, out: Path, progress: Progress | None = None) -> Recor
         out,
         total=sum(len(instance.touches) for instance in objects),
         progress=progress,
-        metadata=DataSetMetadata({instance.object_id: instance.metadata for instance in objects}),
+        objects={instance.object_id: instance.metadata for instance in objects},
     )
 
 

@@ -85,16 +85,6 @@ def test_the_second_picture_of_a_grasp_and_finger_is_skipped(source, tmp_path):
     assert recording.info["skipped"] == {"another picture of the same grasp and finger was found": 1}
 
 
-def test_links_to_other_folders_are_followed_without_cycles(source, tmp_path):
-    picture(tmp_path / "disk/cup/touch_1.png", 5)
-    picture(tmp_path / "disk/cup/photo_1.jpg", 6)
-    (tmp_path / "disk/back").symlink_to(tmp_path / "disk")
-    for name, target in (("cup", tmp_path / "disk/cup"), ("again", source), ("same", source / "mug")):
-        (source / name).symlink_to(target)
-    recording = import_folder(source, tmp_path / "out")
-    assert {grasp.object_id for grasp in recording.grasps} == {"mug", "tin can", "cup"}
-
-
 def test_a_folder_that_cannot_be_listed_is_an_error(source, tmp_path, monkeypatch):
     scandir = os.scandir
 
