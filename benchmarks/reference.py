@@ -91,7 +91,6 @@ plug-in](extending.md).
 | data set | options of `retrieve import folder` |
 | --- | --- |
 | SSVTP | `touch=images_tac/image_{object}_tac photo=images_rgb/image_{object}_rgb`; each pair is an object |
-| Touch and Go | `pairs=pairs.csv`, a file of the pairs in `label.txt`; `{object}` is a video |
 | TVL, part HCT | `touch={data}/{object}/tactile/{frame} photo={data}/{object}/vision/{frame}` |
 | X-Capture | `touch={object}/{point}/*_tactile photo={object}/{point}/*_rgb` |
 | YCB-Slide | `touch=real/{object}/{log}/frames/{n}00 photo=real/{object}/{log}/webcam_frames/{n}00` |

@@ -24,7 +24,7 @@ from typing import Any
 
 from robot.errors import RecordingError, RobotConfigError
 from robot.grasping.attempt import AttemptRunner, GraspAttempt
-from robot.grasping.gates import ContactAreaGate, Gate, RecordedTouches, apply_gate
+from robot.grasping.gates import ContactAreaGate, Gate, apply_gate, recorded_touches
 from robot.grasping.settings import AttemptSettings
 from robot.recording.attempt_log import UNGRASPABLE, AttemptLog, LoggedAttempt, Tally, tally
 from robot.recording.folder import INFO_FILE, RecordingWriter, read_info, read_recording, software_version
@@ -248,7 +248,7 @@ class _Collection:
         is_enough: Callable[[Sequence[RecordedGrasp]], bool] | None,
     ) -> None:
         self.writer, self.log, self.names, self.settings, self.gate = writer, log, names, settings, gate
-        _check_log(log, writer, names, settings.rounds)
+        _check_log(log, writer, names)
         self.tallies = {name: Tally(name) for name in names} | tally(log.attempts)
         self._seconds = log.attempts[-1].ended_s if log.attempts else 0.0
         self._pending: dict[str, deque[Callable[[], GraspAttempt]]] = defaultdict(deque)
@@ -321,7 +321,7 @@ class _Collection:
 
     def _add_accepted(self, grasp: RecordedGrasp) -> None:
         self._accepted[grasp.object_id].append(grasp)
-        if self._is_enough and self._is_enough(self._accepted[grasp.object_id]):
+        if self._is_enough is not None and self._is_enough(self._accepted[grasp.object_id]):
             self._ended.add(grasp.object_id)
             self._pending.pop(grasp.object_id, None)
 
@@ -336,7 +336,7 @@ class _Collection:
         )
         if attempt.outcome in ("no_plan", UNGRASPABLE):
             return logged(accepted=False, reason=attempt.reason)
-        accepted, score = apply_gate(self.gate, RecordedTouches(attempt.images))
+        accepted, score = apply_gate(self.gate, recorded_touches(attempt.images))
         grasp_id = grasp_id_of(attempt.object_id, attempt.number)
         return logged(accepted=accepted, grasp_id=grasp_id, score=score, fit=attempt.fit)
 
@@ -357,21 +357,16 @@ class _Collection:
         )
 
 
-def _check_log(log: AttemptLog, writer: RecordingWriter, names: Sequence[str], rounds: bool) -> None:
+def _check_log(log: AttemptLog, writer: RecordingWriter, names: Sequence[str]) -> None:
     """Raise RecordingError unless the log has every grasp, and its objects are the first of `names`, in this order."""
     logged = {attempt.grasp_id for attempt in log.attempts} - {None}
     if lost := writer.grasp_ids - logged:
         raise RecordingError(f"{log.folder}: attempts.jsonl lacks grasp {min(lost)}; restore it or give a new folder")
-    tallies = tally(log.attempts)
-    order = list(tallies)
+    order = list(tally(log.attempts))
     if order != list(names[: len(order)]):
         raise RecordingError(
             f"{log.folder} was collected with other objects ({', '.join(order[:3])}, ...); give these objects first, "
             "in the same order; more may follow"
-        )
-    if rounds and len(order) < len(names) and any(counts.accepted > 1 for counts in tallies.values()):
-        raise RecordingError(
-            f"{log.folder} was collected in rounds through {len(order)} objects, not {len(names)}; give the same ones"
         )
 
 

@@ -207,11 +207,8 @@ def load_driver(role: str, table: Mapping[str, Any], where: str, **arguments: An
 
 
 def _sensors(tables: Mapping[str, Any]) -> dict[str, TactileSensor]:
-    for finger, table in tables.items():
-        if finger not in ("a", "b") or not isinstance(table, Mapping):
-            raise RobotConfigError(f"sensors must be the tables [sensors.a] and [sensors.b], or one; got {finger!r}")
-    if not tables:
-        raise RobotConfigError("a rig requires a gel: [sensors.a], [sensors.b] or both")
+    if not tables or not tables.keys() <= {"a", "b"}:
+        raise RobotConfigError(f"a rig requires gels: [sensors.a], [sensors.b] or both; got {', '.join(tables)}")
     return {
         finger: load_driver("sensors", table, f"[sensors.{finger}]", finger=finger) for finger, table in tables.items()
     }
@@ -233,23 +230,18 @@ def _camera(table: Mapping[str, Any]) -> Camera:
 
 def _attempt(attempt: Mapping[str, Any], grasp: Mapping[str, Any], limits: Limits) -> AttemptSettings:
     """Return the attempt settings: the given values, or defaults capped by [limits]; raise RobotConfigError."""
-    low, high = GraspSettings.force_n
-    force_n = (min(low, limits.force_n), min(high, limits.force_n))
-    capped = {
-        "travel_mm_s": min(AttemptSettings.travel_mm_s, limits.arm_speed_mm_s),
-        "approach_mm_s": min(AttemptSettings.approach_mm_s, limits.arm_speed_mm_s),
-        "closing_mm_s": min(AttemptSettings.closing_mm_s, limits.jaw_speed_mm_s),
+    ceilings = {
+        "travel_mm_s": limits.arm_speed_mm_s,
+        "approach_mm_s": limits.arm_speed_mm_s,
+        "closing_mm_s": limits.jaw_speed_mm_s,
     }
+    capped = {name: min(getattr(AttemptSettings, name), ceiling) for name, ceiling in ceilings.items()}
+    force_n = tuple(min(each, limits.force_n) for each in GraspSettings.force_n)
     settings = parse_attempt_settings({**capped, **attempt}, {"force_n": force_n, **grasp})
-    requested = {
-        "[grasp]: force_n": (settings.grasp.force_n[1], limits.force_n, "force_n"),
-        "[attempt]: travel_mm_s": (settings.travel_mm_s, limits.arm_speed_mm_s, "arm_speed_mm_s"),
-        "[attempt]: approach_mm_s": (settings.approach_mm_s, limits.arm_speed_mm_s, "arm_speed_mm_s"),
-        "[attempt]: closing_mm_s": (settings.closing_mm_s, limits.jaw_speed_mm_s, "jaw_speed_mm_s"),
-    }
-    for name, (value, ceiling, limit) in requested.items():
-        if value > ceiling:
-            raise RobotConfigError(f"{name} must be at most {limit} = {ceiling:g} of [limits], got {value:g}")
+    values = {name: getattr(settings, name) for name in ceilings} | {"force_n": settings.grasp.force_n[1]}
+    for name, ceiling in (ceilings | {"force_n": limits.force_n}).items():
+        if values[name] > ceiling:
+            raise RobotConfigError(f"{name} must be at most {ceiling:g}, as [limits] states, got {values[name]:g}")
     for name in ("settle_s", "hold_s"):
         if getattr(settings, name) < MIN_WAIT_S:
             raise RobotConfigError(

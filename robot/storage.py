@@ -105,14 +105,8 @@ def file_content(column: str, source: ImageSource) -> tuple[bytes, str]:
     if isinstance(source, np.ndarray):
         return _png(column, source), ".png"
     if not isinstance(source, bytes | str | Path):
-        raise RecordingError(
-            f"{column} must be pixels as a NumPy array, or the bytes or the path of a PNG or JPEG file; got "
-            f"{type(source).__name__}"
-        )
-    try:
-        data = source if isinstance(source, bytes) else read_content(source, RecordingError)
-    except RecordingError as error:
-        raise RecordingError(f"{column}: {error}") from error
+        raise RecordingError(f"{column} must be a NumPy array, or a PNG or JPEG file; got {type(source).__name__}")
+    data = source if isinstance(source, bytes) else read_content(source, RecordingError)
     for magic, suffix in _SUFFIXES.items():
         if data.startswith(magic):
             return data, suffix
@@ -170,11 +164,5 @@ def _png(column: str, pixels: npt.NDArray[Any]) -> bytes:
     if not good or (pixels.ndim != 3 or pixels.shape[2] != 3 if colour else pixels.ndim != 2):
         shape = "H x W x 3 uint8 RGB" if colour else "H x W uint16 in millimetres"
         raise RecordingError(f"{column} must be {shape}, got {pixels.shape} {pixels.dtype}")
-    try:
-        plain = np.ascontiguousarray(pixels)
-        done, data = cv2.imencode(".png", cv2.cvtColor(plain, cv2.COLOR_RGB2BGR) if colour else plain)
-    except cv2.error:
-        done = False
-    if not done:
-        raise RecordingError(f"{column} cannot be written as PNG; its shape is {pixels.shape}")
-    return data.tobytes()
+    plain = np.ascontiguousarray(pixels)
+    return cv2.imencode(".png", cv2.cvtColor(plain, cv2.COLOR_RGB2BGR) if colour else plain)[1].tobytes()

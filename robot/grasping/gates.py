@@ -6,8 +6,9 @@ contacts, because it uses the images on which a matcher is trained later; theref
 """
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -30,31 +31,22 @@ class GraspFrames:
     after: Picture | None = None
 
 
-class RecordedTouches(Mapping[str, GraspFrames]):
-    """Each finger's frames as recorded, so the gate gets the same pixels as training; decoded on access."""
+def recorded_touches(images: Mapping[str, bytes]) -> dict[str, GraspFrames]:
+    """Return each finger's frames as recorded, so the gate gets the same pixels as training.
 
-    def __init__(self, images: Mapping[str, bytes]) -> None:
-        self._images = images
-        self._fingers = [match[1] for column in images if (match := _TOUCH.fullmatch(column))]
+    Args:
+        images: Content of the image files by column; touch_a and others, encoded by robot.grasping.attempt.
+    """
 
-    def __getitem__(self, finger: str) -> GraspFrames:
-        before, during, after = (self._decode(f"touch_{finger}{moment}") for moment in ("_before", "", "_after"))
-        if during is None:
-            raise KeyError(finger)
-        return GraspFrames(before, during, after)
+    def decode(column: str) -> Any:
+        pixels = decode_picture(images[column]) if column in images else None
+        return None if pixels is None else cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
 
-    def _decode(self, column: str) -> npt.NDArray[np.uint8] | None:
-        if column not in self._images:
-            return None
-        pixels = decode_picture(self._images[column])
-        assert pixels is not None, "it was encoded by robot.grasping.attempt"
-        return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), np.uint8)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._fingers)
-
-    def __len__(self) -> int:
-        return len(self._fingers)
+    return {
+        match[1]: GraspFrames(decode(f"{column}_before"), decode(column), decode(f"{column}_after"))
+        for column in images
+        if (match := _TOUCH.fullmatch(column))
+    }
 
 
 Gate = Callable[[Mapping[str, GraspFrames]], bool | float]

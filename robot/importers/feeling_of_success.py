@@ -7,8 +7,7 @@
 
 The photo is the Kinect picture before the grasp. "during" is after closing and before the lift; "before" and "after"
 become the no-contact frame and the gel after the lift. `grasped` is the data set's `is_gripping`: training leaves
-failed grasps out. Consecutive grasps of one object are a sequence. Nothing in the files is unpickled, and links to
-other files are not followed.
+failed grasps out. Consecutive grasps of one object are a sequence. Nothing in the files is unpickled.
 """
 
 import contextlib
@@ -68,7 +67,6 @@ _COLUMNS = {
     **{f"touch_{finger}_after": f"gelsight{sensor}_after" for finger, sensor in (("a", "A"), ("b", "B"))},
 }
 _GRIPPING = {0: False, 1: True}
-_MAX_PIXELS = 50_000_000
 _BROKEN = (OSError, KeyError, ValueError, RuntimeError, TypeError)
 """Errors that h5py raises for damaged files."""
 
@@ -102,7 +100,7 @@ def _items(h5py: Any, files: list[Path]) -> Iterator[Item | Skip]:
     for path in files:
         with contextlib.ExitStack() as stack:
             try:
-                data = _local(h5py, stack.enter_context(h5py.File(path)), "data")
+                data = stack.enter_context(h5py.File(path)).get("data")
                 names = sorted(filter(_GRASP.fullmatch, data or ()), key=natural_sort_key)
             except _BROKEN:
                 yield Skip("its file is not HDF5 or is cut off", path.name)
@@ -111,8 +109,8 @@ def _items(h5py: Any, files: list[Path]) -> Iterator[Item | Skip]:
                 yield Skip("its file has no /data; it may be of another version", path.name)
             for key in names:
                 name = safe_name(path.stem, key)
-                group = _local(h5py, data, key)
                 try:
+                    group = data[key]
                     object_id, grasped = _text(group.attrs["object_name"]), _GRIPPING[group.attrs["is_gripping"]]
                 except (*_BROKEN, AttributeError):
                     object_id, grasped = "", False
@@ -129,22 +127,12 @@ def _text(name: Any) -> str:
     return (name.decode(errors="replace") if isinstance(name, bytes) else str(name)).strip()
 
 
-def _local(h5py: Any, group: Any, name: str) -> Any:
-    """Return the object of this name in the file itself; None if it is missing or a link."""
-    try:
-        return group[name] if isinstance(group.get(name, getlink=True), h5py.HardLink) else None
-    except _BROKEN:
-        return None
-
-
 def _read(h5py: Any, group: Any, name: str) -> npt.NDArray[Any]:
     """Return a picture; raise ImporterError without the name of the file."""
-    dataset = _local(h5py, group, name)
     try:
-        if not isinstance(dataset, h5py.Dataset) or dataset.external or dataset.is_virtual:
+        if not isinstance(dataset := group.get(name), h5py.Dataset):
             raise ImporterError(f"its {name} is missing")
-        height, width, *colours = (*(dataset.shape or ()), 0, 0)[:3]
-        if dataset.dtype != "uint8" or dataset.ndim != 3 or colours != [3] or height * width > _MAX_PIXELS:
+        if dataset.dtype != "uint8" or dataset.ndim != 3 or dataset.shape[2] != 3:
             raise ImporterError(f"its {name} is not a picture with 8-bit colours")
         return dataset[()]  # type: ignore[no-any-return]
     except _BROKEN as error:

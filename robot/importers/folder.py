@@ -1,4 +1,4 @@
-"""Pictures of your own, found by patterns or listed in a CSV file.
+"""Pictures of your own, found by patterns.
 
     <object>/touch_*.png     by the pattern `touch`
     <object>/photo_*.jpg     by the pattern `photo`
@@ -12,20 +12,15 @@ suffix of the file name is optional. Words that occur in two patterns must have 
 photos match, the first touch gets the first photo, the second touch the second photo, and so on, cyclically.
 `background` is a pattern for the no-contact frames: `rest_{finger}.png` for one per finger, `{object}/rest.png` for one
 per object.
-
-Instead of patterns, `pairs` names a CSV file below the folder, with a header. Each line is a grasp with `object`,
-`photo` and `touch` (or `touch_a`, `touch_b`), and optionally `background` (or `touch_a_before`, ...), `sequence`,
-`force_n`, `opening_mm` and `time_s`. Paths are relative to the folder.
 """
 
-import csv
 import os
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from hashlib import sha256
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from string import ascii_lowercase
 from typing import NoReturn
 
@@ -49,14 +44,11 @@ DATA_SET = DataSet(
     citation="set by you",
     sensor="set by you",
     rig="unknown",
-    expects="`<object>/touch_*.png` and `<object>/photo_*.jpg`, or files that match the patterns, or a file of pairs",
+    expects="`<object>/touch_*.png` and `<object>/photo_*.jpg`, or files that match the patterns",
     fingers=0,
 )
 _ENDINGS = (".png", ".jpg", ".jpeg")
 _WORD = re.compile(r"(\{\w+\}|\*)")
-_COLUMNS = {"object": "object_id", "touch": "touch_a", "background": "touch_a_before", "sequence": "sequence_id"}
-_NUMBERS = ("force_n", "opening_mm", "time_s")
-_TOUCH = re.compile("touch_[a-z]")
 
 Words = Mapping[str, str]
 
@@ -69,7 +61,6 @@ def import_folder(
     touch: str = "{object}/touch_*",
     photo: str = "{object}/photo_*",
     background: str = "",
-    pairs: str = "",
     sensor: str = "unknown",
     licence: str = NOT_STATED,
 ) -> Recording:
@@ -82,7 +73,6 @@ def import_folder(
         touch: Pattern of the gel images.
         photo: Pattern of the photos.
         background: Pattern of the no-contact frames; empty if there are none.
-        pairs: File of pairs, relative to `src`, instead of the patterns.
         sensor: Name of the sensor.
         licence: Licence of the pictures.
 
@@ -92,9 +82,7 @@ def import_folder(
     src = Path(src)
     if not src.is_dir():
         raise ImporterError(f"{src} must be a folder of pictures")
-    matches: _PairsFile | _PatternMatches = (
-        _PairsFile(src, pairs) if pairs else _PatternMatches(src, touch, photo, background)
-    )
+    matches = _PatternMatches(src, touch, photo, background)
     data_set = replace(
         DATA_SET,
         sensor=sensor,
@@ -103,9 +91,6 @@ def import_folder(
         background="as in the pictures" if matches.has_background else "none",
     )
     return import_items(data_set, matches.items(), out, total=matches.total, progress=progress)
-
-
-# By patterns -----------------------------------------------------------------------------------------------
 
 
 class _Pattern:
@@ -231,60 +216,3 @@ def _pictures(src: Path) -> list[str]:
 
 def _shared(src: Path, path: str) -> SharedImage:
     return SharedImage(f"{sha256(path.encode(errors='surrogateescape')).hexdigest()[:24]}", src / path)
-
-
-# By a file of pairs ----------------------------------------------------------------------------------------
-
-
-class _PairsFile:
-    """The grasps in a file of pairs, read line by line."""
-
-    def __init__(self, src: Path, pairs: str) -> None:
-        self.src, self._file = src, src / pairs
-        if not os.path.isfile(self._file):
-            raise ImporterError(f"{self._file} must be a CSV file of pairs, but does not exist")
-        first = next(self._rows(), {})
-        self.fingers = sorted(filter(_TOUCH.fullmatch, first))
-        if not self.fingers or not {"object_id", "photo"} <= first.keys():
-            raise ImporterError(
-                f"{self._file} must contain object, photo and touch (or touch_a, touch_b, ...) in each line"
-            )
-        self.has_background = any(column.endswith("_before") for column in first)
-        self.total = sum(1 for _ in self._rows())
-
-    def items(self) -> Iterator[Item | Skip]:
-        """Yield a grasp for each line, and a `Skip` for each unusable one."""
-        required = ("photo", *self.fingers)
-        for number, row in enumerate(self._rows(), start=1):
-            name = safe_name(row["object_id"], str(number))
-            columns = (*required, *(f"{finger}_before" for finger in self.fingers))
-            paths = {column: row[column] for column in columns if row.get(column)}
-            if not row["object_id"] or not all(row[column] for column in required):
-                yield Skip("its line lacks the object, the photo or a touch", name)
-            elif any(path.startswith("/") or ".." in PurePosixPath(path).parts for path in paths.values()):
-                yield Skip("a path must be relative to the folder and lead to a file below it", name)
-            elif (numbers := _numbers(row)) is None:
-                yield Skip(f"{', '.join(_NUMBERS)} must be numbers", name)
-            else:
-                images: Images = {
-                    column: self.src / path if column in self.fingers else _shared(self.src, path)
-                    for column, path in paths.items()
-                }
-                yield Item(name, row["object_id"], images, {"sequence_id": row.get("sequence_id") or None, **numbers})
-
-    def _rows(self) -> Iterator[dict[str, str]]:
-        """Yield rows with columns named as in a recording; a missing value is empty."""
-        try:
-            with open(self._file, encoding="utf-8-sig", newline="") as file:
-                for row in csv.DictReader(file):
-                    plain = {key.removesuffix("_file_name"): value or "" for key, value in row.items() if key}
-                    yield {_COLUMNS.get(key, key): value for key, value in plain.items()}
-        except (csv.Error, UnicodeDecodeError) as error:
-            raise ImporterError(f"{self._file} must be CSV with a header, in UTF-8: {error}") from error
-
-
-def _numbers(row: Mapping[str, str]) -> dict[str, float] | None:
-    try:
-        return {name: float(row[name]) for name in _NUMBERS if row.get(name)}
-    except ValueError:
-        return None

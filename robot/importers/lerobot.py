@@ -62,8 +62,6 @@ _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 _DATA_PATH, _VIDEO_PATH = f"data/{_FILE}.parquet", "videos/{video_key}/" + f"{_FILE}.mp4"
 _GEL = re.compile("touch|tactile|gel|digit", re.IGNORECASE)
 _FIELDS = ("force_n", "opening_mm", "touch_skew_s", "time_s", "outcome", "grasped", "pose")
-_MOMENTS = (["before", "during"], ["during", "after"], ["before", "during", "after"], ["during"])
-"""Moments of the steps in our own exports."""
 _WHAT = "a LeRobot data set"
 
 _Row = dict[str, Any]
@@ -87,8 +85,7 @@ def import_lerobot(
     src = Path(src)
     if not (src / "meta" / "info.json").is_file():
         raise DATA_SET.mismatch_error(src, "there is no such file")
-    import_extra("pyarrow", _WHAT)
-    import_extra("av", _WHAT)
+    import_extra("pyarrow", _WHAT), import_extra("av", _WHAT)
     source = _LeRobotSource(src, touch, photo)
     total = sum(1 for _ in source.episodes(("episode_index",)))
     return import_items(
@@ -145,10 +142,9 @@ class _LeRobotSource:
                 f"{src} must have a camera for the photo and gel cameras; choose them with --option photo=... "
                 f"touch=... from: {', '.join(kinds) or 'none'}"
             )
-        if len(self.touch) > 26 or any("/" in name or ".." in name for name in kinds):
-            raise ImporterError(f"{src} must have at most 26 gel cameras, and no camera name that is a path")
-        moments = self._info.recording.get("moments")
-        self._moments = moments if moments in _MOMENTS else None
+        if any("/" in name or ".." in name for name in kinds):
+            raise ImporterError(f"{src} must have no camera name that is a path")
+        self._moments = self._info.recording.get("moments")
         self._videos: dict[str, tuple[Path, Any]] = {}
 
     def stored_facts(self) -> dict[str, Any]:
@@ -190,9 +186,6 @@ class _LeRobotSource:
         ):
             number = row.get("episode_index")
             name = safe_name(str(row.get("grasp_id") or f"episode-{number}"))
-            if not isinstance(number, int) or not isinstance(row.get("length"), int):
-                yield Skip("its episode has no number or no length", name)
-                continue
             fields = {key: row[key] for key in _FIELDS if row.get(key) is not None}
             sequence = row.get("sequence_id") or f"episode-{number}"
             moments = self._moments if row["length"] == len(self._moments or ()) else None

@@ -15,7 +15,6 @@ split of a pack is stored if its parts have different objects. Audio is ignored.
 import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -40,21 +39,15 @@ DATA_SET = DataSet(
     terms="ObjectFolder Real: see its page; simulated touches (ObjectFolder 2.0): CC BY 4.0",
     citation="Gao, Dou, Li and others, The ObjectFolder Benchmark: Multisensory Learning with Neural and Real Objects, "
     "CVPR 2023",
-    sensor="GelSight",
+    sensor="GelSight, real or simulated (Taxim)",
     rig="robot arm; photos of the object alone",
     expects="`<index>/visual/0.png` and `<index>/tactile/0.png`, or `vision/<object>/` and `touch/<object>/`",
     caveats=(
         "The benchmark counts any picture of the right object as correct (mAP, mean average precision). Some published "
         "numbers for real objects are those of training objects.",
     ),
-    unverified=(
-        "that pictures of the simulated packs are 160 pixels wide, which distinguishes them from the real ones",
-        "whether the split of each pack is by object or by picture",
-    ),
+    unverified=("whether the split of each pack is by object or by picture",),
 )
-_SIMULATED = "GelSight, simulated (Taxim)"
-_SIMULATED_TERMS = "name the authors; the meshes of ObjectFolder 2.0 have licences of their own"
-_SIMULATED_WIDTH = 160
 _PICTURE = re.compile(r"(\d+)\.(png|jpg)")
 _NAMES = "objectfolder_real_metadata.csv"
 _PARTS = {"train": "train", "val": "validation", "test": "test"}
@@ -79,12 +72,9 @@ def import_objectfolder(src: Path, out: Path, progress: Progress | None = None) 
     }
     if not objects:
         raise DATA_SET.mismatch_error(src, "it contains no touch of that kind")
-    facts = DATA_SET
-    if _width(next(iter(objects.values()))[0][0][1]) == _SIMULATED_WIDTH:
-        facts = replace(facts, sensor=_SIMULATED, licence="CC BY 4.0", terms=_SIMULATED_TERMS)
     names = _names(src / _NAMES)
     return import_items(
-        facts,
+        DATA_SET,
         _items(objects),
         out,
         total=sum(len(touches) for touches, _ in objects.values()),
@@ -107,13 +97,6 @@ def _items(objects: Mapping[str, tuple[_Files, _Files]]) -> Iterator[Item | Skip
             photo = photos.get(match[1]) or list(photos.values())[number % len(photos)]
             shared = SharedImage(safe_name(name, "photo", photo.stem), photo)
             yield Item(safe_name(name, match[1]), name, {"photo": shared, "touch_a": path})
-
-
-def _width(path: Path) -> int:
-    """Return the width of a PNG from its header; 0 for another file."""
-    with open(path, "rb") as file:
-        header = file.read(24)
-    return int.from_bytes(header[16:20], "big") if header[12:16] == b"IHDR" else 0
 
 
 def _names(path: Path) -> Mapping[str, Mapping[str, Any]]:

@@ -147,7 +147,7 @@ class _Store:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
-            root = zipfile.Path(path) if path.is_file() else path
+            root: Any = zipfile.Path(path) if path.is_file() else path
         except (OSError, zipfile.BadZipFile) as error:
             raise ImporterError(f"{path} cannot be read as a zip file: {error}") from error
         inside = list(root.iterdir())

@@ -11,7 +11,7 @@ the file names, part by part.
 
 import heapq
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import cache, partial
 from pathlib import Path
 
@@ -86,13 +86,9 @@ def _items(part: str, path: Path, frames: int) -> Iterator[Item | Skip]:
     before = SharedImage(safe_name(sequence, "no_contact"), lambda: read()[0])  # type: ignore[arg-type]  # import_items calls it
     for number in range(1, frames + 1):
         name = safe_name(sequence, str(number))
-        touch = SharedImage(name, partial(_frame, read, number))  # type: ignore[arg-type]
+        touch = SharedImage(name, lambda number=number: read()[number])  # type: ignore[arg-type,misc]
         images = {"photo": touch, "touch_a": touch, "touch_a_before": before}
         yield Item(name, part, images, {"sequence_id": sequence})
-
-
-def _frame(read: Callable[[], list[Frame]], number: int) -> Frame:
-    return read()[number]
 
 
 def strongest_frames(path: Path, count: int) -> list[Frame]:
@@ -112,14 +108,12 @@ def strongest_frames(path: Path, count: int) -> list[Frame]:
     first = next(decoded, None)
     if first is None:
         raise ImporterError("its video contains no frame")
-    strongest: list[tuple[float, int, Frame]] = []
-    for number, frame in enumerate(decoded):
-        change = float(np.abs(frame.astype(np.int16) - first).mean())
-        # Among equal changes the earlier frame stays. Numbers differ, so frames are never compared.
-        heapq.heappush(strongest, (change, -number, frame))
-        if len(strongest) > count:
-            heapq.heappop(strongest)
-    if len(strongest) < count or not strongest[0][0]:
+    # Numbers differ, so frames are never compared; among equal changes the earlier frame is taken.
+    changes = (
+        (float(np.abs(frame.astype(np.int16) - first).mean()), -number, frame) for number, frame in enumerate(decoded)
+    )
+    strongest = heapq.nlargest(count, changes)
+    if len(strongest) < count or not strongest[-1][0]:
         raise ImporterError(f"its video must have at least {count} frames that differ from the first one")
     return [first, *(frame for _, _, frame in sorted(strongest, key=lambda entry: -entry[1]))]
 

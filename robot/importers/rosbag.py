@@ -26,7 +26,7 @@ read twice, one message at a time; only times and numbers of its messages stay i
 
 import contextlib
 from array import array
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -118,7 +118,6 @@ def import_rosbag(
     paths = _bag_paths(src)
     if not paths:
         raise DATA_SET.mismatch_error(src, "there is no such bag")
-    import_extra("rosbags", "a ROS bag")
     topics = _Topics(tuple(filter(None, (touch_a, touch_b))), photo, gripper, grasp, object)
     scans: dict[Path, _Scan] = {}
     skips: list[Skip] = []
@@ -131,14 +130,13 @@ def import_rosbag(
     if not scans:
         raise ImporterError(f"{paths[0]}: {skips[0].reason}")
     grasps = {path: _find_grasps(scan, topics, contact, settle_s) for path, scan in scans.items()}
-    unreadable = sum((scan.unreadable for scan in scans.values()), Counter[str]())
-    lost = [f"{count} image(s) of {topic} cannot be decoded, or differ in size" for topic, count in unreadable.items()]
+    lost = sum(scan.unreadable for scan in scans.values())
     facts = replace(
         DATA_SET,
         fingers=len(topics.touch),
         sensor=sensor,
         licence=licence,
-        caveats=(*lost, *DATA_SET.caveats),
+        caveats=(*([f"{lost} gel image(s) cannot be decoded, or differ in size"] if lost else []), *DATA_SET.caveats),
     )
     start_ns = min(scan.first_ns for scan in scans.values())
     items = (item for path, scan in scans.items() for item in _items(path, scan, grasps[path], topics, start_ns))
@@ -156,18 +154,19 @@ def _bag_paths(source: Path) -> list[Path]:
     """
     if source.is_file() or (source / "metadata.yaml").is_file():
         return [source]
-    inside = sorted(source.iterdir(), key=lambda path: natural_sort_key(path.name)) if source.is_dir() else []
+    inside = _sorted(source) if source.is_dir() else []
     return [path for path in inside if (path.suffix in _SUFFIXES if path.is_file() else bool(_storage_files(path)))]
+
+
+def _sorted(folder: Path) -> list[Path]:
+    return sorted(folder.iterdir(), key=lambda path: natural_sort_key(path.name))
 
 
 def _storage_files(path: Path) -> list[Path]:
     """Return the files of a bag with messages, in natural order."""
     if path.is_file():
         return [path]
-    return sorted(
-        (file for file in path.iterdir() if file.is_file() and file.suffix in _SUFFIXES[1:]),
-        key=lambda file: natural_sort_key(file.name),
-    )
+    return [file for file in _sorted(path) if file.is_file() and file.suffix in _SUFFIXES[1:]]
 
 
 class BagMessage(NamedTuple):
@@ -317,7 +316,7 @@ class _Scan:
         forces_n: Force in each message of the gripper; NaN if it has no efforts.
         changes: Topic of a finger -> mean change of each gel image from the first one, in grey levels.
         changed: The same as the fraction of the gel's area that changed; empty if a topic marks the grasps.
-        unreadable: Topic -> number of images that cannot be decoded or have another size.
+        unreadable: Number of gel images that cannot be decoded or have another size.
         first_ns: When the first message was recorded.
     """
 
@@ -327,7 +326,7 @@ class _Scan:
     forces_n: "array[float]" = field(default_factory=lambda: array("d"))
     changes: dict[str, "array[float]"] = field(default_factory=lambda: defaultdict(lambda: array("d")))
     changed: dict[str, "array[float]"] = field(default_factory=lambda: defaultdict(lambda: array("d")))
-    unreadable: Counter[str] = field(default_factory=Counter)
+    unreadable: int = 0
     first_ns: int = 0
 
     def latest(self, topic: str, time_ns: int) -> int | None:
@@ -354,7 +353,7 @@ def _scan_bag(bag: Bag, topics: _Topics) -> _Scan:
             picture = picture_of(message)
             gel = decode_picture(picture) if isinstance(picture, bytes) else picture
             if gel is None or gel.shape != first.setdefault(topic, gel.copy()).shape:
-                scan.unreadable[topic] += 1
+                scan.unreadable += 1
                 continue
             scan.changes[topic].append(float(np.mean(np.abs(np.subtract(gel, first[topic], dtype=np.int16)))))
             if gate is not None:

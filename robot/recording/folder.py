@@ -130,30 +130,25 @@ def read_recording(folder: str | Path) -> Recording:
     info = read_info(root)
     path = root / METADATA_FILE
     data = read_content(path, RecordingError)
-    ignored: set[str] = set()
-    grasps = tuple(_grasps(path, data, ignored))
+    grasps = tuple(_grasps(path, data))
     dropped = len(_incomplete_last_line(data))
     notes = [f"{path}: dropped an incomplete last line ({dropped} bytes), left by a crash"] if dropped else []
-    if ignored:
-        notes.append(f"{path}: ignored keys that the format does not define: {', '.join(sorted(ignored))}")
     return Recording(root, info, grasps, tuple(notes))
 
 
-def _grasps(path: Path, data: bytes, ignored: set[str]) -> Iterator[RecordedGrasp]:
-    """Yield the grasps of metadata.jsonl and add unknown keys to `ignored`; raise RecordingError if invalid."""
+def _grasps(path: Path, data: bytes) -> Iterator[RecordedGrasp]:
+    """Yield the grasps of metadata.jsonl; raise RecordingError if a line is invalid."""
     grasp_ids: set[str] = set()
     for number, line in enumerate(io.BytesIO(data.removesuffix(_incomplete_last_line(data))), start=1):
         if not line.strip():
             continue
         try:
-            row = parse_object(line, RecordingError)
-            grasp = RecordedGrasp.from_row(row)
+            grasp = RecordedGrasp.from_row(parse_object(line, RecordingError))
             if grasp.grasp_id in grasp_ids:
                 raise RecordingError(f"grasp_id must be unique, got {grasp.grasp_id!r} twice")
         except RecordingError as error:
             raise RecordingError(f"{path}, line {number}: {error}") from error
         grasp_ids.add(grasp.grasp_id)
-        ignored |= unknown_keys(row)
         yield grasp
 
 
@@ -244,9 +239,8 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
         for key in _FIXED_KEYS:
             if (old := self.info.get(key)) != (new := expected.get(key)):
                 raise RecordingError(f"{self.folder} was recorded with {key} {old!r}, not {new!r}; give another folder")
-        self._shared: dict[str, str] = {}
         data = self._file.read()
-        self._grasp_ids = {grasp.grasp_id: None for grasp in _grasps(self.folder / METADATA_FILE, data, set())}
+        self._grasp_ids = {grasp.grasp_id: None for grasp in _grasps(self.folder / METADATA_FILE, data)}
         self._end = len(data) - len(_incomplete_last_line(data))
         self._file.truncate(self._end)
         if (last := _after_last_newline(data)) and not _incomplete_last_line(data):
@@ -275,21 +269,19 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
         """
         if self._file.closed:
             raise RecordingError(f"the writer of {self.folder} is closed; open another")
-        if not isinstance(grasp_id, str) or not GRASP_ID.fullmatch(grasp_id):
-            raise RecordingError(
-                "grasp_id must have 1 to 128 characters: ASCII letters, digits, '.', '_' or '-'; the first must be a "
-                f"letter or a digit; got {grasp_id!r}"
-            )
+        _check_id("grasp_id", grasp_id)
         if grasp_id in self._grasp_ids:
             raise RecordingError(f"the recording already contains grasp {grasp_id}; see grasp_ids")
         contents: dict[str, bytes] = {}
         paths: dict[str, str] = {}
         for column, source in images.items():
-            if isinstance(source, SharedImage) and self.has_shared(source.name):
-                paths[f"{column}_file_name"] = self._shared[source.name]
-                continue
-            data, suffix = file_content(column, source.source if isinstance(source, SharedImage) else source)
-            name = f"{source.name}_shared" if isinstance(source, SharedImage) else f"{grasp_id}_{column}"
+            name = f"{grasp_id}_{column}"
+            if isinstance(source, SharedImage):
+                if stored := self._shared(source.name):
+                    paths[f"{column}_file_name"] = stored
+                    continue
+                name, source = f"{source.name}_shared", source.source
+            data, suffix = file_content(column, source)
             paths[f"{column}_file_name"] = path = f"{IMAGES_FOLDER}/{name}{suffix}"
             contents[path] = data
         row = {"grasp_id": grasp_id, "object_id": object_id, **fields, **paths}
@@ -305,17 +297,12 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
 
     def has_shared(self, name: str) -> bool:
         """Return whether the recording contains the shared image `name`; raise RecordingError for an invalid name."""
-        if not GRASP_ID.fullmatch(name):
-            raise RecordingError(
-                "the name of a shared image must have 1 to 128 characters: ASCII letters, digits, '.', '_' or '-'; the "
-                f"first must be a letter or a digit; got {name!r}"
-            )
-        if name not in self._shared:
-            for suffix in (".png", ".jpg"):
-                path = f"{IMAGES_FOLDER}/{name}_shared{suffix}"
-                if (self.folder / path).is_file():
-                    self._shared[name] = path
-        return name in self._shared
+        return self._shared(name) is not None
+
+    def _shared(self, name: str) -> str | None:
+        _check_id("the name of a shared image", name)
+        paths = (f"{IMAGES_FOLDER}/{name}_shared{suffix}" for suffix in (".png", ".jpg"))
+        return next((path for path in paths if (self.folder / path).is_file()), None)
 
     def update_info(self, **info: Any) -> None:
         """Add or replace entries of recording.json, except schema_version, source, sensor, units and background.
@@ -343,6 +330,14 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _check_id(what: str, name: str) -> None:
+    if not isinstance(name, str) or not GRASP_ID.fullmatch(name):
+        raise RecordingError(
+            f"{what} must have 1 to 128 characters: ASCII letters, digits, '.', '_' or '-'; the first must be a "
+            f"letter or a digit; got {name!r}"
+        )
 
 
 def _full_info(info: Mapping[str, Any]) -> dict[str, Any]:
@@ -374,10 +369,9 @@ def software_version() -> str:
     """Return the installed version of this project, or "unknown"."""
     from importlib.metadata import PackageNotFoundError, version
 
-    try:
+    with contextlib.suppress(PackageNotFoundError):
         return version("touch-retrieval")
-    except PackageNotFoundError:
-        return "unknown"
+    return "unknown"
 
 
 def _check_no_other_files(folder: Path) -> None:

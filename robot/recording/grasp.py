@@ -4,7 +4,7 @@ import contextlib
 import math
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from numbers import Real
 from pathlib import PurePosixPath
@@ -80,7 +80,9 @@ class RecordedGrasp:
             if getattr(self, key) is not None:
                 object.__setattr__(self, key, _number(key, getattr(self, key)))
         if self.pose is not None:
-            object.__setattr__(self, "pose", _pose(self.pose))
+            if not isinstance(self.pose, Sequence | np.ndarray) or isinstance(self.pose, str):
+                raise RecordingError(f"pose must be a list of numbers, got {self.pose!r}")
+            object.__setattr__(self, "pose", tuple(_number("pose", number) for number in self.pose))
         if not isinstance(self.grasped, bool | np.bool_ | None):
             raise RecordingError(f"grasped must be true or false, got {self.grasped!r}")
         if self.grasped is not None:
@@ -104,36 +106,30 @@ class RecordedGrasp:
     @classmethod
     def from_row(cls, row: Mapping[str, Any]) -> Self:
         """Parse a row of `to_row`; null means not recorded, unknown keys are ignored; raise RecordingError on error."""
-        present: dict[str, Any] = {
-            key: sys.intern(value) if type(value) is str and _REPEATED_KEYS.fullmatch(key) else value
-            for key, value in row.items()
-            if value is not None
-        }
-        files = {key: value for key, value in present.items() if _IMAGE_KEY.fullmatch(key)}
-        plain = {key: value for key, value in present.items() if key in _PLAIN_KEYS}
-        for key in ("grasp_id", "object_id", "photo_file_name"):
-            if key not in plain and key not in files:
-                raise RecordingError(f"{key} is missing")
-        return cls(**plain, **_image_fields(files))
+        plain: dict[str, Any] = {}
+        touches: dict[str, dict[str, str]] = {"touches": {}, "touches_before": {}, "touches_after": {}}
+        for key, value in row.items():
+            if value is None:
+                continue
+            if type(value) is str and _REPEATED_KEYS.fullmatch(key):
+                value = sys.intern(value)
+            if key in _PLAIN_KEYS:
+                plain[key] = value
+            elif match := _IMAGE_KEY.fullmatch(key):
+                whole, finger, moment = match.groups()
+                if finger:
+                    touches[f"touches{moment or ''}"][finger] = value
+                else:
+                    plain[whole] = value
+        for key in ("grasp_id", "object_id", "photo"):
+            if key not in plain:
+                raise RecordingError(f"{key}{'_file_name' * (key == 'photo')} is missing")
+        return cls(**plain, **touches)
 
 
 def unknown_keys(row: Mapping[str, Any]) -> set[str]:
     """Return the keys of a line that the format does not define, such as those of other tools."""
     return {key for key in row if key not in _PLAIN_KEYS and not _IMAGE_KEY.fullmatch(key)}
-
-
-def _image_fields(files: Mapping[str, str]) -> dict[str, Any]:
-    """Convert columns with `_file_name` to the image fields of RecordedGrasp."""
-    found: dict[str, Any] = {"touches": {}, "touches_before": {}, "touches_after": {}}
-    for key, path in files.items():
-        match = _IMAGE_KEY.fullmatch(key)
-        assert match is not None
-        whole, finger, moment = match.groups()
-        if finger:
-            found["touches" + (moment or "")][finger] = path
-        else:
-            found[whole] = path
-    return found
 
 
 def check_name(key: str, value: object, optional: bool = False) -> None:
@@ -154,14 +150,10 @@ def _check_path(column: str, path: Any) -> None:
 
 
 def _number(key: str, value: object) -> float:
-    if not isinstance(value, bool) and isinstance(value, Real):
+    number = math.nan
+    if isinstance(value, Real) and not isinstance(value, bool):
         with contextlib.suppress(OverflowError):
-            if math.isfinite(value):
-                return float(value)
-    raise RecordingError(f"{key} must be a finite number, got {value!r}")
-
-
-def _pose(value: object) -> tuple[float, ...]:
-    if isinstance(value, str | bytes | Mapping) or not hasattr(value, "__iter__"):
-        raise RecordingError(f"pose must be a list of numbers, got {value!r}")
-    return tuple(_number("pose", number) for number in value)
+            number = float(value)
+    if not math.isfinite(number):
+        raise RecordingError(f"{key} must be a finite number, got {value!r}")
+    return number

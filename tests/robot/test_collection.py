@@ -11,7 +11,7 @@ import pytest
 from robot.collection import CollectSettings, Progress, collect, grasp_id_of
 from robot.errors import DeviceError, RecordingError, RobotConfigError, StorageError, UngraspableError
 from robot.grasping.attempt import AttemptRunner, depth_in_mm
-from robot.grasping.gates import ContactAreaGate, RecordedTouches
+from robot.grasping.gates import ContactAreaGate, recorded_touches
 from robot.grasping.planner import CylinderPlanner, GraspPlan
 from robot.grasping.settings import AttemptSettings, GraspSettings
 from robot.readings import Pose
@@ -53,18 +53,15 @@ def rows(folder):
 # Recorded data ----------------------------------------------------------------------------------------------
 
 
-def test_a_gate_gets_the_recorded_frames_in_rgb_and_unused_frames_are_not_decoded():
+def test_a_gate_gets_the_recorded_frames_in_rgb():
     red, blue = np.full((4, 6, 3), (200, 10, 0), np.uint8), np.full((4, 6, 3), (0, 20, 190), np.uint8)
     files = {"touch_a": red, "touch_a_before": blue}
     images = {column: file_content(column, pixels)[0] for column, pixels in files.items()}
-    touches = RecordedTouches({"photo": b"no picture", **images, "touch_b": b"no picture", "touch_b_before": b""})
-    assert list(touches) == ["a", "b"]
-    frames = touches["a"]
-    np.testing.assert_array_equal(frames.during, red)
-    np.testing.assert_array_equal(frames.before, blue)
-    assert frames.after is None
-    with pytest.raises(KeyError):
-        touches["c"]
+    touches = recorded_touches({"photo": b"no picture", **images})
+    assert list(touches) == ["a"]
+    np.testing.assert_array_equal(touches["a"].during, red)
+    np.testing.assert_array_equal(touches["a"].before, blue)
+    assert touches["a"].after is None
 
 
 def test_every_object_gets_its_accepted_grasps_and_rejected_ones_are_recorded_too(tmp_path):
@@ -274,7 +271,7 @@ def test_rounds_stopped_after_any_attempt_continue_to_the_same_bytes(tmp_path, s
     assert files(tmp_path / "r") == files(tmp_path / "whole")
 
 
-def test_another_order_or_more_objects_in_later_rounds_are_refused(tmp_path):
+def test_another_order_is_refused(tmp_path):
     run(tmp_path / "r", NAMES[:2], rounds=True)
     run(tmp_path / "default", NAMES[:2])
     before = files(tmp_path / "r")
@@ -282,8 +279,6 @@ def test_another_order_or_more_objects_in_later_rounds_are_refused(tmp_path):
         run(tmp_path / "r", NAMES[:2])
     with pytest.raises(RecordingError, match="was collected with rounds False, not True"):
         run(tmp_path / "default", NAMES[:2], rounds=True)
-    with pytest.raises(RecordingError, match="in rounds through 2 objects, not 3; give the same ones"):
-        run(tmp_path / "r", rounds=True)
     assert files(tmp_path / "r") == before
 
 

@@ -141,15 +141,15 @@ BAD = {
     "no driver": ({"gripper": 'port = "a"'}, r"\[gripper\]: driver must be one of own, wsg50; got None"),
     "an unknown key": ({"gripper": 'driver = "wsg50"\nport = "a"\nbort = 1'}, r"\[gripper\] has no setting 'bort'"),
     "a key too few": ({"gripper": 'driver = "wsg50"'}, r"\[gripper\] requires 'port'"),
-    "an unknown finger": ({"sensors.c": 'driver = "uvc"'}, r"\[sensors.a\] and .*; got 'c'"),
+    "an unknown finger": ({"sensors.c": 'driver = "uvc"'}, r"\[sensors.b\] or both; got .*c"),
     "a limit of zero": (
         {"limits": TABLES["limits"] + "\nstate_age_s = 0"},
         r"\[limits\]: state_age_s must be",
     ),
-    "a force above the limit": ({"grasp": "force_n = [5, 16]"}, r"\[grasp\]: force_n must be at most force_n = 15"),
+    "a force above the limit": ({"grasp": "force_n = [5, 16]"}, "force_n must be at most 15"),
     "a speed above the limit": (
         {"attempt": "travel_mm_s = 91"},
-        r"\[attempt\]: travel_mm_s must be at most arm_speed_mm_s = 90 of \[limits\], got 91",
+        r"travel_mm_s must be at most 90, as \[limits\] states, got 91",
     ),
     "an unknown attempt setting": ({"attempt": "speed = 3"}, r"\[attempt\] has no setting 'speed'"),
     "an infinite speed": ({"attempt": "travel_mm_s = inf"}, r"attempt\.travel_mm_s must be a finite number"),

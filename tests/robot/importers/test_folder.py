@@ -1,4 +1,4 @@
-"""Importer of your own pictures, by patterns and by files of pairs; test_importers.py tests the common behaviour."""
+"""Importer of your own pictures, by patterns; test_importers.py tests the common behaviour."""
 
 import os
 
@@ -116,57 +116,9 @@ def test_a_folder_whose_name_is_not_utf8_costs_its_own_grasps(source, tmp_path):
         ({"touch": "{object}/{"}, "must contain one word each"),
         ({"touch": "{object}/{1}"}, "must consist of letters"),
         ({"touch": "{object}/*", "photo": "{object}/*"}, "matches both patterns"),
-        ({"pairs": "gone.csv"}, "does not exist"),
-        ({"pairs": "g" * 5000}, "does not exist"),
     ],
 )
 def test_invalid_patterns_are_refused(source, tmp_path, options, message):
     with pytest.raises(ImporterError, match=message):
         import_folder(source, tmp_path / "out", **options)
-    assert not (tmp_path / "out").exists()
-
-
-# Files of pairs ------------------------------------------------------------------------------------------------
-
-
-def write_pairs(source, rows):
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    lines = [",".join(columns), *(",".join(str(row.get(each, "")) for each in columns) for row in rows)]
-    (source / "pairs.csv").write_text("\n".join(lines))
-    return "pairs.csv"
-
-
-def row(number, **changes):
-    plain = {"object": "mug", "photo": "mug/photo_1.jpg", "touch": f"mug/touch_{number}.png"}
-    return {**plain, "sequence": "monday", "force_n": 2.5, **changes}
-
-
-def test_each_line_of_a_file_of_pairs_is_a_grasp(source, tmp_path):
-    name = write_pairs(source, [row(1), row(10, background="mug/touch_2.png"), row(2)])
-    recording = import_folder(source, tmp_path / "out", pairs=name)
-    assert ids_of(recording) == [("mug-1", "mug"), ("mug-2", "mug"), ("mug-3", "mug")]
-    touch = (tmp_path / "out" / recording.grasps[1].touches["a"]).read_bytes()
-    assert touch == (source / "mug/touch_10.png").read_bytes()
-    assert {(grasp.sequence_id, grasp.force_n) for grasp in recording.grasps} == {("monday", 2.5)}
-    assert len({grasp.photo for grasp in recording.grasps}) == 1
-
-
-def test_invalid_lines_are_skipped_by_reason(source, tmp_path):
-    wrong = [row(2, photo=""), row(2, touch="../../etc/touch.png"), row(2, force_n="much"), row(3)]
-    name = write_pairs(source, [row(1), *wrong])
-    recording = import_folder(source, tmp_path / "out", pairs=name)
-    assert ids_of(recording) == [("mug-1", "mug")]
-    assert recording.info["skipped"] == {
-        "its line lacks the object, the photo or a touch": 1,
-        "a path must be relative to the folder and lead to a file below it": 1,
-        "force_n, opening_mm, time_s must be numbers": 1,
-        "its touch a is missing": 1,
-    }
-
-
-@pytest.mark.parametrize("content", [b"", b"object,photo\nmug,x.jpg\n", b"\xff\xfe\x00", b"object\x00,photo"])
-def test_a_file_without_pairs_is_refused(source, tmp_path, content):
-    (source / "pairs.csv").write_bytes(content)
-    with pytest.raises(ImporterError, match=r"pairs\.csv"):
-        import_folder(source, tmp_path / "out", pairs="pairs.csv")
     assert not (tmp_path / "out").exists()

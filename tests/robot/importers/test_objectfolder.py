@@ -49,12 +49,6 @@ def test_an_invalid_split_is_refused(pack, tmp_path, content):
         import_objectfolder(pack, tmp_path / "out")
 
 
-@pytest.mark.parametrize(("width", "sensor"), [(160, "GelSight, simulated (Taxim)"), (320, "GelSight")])
-def test_simulated_packs_are_distinguished_from_real_ones(tmp_path, width, sensor):
-    objectfolder.write(tmp_path / "src", width)
-    assert import_objectfolder(tmp_path / "src", tmp_path / "out").info["sensor"] == sensor
-
-
 def test_each_sample_of_real_is_an_object_with_its_name(tmp_path):
     objectfolder.write_samples(tmp_path / "src")
     recording = import_objectfolder(tmp_path / "src", tmp_path / "out")

@@ -204,7 +204,7 @@ def test_images_that_cannot_be_decoded_are_counted(tmp_path):
 
     recording = import_rosbag(write_bag(tmp_path / "a.bag", content()), tmp_path / "out")
     assert numbers_of(recording) == [(18, 27), (48, 58)]
-    assert any(note.startswith("2 image(s) of /gel/a cannot be decoded") for note in recording.notes)
+    assert any(note.startswith("2 gel image(s) cannot be decoded") for note in recording.notes)
 
 
 def test_images_are_not_all_in_memory(name, tmp_path):

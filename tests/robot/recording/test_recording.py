@@ -339,19 +339,15 @@ BAD_IMAGES = {
     "float": ({"photo": pixels() / 255, "touch_a": pixels()}, "photo must be H x W x 3 uint8 RGB"),
     "grey": ({"photo": pixels()[..., 0], "touch_a": pixels()}, "photo must be H x W x 3 uint8 RGB"),
     "no pixels": ({"photo": pixels(), "touch_a": np.zeros((0, 2, 3), np.uint8)}, "touch_a must be H x W"),
-    "too wide": (
-        {"photo": np.zeros((1, 2_000_000, 3), np.uint8), "touch_a": pixels()},
-        "cannot be written as PNG",
-    ),
     "colour depth": ({**pictures(), "depth": pixels()}, "depth must be H x W uint16"),
     "gif": (
         {"photo": b"GIF89a", "touch_a": pixels()},
         "photo must be a PNG or JPEG file; its first bytes are b'GIF8'",
     ),
-    "no file": ({"photo": "/nowhere/x.png", "touch_a": pixels()}, "photo: /nowhere/x.png cannot be read"),
+    "no file": ({"photo": "/nowhere/x.png", "touch_a": pixels()}, "/nowhere/x.png cannot be read"),
     "a Pillow image": (
         {"photo": Image.new("RGB", (2, 2)), "touch_a": pixels()},
-        "the path of a PNG or JPEG file; got Image",
+        "PNG or JPEG file; got Image",
     ),
     "unknown column": ({**pictures(), "foto": pixels()}, "unknown key 'foto_file_name'"),
 }
@@ -415,12 +411,10 @@ def test_a_grasp_is_not_appended_twice_nor_to_a_closed_writer(tmp_path):
     assert ids(tmp_path) == ["1"]
 
 
-def test_keys_of_other_tools_are_ignored_with_a_note(tmp_path: Path) -> None:
+def test_keys_of_other_tools_are_ignored(tmp_path: Path) -> None:
     (tmp_path / "recording.json").write_text(json.dumps({"schema_version": 1, "source": "x", "sensor": "y"}))
     (tmp_path / "metadata.jsonl").write_text(json.dumps({**ROW, "text": "a red mug"}) + "\n")
-    recording = read_recording(tmp_path)
-    assert len(recording.grasps) == 1
-    assert "ignored keys that the format does not define: text" in recording.notes[0]
+    assert len(read_recording(tmp_path).grasps) == 1
 
 
 @pytest.mark.parametrize("name", ["recording.json", "metadata.jsonl"])
