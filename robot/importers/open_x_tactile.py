@@ -158,7 +158,7 @@ class _Store:
 
     def has(self, name: str) -> bool:
         """Whether the store contains a file."""
-        return (self._root / name).is_file()
+        return bool((self._root / name).is_file())
 
     def texts(self, name: str) -> list[str]:
         """Return the distinct texts of a small array, in order; none if the array is missing."""

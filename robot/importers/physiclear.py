@@ -86,7 +86,7 @@ def _items(part: str, path: Path, frames: int) -> Iterator[Item | Skip]:
     before = SharedImage(safe_name(sequence, "no_contact"), lambda: read()[0])  # type: ignore[arg-type]  # import_items calls it
     for number in range(1, frames + 1):
         name = safe_name(sequence, str(number))
-        touch = SharedImage(name, lambda number=number: read()[number])  # type: ignore[arg-type,misc]
+        touch = SharedImage(name, lambda number=number: read()[number])  # type: ignore[arg-type]
         images = {"photo": touch, "touch_a": touch, "touch_a_before": before}
         yield Item(name, part, images, {"sequence_id": sequence})
 

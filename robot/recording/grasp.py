@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from numbers import Real
 from pathlib import PurePosixPath
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import numpy as np
 
@@ -80,7 +80,7 @@ class RecordedGrasp:
             if getattr(self, key) is not None:
                 object.__setattr__(self, key, _number(key, getattr(self, key)))
         if self.pose is not None:
-            if not isinstance(self.pose, Sequence | np.ndarray) or isinstance(self.pose, str):
+            if isinstance(pose := cast(object, self.pose), str) or not isinstance(pose, Sequence | np.ndarray):
                 raise RecordingError(f"pose must be a list of numbers, got {self.pose!r}")
             object.__setattr__(self, "pose", tuple(_number("pose", number) for number in self.pose))
         if not isinstance(self.grasped, bool | np.bool_ | None):
@@ -107,7 +107,7 @@ class RecordedGrasp:
     def from_row(cls, row: Mapping[str, Any]) -> Self:
         """Parse a row of `to_row`; null means not recorded, unknown keys are ignored; raise RecordingError on error."""
         plain: dict[str, Any] = {}
-        touches: dict[str, dict[str, str]] = {"touches": {}, "touches_before": {}, "touches_after": {}}
+        touches: dict[str, Any] = {"touches": {}, "touches_before": {}, "touches_after": {}}
         for key, value in row.items():
             if value is None:
                 continue
@@ -151,7 +151,7 @@ def _check_path(column: str, path: Any) -> None:
 
 def _number(key: str, value: object) -> float:
     number = math.nan
-    if isinstance(value, Real) and not isinstance(value, bool):
+    if not isinstance(value, bool) and isinstance(value, Real):
         with contextlib.suppress(OverflowError):
             number = float(value)
     if not math.isfinite(number):
