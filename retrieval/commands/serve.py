@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from retrieval.commands.options import (
-    COUNT,
     SECONDS,
     WORKERS,
     Index,
@@ -60,12 +59,6 @@ def serve(
         Path | None,
         typer.Option(metavar="RECORDING", help="offer people a test with objects that the model was not trained on"),
     ] = None,
-    queue: Annotated[
-        int,
-        typer.Option(
-            parser=COUNT, help="maximum number of waiting and running requests; further requests are answered with 429"
-        ),
-    ] = 8,
     workers: Annotated[int, typer.Option(parser=WORKERS, help="requests that run in parallel")] = 1,
     deadline: Annotated[
         float, typer.Option(metavar="SECONDS", parser=SECONDS, help="maximum time for one request")
@@ -114,7 +107,6 @@ def serve(
         host=host,
         port=port,
         token=_read_token(token_file),
-        queue=queue,
         workers=workers,
         deadline_s=deadline,
         history=None if no_history else history or local.with_name(f"{local.name}-history"),

@@ -168,8 +168,8 @@ def test_a_broken_generation_leaves_the_previous_one_served(grown, body, caplog)
 @pytest.mark.parametrize("sign", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
 def test_requests_in_flight_at_the_end_signal_are_answered(index, body, sign, tmp_path):
     with (
-        command("--index", index, "--port", "0", "--queue", "40", "--history", tmp_path / "store") as found,
-        ThreadPoolExecutor(12) as client_threads,
+        command("--index", index, "--port", "0", "--history", tmp_path / "store") as found,
+        ThreadPoolExecutor(8) as client_threads,
     ):
         process, url, _ = found
         post_query(url, body)
@@ -187,13 +187,13 @@ def test_requests_in_flight_at_the_end_signal_are_answered(index, body, sign, tm
                     data += more
                 return data
 
-        answers = [client_threads.submit(ask) for _ in range(12)]
+        answers = [client_threads.submit(ask) for _ in range(8)]
         for _ in answers:
             connected.acquire(timeout=30)
         process.send_signal(sign)
         received = [one.result(timeout=60) for one in answers]
         assert process.wait(60) == 0
-        assert [data.split(b" ", 2)[1] for data in received] == [b"200"] * 12
+        assert [data.split(b" ", 2)[1] for data in received] == [b"200"] * 8
         assert all(data.endswith(b"}") for data in received)
 
 
