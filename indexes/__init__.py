@@ -46,6 +46,9 @@ def kind_name(kind: "str | type[VectorIndex]") -> str:
 
     Raises:
         ParameterError: The class is unusable.
+
+    >>> indexes.kind_name("HNSW32;efSearch=64")
+    'HNSW32;efSearch=64'
     """
     return KINDS.name_of(kind) if not isinstance(kind, str) or ":" in kind or kind in KINDS.names() else kind
 
@@ -71,7 +74,8 @@ def build(vectors: "Floats", kind: "str | type[VectorIndex]" = "flat", *, thread
         VectorError: A vector is invalid, or there is none.
         ParameterError: The kind is unknown or needs more vectors.
 
-    >>> indexes.build(vectors, "octree")
+    >>> import numpy
+    >>> indexes.build(numpy.eye(3, dtype=numpy.float32), "octree")
     Traceback (most recent call last):
     indexes.errors.ParameterError: the kind of index must be flat, a factory string of FAISS ... 'octree' ...
     """

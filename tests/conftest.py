@@ -52,13 +52,14 @@ def _cache_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def _own_cache(_cache_folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def _own_cache(_cache_folder: Path) -> Iterator[None]:
     """Separate the cache of each test from those of the user and of other tests.
 
     All tests use one folder, which is emptied after each: creating one per test takes half a minute in total.
     """
-    monkeypatch.setenv("XDG_CACHE_HOME", str(_cache_folder))
-    yield
+    with pytest.MonkeyPatch.context() as patch:  # not the test's own, which may replace functions of the clean-up
+        patch.setenv("XDG_CACHE_HOME", str(_cache_folder))
+        yield
     shutil.rmtree(_cache_folder)
     _cache_folder.mkdir()
 

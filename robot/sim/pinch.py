@@ -6,6 +6,7 @@ towards the fingertip (-z) and columns to the finger's right. Each quantity is c
 """
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -88,6 +89,7 @@ class Pinch:
         sensors: the gel of each finger; a finger without a gel is rigid.
         hand: the gripper.
         seed: seed of the error of the object's final turn.
+        passes: counts of the computations done, by name.
 
     Raises:
         SceneError: Force or opening is out of range.
@@ -99,6 +101,7 @@ class Pinch:
     sensors: Mapping[str, GelSensor]
     hand: Hand
     seed: int
+    passes: Counter[str]
     _contacts: dict[str, Contact] = field(default_factory=dict, init=False, repr=False)
     _clean_images: dict[str, npt.NDArray[np.float32]] = field(default_factory=dict, init=False, repr=False)
 
@@ -136,6 +139,7 @@ class Pinch:
 
     def _finger_reach(self, turns: Sequence[float]) -> Array:
         """Return (turns, fingers): the distance along its rays at which each finger touches; inf for a miss."""
+        self.passes["turn"] += 1
         placements = [self._rotated_placement(angle) for angle in turns]
         rays = [self._rays(side, _COARSE_GRID, placements) for side in SIDES.values()]
         starts, directions = (np.stack(parts, axis=1).reshape(-1, 3) for parts in zip(*rays, strict=True))
@@ -179,6 +183,7 @@ class Pinch:
         distances = {}
         for finger, side in SIDES.items():
             grid = self.hand.grid if finger in self.sensors else _COARSE_GRID
+            self.passes["wall" if finger in self.sensors else "bare_finger"] += 1
             (starts,), (directions,) = self._rays(side, grid, [self.final_placement])
             distances[finger] = self.obj.body.cast(starts, directions).reshape(grid)
         return distances
@@ -192,6 +197,7 @@ class Pinch:
     def contact(self, finger: str) -> Contact:
         """Return the contact of one finger's gel with the object; valid only if `miss_reason` is None."""
         if finger not in self._contacts:
+            self.passes["contact"] += 1
             self._contacts[finger] = press(
                 self.gap(finger),
                 self._pixel_mm,
@@ -208,6 +214,7 @@ class Pinch:
         if self.miss_reason:
             return self.sensors[finger].background(noise_seed)
         if finger not in self._clean_images:
+            self.passes["gel"] += 1
             self._clean_images[finger] = self.sensors[finger].render_clean(self.contact(finger).displacement_mm)
         return self.sensors[finger].capture(self._clean_images[finger], noise_seed)
 

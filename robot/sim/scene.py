@@ -3,10 +3,12 @@
     scene = Scene(draw_object(0, 3), outputs={"photo", "touch_a"}, grip=Grip(Pose(0, 0, 60, 0.4), force_n=12))
     images = scene.run()        # {"photo": (256, 256, 3) uint8, "touch_a": (240, 320, 3) uint8}
 
-Outputs have the names of a recording's image columns. Nothing else is computed.
+Outputs have the names of a recording's image columns. Nothing else is computed: `scene.passes` counts the
+computations (view, photo, depth, turn, wall, bare_finger, contact, gel, background).
 """
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Set
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -39,6 +41,7 @@ class Scene:
         grip: pose and force of the jaws; None before a grasp.
         seed: seed of light, noise and the error of the object's turn.
         outputs: names of the outputs that `run` computes.
+        passes: counts of the computations done, by name.
 
     Raises:
         SceneError: An output is unknown, a touch has no sensor or no grip, or a finger is not a or b.
@@ -56,6 +59,7 @@ class Scene:
     grip: Grip | None = None
     seed: int = 0
     outputs: Set[str] = frozenset()
+    passes: Counter[str] = field(default_factory=Counter, repr=False)
 
     def __post_init__(self) -> None:
         if unknown := sorted(set(self.sensors) - set(SIDES)):
@@ -82,18 +86,21 @@ class Scene:
         if name == "photo":
             return self._photo()
         if name == "depth":
+            self.passes["depth"] += 1
             return cameras.depth(self._view, self._noise(0, 1))
         touch = _TOUCH.fullmatch(name)
         assert touch is not None
         return self._touch(touch[1], touch[2])
 
     def _photo(self) -> npt.NDArray[np.uint8]:
+        self.passes["photo"] += 1
         lighting = Lighting.draw(np.random.default_rng([91, self.seed]))
         return cameras.photo(self._view, lighting, self._noise(0, 0))
 
     @cached_property
     def _view(self) -> cameras.CameraView:
         """Geometry pass that photo and depth share."""
+        self.passes["view"] += 1
         return cameras.cast_camera_rays(self.obj, self.placement, self.camera)
 
     @cached_property
@@ -108,12 +115,14 @@ class Scene:
             sensors=self.sensors,
             hand=self.hand,
             seed=self.seed,
+            passes=self.passes,
         )
 
     def _touch(self, finger: str, moment: str | None) -> npt.NDArray[np.uint8]:
         """Return the gel image before, during or after the hold; after a slip it is a no-contact frame."""
         noise = self._noise(_MOMENTS[moment], ord(finger))
         if moment == "_before" or (moment == "_after" and self.pinch.slip_reason):
+            self.passes["background"] += 1
             return self.sensors[finger].background(noise)
         return self.pinch.touch(finger, noise)
 

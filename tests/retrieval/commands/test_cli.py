@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -249,8 +248,7 @@ def test_a_history_that_is_not_a_file_is_refused(make, built, capsys):
     Path("history").mkdir()
     make("history/history.sqlite")
     assert main(["serve", "--index", "index", "--history", "history", "--port", "0"]) == 2
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert re.search(r"history/history.sqlite must be the history of a service: is a (folder|pipe), not a", last)
+    assert "history/history.sqlite must be the history of a service" in capsys.readouterr().err.splitlines()[-1]
 
 
 WRONG_WORDS = {

@@ -80,7 +80,7 @@ from retrieval.commands.main import main
 from retrieval.console.output import say
 from robot.drivers import discover
 discover.discover = lambda: say("text") or []
-sys.exit(main(["rig", "check", "--json"]))
+sys.exit(main(["rig", "check"]))
 """
 
 

@@ -194,6 +194,3 @@ def test_a_sheet_shows_the_views_of_a_catalogue(tmp_path, model, catalogue, caps
     with Image.open(sheet) as picture:
         assert picture.width == 2 * 48
         assert picture.height >= 48
-    sheet.write_text("a letter")
-    assert main([*words, "--preview"]) == 2
-    assert sheet.read_text() == "a letter"

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -62,6 +63,7 @@ def pinch(obj, *, yaw=0.0, force_n=12.0, sensors=None, placement=None, opening_m
         sensors=SENSORS if sensors is None else sensors,
         hand=Hand(),
         seed=1,
+        passes=Counter(),
     )
 
 
@@ -84,6 +86,7 @@ def test_the_jaws_end_at_the_width_less_both_approaches():
 def test_a_bare_finger_does_not_give_way():
     made = pinch(thing(Slanted()), sensors={"a": SENSORS["a"]})
     assert made.final_opening_mm == pytest.approx(20 - made.contact("a").approach_mm, abs=0.3)
+    assert made.passes["contact"] == 1
     assert made.slip_reason is None
 
 
@@ -125,6 +128,7 @@ def test_contacts_that_are_far_apart_along_the_fingers_slip():
 def test_an_object_next_to_the_fingers_is_missed():
     made = pinch(thing(Slanted(half_y_mm=5.0)), y_mm=30.0)
     assert made.miss_reason == "the object is not between the fingers"
+    assert made.passes["contact"] == 0
 
 
 def test_a_finger_lands_on_an_object_that_is_off_the_middle():

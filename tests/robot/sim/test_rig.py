@@ -97,6 +97,7 @@ def test_an_attempt_depends_only_on_seed_object_and_number(rig):
 def test_without_depth_no_depth_is_computed(rig):
     rig.prepare(rig.object_ids(1)[0], 0)
     assert rig.camera.read(depth=False).depth_m is None
+    assert rig.sim_state.scene.passes["depth"] == 0
 
 
 def test_the_camera_pose_is_off_by_five_to_ten_millimetres():

@@ -30,10 +30,66 @@ def scene(outputs, **changes):
     return Scene(**settings)
 
 
-def test_a_whole_scene_has_the_requested_outputs_only():
-    assert set(scene(ALL).run()) == ALL
-    assert scene(()).run() == {}
-    assert set(scene(["touch_a_before"], grip=None).run()) == {"touch_a_before"}
+def passes_of(outputs, **changes):
+    """Return the computations done for these outputs, by name and number."""
+    made = scene(outputs, **changes)
+    images = made.run()
+    assert set(images) == set(outputs)
+    return dict(made.passes)
+
+
+def test_a_whole_scene_does_each_thing_once_for_each_finger():
+    assert passes_of(ALL) == {
+        "view": 1,
+        "photo": 1,
+        "depth": 1,
+        "turn": 2,
+        "wall": 2,
+        "contact": 2,
+        "gel": 2,
+        "background": 2,
+    }
+
+
+def test_no_outputs_need_no_work():
+    assert passes_of(()) == {}
+
+
+def test_a_photo_needs_neither_depth_nor_touch():
+    assert passes_of(["photo"]) == {"view": 1, "photo": 1}
+
+
+def test_a_depth_image_needs_no_shading():
+    assert passes_of(["depth"]) == {"view": 1, "depth": 1}
+
+
+def test_photo_and_depth_share_one_geometry_pass():
+    assert passes_of(["photo", "depth"])["view"] == 1
+
+
+def test_touches_need_no_camera():
+    assert not set(passes_of(["touch_a", "touch_b"])) & {"view", "photo", "depth"}
+
+
+def test_a_no_contact_frame_needs_no_contact_solve_and_no_grip():
+    assert passes_of(["touch_a_before"], grip=None) == {"background": 1}
+
+
+def test_a_sensor_on_one_finger_solves_one_contact():
+    done = passes_of(["touch_a", "touch_a_after"], sensors={"a": SENSORS["a"]})
+    assert done["contact"] == done["wall"] == done["bare_finger"] == 1
+
+
+def test_one_of_two_fingers_solves_one_contact_until_the_lift_needs_the_other():
+    assert passes_of(["touch_a"])["contact"] == 1
+    assert passes_of(["touch_a", "touch_a_after"])["contact"] == 2
+
+
+def test_a_missed_grasp_solves_no_contact():
+    miss = Grip(Pose(140.0, 0.0, MIDDLE_MM, 0.3), force_n=12.0)
+    done = passes_of(["touch_a", "touch_b", "touch_a_after"], grip=miss)
+    assert "contact" not in done
+    assert "gel" not in done
 
 
 def test_a_finger_that_comes_down_on_the_object_is_a_miss_with_this_reason():
