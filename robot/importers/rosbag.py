@@ -118,6 +118,7 @@ def import_rosbag(
     paths = _bag_paths(src)
     if not paths:
         raise DATA_SET.mismatch_error(src, "there is no such bag")
+    import_extra("rosbags", "a ROS bag")
     topics = _Topics(tuple(filter(None, (touch_a, touch_b))), photo, gripper, grasp, object)
     scans: dict[Path, _Scan] = {}
     skips: list[Skip] = []
