@@ -33,6 +33,9 @@ class Row(Struct, frozen=True):
         object_id: The object that the photo shows.
         digest: SHA-256 of the file, in hexadecimal.
         metadata: The user's own keys and values.
+
+    >>> indexes.open("index").rows[0].path
+    'mug/1.jpg'
     """
 
     path: str

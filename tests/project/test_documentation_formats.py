@@ -117,7 +117,7 @@ def test_the_results_of_the_benchmark_of_real_data(tmp_path):
 
 
 def test_the_history_of_a_service(tmp_path):
-    store = HistoryStore(tmp_path / "history.sqlite", 1, 1)
+    store = HistoryStore(tmp_path / "history.sqlite", 1)
     store.close()
     with closing(sqlite3.connect(tmp_path / "history.sqlite")) as database:
         columns = {

@@ -77,19 +77,19 @@ def test_an_ascii_terminal_gets_escapes():
 PRINTING = """
 import sys
 from retrieval.commands.main import main
-from retrieval.console.output import say
 from robot.drivers import discover
-discover.discover = lambda: say("text") or []
+discover.discover = lambda: [discover.DiscoveredDevice("camera", "/dev/x", "gel", "a = 1")]
 sys.exit(main(["rig", "check"]))
 """
+FOUND = "1 device(s) found; copy the lines above into a rig file"
 
 
 @pytest.mark.parametrize(
     ("streams", "code", "output"),
     [
-        (">/dev/full", 1, "text\nretrieve rig: Standard output cannot be written: No space left on device\n"),
-        ("2>/dev/full", 0, '{"found": []}\n'),
-        (">&-", 0, "text\n"),
+        (">/dev/full", 1, "retrieve rig: Standard output cannot be written: No space left on device\n"),
+        ("2>/dev/full", 0, "# camera: gel\na = 1\n\n"),
+        (">&-", 0, f"{FOUND}\n"),
         (">&- 2>&-", 0, ""),
     ],
 )
