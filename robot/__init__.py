@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from robot.errors import RobotError as RobotError
     from robot.grasping.planner import GraspPlan as GraspPlan
     from robot.grasping.planner import GraspPlanner as GraspPlanner
+    from robot.grasping.spread import SpreadPlanner as SpreadPlanner
     from robot.importers import load_importer as load_importer
     from robot.readings import Frame as Frame
     from robot.readings import Pose as Pose
@@ -53,6 +54,7 @@ _MODULES = {
     "RobotError": "errors",
     "Scene": "sim.scene",
     "SharedImage": "recording.folder",
+    "SpreadPlanner": "grasping.spread",
     "TactileSensor": "devices",
     "collect": "collection",
     "draw_object": "sim.objects.draw",

@@ -62,7 +62,8 @@ def identify(
 ) -> int:
     """Grasp the object with a rig until the answer is clear; stay next to a real rig. Resumes a stopped run.
 
-    Use another --out for each object.
+    Each further grasp is planned at a height that differs much from those of the earlier grasps. Use another --out for
+    each object.
     """
     if far is not None and expect is None:
         raise BadInput("--far is the false-accept rate of --expect; give both, or neither")
@@ -71,6 +72,7 @@ def identify(
     from retrieval.search.query.searcher import Searcher
     from retrieval.search.query.verification import VERIFY_EXIT_CODES
     from robot.collection import CollectSettings, collect
+    from robot.grasping.spread import SpreadPlanner
     from robot.rig import load_rig
 
     with Searcher.open(path, model=model) as searcher:
@@ -85,6 +87,7 @@ def identify(
                     f"the model of {path} takes {searcher.reader.fingers} gel image(s) of a grasp, but the rig {rig} "
                     f"has {len(made.sensors)} sensor(s); give --model, or another rig"
                 )
+            made.planner = SpreadPlanner(made.planner, run.heights_mm)
             return made
 
         attempts: set[int] = set()  # total counts of attempts: at the start, then after each new attempt
@@ -121,6 +124,7 @@ class _Run:
     """The grasps of one run, and the answer after the last of them.
 
     Attributes:
+        heights_mm: Height of each grasp.
         answer: `QueryResult`, or `Verification` with an expected object; None before the first grasp.
     """
 
@@ -129,6 +133,7 @@ class _Run:
     ) -> None:
         self.searcher, self.folder, self.expect, self.far = searcher, folder, expect, far
         self.confidence, self.grasps = confidence, grasps
+        self.heights_mm: list[float] = []
         self.answer: Any = None
 
     def is_enough(self, grasps: Sequence["RecordedGrasp"]) -> bool:
@@ -136,6 +141,7 @@ class _Run:
         from retrieval.model.fusion_scorer import NOT_A_GEL
         from retrieval.model.verification import ACCEPT, REJECT
 
+        self.heights_mm[:] = [grasp.pose[2] for grasp in grasps if grasp.pose is not None]
         touches = [self._files(grasp.touches) for grasp in grasps]
         background = self._files(grasps[-1].touches_before) if self.searcher.reader.takes_background else None
         if self.expect is None:

@@ -22,7 +22,6 @@ every shift (`retrieval.data.check.shift_alignment`).
 from collections.abc import Sequence
 from dataclasses import dataclass
 from hashlib import sha256
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -37,7 +36,6 @@ from retrieval.data.check.shift_alignment import (
     FineGreys,
     fine_grey_levels,
 )
-from retrieval.data.images import decode_rgb, read_bytes
 from retrieval.data.resize import RgbImage
 
 PX = 16
@@ -71,16 +69,6 @@ class Thumbnail:
     grey: Greys
     distorted: Greys
     fine_grey_levels: FineGreys
-
-
-def load_thumbnail(path: Path) -> Thumbnail:
-    """Read a picture and reduce it.
-
-    Raises:
-        ImageError: The picture cannot be read.
-    """
-    data = read_bytes(path)
-    return thumbnail(data, decode_rgb(data, path))
 
 
 def thumbnail(data: bytes, image: RgbImage) -> Thumbnail:
@@ -263,17 +251,3 @@ class PictureSet:
         distance = 1.0 - similarity.astype(np.float64)
         distance[self.objects[queries][:, None] == self.objects[among]] = np.inf
         return distance
-
-    def within_object_distances(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return each picture's distance to the nearest other picture of its object.
-
-        Objects with one picture are left out.
-        """
-        distances = [np.zeros(0)]
-        for name in np.unique(self.objects[rows]):
-            own = self._shapes[rows[self.objects[rows] == name]]
-            similarity = own @ own.T
-            np.fill_diagonal(similarity, -np.inf)
-            if len(own) > 1:
-                distances.append(1.0 - similarity.max(axis=1).astype(np.float64))
-        return np.concatenate(distances)
