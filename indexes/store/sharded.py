@@ -18,7 +18,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from _touch_retrieval.files import file_digest, named_write_errors, write_atomically
+from _touch_retrieval.files import file_digest, write_atomically
 from indexes.errors import AGAIN, CorruptIndex, MismatchedIndex, NoIndex
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
@@ -99,16 +99,6 @@ def shard_folder(number: int, of: int) -> str:
     return f"shard-{number:02d}-of-{of:02d}"
 
 
-def sharded_generation_name(number: int) -> str:
-    """Return the name of a generation of a sharded index, such as sharded-000007."""
-    return f"sharded-{number:06d}"
-
-
-def generation_number(name: str) -> int:
-    """Return the number in a generation's name."""
-    return int(name.rpartition("-")[2])
-
-
 def shard_entry(index: Path, folder: str, generation: Generation) -> ShardEntry:
     """Return the manifest entry of a written shard.
 
@@ -122,14 +112,10 @@ def shard_entry(index: Path, folder: str, generation: Generation) -> ShardEntry:
 
 
 def write_sharded_manifest(folder: Path, manifest: ShardedManifest) -> None:
-    """Write the manifest, which switches the sharded index to this generation."""
-    with named_write_errors(folder / NAME):
-        write_atomically(folder / NAME, sharded_manifest_bytes(manifest))
-
-
-def sharded_manifest_bytes(manifest: ShardedManifest) -> bytes:
-    """Return the content of the file."""
-    return encode_document(manifest, FORMAT)
+    """Write the manifest, which switches the sharded index to this generation; delete files of killed writers."""
+    for path in folder.glob(f".{NAME}.*.tmp"):
+        path.unlink()
+    write_atomically(folder / NAME, encode_document(manifest, FORMAT))
 
 
 def read_sharded_manifest(folder: Path) -> ShardedManifest:

@@ -30,13 +30,10 @@ def frontier(
             parser=OptionValues.parse, metavar="NAME...", help=f"measure only these: {', '.join(APPROXIMATIONS)}"
         ),
     ] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="smallest sizes, to test that the command runs; the results mean nothing")
-    ] = False,
     json: Json = False,
 ) -> None:
     """Plot the error of each approximation against its run time, on a page. Resumes a stopped run."""
-    document = run_frontier(out, model=model, recording=recording, only=only or (), quick=quick)
+    document = run_frontier(out, model=model, recording=recording, only=only or ())
     if json:
         print_json(document)
 

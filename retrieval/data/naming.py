@@ -12,9 +12,8 @@ matches the same text.
 """
 
 import re
-import statistics
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import PurePosixPath
@@ -121,8 +120,3 @@ def naming_warnings(photos: Mapping[str, int], naming: Naming) -> list[str]:
             f"{abbreviate_list(similar, _MAX_EXAMPLES)}; if these show one object, use --objects-from stem or a pattern"
         )
     return warnings
-
-
-def count_summary(counts: Sequence[int]) -> dict[str, float]:
-    """Return the minimum, median and maximum number of photos of an object."""
-    return {"min": min(counts), "median": statistics.median(counts), "max": max(counts)}

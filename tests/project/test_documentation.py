@@ -47,7 +47,7 @@ SHORTER = {
     "export": [],
     "export-recording": [],
     "evaluate": ["--preset", "tiny", "--iterations", "2", "--seeds", "1", "--methods", "late_fusion,chance"],
-    "frontier": ["--quick", "--only", "partials", "--recording", "recording"],
+    "frontier": ["--only", "partials", "--recording", "recording"],
     "serve": ["--port", "0"],
     "benchmark": ["--preset", "tiny", "--iterations", "2", "--seeds", "1", "--methods", "cca"],
 }

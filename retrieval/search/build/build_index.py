@@ -17,7 +17,7 @@ from indexes.store.generation import RECALL_QUERIES, Arrays, Generation, Generat
 from indexes.store.manifest import read_manifest
 from indexes.store.rows import TEXT, Row, encode_rows
 from retrieval.data.catalogue import Catalogue, list_catalogue
-from retrieval.data.naming import FOLDER, Naming, count_summary, naming_warnings
+from retrieval.data.naming import FOLDER, Naming, naming_warnings
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.checkpoint_info import fingerprint
@@ -144,7 +144,6 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
     manifest, objects = generation.manifest, Counter(row.object_id for row in job.rows)
     names, inside = sorted(objects), out.resolve()
     shown = dict.fromkeys((names[0], names[len(names) // 2], names[-1]))
-    unread = len(files.known.keys() & photos.digests.keys())
     return BuildReport(
         index=str(out),
         generation=generation.name,
@@ -153,12 +152,10 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
         photos=generation.count,
         objects=len(names),
         objects_from=options.naming.text,
-        per_object=count_summary(list(objects.values())),
         examples=[(name, catalogue.photos.paths[catalogue.photos.objects.index(name)]) for name in shown],
         warnings=naming_warnings(objects, options.naming),
         embedded=photos.encoded,
         reused=generation.count - photos.encoded,
-        unread=unread,
         skipped=[*catalogue.skipped, *photos.skipped, *references.skipped],
         ignored=[name for name in catalogue.ignored if not (catalogue.folder / name).resolve().is_relative_to(inside)],
         without_photo=sorted(set(catalogue.object_ids) - objects.keys()),
@@ -171,7 +168,6 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
         candidates=manifest.about["candidates"],
         partial_error=manifest.about["partial_error"],
         cells=options.cells,
-        photo_bytes={name: array.dtype.itemsize * array.shape[1] for name, array in generation.arrays.items()},
         seconds=seconds,
         references=references.summary,
     )

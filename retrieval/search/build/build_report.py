@@ -1,13 +1,10 @@
 """The report of `build-index`, for people and as JSON."""
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import PurePosixPath
 from typing import Any
 
 from retrieval.data.folder_walk import SkippedPhoto
-from retrieval.model.stored_partials import CELLS, PARTIALS
 
 SHOWN, FEW = 20, 5
 """Number of printed lines for entries with a reason each, and for entries without."""
@@ -25,12 +22,10 @@ class BuildReport:
         photos: Number of photos in the index.
         objects: Number of objects in the index.
         objects_from: Rule that names objects (`retrieval.data.naming`).
-        per_object: Smallest, median and largest number of photos of an object.
         examples: Some objects, each with one of its photos.
         warnings: Sentences about suspicious object names.
         embedded: Number of photos that were encoded now.
         reused: Number of photos that were not.
-        unread: Number of photos whose files were not read, because size and time did not change.
         skipped: Images that could not be read.
         ignored: Files that are not images, by their names.
         without_photo: Objects without a readable image.
@@ -41,7 +36,6 @@ class BuildReport:
         candidates: Measured number of candidates; None if the checkpoint stores no touches to measure with.
         partial_error: Largest possible rounding error of a stored partial activation.
         cells: Whether the index stores the cells of photos, for late interaction; None for a model without cells.
-        photo_bytes: Bytes of a photo in each array: of its pooled partial activation (`partials`), and of its cells.
         seconds: Time of decoding and encoding.
         shards: Shards of a sharded index, as in its manifest (`indexes.store.sharded`); None for an index folder.
         references: Numbers of reference touches (`touches`), their objects (`objects`), objects without photos
@@ -60,12 +54,10 @@ class BuildReport:
     photos: int
     objects: int
     objects_from: str
-    per_object: dict[str, float]
     examples: list[tuple[str, str]]
     warnings: list[str]
     embedded: int
     reused: int
-    unread: int
     skipped: list[SkippedPhoto]
     ignored: list[str]
     without_photo: list[str]
@@ -76,22 +68,13 @@ class BuildReport:
     candidates: dict[str, Any] | None
     partial_error: float
     cells: bool | None
-    photo_bytes: dict[str, int]
     seconds: float
     shards: list[dict[str, Any]] | None = None
     references: dict[str, Any] | None = None
 
-    @property
-    def left_out(self) -> dict[str, int]:
-        """Number of skipped or ignored files for each reason, the most frequent reason first."""
-        endings = (PurePosixPath(name).suffix.lower() or "without an ending" for name in self.ignored)
-        reasons = [f"not an image file ({ending})" for ending in endings]
-        reasons += [item.reason.split(":")[0] for item in self.skipped]
-        return dict(Counter(reasons).most_common())
-
     def to_dict(self) -> dict[str, Any]:
         """Return a plain dictionary for JSON."""
-        document = asdict(self) | {"left_out": self.left_out}
+        document = asdict(self)
         if self.references is None:
             del document["references"]
         return document
@@ -103,10 +86,7 @@ class BuildReport:
         yield f"{self.index} ({self.generation}): {self.photos} photos of {self.objects} objects; {counts}"
         if not self.written:
             yield "nothing changed: the index stays as it is"
-        if self.unread:
-            yield f"{self.unread} photos were not read, because size and time of their files did not change"
-        each = " / ".join(f"{self.per_object[name]:g}" for name in ("min", "median", "max"))
-        yield f"{self.objects} objects by --objects-from {self.objects_from}; photos of each: {each} (min, median, max)"
+        yield f"{self.objects} objects by --objects-from {self.objects_from}, such as:"
         yield from (f"  {name} <- {photo}" for name, photo in self.examples)
         yield from (f"warning: {warning}" for warning in self.warnings)
         if references := self.references:
@@ -124,15 +104,9 @@ class BuildReport:
         for shard in self.shards or ():
             yield f"  {shard['folder']} ({shard['generation']}): {shard['photos']} photos of {shard['objects']} objects"
         yield f"candidate search: {self.kind}. {self.reason}{measured}"
-        yield f"partial activations are stored as float16, with an error of at most {self.partial_error:.2g}"
-        if self.cells is not None:
-            pooled, cells = (self.photo_bytes.get(name, 0) for name in (PARTIALS, CELLS))
-            what = "cells are stored as int8" if self.cells else "no cells are stored (--cells stores them)"
-            yield f"{what}; a photo takes {pooled + cells:,} bytes: {pooled:,} pooled and {cells:,} of cells"
+        if self.cells is False:
+            yield "no cells are stored (--cells stores them)"
         yield from _list_lines("remark(s)", self.notes)
-        if self.left_out:
-            reasons = ", ".join(f"{count} {reason}" for reason, count in self.left_out.items())
-            yield f"{sum(self.left_out.values())} file(s) left out: {reasons}"
         yield from _list_lines("file(s) ignored, not images", self.ignored, FEW)
         yield from _list_lines("photo(s) skipped", [f"{item.path}: {item.reason}" for item in self.skipped])
         if self.without_photo:

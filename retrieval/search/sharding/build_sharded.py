@@ -11,8 +11,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from _touch_retrieval.files import remove_folder
 from indexes import kind_name
 from indexes.errors import CorruptIndex, NoIndex, UnsupportedFormat
@@ -24,18 +22,16 @@ from indexes.store.sharded import (
     SHARD_FOLDER,
     ShardedManifest,
     ShardEntry,
-    generation_number,
     read_sharded_manifest,
     shard_entry,
     shard_folder,
     shard_number,
-    sharded_generation_name,
     write_sharded_manifest,
 )
 from retrieval.data.catalogue import Catalogue, CataloguePhoto, PhotoTable, list_catalogue
 from retrieval.data.catalogue_touches import CatalogueTouch
 from retrieval.data.folder_walk import SkippedPhoto
-from retrieval.data.naming import Naming, count_summary, naming_warnings
+from retrieval.data.naming import Naming, naming_warnings
 from retrieval.errors import BadInput, NoReadablePhoto
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.checkpoint_info import fingerprint
@@ -48,7 +44,7 @@ from retrieval.search.build.embed_touches import require_reference_calibration
 from retrieval.version import __version__
 
 _KEEP_ALL = 10**6
-ADDITIVE_FIELDS = ("photos", "embedded", "reused", "unread", "seconds")
+ADDITIVE_FIELDS = ("photos", "embedded", "reused", "seconds")
 """Fields of a report that add up over the shards."""
 
 
@@ -79,14 +75,12 @@ class ShardBuild:
         folder: Folder of the shard.
         entry: Its entry in the manifest; None if none of its photos can be read.
         report: Its report; None in the same case.
-        counts: Number of photos of each object.
         skipped: Photos that could not be read.
     """
 
     folder: str
     entry: ShardEntry | None
     report: BuildReport | None
-    counts: list[int]
     skipped: list[SkippedPhoto]
 
 
@@ -187,10 +181,9 @@ def build_shard(job: ShardJob, checkpoint: Checkpoint | None = None) -> ShardBui
     try:
         report = build_listed(job.catalogue, model, store.path, job.options)
     except NoReadablePhoto as error:
-        return ShardBuild(job.folder, None, None, [], error.skipped)
+        return ShardBuild(job.folder, None, None, error.skipped)
     generation = store.open(name=report.generation, verify=False)
-    counts = np.bincount(generation.rows.objects).tolist()
-    return ShardBuild(job.folder, shard_entry(job.index, job.folder, generation), report, counts, report.skipped)
+    return ShardBuild(job.folder, shard_entry(job.index, job.folder, generation), report, report.skipped)
 
 
 def _delete_old_shards(out: Path, before: ShardedManifest | None, shards: int) -> None:
@@ -227,7 +220,6 @@ def _report(
     skipped = [*catalogue.skipped, *(item for one in built for item in one.skipped)]
     if not reports:
         raise no_photo(catalogue, skipped)
-    counts = [count for one in built for count in one.counts]
     lost = {name for report in reports for name in report.without_photo}
     bad = {item.path for one in built if one.report is None for item in one.skipped}
     lost |= {photo.object_id for photo in catalogue.photos if photo.path in bad}
@@ -241,9 +233,8 @@ def _report(
         generation="",
         written=True,
         model=str(checkpoint.path),
-        objects=len(counts),
+        objects=sum(report.objects for report in reports),
         objects_from=naming.text,
-        per_object=count_summary(counts),
         warnings=naming_warnings(Counter(catalogue.photos.objects), naming),
         skipped=skipped,
         ignored=list(catalogue.ignored),
@@ -278,8 +269,9 @@ def _manifest(
     if report.references is not None and checkpoint.references is not None:
         about[REFERENCE_ROWS] = {key: report.references[key] for key in ("touches", "objects")}
         about[REFERENCE_CALIBRATION] = {"calibration": checkpoint.references.to_dict()}
+    number = 1 if before is None else 1 + int(before.generation.rpartition("-")[2])
     made = ShardedManifest(
-        generation=sharded_generation_name(1 if before is None else generation_number(before.generation) + 1),
+        generation=f"sharded-{number:06d}",
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         software=__version__,
         kind=report.kind,

@@ -287,11 +287,11 @@ def test_an_option_of_several_values_takes_the_words_up_to_the_next_option(monke
     words = ["--gelsight", "a.png", "b.png", "--top", "3", "--gelsight", "a2.png", "b2.png", "--background", "n.png"]
     assert main(["query", *words]) == 0
     assert main(["query", "--gelsight=a.png", "--index", "-1"]) == 0
-    assert main(["frontier", "--out", "o", "--only", "closing", "contact", "--quick"]) == 0
+    assert main(["frontier", "--out", "o", "--only", "closing", "contact", "--json"]) == 0
     assert tuple(calls[0]["gelsight"]) == (("a.png", "b.png"), ("a2.png", "b2.png"))
     assert (calls[0]["background"], calls[0]["top"]) == (("n.png",), 3)
     assert (tuple(calls[1]["gelsight"]), calls[1]["index"]) == ((("a.png",),), "-1")
-    assert (calls[2]["only"], calls[2]["quick"]) == (("closing", "contact"), True)
+    assert (calls[2]["only"], calls[2]["json"]) == (("closing", "contact"), True)
 
 
 def test_the_package_runs_the_command_line():

@@ -64,7 +64,7 @@ def test_labels_of_near_points_are_above_and_below():
 
 
 def test_the_command_writes_a_page_and_prints_a_line_for_each_panel(model, recording, tmp_path, capsys):
-    command = ["frontier", "--out", str(tmp_path), "--model", str(model), "--recording", str(recording), "--quick"]
+    command = ["frontier", "--out", str(tmp_path), "--model", str(model), "--recording", str(recording)]
     assert main([*command, "--only", "partials", "--json"]) == 0
     output = capsys.readouterr()
     assert json.loads(output.out)["rows"].keys() == {"partials"}

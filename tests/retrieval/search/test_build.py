@@ -224,18 +224,17 @@ def test_a_damaged_index_is_written_anew_from_the_codes(catalogue_copy, checkpoi
 
 def test_only_files_with_another_size_or_time_are_read(catalogue_copy, checkpoint, index, read, old_files):
     first = build_index(catalogue_copy, checkpoint, index, quiet=True)
-    assert (len(read), first.unread) == (24, 0)
+    assert (len(read), first.written) == (24, True)
     read.clear()
     again = build_index(catalogue_copy, checkpoint, index, quiet=True)
-    assert (read, again.unread, again.written) == ([], 24, False)
-    assert any("24 photos were not read" in line for line in again.lines())
+    assert (read, again.written) == ([], False)
     other_picture(old_files[3])
     old_files[7].touch()
     moved = old_files[11].rename(old_files[11].with_name("moved.jpg"))
     read.clear()
     report = build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert sorted(read) == sorted(named(catalogue_copy, path) for path in (old_files[3], old_files[7], moved))
-    assert (report.embedded, report.unread) == (1, 21)
+    assert report.embedded == 1
 
 
 @pytest.mark.parametrize(("min_age_ns", "found"), [(codes.MIN_AGE_NS, 1), (-HOUR_NS, 0)])
@@ -427,7 +426,6 @@ def test_the_error_of_float16_partials_is_within_the_reported_bound(catalogue_co
     assert stored.dtype == np.float16
     assert np.abs(stored - exact).max() <= report.partial_error + 1e-5  # in other batches of the tower
     assert report.partial_error == pytest.approx(2**-11 * np.abs(exact).max(), rel=1e-2)
-    assert f"error of at most {report.partial_error:.2g}" in "\n".join(report.lines())
 
 
 def test_recall_and_time_of_an_approximate_kind_are_measured_and_printed(catalogue_copy, checkpoint, index):

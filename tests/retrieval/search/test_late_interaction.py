@@ -28,8 +28,6 @@ from tests.reference_model import REFERENCE_CALIBRATION, write_reference_model
 CELLS = dataclasses.replace(TINY.matcher, tower_output="stages", cosine=True, cell_dim=4, touch_cells=2, photo_cells=3)
 POSTERIOR, POOLED_POSTERIOR = Posterior(0.9, -0.5, 0.7, 40), Posterior(1.1, -0.4, 0.6, 40)
 POOLED_REFERENCES = ReferenceCalibration(Posterior(7.0, -2.0, 0.5, 40), 4.0, Posterior(1.2, -1.0, 0.8, 40), 20, 40)
-POOLED_BYTES, CELL_BYTES = 2 * (32 + 16), 3 * 3 * 4
-"""Bytes of a photo: 32 hidden units and an embedding of 16 in float16; 3 x 3 cells of 4 numbers in int8."""
 
 
 @pytest.fixture
@@ -141,15 +139,6 @@ def test_cells_can_be_dropped_and_added_again(index, pooled_index, catalogue, ch
     assert IndexStore(index).open().documents["calibration"] == POSTERIOR.to_dict()
 
 
-def test_the_report_states_the_bytes_of_a_photo(index, catalogue, checkpoint):
-    stored = build_index(catalogue, checkpoint, index, quiet=True)
-    assert stored.photo_bytes == {"partials": POOLED_BYTES, "cells": CELL_BYTES}
-    assert "cells are stored as int8; a photo takes 132 bytes: 96 pooled and 36 of cells" in list(stored.lines())
-    dropped = build_index(catalogue, checkpoint, index, cells=False, quiet=True)
-    line = "no cells are stored (--cells stores them); a photo takes 96 bytes: 96 pooled and 0 of cells"
-    assert line in list(dropped.lines())
-
-
 def test_the_command_takes_the_option(catalogue, checkpoint, tmp_path, capsys):
     command = ["build-index", str(catalogue), "--model", str(checkpoint.path), "--out", str(tmp_path / "made")]
     assert main([*command, "--no-cells"]) == 0
@@ -170,7 +159,7 @@ def test_a_sharded_index_without_cells_gives_the_results_of_one_folder(
     pooled_index, catalogue, checkpoint, tmp_path, touches
 ):
     report = build_sharded(catalogue, checkpoint, tmp_path / "sharded", 2, cells=False, quiet=True)
-    assert (report.cells, report.photo_bytes) == (False, {"partials": POOLED_BYTES})
+    assert report.cells is False
     assert read_sharded_manifest(tmp_path / "sharded").calibration == POOLED_POSTERIOR.to_dict()
     assert not build_sharded(catalogue, checkpoint, tmp_path / "sharded", 2, quiet=True).written
     files = next(iter(touches.values()))[0]

@@ -222,11 +222,13 @@ def test_killed_between_shards_the_index_is_unchanged_and_the_next_build_embeds_
     with pytest.raises(Killed):
         build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True)
     assert not (tmp_path / "c" / "SHARDS.json").exists()
+    (tmp_path / "c" / ".SHARDS.json.1.tmp").touch()  # of a build that was killed in its last step
     monkeypatch.setattr(module, "build_shard", build)
     done = sum(one.report.photos for one in finished)
     embedded.clear()
     report = build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True)
     assert (report.photos, sum(embedded)) == (24, 24 - done)
+    assert not list((tmp_path / "c").glob(".SHARDS.json.*"))
 
 
 def test_killed_before_every_switch_the_old_generations_answer(catalogue_copy, model, touch, monkeypatch):
