@@ -33,19 +33,11 @@ class IndexesError(Exception):
 
 
 class VectorError(IndexesError):
-    """A vector is not a finite unit vector of the right size. `row` is the id if one row is the cause."""
-
-    def __init__(self, message: str, row: str | None = None) -> None:
-        super().__init__(message)
-        self.row = row
+    """A vector is not a finite unit vector of the right size."""
 
 
 class RowError(IndexesError):
-    """The rows, arrays or documents of an index are invalid. `row` is the id if one row is the cause."""
-
-    def __init__(self, message: str, row: str | None = None) -> None:
-        super().__init__(message)
-        self.row = row
+    """The rows, arrays or documents of an index are invalid."""
 
 
 class ParameterError(IndexesError):
@@ -69,11 +61,7 @@ class UnsupportedFormat(IndexesError):
 
 
 class LockedIndex(IndexesError):
-    """Another writer is writing the index. `holder` is its process id, if known."""
-
-    def __init__(self, message: str, holder: int | None = None) -> None:
-        super().__init__(message)
-        self.holder = holder
+    """Another writer is writing the index."""
 
 
 class JobFailed(IndexesError):

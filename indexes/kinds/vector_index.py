@@ -182,7 +182,7 @@ def check_unit(vectors: object, *, dim: int | None = None, names: Sequence[str] 
         name = names[number] if names else str(number)
         more = f" ({len(bad) - 1} more like it)" if len(bad) > 1 else ""
         fault = _fault(table[number], float(norms[number]))
-        raise VectorError(f"{what} {name!r}: the norm must be 1 within {NORM_TOLERANCE}; {fault}{more}", name)
+        raise VectorError(f"{what} {name!r}: the norm must be 1 within {NORM_TOLERANCE}; {fault}{more}")
     return table
 
 

@@ -214,7 +214,7 @@ def _check_block(block: Arrays, rows: Sequence[Row]) -> None:
         finite = np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
         if not finite.all():
             row = paths[int(np.argmin(finite))]
-            raise RowError(f"array {name!r}: row {row!r} has NaN or infinity (too large for its type?)", row)
+            raise RowError(f"array {name!r}: row {row!r} has NaN or infinity (too large for its type?)")
 
 
 def _recall(index: VectorIndex, queries: Floats | None) -> dict[str, Any]:

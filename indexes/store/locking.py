@@ -55,7 +55,7 @@ class WriterLock:
             message = (
                 f"{self.path.parent}: only one writer at a time is allowed, and {who} is writing. Wait until it ends"
             )
-            raise LockedIndex(message, int(holder) if holder else None) from error
+            raise LockedIndex(message) from error
         except (OSError, WriteFailed) as error:
             os.close(descriptor)
             if isinstance(error, WriteFailed):

@@ -111,7 +111,7 @@ def encode_rows(rows: Iterable[Row]) -> bytes:
         try:
             text += encoder.encode(row)
         except (TypeError, ValueError, OverflowError, RecursionError) as error:
-            raise RowError(f"row {row.path!r} must be JSON ({error})", row.path) from error
+            raise RowError(f"row {row.path!r} must be JSON ({error})") from error
         text += b"\n"
     return bytes(text)
 
@@ -126,7 +126,7 @@ def write_rows(folder: Path, rows: Sequence[Row]) -> None:
         raise RowError("an index needs at least one row; got none")
     for before, row in pairwise(rows):
         if row.path <= before.path:
-            raise RowError(f"rows must be sorted by path, each once; {row.path!r} follows {before.path!r}", row.path)
+            raise RowError(f"rows must be sorted by path, each once; {row.path!r} follows {before.path!r}")
     text = encode_rows(rows)
     table = np.empty(len(rows), RECORD)
     table["stop"] = np.flatnonzero(np.frombuffer(text, np.uint8) == ord("\n")) + 1

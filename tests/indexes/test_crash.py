@@ -216,9 +216,8 @@ def test_a_writer_killed_before_the_first_switch_does_not_block_the_next(tmp_pat
 def test_two_writers_in_one_process_exclude_each_other(tmp_path):
     store = IndexStore(tmp_path)
     with store.lock():
-        with pytest.raises(LockedIndex, match=rf"process {os.getpid()} is writing") as caught:
+        with pytest.raises(LockedIndex, match=rf"process {os.getpid()} is writing"):
             filled(tmp_path)
-        assert caught.value.holder == os.getpid()
         assert store.write(rows_of("a"), unit(1, DIM)).count == 1
         with pytest.raises(LockedIndex):
             filled(tmp_path)
