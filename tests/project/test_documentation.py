@@ -107,20 +107,23 @@ def home(tmp_path, recording, catalogue, model, monkeypatch):
     "page", [page for page in RUN_TOGETHER if of_program("retrieve", page)], ids=lambda page: page.stem
 )
 def test_every_retrieve_command_of_a_page_runs_from_top_to_bottom(page, home):
+    if page.stem == "benchmark":  # another page collects it
+        shutil.copytree(home / "recording", home / "benchmark")
     for line in of_program("retrieve", page):
         if line[1] == "serve":  # runs until SIGTERM
             with serving.command(*line[2:], *SHORTER["serve"], cwd=home) as (process, _, _):
                 process.terminate()
                 assert process.wait(60) == 0
             continue
-        # An export that is not faster on this machine is refused with exit code 1.
         accepted = {
-            "export": {0, 1},
             "query": set(EXIT_CODES.values()),
             "verify": set(VERIFY_EXIT_CODES.values()),
             "identify": {*EXIT_CODES.values(), *VERIFY_EXIT_CODES.values()},
         }.get(line[1], {0})
-        assert main([*line[1:], *SHORTER[line[1]]]) in accepted, line
+        shorter = SHORTER[line[1]]
+        if "--init" in line and line[1] == "evaluate":  # the preset tiny has other towers
+            shorter = shorter[2:]
+        assert main([*line[1:], *shorter]) in accepted, line
 
 
 def test_every_retrieve_command_is_in_a_tested_block():

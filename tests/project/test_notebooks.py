@@ -76,7 +76,7 @@ def committed(name):
 def demo_folder(tmp_path, monkeypatch):
     """A folder next to the notebooks with a recording and a catalogue in the demo's sizes."""
     monkeypatch.setenv("MPLBACKEND", "Agg")
-    synthetic.write_recording(tmp_path / "demo" / "recording", synthetic.make_objects(24), 3)
+    synthetic.write_recording(tmp_path / "demo" / "recording", synthetic.make_objects(24), 5)
     synthetic.write_catalogue(tmp_path / "demo" / "catalog", synthetic.make_objects(4), photos_per_object=2)
     (tmp_path / "notebooks").mkdir()
     monkeypatch.chdir(tmp_path / "notebooks")
