@@ -184,7 +184,7 @@ def test_a_query_with_a_hanging_picture_ends_at_its_deadline_and_blocks_no_other
 
 def _named_in(folder):
     """Name the pictures after files of a folder."""
-    return lambda pictures: [(str(folder / str(number)), data) for number, data in enumerate(pictures.files[0][0])]
+    return lambda pictures: [(str(folder / str(number)), data) for number, data in enumerate(pictures.files[0])]
 
 
 @pytest.mark.slow
