@@ -15,9 +15,9 @@ from retrieval.commands.options import (
     Json,
     OptionValues,
     ReportOut,
-    announce_resume,
     training_config,
 )
+from retrieval.console.interruption import resumable
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput
 from retrieval.evaluation.real import PROTOCOLS
@@ -91,7 +91,7 @@ def real(
     data_set_of = {name: PROTOCOLS.resolve(name).data_set for name in requested}
     config = training_config(preset, iterations, init=init)
     cache = cache or out / "cache"
-    with announce_resume(f"results so far are stored in {cache}"):
+    with resumable(cache):
         recordings, missing = _recordings(data, data_set_of.values(), cache / "recordings")
         skipped = {name: missing[data_set] for name, data_set in data_set_of.items() if data_set in missing}
         if protocols or len(skipped) < len(requested):

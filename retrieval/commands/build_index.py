@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from retrieval.commands.options import COUNT, Json, Model, announce_resume
+from retrieval.commands.options import COUNT, Json, Model
+from retrieval.console.interruption import resumable
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput, RetrievalError
 
@@ -91,7 +92,7 @@ def build_index(
         from retrieval.cluster.building import ray_runner
 
         run = ray_runner()
-    with announce_resume(f"embedded photos are stored in {out}"):
+    with resumable(out):
         if shards is None:
             report = build.build_index(catalogue, checkpoint, out, **options)
         else:

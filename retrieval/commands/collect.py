@@ -5,7 +5,8 @@ from typing import Annotated, Any
 
 import typer
 
-from retrieval.commands.options import COUNT, SEED, Jobs, Objects, announce_resume, refuse_options
+from retrieval.commands.options import COUNT, SEED, Jobs, Objects, refuse_options
+from retrieval.console.interruption import resumable
 from retrieval.console.output import say, show
 from retrieval.console.progress import CountedBar
 from retrieval.errors import RetrievalError
@@ -58,7 +59,7 @@ def collect(
             f"{grasps} rounds through {objects} objects, one accepted grasp of each in a round; where a person changes "
             "the objects, the rig requests another object after each accepted grasp"
         )
-    with announce_resume(f"the grasps so far are stored in {out}"), CountedBar("collect", "grasps") as bar:
+    with resumable(out), CountedBar("collect", "grasps") as bar:
         tallies = collect_grasps(
             partial(load_rig, rig, seed=seed),
             out,

@@ -15,7 +15,6 @@ from retrieval.commands.options import (
     Recording,
     ReportOut,
     SplitFile,
-    announce_resume,
     read_split,
     training_config,
 )
@@ -55,18 +54,17 @@ def evaluate(
 
     if model and (preset or init):
         raise BadInput("--model already defines towers and settings; give either --model or --preset and --init")
-    with announce_resume(f"results so far are stored in {out}"):
-        results = run(
-            recording,
-            out,
-            config=training_config(preset, iterations, init=init, seed=seed),
-            preset="of the model" if model else Path(preset or DEFAULT_PRESET).stem,
-            methods=methods.split(",") if methods else tuple(METHODS),
-            model=model,
-            seeds=seeds,
-            split=read_split(split),
-            cache=cache,
-        )
+    results = run(
+        recording,
+        out,
+        config=training_config(preset, iterations, init=init, seed=seed),
+        preset="of the model" if model else Path(preset or DEFAULT_PRESET).stem,
+        methods=methods.split(",") if methods else tuple(METHODS),
+        model=model,
+        seeds=seeds,
+        split=read_split(split),
+        cache=cache,
+    )
     text, page, *_ = write_report(out)
     say(f"report: {text}, {page}")
     if json:

@@ -8,7 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
-from retrieval.commands.options import Json, Model, OptionValues, announce_resume
+from retrieval.commands.options import Json, Model, OptionValues
+from retrieval.console.interruption import resumable
 from retrieval.console.output import print_json, say
 from retrieval.frontier import APPROXIMATIONS
 
@@ -69,7 +70,7 @@ def run_frontier(
     path, reason = defaults.find_model(model)
     say(f"model: {path} ({reason})")
     grasps = partial(_recording, recording, out, quick)
-    with announce_resume(f"measurements so far are stored in {out}"):
+    with resumable(out):
         document = measure_frontier(out, path, grasps, only=only, quick=quick, table=table, model_free=model_free)
     say(f"page: {out / 'frontier.html'}")
     return document

@@ -13,9 +13,9 @@ from retrieval.commands.options import (
     Index,
     IndexModel,
     Json,
-    announce_resume,
     resolve_index,
 )
+from retrieval.console.interruption import resumable
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput, RetrievalError
 
@@ -91,7 +91,7 @@ def identify(
             return made
 
         attempts: set[int] = set()  # total counts of attempts: at the start, then after each new attempt
-        with announce_resume(f"the grasps so far are stored in {out}"):
+        with resumable(out):
             (tally,) = collect(
                 make_rig,
                 out,

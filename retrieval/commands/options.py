@@ -1,8 +1,6 @@
 """Options that several commands have in common, their parsers, and the reading of files that options name."""
 
 import dataclasses
-from collections.abc import Iterator
-from contextlib import contextmanager
 from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
@@ -177,20 +175,6 @@ def refuse_options(reason: str, **options: object) -> None:
     for name, value in options.items():
         if value is not None and value is not False:
             raise BadInput(f"--{name.replace('_', '-')} {reason}")
-
-
-@contextmanager
-def announce_resume(stored: str) -> Iterator[None]:
-    """On Ctrl-C, print a message that the same command continues the job.
-
-    Args:
-        stored: Sentence on the results so far and their folder.
-    """
-    try:
-        yield
-    except KeyboardInterrupt:
-        say(f"{stored}; run the same command to continue")
-        raise
 
 
 def resolve_index(index: str | None) -> Path:

@@ -1,9 +1,12 @@
-"""Handling of Ctrl-C: finish the current step first, or raise as usual and record the signal."""
+"""Handling of Ctrl-C: finish the current step first, say how to continue, or raise as usual and record the signal."""
 
 import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
+
+from retrieval.errors import JobInterrupted
 
 
 @contextmanager
@@ -23,6 +26,24 @@ def interruption() -> Iterator[threading.Event]:
         yield stop
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def resumable(folder: Path) -> Iterator[None]:
+    """Say after Ctrl-C that the same command continues the job, which stores each finished part (`Cache`, recordings).
+
+    Args:
+        folder: Folder of the finished parts.
+
+    Raises:
+        JobInterrupted: After Ctrl-C.
+    """
+    try:
+        yield
+    except (KeyboardInterrupt, JobInterrupted) as error:
+        raise JobInterrupted(
+            f"Stopped. Finished parts are stored in {folder}; run the same command to continue."
+        ) from error
 
 
 @contextmanager

@@ -2,15 +2,14 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 from torch import Tensor
 
 from _touch_retrieval.files import read_json, write_atomically
-from retrieval.errors import CheckpointError, JobInterrupted
+from retrieval.errors import CheckpointError
 from retrieval.model.checkpoint import read_tensors, write_tensors
 
 T = TypeVar("T")
@@ -65,21 +64,3 @@ def write_document(path: Path, document: Mapping[str, Any]) -> None:
     """Write a JSON file atomically. Equal documents give equal bytes."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, f"{json.dumps(document, sort_keys=True, indent=1, allow_nan=False)}\n".encode())
-
-
-@contextmanager
-def resumable(folder: Path) -> Iterator[None]:
-    """Add to the message after Ctrl-C that the same command resumes from `folder`.
-
-    Args:
-        folder: The folder of the finished parts.
-
-    Raises:
-        JobInterrupted: After Ctrl-C.
-    """
-    try:
-        yield
-    except JobInterrupted as error:
-        raise JobInterrupted(
-            f"Stopped. Finished parts are stored in {folder}; run the same command to continue."
-        ) from error

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from retrieval.console.interruption import resumable
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import AnyRecording, Split, folder_of
 from retrieval.errors import BadInput
 from retrieval.evaluation import SCHEMA_VERSION
-from retrieval.evaluation.cache import resumable, write_document
+from retrieval.evaluation.cache import write_document
 from retrieval.evaluation.controls import (
     CEILING_METHOD,
     CEILINGS,

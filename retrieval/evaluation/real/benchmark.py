@@ -9,10 +9,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from retrieval.console.interruption import resumable
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import AnyRecording, Split, data_digest, folder_of
 from retrieval.errors import BadInput
-from retrieval.evaluation.cache import resumable, write_document
+from retrieval.evaluation.cache import write_document
 from retrieval.evaluation.experiment import Experiment
 from retrieval.evaluation.queries import draw_queries
 from retrieval.evaluation.real import PROTOCOLS, SCHEMA_VERSION

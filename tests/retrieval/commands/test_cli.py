@@ -376,11 +376,8 @@ def test_ctrl_c_while_collecting_prints_how_to_continue(workplace, capsys, monke
 
     monkeypatch.setattr(FakeGripper, "_grasp", interrupted)
     assert main(COLLECT) == 1
-    output = capsys.readouterr().err.splitlines()
-    assert output == [
-        "the grasps so far are stored in rec; run the same command to continue",
-        "retrieve collect: stopped by Ctrl-C",
-    ]
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith("stored in rec; run the same command to continue.")
     monkeypatch.undo()
 
 

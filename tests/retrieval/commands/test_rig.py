@@ -129,7 +129,7 @@ def test_a_collection_ended_by_sigterm_opens_its_jaws_closes_its_rig_and_leaves_
     monkeypatch.setattr(FakeRig, "prepare", lambda self, *attempt: (rigs.append(self), real_prepare(self, *attempt))[1])
     before = signal.getsignal(signal.SIGTERM)
     assert main(collect) == 1
-    assert capsys.readouterr().err.endswith("retrieve collect: stopped by SIGTERM\n")
+    assert capsys.readouterr().err.endswith("run the same command to continue.\n")
     assert signal.getsignal(signal.SIGTERM) is before
     assert rigs[0].shared.force is None
     assert not any(device.is_connected for device in rigs[0].devices)

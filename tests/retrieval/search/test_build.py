@@ -334,7 +334,7 @@ def test_ctrl_c_keeps_the_finished_embeddings_and_reports_it(
     with monkeypatch.context() as patch:
         patch.setattr(codes.CodeCache, "add", interrupted)
         assert main(command) == 1
-    assert f"embedded photos are stored in {index}; run the same command to continue" in capsys.readouterr().err
+    assert f"stored in {index}; run the same command to continue" in capsys.readouterr().err
     assert main([*command, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["embedded"] <= 24 - 16
 
