@@ -95,8 +95,7 @@ DRIVERS: Mapping[str, Registry[type[Device]]] = {
     "camera": _drivers(
         "camera",
         "Camera",
-        kinect2="robot.drivers.cameras.kinect2:Kinect2",
-        realsense="robot.drivers.cameras.realsense:RealSense",
+        realsense="robot.drivers.realsense:RealSense",
         uvc="robot.drivers.usb_camera.driver:UvcCamera",
     ),
 }

@@ -1,8 +1,7 @@
-"""Fake cameras with the interfaces of OpenCV, pyrealsense2 and pylibfreenect2, and with faults to switch on."""
+"""Fake cameras with the interfaces of OpenCV and pyrealsense2, and with faults to switch on."""
 
 import threading
 import time
-import weakref
 from types import SimpleNamespace
 
 import cv2
@@ -173,85 +172,6 @@ class FakeRealSense:
     def _align(self, frames):
         self.aligned += 1
         return frames
-
-
-class _Freed(SimpleNamespace):
-    """An object that can be freed; a device that still refers to it would crash."""
-
-
-class FakeFreenect2:
-    """The module pylibfreenect2 with one or more cameras; `pipelines` exist in this build, `broken` ones fail."""
-
-    def __init__(self, serials=(b"k1",), pipelines=("OpenGLPacketPipeline", "CpuPacketPipeline"), broken=()):
-        self.serials, self.events = serials, []
-        self.needed = []
-        self.taken = self.released = 0
-        self.silent = self.fails = False
-        self.FrameType = SimpleNamespace(Color=1, Ir=2, Depth=4)
-        self.depth = np.full((424, 512), 900.0, np.float32)
-        self.depth[0, :3] = 0, np.inf, np.nan
-        for name in pipelines:
-            setattr(self, name, lambda name=name: self._pipeline(name, broken))
-
-    def _pipeline(self, name, broken):
-        if name in broken:
-            raise RuntimeError("no display")
-        return name
-
-    def Freenect2(self):
-        device_manager = _Freed(
-            enumerateDevices=lambda: len(self.serials),
-            getDeviceSerialNumber=self.serials.__getitem__,
-            openDevice=self._open,
-        )
-        self.needed = [weakref.ref(device_manager)]
-        return device_manager
-
-    def _listen(self, listener):
-        self.needed.append(weakref.ref(listener))
-
-    def _note(self, *event):
-        assert all(reference() is not None for reference in self.needed), "the package would read freed memory"
-        self.events.append(event)
-
-    def _open(self, serial, pipeline):
-        assert serial in self.serials
-        self.events.append(("open", serial, pipeline))
-        note = {name: lambda *args, name=name: self._note(name, *args) for name in ("start", "stop", "close")}
-        return SimpleNamespace(
-            setColorFrameListener=self._listen,
-            setIrAndDepthFrameListener=self._listen,
-            getIrCameraParams=lambda: SimpleNamespace(fx=364.5, fy=364.6, cx=259.0, cy=202.4),
-            getColorCameraParams=lambda: SimpleNamespace(fx=1081.0, fy=1081.0, cx=959.5, cy=539.5),
-            **note,
-        )
-
-    def SyncMultiFrameListener(self, types):
-        assert types == 5
-        return _Freed(hasNewFrame=lambda: not self.silent, waitForNewFrame=self._wait, release=self._release)
-
-    def _wait(self):
-        assert self.taken == self.released, "a new set requires the release of the last one"
-        self.taken += 1
-        return {"color": np.zeros((1080, 1920, 4), np.uint8), "depth": self.depth}
-
-    def _release(self, frames):
-        self.released += 1
-
-    def Registration(self, infrared, colour):
-        return SimpleNamespace(apply=self._apply)
-
-    def _apply(self, colour, depth, undistorted, registered):
-        if self.fails:
-            raise ValueError("an error of the package")
-        undistorted.array[:] = depth.view(np.uint8).reshape(424, 512, 4)
-        registered.array[:] = (10, 20, 30, 0)
-        registered.array[0, 0] = (1, 2, 3, 0)
-
-    def Frame(self, width, height, bytes_per_pixel):
-        array = np.zeros((height, width, bytes_per_pixel), np.uint8)
-        as_type = {np.uint8: array, np.float32: array.view(np.float32)[..., 0]}
-        return SimpleNamespace(array=array, asarray=as_type.__getitem__)
 
 
 def own_threads():

@@ -3,11 +3,10 @@
 Cameras: /dev/v4l/by-id contains a link for each, named by maker, model and serial number, independent of the socket;
 by-path names the socket, for cameras without a name of their own. "-video-index0" gives the pictures, higher numbers
 only metadata. /sys/class/video4linux/*/name is the camera's own name. Serial ports: those that pyserial lists.
-RealSense and Kinect 2 cameras are listed by their packages if these are installed.
+RealSense cameras are listed by their package if it is installed.
 """
 
 import logging
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -23,7 +22,7 @@ class DiscoveredDevice:
     """A connected device.
 
     Attributes:
-        kind: "camera", "serial port", "realsense" or "kinect2".
+        kind: "camera", "serial port" or "realsense".
         device: Stable name.
         label: The device's own name.
         toml: Lines for the device's table in a rig's file.
@@ -37,8 +36,7 @@ class DiscoveredDevice:
 
 def discover(dev: Path = DEV, sys: Path = SYS) -> list[DiscoveredDevice]:
     """Return all connected devices, cameras first; `dev` and `sys` are the system's device folders."""
-    vendors = [*_list_safely("RealSense", _realsenses), *_list_safely("Kinect 2", _kinects)]
-    return [*find_cameras(dev, sys), *find_serial_ports(dev), *vendors]
+    return [*find_cameras(dev, sys), *find_serial_ports(dev), *_find_realsenses()]
 
 
 def camera_names(dev: Path = DEV) -> list[str]:
@@ -79,36 +77,21 @@ def find_serial_ports(dev: Path = DEV) -> list[DiscoveredDevice]:
     return [DiscoveredDevice("serial port", name, label, f'driver = "wsg50"\nport = "{name}"') for name, label in names]
 
 
-def _realsenses() -> Iterator[tuple[str, str]]:
-    rs = import_module("pyrealsense2")
-    for device in rs.context().query_devices():
-        yield device.get_info(rs.camera_info.serial_number), device.get_info(rs.camera_info.name)
-
-
-def _kinects() -> Iterator[tuple[str, str]]:
-    freenect = import_module("pylibfreenect2").Freenect2()
-    for number in range(freenect.enumerateDevices()):
-        yield decode_serial(freenect.getDeviceSerialNumber(number)), "Kinect 2"
-
-
-def _list_safely(camera: str, list_cameras: Callable[[], Iterator[tuple[str, str]]]) -> list[DiscoveredDevice]:
-    """List cameras with the vendor's package; return [] if it is not installed, and log a warning if it fails."""
-    driver = camera.lower().replace(" ", "")
+def _find_realsenses() -> list[DiscoveredDevice]:
+    """List the cameras with the maker's package, if it is installed; log a warning if it fails."""
     try:
-        return [
-            DiscoveredDevice(driver, serial, label, f'driver = "{driver}"\nserial = "{serial}"')
-            for serial, label in list_cameras()
-        ]
+        rs = import_module("pyrealsense2")
+        info = rs.camera_info
+        names = [(each.get_info(info.serial_number), each.get_info(info.name)) for each in rs.context().query_devices()]
     except ModuleNotFoundError:
         return []
-    except Exception as error:  # a failing vendor package must not hide the other devices
-        log.warning("%s cameras could not be listed: %s", camera, error)
+    except Exception as error:  # a failing package must not hide the other devices
+        log.warning("RealSense cameras could not be listed: %s", error)
         return []
-
-
-def decode_serial(serial: str | bytes) -> str:
-    """Return a serial number as text; pylibfreenect2 returns bytes or text, depending on its version."""
-    return serial.decode("ascii", "replace") if isinstance(serial, bytes) else serial
+    return [
+        DiscoveredDevice("realsense", serial, name, f'driver = "realsense"\nserial = "{serial}"')
+        for serial, name in names
+    ]
 
 
 def _text(path: Path) -> str:

@@ -31,7 +31,7 @@ from typing import Any, ClassVar
 from _touch_retrieval.documents import typed
 from _touch_retrieval.registry import Registry
 from robot.devices import Actuator, Arm, Clock, Gripper
-from robot.drivers.vendor import vendor_errors
+from robot.drivers.packages import package_errors
 from robot.errors import DeviceError, UnknownName
 from robot.readings import GripperState, Pose, Region
 from robot.settings import check_range
@@ -60,7 +60,7 @@ class OwnDevice(Actuator):
         self._make, self._options = ROBOTS.resolve(robot), settings
 
     def _connect(self) -> None:
-        with vendor_errors(f"{self.name} cannot be made"):
+        with package_errors(f"{self.name} cannot be made"):
             self._program = self._make(**self._options)
         if lacking := [name for name in self._methods if not callable(getattr(self._program, name, None))]:
             methods = ", ".join(self._methods)
@@ -81,7 +81,7 @@ class OwnDevice(Actuator):
 
     def _call(self, method: str, **values: float) -> Any:
         """Call a method and return its answer; raise DeviceError or OSError if it fails."""
-        with vendor_errors(f"{method} of {self.name} failed"):
+        with package_errors(f"{method} of {self.name} failed"):
             answer = getattr(self._program, method)(**values)
         if isinstance(answer, Mapping):  # numbers of vendors' packages are often numpy scalars
             return {key: value.item() if hasattr(value, "item") else value for key, value in answer.items()}

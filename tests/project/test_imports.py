@@ -137,7 +137,7 @@ SERVE = ("fastapi", "starlette", "uvicorn", "pydantic", "httpx")
 HEAVY = ("torch", "faiss", "cv2", "sklearn", "matplotlib", "serial", "numpy", "PIL", "scipy", "rich", "jinja2", *SERVE)
 
 
-DEVICE_PACKAGES = ("serial", "websockets", "pyrealsense2", "pylibfreenect2", "roslibpy", "trimesh", "torch", "faiss")
+DEVICE_PACKAGES = ("serial", "websockets", "pyrealsense2", "roslibpy", "trimesh", "torch", "faiss")
 
 
 def names_of_robot():
@@ -170,7 +170,6 @@ def test_packages_can_be_imported_without_what_they_do_not_need(imports, blocked
             "pip install 'touch-retrieval[sawyer]'",
         ),
         ("camera", {"driver": "realsense"}, "pip install 'touch-retrieval[realsense]'"),
-        ("camera", {"driver": "kinect2"}, "pylibfreenect2"),
     ],
 )
 def test_a_driver_without_its_package_prints_how_to_install_it(role, table, message):

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from robot.devices import Clock
+from robot.drivers.packages import import_package
 from robot.errors import DeviceError
 
 Message = Mapping[str, Any]
@@ -78,12 +79,7 @@ class RosbridgeLink:
 
     def open(self) -> None:
         """Connect, once only, or raise DeviceError; a closed link cannot be opened again."""
-        try:
-            from websockets.sync.client import connect
-        except ImportError as error:
-            raise DeviceError(
-                "rosbridge requires websockets, which is missing; run pip install 'touch-retrieval[sawyer]'"
-            ) from error
+        connect = import_package("websockets.sync.client", "rosbridge", "sawyer").connect
         try:
             connection = connect(
                 self.url,

@@ -13,10 +13,10 @@ import os
 import select
 import time
 from collections.abc import Callable, Iterator
-from importlib import import_module
 from operator import methodcaller
 from typing import Any, TypeVar
 
+from robot.drivers.packages import import_package
 from robot.drivers.wsg50 import codec
 from robot.drivers.wsg50.codec import MAX_PAYLOAD, CommandId, Packet, Status, WireError, command_name, decode, encode
 from robot.errors import DeviceError
@@ -86,12 +86,7 @@ class Link:
         """Open the port if it is closed; send nothing."""
         if self._port is not None:
             return
-        try:
-            serial = import_module("serial")
-        except ImportError as error:
-            raise DeviceError(
-                "the WSG-50 driver requires pyserial, which is missing; run pip install 'touch-retrieval[gripper]'"
-            ) from error
+        serial = import_package("serial", "a WSG-50", "gripper")
         try:
             self._port = serial.serial_for_url(
                 self.name,

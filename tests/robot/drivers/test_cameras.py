@@ -1,4 +1,4 @@
-"""Cameras of the table: RealSense and Kinect 2 with fakes of their packages, and a plain USB camera."""
+"""Cameras of the table: RealSense with a fake of its package, and a plain USB camera."""
 
 import math
 import sys
@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from robot.drivers import discover
-from robot.drivers.cameras.kinect2 import Kinect2
-from robot.drivers.cameras.realsense import RealSense
+from robot.drivers.realsense import RealSense
 from robot.drivers.usb_camera.driver import UvcCamera
 from robot.errors import DeviceError, RobotConfigError
-from tests.fake_video import EXTRINSICS, FakeFreenect2, FakeRealSense, FakeVideoDevice, own_threads
+from tests.fake_video import EXTRINSICS, FakeRealSense, FakeVideoDevice, own_threads
 
 
 @pytest.fixture
@@ -20,8 +19,7 @@ def install(monkeypatch):
     """Return a function that installs a fake package."""
 
     def installed(fake):
-        name = "pyrealsense2" if isinstance(fake, FakeRealSense) else "pylibfreenect2"
-        monkeypatch.setitem(sys.modules, name, fake)
+        monkeypatch.setitem(sys.modules, "pyrealsense2", fake)
         return fake
 
     return installed
@@ -29,10 +27,6 @@ def install(monkeypatch):
 
 def realsense(**more):
     return RealSense(extrinsics=EXTRINSICS, **{"warmup_frames": 3, **more})
-
-
-def kinect(**more):
-    return Kinect2(extrinsics=EXTRINSICS, **{"timeout_s": 0.05, **more})
 
 
 # RealSense --------------------------------------------------------------------------------------------------
@@ -131,98 +125,13 @@ def test_settings_of_a_realsense_out_of_range_are_refused(setting):
         realsense(**setting)
 
 
-# Kinect 2 ---------------------------------------------------------------------------------------------------
-
-
-def test_a_kinect_returns_depth_in_metres_and_the_colour_of_each_pixel(install):
-    install(FakeFreenect2())
-    with kinect() as eye:
-        image = eye.read()
-        lens = image.intrinsics
-    assert image.colour.shape == (424, 512, 3)
-    assert image.colour[0, 0].tolist() == [3, 2, 1]
-    assert image.colour[9, 9].tolist() == [30, 20, 10]
-    assert np.isnan(image.depth_m[0, :3]).all()
-    assert image.depth_m[9, 9] == pytest.approx(0.9)
-    assert (lens.fx, lens.fy, lens.cx, lens.cy) == (364.5, 364.6, 259.0, 202.4)
-
-
-def test_every_set_of_frames_is_released_also_after_a_failure(install):
-    freenect = install(FakeFreenect2())
-    with kinect() as eye:
-        eye.read()
-        eye.read(depth=False)
-        freenect.fails = True
-        with pytest.raises(DeviceError, match="kinect2 returned no picture: an error of the package"):
-            eye.read()
-        freenect.fails = False
-        eye.read()
-    assert freenect.taken == freenect.released == 5 + 2 * 4  # five to warm up; each read skips a waiting set
-
-
-def test_a_kinect_is_started_stopped_and_closed_in_order(install):
-    freenect = install(FakeFreenect2())
-    with kinect():
-        pass
-    assert freenect.events == [("open", b"k1", "OpenGLPacketPipeline"), ("start",), ("stop",), ("close",)]
-
-
-@pytest.mark.parametrize(
-    ("available", "broken", "expected"),
-    [
-        (("CudaPacketPipeline", "CpuPacketPipeline"), (), "CudaPacketPipeline"),
-        (("OpenGLPacketPipeline", "CpuPacketPipeline"), ("OpenGLPacketPipeline",), "CpuPacketPipeline"),
-    ],
-)
-def test_the_first_pipeline_that_works_computes_the_depth(install, available, broken, expected):
-    freenect = install(FakeFreenect2(pipelines=available, broken=broken))
-    with kinect():
-        assert freenect.events[0] == ("open", b"k1", expected)
-
-
-@pytest.mark.parametrize("serials", [(b"k1", b"k2"), ("k1", "k2")])
-def test_a_kinect_is_chosen_by_its_serial_number_as_bytes_or_text(install, serials):
-    freenect = install(FakeFreenect2(serials=serials))
-    with kinect(serial="k2") as eye:
-        assert eye.settings()["serial"] == "k2"
-    assert freenect.events[0][1] == serials[1]
-
-
-@pytest.mark.parametrize("serial", ["", "k3"])
-def test_a_kinect_that_is_not_connected_is_never_opened(install, serial):
-    freenect = install(FakeFreenect2(serials=(b"k1", b"k2")))
-    with pytest.raises(DeviceError, match="connected: k1, k2"):
-        kinect(serial=serial).connect()
-    assert freenect.events == []
-
-
-def test_a_silent_kinect_is_an_error_and_can_be_started_again(install):
-    freenect = install(FakeFreenect2())
-    with kinect() as eye:
-        freenect.silent = True
-        with pytest.raises(DeviceError, match=r"no picture within 0\.05 s.*USB 3"):
-            eye.read()
-        with pytest.raises(DeviceError, match="no picture within"):
-            eye.recover()
-        with pytest.raises(DeviceError, match=r"call recover\(\) again"):
-            eye.read()
-        freenect.silent = False
-        eye.recover()
-        eye.read()
-    names = [event[0] for event in freenect.events]
-    assert names == ["open", "start", "stop", "close"] * 3
-
-
 # Missing packages -------------------------------------------------------------------------------------------
 
 
 def test_a_missing_package_is_a_device_error_with_the_install_command(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    monkeypatch.setitem(sys.modules, "pylibfreenect2", None)
     with pytest.raises(DeviceError, match=r"pip install 'touch-retrieval\[realsense\]'"):
         realsense().connect()
-    with pytest.raises(DeviceError, match="build libfreenect2 with shared libraries first"):
-        kinect().connect()
 
 
 def test_a_missing_system_library_is_named(tmp_path, monkeypatch):

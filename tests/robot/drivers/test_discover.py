@@ -7,9 +7,9 @@ import pytest
 
 from robot.drivers import discover
 from robot.drivers.discover import DiscoveredDevice
-from tests.fake_video import FakeFreenect2, FakeRealSense
+from tests.fake_video import FakeRealSense
 
-MISSING_PACKAGES = ("pyrealsense2", "pylibfreenect2", "serial", "serial.tools")
+MISSING_PACKAGES = ("pyrealsense2", "serial", "serial.tools")
 
 
 @pytest.fixture(autouse=True)
@@ -104,9 +104,8 @@ def test_serial_ports_with_hardware_are_found_by_their_stable_names(roots, monke
 
 def test_depth_cameras_are_listed_by_their_installed_packages(roots, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyrealsense2", FakeRealSense(serials=("8", "9")))
-    monkeypatch.setitem(sys.modules, "pylibfreenect2", FakeFreenect2(serials=(b"k1",)))
     found = discover.discover(*roots)
-    assert [(each.kind, each.device) for each in found] == [("realsense", "8"), ("realsense", "9"), ("kinect2", "k1")]
+    assert [(each.kind, each.device) for each in found] == [("realsense", "8"), ("realsense", "9")]
     assert tomllib.loads(found[1].toml) == {"driver": "realsense", "serial": "9"}
 
 
@@ -114,6 +113,6 @@ def test_a_failing_package_gives_a_warning_and_hides_nothing_else(roots, monkeyp
     broken = FakeRealSense()
     broken.context = lambda: (_ for _ in ()).throw(RuntimeError("no udev rules"))
     monkeypatch.setitem(sys.modules, "pyrealsense2", broken)
-    monkeypatch.setitem(sys.modules, "pylibfreenect2", FakeFreenect2())
-    assert [each.kind for each in discover.discover(*roots)] == ["kinect2"]
+    plug_camera(roots, "usb-Maker_Webcam_12-video-index0", 0, "Webcam")
+    assert [each.kind for each in discover.discover(*roots)] == ["camera"]
     assert "RealSense cameras could not be listed: no udev rules" in caplog.text

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from robot.drivers.cameras import realsense
-from robot.drivers.cameras.realsense import RealSense
+from robot.drivers import realsense
 from robot.drivers.discover import discover
+from robot.drivers.realsense import RealSense
 from robot.errors import DeviceError
 from tests.fake_video import EXTRINSICS
 

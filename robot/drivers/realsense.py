@@ -5,7 +5,10 @@ colour stream's pixels. Pixel coordinates count from the centre of the first pix
 the distortion model of the colour stream. Automatic exposure settles within about 30 pictures.
 """
 
+import contextlib
+import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,24 +16,36 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from robot.devices import Clock
-from robot.drivers.vendor import VendorCamera, VendorSettings, check_finite, import_package, vendor_errors
+from robot.devices import Camera, Clock
+from robot.drivers.packages import import_package, package_errors
+from robot.drivers.usb_camera.stream import MAX_CAMERA_WAIT_S
 from robot.errors import DeviceError
 from robot.readings import RGBD, Intrinsics
-from robot.settings import bounded
+from robot.settings import TypedSettings, bounded
 
 
 @dataclass(frozen=True, kw_only=True)
-class RealSenseSettings(VendorSettings):
-    """Size in pixels and frame rate of both streams, and the settings of every vendor camera."""
+class RealSenseSettings(TypedSettings):
+    """Settings of a RealSense.
 
+    Attributes:
+        serial: Serial number of the camera, required if several are connected.
+        width: Width of both streams in pixels.
+        height: Height of both streams in pixels.
+        fps: Frame rate of both streams.
+        warmup_frames: Frames dropped after connecting.
+        timeout_s: Longest wait for a picture.
+    """
+
+    serial: str = ""
     width: int = bounded(1, 20_000, 640, unit="pixels")
     height: int = bounded(1, 20_000, 480, unit="pixels")
     fps: int = bounded(1, 1000, 30)
     warmup_frames: int = bounded(0, 1000, 30)
+    timeout_s: float = bounded(1e-3, MAX_CAMERA_WAIT_S, 3.0, unit="s")
 
 
-class RealSense(VendorCamera):
+class RealSense(Camera):
     """A RealSense depth camera; the fields of RealSenseSettings are keyword arguments of the constructor.
 
     A picture with lens distortion is undistorted by the vendor's model, and `settings` reports it. Depth takes the
@@ -48,12 +63,14 @@ class RealSense(VendorCamera):
         self._intrinsics: Intrinsics | None = None
         self._scale_m = 0.0
         self._undistortion: npt.NDArray[np.float32] | None = None
+        self._reported: dict[str, Any] = {}
 
     def _connect(self) -> None:
-        rs = import_package("pyrealsense2", "a RealSense camera", "run pip install 'touch-retrieval[realsense]'")
-        with vendor_errors("realsense cannot be started"):
-            found = [str(each.get_info(rs.camera_info.serial_number)) for each in rs.context().query_devices()]
-            serial = found[self._choose_camera(self._options.serial, found)]
+        rs = import_package("pyrealsense2", "a RealSense camera", "realsense")
+        with package_errors("realsense cannot be started"):
+            serial = self._choose(
+                [str(each.get_info(rs.camera_info.serial_number)) for each in rs.context().query_devices()]
+            )
             pipeline = rs.pipeline()
             config, size = rs.config(), (self._options.width, self._options.height)
             config.enable_device(serial)
@@ -66,14 +83,27 @@ class RealSense(VendorCamera):
             for _ in range(self._options.warmup_frames):
                 self._wait()
 
+    def _choose(self, connected: Sequence[str]) -> str:
+        """Return the serial number of the camera to open; raise DeviceError if it is not unique or not connected."""
+        serial, known = self._options.serial, ", ".join(connected) or "none"
+        if serial and serial not in connected:
+            raise DeviceError(f"realsense {serial} is not connected; connected: {known}")
+        if not serial and len(connected) != 1:
+            raise DeviceError(f"connect exactly one realsense, or set its serial number; connected: {known}")
+        return serial or connected[0]
+
     def _read_parameters(self, rs: Any, profile: Any, serial: str) -> None:
         """Read the depth scale, the intrinsics and the distortion."""
         video = profile.get_stream(rs.stream.color).as_video_stream_profile()
         lens = video.get_intrinsics()
-        depth = profile.get_device().first_depth_sensor()
-        (self._scale_m,) = check_finite("a RealSense's depth scale", [depth.get_depth_scale()])
+        self._scale_m = float(profile.get_device().first_depth_sensor().get_depth_scale())
+        coefficients = list(map(float, lens.coeffs))
+        if not all(map(math.isfinite, (self._scale_m, *coefficients))):
+            raise DeviceError(
+                f"realsense reports the depth scale {self._scale_m} and the distortion {coefficients}, which must be "
+                "finite; plug the camera in again"
+            )
         self._intrinsics = Intrinsics(lens.fx, lens.fy, lens.ppx, lens.ppy)
-        coefficients = check_finite("a RealSense's distortion coefficients", lens.coeffs)
         self._undistortion = _undistortion(rs, lens) if any(coefficients) else None
         self._reported = {
             "serial": serial,
@@ -85,17 +115,31 @@ class RealSense(VendorCamera):
             "undistorted": self._undistortion is not None,
         }
 
+    def _settings(self) -> dict[str, Any]:
+        return dict(self._reported)
+
     def _close(self) -> None:
         pipeline, self._pipeline = self._pipeline, None
         if pipeline is not None:
-            with vendor_errors("realsense cannot be stopped"):
+            with package_errors("realsense cannot be stopped"):
                 pipeline.stop()
+
+    def _recover(self) -> None:
+        """Close the camera despite errors, then connect completely or not at all."""
+        with contextlib.suppress(DeviceError, OSError):
+            self._close()
+        try:
+            self._connect()
+        except BaseException:
+            with contextlib.suppress(DeviceError, OSError):
+                self._close()
+            raise
 
     def _wait(self) -> Any:
         return self._pipeline.wait_for_frames(round(1000 * self._options.timeout_s))
 
     def _read(self, depth: bool) -> RGBD:
-        with vendor_errors("realsense returned no picture; is it plugged into USB 3?"):
+        with package_errors("realsense returned no picture; is it plugged into USB 3?"):
             if self._pipeline is None:
                 raise DeviceError("realsense was stopped by a failed recovery; call recover() again")
             self._pipeline.poll_for_frames()  # drops frames taken before this call

@@ -1,1 +1,0 @@
-"""Cameras over the table."""
