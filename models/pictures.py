@@ -8,6 +8,7 @@ A photographed object takes a tenth of the time of a grasp, and a press a third.
 pictures are on disk; an interrupted collection continues.
 """
 
+import contextlib
 import functools
 import itertools
 import json
@@ -24,7 +25,7 @@ from retrieval.console.progress import Bar
 from robot.recording.folder import read_info
 from robot.rig import load_rig
 from robot.sim.rig import SimRig
-from robot.storage import append_line, file_content, sync_threads, write_files
+from robot.storage import LineFile, file_content, sync_threads, write_files
 from robot.workers import Work, WorkerPool
 
 FAMILIES = ("relief", "shape")
@@ -97,17 +98,15 @@ def collect_pictures(
     make = functools.partial(_worker, kind, rig, seed)
     names = _sim_rig(rig, seed).object_ids(objects)
     (folder / IMAGES).mkdir(parents=True, exist_ok=True)
-    lines = (folder / METADATA).read_bytes().splitlines(keepends=True) if (folder / METADATA).exists() else []
-    whole = [line for line in lines if line.endswith(b"\n")]  # a crash may cut the last one
-    (folder / METADATA).write_bytes(b"".join(whole))
-    done = {json.loads(line)["object_id"] for line in whole}
-    missing = iter([name for name in names if name not in done])
-    with (
-        Bar(f"collect {kind}", len(names), "objects", done=len(done)) as bar,
-        WorkerPool(jobs, make(), make) as workers,
-        sync_threads() as threads,
-        open(folder / METADATA, "r+b", buffering=0) as metadata,
-    ):
+    with contextlib.ExitStack() as stack:
+        metadata = stack.enter_context(LineFile(folder / METADATA))
+        lines = metadata.read()
+        metadata.keep(len(lines))
+        done = {json.loads(line)["object_id"] for line in lines.splitlines()}
+        missing = iter([name for name in names if name not in done])
+        bar = stack.enter_context(Bar(f"collect {kind}", len(names), "objects", done=len(done)))
+        workers = stack.enter_context(WorkerPool(jobs, make(), make))
+        threads = stack.enter_context(sync_threads())
         waiting = [(name, workers.submit(name, 0)) for name in itertools.islice(missing, workers.window)]
         while waiting:
             name, result = waiting.pop(0)
@@ -119,8 +118,7 @@ def collect_pictures(
                 files[which] = f"{IMAGES}/{name}-{which}{suffix}"
                 contents[folder / files[which]] = data
             write_files(contents, threads)
-            row = json.dumps({"object_id": name, **labels, "pictures": files}) + "\n"
-            append_line(metadata, metadata.seek(0, 2), row.encode())
+            metadata.append(json.dumps({"object_id": name, **labels, "pictures": files}).encode())
             bar.advance()
     return load_pictures(folder)
 

@@ -31,7 +31,8 @@ from numpy.typing import NDArray
 from robot.errors import ImporterError, RecordingError
 from robot.importers.episodes import MOMENT_SUFFIXES, Picture
 from robot.importers.importing import Progress, import_extra, picture_bytes
-from robot.recording.folder import RecordedGrasp, Recording
+from robot.recording.folder import Recording
+from robot.recording.grasp import RecordedGrasp
 from robot.storage import decode_picture, storage_errors
 
 FPS = 1

@@ -1,10 +1,11 @@
-"""File access for recordings: PNG and JPEG content, appended lines, JSON objects, and disk errors as StorageError."""
+"""Files of recordings: appended lines, PNG and JPEG content, JSON objects, and disk errors as StorageError."""
 
 import contextlib
+import fcntl
+import json
 import os
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor, ThreadPoolExecutor, wait
-from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -77,19 +78,72 @@ def write_files(contents: Mapping[Path, bytes], threads: Executor) -> None:
         raise
 
 
-def append_line(file: FileIO, end: int, line: bytes) -> int:
-    """Write `line` at offset `end`, sync the file and return the new end; on failure, remove the partial line."""
-    rest = line
+def complete_lines(content: bytes) -> bytes:
+    """Return lines without an incomplete last one, which a crash leaves.
+
+    A last line that lacks only its newline is complete; the newline is added.
+    """
+    last = content[content.rfind(b"\n") + 1 :]
     try:
-        file.seek(end)
-        while rest:
-            rest = rest[file.write(rest) :]
-        os.fsync(file.fileno())
-    except BaseException:
-        with contextlib.suppress(OSError, ValueError):
-            file.truncate(end)
-        raise
-    return end + len(line)
+        json.loads(last)
+    except ValueError:
+        return content.removesuffix(last)
+    return content + b"\n"
+
+
+class LineFile(contextlib.AbstractContextManager["LineFile"]):
+    """A file of lines, locked while it is open; after a crash it contains complete lines only.
+
+    Opening creates a missing file and changes nothing else; it raises BlockingIOError if another process has it open.
+    """
+
+    def __init__(self, path: Path) -> None:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
+        self._file = os.fdopen(descriptor, "r+b", buffering=0)
+        try:
+            open_regular(path).close()
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BaseException:
+            self._file.close()
+            raise
+
+    def read(self) -> bytes:
+        """Return the complete lines."""
+        self._file.seek(0)
+        return complete_lines(self._file.read())
+
+    def keep(self, size: int) -> None:
+        """Cut the file off after the first `size` bytes of its lines; lines can be appended afterwards."""
+        self._end = max(size - 1, 0)
+        self._file.truncate(self._end)
+        if size:
+            self.append(b"")  # the newline, which the file may lack
+
+    def append(self, line: bytes) -> None:
+        """Write a line, sync the file; on failure, remove the partial line."""
+        rest = data = line + b"\n"
+        try:
+            self._file.seek(self._end)
+            while rest:
+                rest = rest[self._file.write(rest) :]
+            os.fsync(self._file.fileno())
+        except BaseException:
+            with contextlib.suppress(OSError, ValueError):
+                self._file.truncate(self._end)
+            raise
+        self._end += len(data)
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the file is closed."""
+        return self._file.closed
+
+    def close(self) -> None:
+        """Close the file and release its lock; a second call does nothing."""
+        self._file.close()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 def file_content(column: str, source: ImageSource) -> tuple[bytes, str]:

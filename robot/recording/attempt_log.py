@@ -8,18 +8,16 @@ before its grasp. After a crash, only the last line may be incomplete or without
 
 import contextlib
 import json
-import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
-from io import FileIO
 from pathlib import Path
 from typing import Any, Self
 
 from robot.errors import RecordingError, RobotConfigError
 from robot.recording.grasp import OUTCOMES
 from robot.settings import build
-from robot.storage import append_line, parse_object, read_content, storage_errors
+from robot.storage import LineFile, complete_lines, parse_object, read_content, storage_errors
 
 ATTEMPTS_FILE = "attempts.jsonl"
 UNGRASPABLE = "ungraspable"
@@ -58,27 +56,21 @@ class LoggedAttempt:
 
 def read_attempts(folder: Path, grasp_ids: Set[str]) -> list[LoggedAttempt]:
     """Read the attempts whose grasps, if any, are in the recording; raise RecordingError for a damaged file."""
-    return [attempt for attempt, _ in _read(folder / ATTEMPTS_FILE, grasp_ids)]
+    path = folder / ATTEMPTS_FILE
+    content = read_content(path, RecordingError) if path.exists() else b""
+    return _parse(path, complete_lines(content).splitlines(), grasp_ids)
 
 
-def _read(path: Path, grasp_ids: Set[str]) -> list[tuple[LoggedAttempt, int]]:
-    """Return the valid attempts, each with the position of its line's end in the file."""
-    if not path.exists():
-        return []
-    lines = read_content(path, RecordingError).splitlines(keepends=True)
-    found: list[tuple[LoggedAttempt, int]] = []
+def _parse(path: Path, lines: Sequence[bytes], grasp_ids: Set[str]) -> list[LoggedAttempt]:
+    attempts: list[LoggedAttempt] = []
     made: Counter[str] = Counter()
-    end = 0
     for number, line in enumerate(lines, start=1):
-        last = number == len(lines)
-        if last and not line.endswith(b"\n"):
-            break
         try:
             attempt = LoggedAttempt.from_row(parse_object(line, RecordingError))
         except RecordingError as error:
             raise RecordingError(f"{path}, line {number}: {error}") from error
         if attempt.grasp_id is not None and attempt.grasp_id not in grasp_ids:
-            if last:
+            if number == len(lines):
                 break
             raise RecordingError(f"{path}, line {number}: its grasp {attempt.grasp_id} is not in the recording")
         if attempt.number != made[attempt.object_id]:
@@ -87,34 +79,35 @@ def _read(path: Path, grasp_ids: Set[str]) -> list[tuple[LoggedAttempt, int]]:
                 f"{made[attempt.object_id]}, got {attempt.number}; restore the file"
             )
         made[attempt.object_id] += 1
-        end += len(line)
-        found.append((attempt, end))
-    return found
+        attempts.append(attempt)
+    return attempts
 
 
 class AttemptLog(contextlib.AbstractContextManager["AttemptLog"]):
-    """Appends to attempts.jsonl, after removing an invalid last line; the recording's writer locks the folder."""
+    """Appends to attempts.jsonl, after removing a last line that is incomplete or lacks its grasp."""
 
     def __init__(self, folder: Path, grasp_ids: Set[str]) -> None:
         self.folder = folder
-        read = _read(folder / ATTEMPTS_FILE, grasp_ids)
-        self.attempts = [attempt for attempt, _ in read]
-        self._end = read[-1][1] if read else 0
         with storage_errors(folder):
-            descriptor = os.open(folder / ATTEMPTS_FILE, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
-            self._file = FileIO(descriptor, "r+b")
-            self._file.truncate(self._end)
+            self._lines = LineFile(folder / ATTEMPTS_FILE)
+            try:
+                lines = self._lines.read().splitlines(keepends=True)
+                self.attempts = _parse(folder / ATTEMPTS_FILE, lines, grasp_ids)
+                self._lines.keep(sum(map(len, lines[: len(self.attempts)])))
+            except BaseException:
+                self._lines.close()
+                raise
 
     def append(self, attempt: LoggedAttempt) -> None:
         """Write one line and sync it; on failure, remove the partial line and raise StorageError."""
-        data = json.dumps(attempt.to_row(), ensure_ascii=False, allow_nan=False).encode() + b"\n"
+        data = json.dumps(attempt.to_row(), ensure_ascii=False, allow_nan=False).encode()
         with storage_errors(self.folder):
-            self._end = append_line(self._file, self._end, data)
+            self._lines.append(data)
         self.attempts.append(attempt)
 
     def close(self) -> None:
         """Close the file."""
-        self._file.close()
+        self._lines.close()
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -18,7 +18,6 @@ A line is written after its images are on disk, so a crash leaves complete grasp
 """
 
 import contextlib
-import fcntl
 import io
 import json
 import os
@@ -28,14 +27,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from _touch_retrieval.files import open_regular, sync, write_atomically
+from _touch_retrieval.files import sync, write_atomically
 from robot.errors import RecordingError
 from robot.gel_settings import UNKNOWN
-from robot.recording.grasp import RecordedGrasp as RecordedGrasp
-from robot.recording.grasp import check_name, unknown_keys
+from robot.recording.grasp import RecordedGrasp, check_name, unknown_keys
 from robot.storage import (
     ImageSource,
-    append_line,
+    LineFile,
+    complete_lines,
     file_content,
     parse_object,
     read_content,
@@ -130,16 +129,16 @@ def read_recording(folder: str | Path) -> Recording:
     info = read_info(root)
     path = root / METADATA_FILE
     data = read_content(path, RecordingError)
-    grasps = tuple(_grasps(path, data))
-    dropped = len(_incomplete_last_line(data))
-    notes = [f"{path}: dropped an incomplete last line ({dropped} bytes), left by a crash"] if dropped else []
-    return Recording(root, info, grasps, tuple(notes))
+    lines = complete_lines(data)
+    dropped = len(data) - len(lines)
+    notes = (f"{path}: dropped an incomplete last line ({dropped} bytes), left by a crash",) if dropped > 0 else ()
+    return Recording(root, info, tuple(_grasps(path, lines)), notes)
 
 
-def _grasps(path: Path, data: bytes) -> Iterator[RecordedGrasp]:
+def _grasps(path: Path, lines: bytes) -> Iterator[RecordedGrasp]:
     """Yield the grasps of metadata.jsonl; raise RecordingError if a line is invalid."""
     grasp_ids: set[str] = set()
-    for number, line in enumerate(io.BytesIO(data.removesuffix(_incomplete_last_line(data))), start=1):
+    for number, line in enumerate(io.BytesIO(lines), start=1):
         if not line.strip():
             continue
         try:
@@ -167,20 +166,6 @@ def _check_info(info: Mapping[str, Any], path: str | Path = INFO_FILE) -> None:
         raise RecordingError(f"{path}: schema_version must be {SCHEMA_VERSION}, got {version!r}")
     for key in ("source", "sensor"):
         check_name(f"{path}: {key}", info.get(key))
-
-
-def _incomplete_last_line(data: bytes) -> bytes:
-    """Return the incomplete last line, if any; a line that lacks only its newline is complete."""
-    last = _after_last_newline(data)
-    try:
-        json.loads(last)
-    except ValueError:
-        return last
-    return b""
-
-
-def _after_last_newline(data: bytes) -> bytes:
-    return data[data.rfind(b"\n") + 1 :]
 
 
 # Writing ---------------------------------------------------------------------------------------------------
@@ -219,18 +204,15 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
         _check_no_other_files(self.folder)
         with storage_errors(self.folder):
             (self.folder / IMAGES_FOLDER).mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(self.folder / METADATA_FILE, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
-            self._file = os.fdopen(descriptor, "r+b", buffering=0)
+            self._lines = LineFile(self.folder / METADATA_FILE)
             try:
-                open_regular(self.folder / METADATA_FILE).close()
-                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 self._start(expected)
             except BaseException:
-                self._file.close()
+                self._lines.close()
                 raise
 
     def _start(self, expected: dict[str, Any]) -> None:
-        """Create recording.json unless it exists, and truncate metadata.jsonl after its last complete line."""
+        """Create recording.json unless it exists, and cut an incomplete last line off metadata.jsonl."""
         for left in self.folder.glob(f".{INFO_FILE}.*.tmp"):  # by a killed writer; this one has locked the folder
             left.unlink()
         if not (self.folder / INFO_FILE).exists():
@@ -239,13 +221,9 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
         for key in _FIXED_KEYS:
             if (old := self.info.get(key)) != (new := expected.get(key)):
                 raise RecordingError(f"{self.folder} was recorded with {key} {old!r}, not {new!r}; give another folder")
-        data = self._file.read()
-        self._grasp_ids = {grasp.grasp_id: None for grasp in _grasps(self.folder / METADATA_FILE, data)}
-        self._end = len(data) - len(_incomplete_last_line(data))
-        self._file.truncate(self._end)
-        if (last := _after_last_newline(data)) and not _incomplete_last_line(data):
-            self._end -= len(last)
-            self._write_line(last)
+        lines = self._lines.read()
+        self._grasp_ids = {grasp.grasp_id: None for grasp in _grasps(self.folder / METADATA_FILE, lines)}
+        self._lines.keep(len(lines))
 
     @property
     def grasp_ids(self) -> Set[str]:
@@ -267,7 +245,7 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
             RecordingError: An argument is invalid, or the writer is closed.
             StorageError: The disk refused a write.
         """
-        if self._file.closed:
+        if self._lines.is_closed:
             raise RecordingError(f"the writer of {self.folder} is closed; open another")
         _check_id("grasp_id", grasp_id)
         if grasp_id in self._grasp_ids:
@@ -291,7 +269,7 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
         with storage_errors(self.folder):
             write_files({self.folder / path: data for path, data in contents.items()}, self._threads)
             sync(self.folder / IMAGES_FOLDER)
-            self._write_line(json.dumps(grasp.to_row(), ensure_ascii=False).encode())
+            self._lines.append(json.dumps(grasp.to_row(), ensure_ascii=False).encode())
         self._grasp_ids[grasp_id] = None
         return grasp
 
@@ -319,13 +297,9 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
                 write_atomically(self.folder / INFO_FILE, _encode_info(updated))
             self.info = updated
 
-    def _write_line(self, line: bytes) -> None:
-        """Write after the last complete line and sync; on failure, remove the partial line."""
-        self._end = append_line(self._file, self._end, line + b"\n")
-
     def close(self) -> None:
         """Close the file and release the folder's lock; a second call does nothing."""
-        self._file.close()
+        self._lines.close()
         self._threads.shutdown()
 
     def __exit__(self, *_: object) -> None:

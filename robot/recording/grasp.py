@@ -1,6 +1,5 @@
 """One grasp of a recording: its fields, their checks, and its line in metadata.jsonl."""
 
-import contextlib
 import math
 import re
 import sys
@@ -150,10 +149,6 @@ def _check_path(column: str, path: Any) -> None:
 
 
 def _number(key: str, value: object) -> float:
-    number = math.nan
-    if not isinstance(value, bool) and isinstance(value, Real):
-        with contextlib.suppress(OverflowError):
-            number = float(value)
-    if not math.isfinite(number):
+    if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
         raise RecordingError(f"{key} must be a finite number, got {value!r}")
-    return number
+    return float(value)

@@ -9,7 +9,8 @@ import numpy.typing as npt
 
 from _touch_retrieval.files import write_atomically
 from robot.errors import RecordingError
-from robot.recording.folder import RecordedGrasp, read_recording
+from robot.recording.folder import read_recording
+from robot.recording.grasp import RecordedGrasp
 from robot.storage import storage_errors
 
 Picture = npt.NDArray[np.uint8]

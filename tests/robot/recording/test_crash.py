@@ -13,7 +13,9 @@ import pytest
 
 from robot.errors import RobotError, StorageError
 from robot.recording import folder as module
-from robot.recording.folder import RecordedGrasp, RecordingWriter
+from robot.recording.folder import RecordingWriter
+from robot.recording.grasp import RecordedGrasp
+from robot.storage import LineFile
 from tests.robot.recording.test_recording import INFO, ids, pictures, two_grasps
 
 
@@ -89,38 +91,38 @@ class FullDisk:
 def test_a_partially_written_line_is_removed(tmp_path, room, truncates):
     two_grasps(tmp_path)
     with RecordingWriter(tmp_path, INFO) as writer:
-        real = writer._file
-        writer._file = FullDisk(real, room)
+        real = writer._lines._file
+        writer._lines._file = FullDisk(real, room)
         if not truncates:
-            writer._file.truncate = lambda size: (_ for _ in ()).throw(OSError(5, "Input/output error"))
+            writer._lines._file.truncate = lambda size: (_ for _ in ()).throw(OSError(5, "Input/output error"))
         with pytest.raises(StorageError, match="could not be written: No space left on device"):
             writer.append("3", "cup", pictures())
         assert ids(tmp_path) == ["1", "2"]
-        writer._file = real
+        writer._lines._file = real
         writer.append("3", "cup", pictures())
     assert ids(tmp_path) == ["1", "2", "3"]
 
 
 def test_a_line_written_in_pieces_is_complete(tmp_path):
     with RecordingWriter(tmp_path, INFO) as writer:
-        real = writer._file
-        writer._file = FullDisk(real, 10**6)
-        writer._file.write = lambda data: real.write(data[:7])
+        real = writer._lines._file
+        writer._lines._file = FullDisk(real, 10**6)
+        writer._lines._file.write = lambda data: real.write(data[:7])
         writer.append("1", "mug", pictures())
     assert ids(tmp_path) == ["1"]
 
 
 def test_the_images_are_on_disk_before_the_line(tmp_path, monkeypatch):
     are_on_disk = []
-    write_line = RecordingWriter._write_line
+    append = LineFile.append
 
     def checked(self, line):
         are_on_disk.append(
             all((tmp_path / path).is_file() for path in RecordedGrasp.from_row(json.loads(line)).images().values())
         )
-        write_line(self, line)
+        append(self, line)
 
-    monkeypatch.setattr(RecordingWriter, "_write_line", checked)
+    monkeypatch.setattr(LineFile, "append", checked)
     two_grasps(tmp_path)
     assert are_on_disk == [True, True]
 

@@ -17,7 +17,8 @@ from PIL import Image
 
 from robot.errors import RecordingError, StorageError
 from robot.recording import folder as module
-from robot.recording.folder import RecordedGrasp, RecordingWriter, SharedImage, read_recording
+from robot.recording.folder import RecordingWriter, SharedImage, read_recording
+from robot.recording.grasp import RecordedGrasp
 
 INFO = {"source": "test", "sensor": "GelSight", "seed": 3}
 ROW = {"grasp_id": "1", "object_id": "mug", "photo_file_name": "p.png", "touch_a_file_name": "a.png"}
