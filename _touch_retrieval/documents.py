@@ -1,4 +1,15 @@
-"""Conversion of plain JSON and TOML documents to typed values, checked by msgspec, with readable error messages."""
+"""The checker of all settings and documents: types and ranges stand in annotations, and msgspec checks them.
+
+    @dataclass(frozen=True)
+    class LampSettings:
+        watts: Positive
+        channels: Annotated[int, Meta(ge=1, le=4)] = 3
+
+        def __post_init__(self) -> None:
+            check_fields(self, "lamp", ConfigError)
+
+`typed` converts a document (JSON, TOML, the value of an option); `check_fields` checks an object that code constructs.
+"""
 
 import math
 import re
@@ -6,11 +17,18 @@ from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from types import UnionType
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgspec
+from msgspec import Meta
 
 T = TypeVar("T")
+
+Count = Annotated[int, Meta(ge=1)]
+Seed = Annotated[int, Meta(ge=0, lt=2**32)]
+Positive = Annotated[float, Meta(gt=0)]
+NonNegative = Annotated[float, Meta(ge=0)]
+Fraction = Annotated[float, Meta(ge=0, le=1)]
 
 _WORDS = {
     "int": "a whole number",

@@ -22,6 +22,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from _touch_retrieval.documents import Count, check_fields, typed
 from robot.errors import RecordingError, RobotConfigError
 from robot.grasping.attempt import AttemptRunner, GraspAttempt
 from robot.grasping.gates import ContactAreaGate, Gate, apply_gate, recorded_touches
@@ -53,15 +54,14 @@ class CollectSettings:
     18
     """
 
-    grasps: int = 44
-    most_attempts: int | None = None
+    grasps: Count = 44
+    most_attempts: Count | None = None
     attempt: AttemptSettings | None = None
     rounds: bool = False
 
     def __post_init__(self) -> None:
         """Raise RobotConfigError for a number below 1."""
-        if self.grasps < 1 or self.limit < 1:
-            raise RobotConfigError(f"grasps and most_attempts must be at least 1, got {self.grasps} and {self.limit}")
+        check_fields(self, "", RobotConfigError)
 
     @property
     def limit(self) -> int:
@@ -142,8 +142,7 @@ def collect(
     """
     settings, gate = settings or CollectSettings(), gate or ContactAreaGate()
     rig = make_rig()
-    if jobs < 1:
-        raise RobotConfigError(f"jobs must be at least 1, got {jobs}")
+    typed(jobs, Count, "jobs", error=RobotConfigError)
     if jobs > 1 and not rig.can_run_jobs:
         raise RobotConfigError(f"{type(rig).__name__} can run in one process only, so jobs must be 1, got {jobs}")
     names = rig.object_ids(objects) if isinstance(objects, int) else list(objects)

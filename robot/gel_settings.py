@@ -7,10 +7,12 @@ modulus_mpa = 0.35      # Young's modulus; leave out unknown values
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Annotated, Any
+
+from msgspec import Meta
 
 from robot.errors import RobotConfigError
-from robot.settings import TypedSettings, bounded, build
+from robot.settings import TypedSettings, build
 
 UNKNOWN = "unknown"
 
@@ -19,9 +21,9 @@ UNKNOWN = "unknown"
 class GelSettings(TypedSettings):
     """Thickness, Young's modulus and Poisson's ratio of one gel; None if unknown (then random in simulation)."""
 
-    thickness_mm: float | None = bounded(0.01, 100.0, None)
-    modulus_mpa: float | None = bounded(1e-4, 1e3, None)
-    poisson: float | None = bounded(0.0, 0.5, None)
+    thickness_mm: Annotated[float, Meta(ge=0.01, le=100.0)] | None = None
+    modulus_mpa: Annotated[float, Meta(ge=1e-4, le=1e3)] | None = None
+    poisson: Annotated[float, Meta(ge=0.0, le=0.5)] | None = None
 
     def known(self) -> dict[str, float]:
         """Return the known values by name."""

@@ -55,7 +55,7 @@ from typing import Any
 
 import numpy as np
 
-from _touch_retrieval.documents import typed
+from _touch_retrieval.documents import NonNegative, Positive, typed
 from _touch_retrieval.registry import Registry
 from robot.devices import Camera, Device, TactileSensor
 from robot.errors import RobotConfigError, UnknownName
@@ -64,7 +64,7 @@ from robot.grasping.planner import load_planner
 from robot.grasping.settings import AttemptSettings, GraspSettings, parse_attempt_settings
 from robot.readings import Region
 from robot.rig import Rig, ask_on_terminal
-from robot.settings import TypedSettings, bounded, build, build_named
+from robot.settings import TypedSettings, build, build_named
 from robot.sight import hand_eye
 from robot.sight.cylinder import CylinderFit
 
@@ -118,10 +118,10 @@ class Limits(TypedSettings):
 
     workspace_lower_mm: tuple[float, float, float]
     workspace_upper_mm: tuple[float, float, float]
-    arm_speed_mm_s: float = bounded(1e-3, 1e6, 200.0)
-    force_n: float = bounded(1e-3, 1e6, 25.0)
-    jaw_speed_mm_s: float = bounded(1e-3, 1e6, 80.0)
-    state_age_s: float = bounded(1e-3, 1e6, 0.5)
+    arm_speed_mm_s: Positive = 200.0
+    force_n: Positive = 25.0
+    jaw_speed_mm_s: Positive = 80.0
+    state_age_s: Positive = 0.5
 
 
 @dataclass(frozen=True)
@@ -130,9 +130,9 @@ class ObjectSettings(TypedSettings):
 
     x_mm: float
     y_mm: float
-    height_mm: float = bounded(1e-3, 1e6)
-    radius_mm: float = bounded(1e-3, 1e6)
-    error_mm: float = bounded(0, 1e6, 5.0)
+    height_mm: Positive
+    radius_mm: Positive
+    error_mm: NonNegative = 5.0
 
     def fit(self) -> CylinderFit:
         """Return the fit that a depth camera would have measured."""

@@ -206,12 +206,6 @@ def load_rig(spec: str, *, seed: int, **settings: Any) -> Rig:
     return rig
 
 
-def check_seed(seed: int) -> None:
-    """Raise RobotConfigError unless `seed` is an integer of at least 0."""
-    if not isinstance(seed, int) or seed < 0:
-        raise RobotConfigError(f"seed must be a whole number from 0, got {seed!r}")
-
-
 def _read_toml(path: Path, over: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     """Return the name of the rig and its settings."""
     try:

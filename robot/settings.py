@@ -1,14 +1,13 @@
-"""Objects from plain TOML settings: each setting is checked by name, annotated type and range.
+"""Objects from plain TOML settings: each setting is checked by its name, annotated type and annotated range.
 
-A group of settings is a frozen dataclass derived from `TypedSettings`; a number's range is given with its default.
+A group of settings is a frozen dataclass derived from `TypedSettings`. `_touch_retrieval.documents` has common ranges.
 """
 
 import functools
 import inspect
-import math
 import typing
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from _touch_retrieval.documents import check_fields, typed
@@ -18,11 +17,6 @@ from robot.errors import RobotConfigError, UnknownName
 _T = TypeVar("_T")
 
 
-def bounded(lowest: float, highest: float, default: Any = MISSING, *, unit: str = "") -> Any:
-    """Return a field of `TypedSettings` with values from `lowest` to `highest`; without a default it is required."""
-    return field(default=default, metadata={"range": (lowest, highest, unit)})
-
-
 @dataclass(frozen=True)
 class TypedSettings:
     """Base of settings dataclasses: checks each value's annotated type (a list becomes a tuple) and range."""
@@ -30,9 +24,6 @@ class TypedSettings:
     def __post_init__(self) -> None:
         """Raise RobotConfigError for a value of another type or out of range."""
         check_fields(self, "", RobotConfigError)
-        for each in fields(self):
-            if (value := getattr(self, each.name)) is not None and "range" in each.metadata:
-                check_range(each.name, value, *each.metadata["range"])
 
 
 def build(cls: type[_T], settings: Mapping[str, Any], *, where: str = "", **arguments: Any) -> _T:
@@ -101,14 +92,8 @@ def _keywords(cls: type) -> dict[str, tuple[Any, bool]]:
     settings: type | None = getattr(cls, "Settings", None)
     for each in (settings, cls):
         if each is not None:
-            hints = typing.get_type_hints(each.__init__)  # type: ignore[misc]
+            hints = typing.get_type_hints(each.__init__, include_extras=True)  # type: ignore[misc]
             for name, parameter in inspect.signature(each).parameters.items():
                 if parameter.kind is not parameter.VAR_KEYWORD:
                     found[name] = hints.get(name, Any), parameter.default is parameter.empty
     return found
-
-
-def check_range(name: str, value: float, lowest: float, highest: float, unit: str = "") -> None:
-    """Raise RobotConfigError unless a setting is a finite number from `lowest` to `highest`."""
-    if not lowest <= value <= highest or math.isinf(value):  # also rejects NaN
-        raise RobotConfigError(f"{name} must be from {lowest:g} to {highest:g}{unit and ' '}{unit}, got {value!r}")

@@ -16,10 +16,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from msgspec import Meta
 from threadpoolctl import threadpool_limits
 
+from _touch_retrieval.documents import Count, Positive, check_fields
 from indexes.errors import IndexesError
 from indexes.store.generation import check_fingerprint
 from indexes.store.sharded import ShardedManifest, ShardEntry, open_shard
@@ -44,8 +46,6 @@ APPLICATION = re.compile(r"shard-\d+-of-\d+-[0-9a-f]{16}-([0-9a-f]{8})")
 RETRY_S, MIN_RESULT_TIMEOUT_S = 0.05, 0.005
 """Pause before a call to a lost replica is repeated, and shortest timeout for a result that may be available."""
 
-MAX_WAIT_S = 86_400
-
 
 @dataclass(frozen=True)
 class ReplicaSettings:
@@ -58,17 +58,14 @@ class ReplicaSettings:
         wait_s: Longest wait for an answer, in seconds.
     """
 
-    replicas: int = 1
-    cpus: float = 0.5
-    max_ongoing_requests: int = 4
-    wait_s: float = 5.0
+    replicas: Count = 1
+    cpus: Positive = 0.5
+    max_ongoing_requests: Count = 4
+    wait_s: Annotated[float, Meta(gt=0, le=86_400)] = 5.0
 
     def __post_init__(self) -> None:
         """Check the values. Raises BadInput."""
-        if self.replicas < 1:
-            raise BadInput(f"replicas must be at least 1; got {self.replicas}")
-        if not 0 < self.wait_s <= MAX_WAIT_S:
-            raise BadInput(f"the wait for a shard must be above 0 and at most {MAX_WAIT_S} seconds; got {self.wait_s}")
+        check_fields(self, "", BadInput)
 
 
 class OwnerActor:

@@ -3,11 +3,13 @@
 import dataclasses
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self, cast, get_args
 
 import typer
+from msgspec import Meta
 from typer.core import TyperCommand
 
+from _touch_retrieval.documents import Count, Fraction, Seed, typed
 from _touch_retrieval.files import read_json
 from retrieval.console.output import say
 from retrieval.errors import BadInput
@@ -77,44 +79,29 @@ Background = Annotated[
 ]
 
 
-@dataclasses.dataclass(frozen=True)
 class NumberParser:
-    """Parser of a number from `low` to `high`, which rejects other values before a command starts.
+    """Parser of an option with a number, which rejects values out of range before a command starts.
 
     The range types of typer accept nan, and print their limits in the help.
-
-    Attributes:
-        kind: int or float.
-        low: Smallest value.
-        high: Largest value.
     """
 
-    kind: type[int] | type[float]
-    low: float
-    high: float
-
-    @property
-    def __name__(self) -> str:
-        """The name of the type in the help."""
-        return self.kind.__name__
+    def __init__(self, annotation: Any) -> None:
+        """Make a parser of numbers that an annotation allows, such as `Annotated[int, Meta(ge=1)]`."""
+        self._annotation, (self._kind, *_) = annotation, get_args(annotation)
+        self.__name__ = self._kind.__name__  # the name of the type in the help
 
     def __call__(self, text: str) -> float:
-        """Return the number.
-
-        Raises:
-            BadParameter: The text is not a number of this kind, or is out of range.
-        """
+        """Return the number. Raises BadParameter for another kind of value, or one out of range."""
         try:
-            value = self.kind(text)
+            value = self._kind(text)
         except ValueError as error:
             raise typer.BadParameter(f"{text!r} is not a valid {self.__name__}") from error
-        if not self.low <= value <= self.high:
-            raise typer.BadParameter(f"must be from {self.low} to {self.high}, got {text}")
-        return value
+        return cast(float, typed(value, self._annotation, error=typer.BadParameter))
 
 
-COUNT, SEED, WORKERS = NumberParser(int, 1, 10**9), NumberParser(int, 0, 2**32 - 1), NumberParser(int, 1, 1024)
-FRACTION, SECONDS = NumberParser(float, 0, 1), NumberParser(float, 0, 86_400)
+COUNT, SEED, FRACTION = NumberParser(Count), NumberParser(Seed), NumberParser(Fraction)
+WORKERS = NumberParser(Annotated[int, Meta(ge=1, le=1024)])
+SECONDS = NumberParser(Annotated[float, Meta(gt=0, le=86_400)])
 Iterations = Annotated[int | None, typer.Option(parser=COUNT, help="optimiser steps (default: those of the preset)")]
 Jobs = Annotated[int, typer.Option(parser=WORKERS, help="simulated rigs that run in parallel")]
 Objects = Annotated[int, typer.Option(parser=COUNT, help="number of objects")]

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from msgspec import Meta
 
 from retrieval.commands.options import (
     SECONDS,
@@ -37,7 +38,7 @@ def serve(
         str, typer.Option(help="address to listen on; one that other machines can reach needs a token")
     ] = "127.0.0.1",
     port: Annotated[
-        int, typer.Option(parser=NumberParser(int, 0, 2**16 - 1), help="port; 0 chooses a free one")
+        int, typer.Option(parser=NumberParser(Annotated[int, Meta(ge=0, lt=2**16)]), help="port; 0 chooses a free one")
     ] = 8000,
     token_file: Annotated[
         Path | None,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from msgspec import Meta
 
-from _touch_retrieval.documents import check_fields, typed
+from _touch_retrieval.documents import Count, NonNegative, Positive, Seed, check_fields, typed
 from _touch_retrieval.files import read_regular
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import ConfigError
@@ -23,9 +23,7 @@ if TYPE_CHECKING:
     from retrieval.model.losses.loss import Loss
     from retrieval.model.towers.tower import Tower
 
-Count = Annotated[int, Meta(ge=1)]
-Fraction = Annotated[float, Meta(ge=0, lt=1)]
-Weight = Annotated[float, Meta(ge=0)]
+FractionBelowOne = Annotated[float, Meta(ge=0, lt=1)]
 
 
 # Settings from which a checkpoint rebuilds its matcher.
@@ -61,7 +59,7 @@ class MatcherConfig:
     tower_output: str = "classes"
     fingers: Count = 2
     hidden: Count = 1024
-    dropout: Fraction = 0.5
+    dropout: FractionBelowOne = 0.5
     standardise: bool = False
     embedding_dim: Count = 128
     candidate_width: Annotated[int, Meta(ge=0)] = 0
@@ -139,8 +137,8 @@ class TrainingConfig:
         freeze_stem: Keep the first layers of the towers (`Tower.stem_layers`) frozen if the towers are trained.
         augment: Change the images of each step at random (`retrieval.training.augmentation`), if towers are trained.
         distil_steps: Steps that distil the candidate encoder after training (`retrieval.training.distil`).
-        validation_fraction: Fraction of the objects that are validation objects.
-        test_fraction: Fraction of the objects that are test objects.
+        validation_fraction: FractionBelowOne of the objects that are validation objects.
+        test_fraction: FractionBelowOne of the objects that are test objects.
         validate_every: Steps between two validations.
         precision: "float32", "bfloat16" or "auto" (`retrieval.model.encode.autocast`).
         seed: Seed of all random choices.
@@ -156,8 +154,8 @@ class TrainingConfig:
     touches_per_batch: Count = 6
     positives_per_touch: Count = 4
     negatives_per_touch: Count = 4
-    learning_rate: Annotated[float, Meta(gt=0)] = 1e-4
-    tower_rate: Annotated[float, Meta(gt=0)] = 1.0
+    learning_rate: Positive = 1e-4
+    tower_rate: Positive = 1.0
     schedule: str = "constant"
     weights: Mapping[str, float] = field(default_factory=dict)
     shuffle_fingers: bool = False
@@ -167,18 +165,18 @@ class TrainingConfig:
     freeze_stem: bool = False
     augment: bool = False
     distil_steps: Count = 600
-    validation_fraction: Fraction = 0.1
-    test_fraction: Fraction = 0.184
+    validation_fraction: FractionBelowOne = 0.1
+    test_fraction: FractionBelowOne = 0.184
     validate_every: Count = 500
     precision: str = "auto"
-    seed: Annotated[int, Meta(ge=0, lt=2**32)] = 0
+    seed: Seed = 0
     workers: Annotated[int, Meta(ge=0)] | str = field(default="auto", compare=False)
 
     def __post_init__(self) -> None:
         own = {name: self.weights[name] for name in sorted(self.weights) if name not in LOSSES}
         weights = {name: self.weights.get(name, 0.0) for name in LOSSES} | own
         for name, weight in weights.items():
-            weights[name] = typed(weight, Weight, f"training.{name}{WEIGHT_SUFFIX}", error=ConfigError)
+            weights[name] = typed(weight, NonNegative, f"training.{name}{WEIGHT_SUFFIX}", error=ConfigError)
         object.__setattr__(self, "weights", weights)
         check_fields(self, "training", ConfigError)
         auto = not isinstance(self.workers, str) or self.workers == "auto"

@@ -4,7 +4,11 @@ import ipaddress
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
+from msgspec import Meta
+
+from _touch_retrieval.documents import Count, check_fields
 from retrieval.data.images import MAX_PIXELS
 from retrieval.errors import ConfigError
 
@@ -16,7 +20,9 @@ MAX_BODY_PIXELS = 5 * MAX_PIXELS
 MAX_PICTURES = 128
 """Maximum number of pictures of one request."""
 MIN_TOKEN_CHARACTERS = 16
-MAX_WAIT_S = 86_400
+Port = Annotated[int, Meta(ge=0, lt=2**16)]
+Wait = Annotated[float, Meta(gt=0, le=86_400)]
+"""A time limit in seconds, at most a day."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,32 +48,23 @@ class ServiceSettings:
         ConfigError: An option is out of its range.
     """
 
-    index: str | Path
+    index: Path
     model: Path | None = None
     verify: bool = True
     host: str = "127.0.0.1"
-    port: int = 8000
+    port: Port = 8000
     token: str | None = None
-    queue: int = 8
-    workers: int = 1
-    deadline_s: float = 30.0
-    body_s: float = 10.0
-    poll_s: float = 1.0
+    queue: Count = 8
+    workers: Count = 1
+    deadline_s: Wait = 30.0
+    body_s: Wait = 10.0
+    poll_s: Wait = 1.0
     history: Path | None = None
-    history_max_queries: int = 5_000
+    history_max_queries: Count = 5_000
 
     def __post_init__(self) -> None:
         """Check the ranges of the options."""
-        for name in ("queue", "workers", "history_max_queries"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name} must be at least 1, got {getattr(self, name)}.")
-        for name in ("deadline_s", "body_s", "poll_s"):
-            if not 0 < getattr(self, name) <= MAX_WAIT_S:
-                raise ConfigError(
-                    f"{name} must be above 0 and at most {MAX_WAIT_S} seconds, got {getattr(self, name)}."
-                )
-        if not 0 <= self.port <= 2**16 - 1:
-            raise ConfigError(f"port must be from 0 to {2**16 - 1}, got {self.port}.")
+        check_fields(self, "", ConfigError)
         if self.token is None and not self.is_local:
             raise ConfigError(
                 f"Other machines can reach {self.host}, so a token is required. Write at least {MIN_TOKEN_CHARACTERS} "

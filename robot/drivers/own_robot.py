@@ -26,15 +26,16 @@ import math
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
-from _touch_retrieval.documents import typed
+from msgspec import Meta
+
+from _touch_retrieval.documents import Positive, typed
 from _touch_retrieval.registry import Registry
 from robot.devices import Actuator, Arm, Clock, Gripper
 from robot.drivers.packages import package_errors
-from robot.errors import DeviceError, UnknownName
+from robot.errors import DeviceError, RobotConfigError, UnknownName
 from robot.readings import GripperState, Pose, Region
-from robot.settings import check_range
 
 ROBOTS: "Registry[Callable[..., Any]]" = Registry("robot", "robots", {}, error=UnknownName)
 """Classes and functions that make a user's robot, by entry point or `module:Class`."""
@@ -161,8 +162,8 @@ class OwnGripper(OwnDevice, Gripper):
     def __init__(
         self,
         *,
-        stroke_mm: float,
-        min_force_n: float,
+        stroke_mm: Annotated[float, Meta(ge=1, le=1000)],
+        min_force_n: Positive,
         robot: str,
         settings: Mapping[str, Any] = {},
         max_force_n: float = 1000.0,
@@ -170,8 +171,8 @@ class OwnGripper(OwnDevice, Gripper):
         clock: Clock = time.monotonic,
     ) -> None:
         """Check the settings; raise RobotConfigError, or UnknownName for a class that cannot be imported."""
-        check_range("stroke_mm", stroke_mm, 1, 1000, "mm")
-        check_range("min_force_n", min_force_n, 1e-3, max_force_n, "N")
+        if min_force_n > max_force_n:
+            raise RobotConfigError(f"min_force_n must be at most max_force_n, got {min_force_n} and {max_force_n}")
         forces = {"min_force_n": min_force_n, "max_force_n": max_force_n}
         limits = {"stroke_mm": stroke_mm, "max_speed_mm_s": max_speed_mm_s, **forces}
         super().__init__(robot=robot, settings=settings, clock=clock, **limits)

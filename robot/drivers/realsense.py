@@ -10,18 +10,19 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from msgspec import Meta
 
 from robot.devices import Camera, Clock
 from robot.drivers.packages import import_package, package_errors
 from robot.drivers.usb_camera.stream import MAX_CAMERA_WAIT_S
 from robot.errors import DeviceError
 from robot.readings import RGBD, Intrinsics
-from robot.settings import TypedSettings, bounded
+from robot.settings import TypedSettings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,11 +39,11 @@ class RealSenseSettings(TypedSettings):
     """
 
     serial: str = ""
-    width: int = bounded(1, 20_000, 640, unit="pixels")
-    height: int = bounded(1, 20_000, 480, unit="pixels")
-    fps: int = bounded(1, 1000, 30)
-    warmup_frames: int = bounded(0, 1000, 30)
-    timeout_s: float = bounded(1e-3, MAX_CAMERA_WAIT_S, 3.0, unit="s")
+    width: Annotated[int, Meta(ge=1, le=20_000)] = 640
+    height: Annotated[int, Meta(ge=1, le=20_000)] = 480
+    fps: Annotated[int, Meta(ge=1, le=1000)] = 30
+    warmup_frames: Annotated[int, Meta(ge=0, le=1000)] = 30
+    timeout_s: Annotated[float, Meta(ge=1e-3, le=MAX_CAMERA_WAIT_S)] = 3.0
 
 
 class RealSense(Camera):

@@ -16,12 +16,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from _touch_retrieval.documents import Seed, typed
 from robot.devices import MAX_AGE_S, read_together
-from robot.errors import DeviceError, PlanError, UngraspableError
+from robot.errors import DeviceError, PlanError, RobotConfigError, UngraspableError
 from robot.grasping.planner import GraspPlan
 from robot.grasping.settings import AttemptSettings
 from robot.readings import RGBD, Pose
-from robot.rig import Rig, check_seed
+from robot.rig import Rig
 from robot.storage import file_content
 
 _OUTCOME_FROM = {"holding": "held", "no_part": "missed", "part_lost": "slipped"}
@@ -68,7 +69,7 @@ class AttemptRunner:
     """
 
     def __init__(self, rig: Rig, seed: int, settings: AttemptSettings) -> None:
-        check_seed(seed)
+        typed(seed, Seed, "seed", error=RobotConfigError)
         settings.grasp.check(rig.arm, rig.gripper)
         self.rig, self.seed, self.settings = rig, seed, settings
 

@@ -8,14 +8,15 @@ contacts, because it uses the images on which a matcher is trained later; theref
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from msgspec import Meta
 
 from robot.errors import RobotConfigError, RobotError
-from robot.settings import TypedSettings, bounded
+from robot.settings import TypedSettings
 from robot.storage import decode_picture
 
 Picture = npt.NDArray[np.uint8]
@@ -88,9 +89,9 @@ class ContactAreaGate(TypedSettings):
         every_finger: Whether every finger's gel must have changed.
     """
 
-    noise_levels: float = bounded(0.1, 254, 8.0)
-    least_share: float = bounded(1e-6, 1, 0.01)
-    blur_px: int = bounded(1, 1000, 5)
+    noise_levels: Annotated[float, Meta(ge=0.1, le=254)] = 8.0
+    least_share: Annotated[float, Meta(ge=1e-6, le=1)] = 0.01
+    blur_px: Annotated[int, Meta(ge=1, le=1000)] = 5
     every_finger: bool = False
 
     def __call__(self, touches: Mapping[str, GraspFrames]) -> bool:

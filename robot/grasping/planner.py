@@ -18,11 +18,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from _touch_retrieval.documents import NonNegative
 from _touch_retrieval.registry import Registry
 from robot.errors import PlanError, RobotConfigError, UnknownName
 from robot.grasping.settings import GraspSettings
 from robot.readings import RGBD, Pose, Region
-from robot.settings import build_named, check_range
+from robot.settings import build_named
 from robot.sight.cylinder import CylinderFit, fit_cylinder
 
 if TYPE_CHECKING:
@@ -113,8 +114,7 @@ class CylinderPlanner(GraspPlanner):
         search_margin_mm: Width of the border around the workspace that is searched for objects too.
     """
 
-    def __init__(self, *, search_margin_mm: float = 150.0) -> None:
-        check_range("search_margin_mm", search_margin_mm, 0, 1e6, "mm")
+    def __init__(self, *, search_margin_mm: NonNegative = 150.0) -> None:
         self.search_margin_mm = search_margin_mm
 
     def plan(self, rig: "Rig", image: RGBD, settings: GraspSettings, rng: np.random.Generator) -> GraspPlan:

@@ -2,11 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
+from msgspec import Meta
+
+from _touch_retrieval.documents import NonNegative, Positive
 from robot.devices import Arm, Gripper
 from robot.errors import RobotConfigError
-from robot.settings import TypedSettings, bounded, build
+from robot.settings import TypedSettings, build
 
 OUTPUTS = ("depth", "before", "after")
 """Optional outputs: the depth picture, the no-contact gel images, and the gel images after the lift (object held)."""
@@ -28,13 +31,13 @@ class GraspSettings(TypedSettings):
     """
 
     force_n: tuple[float, float] = (5.0, 25.0)
-    jitter_mm: float = bounded(0, 1e6, 1.0)
-    floor_mm: float = bounded(0, 1e6, 10.0)
-    top_margin_mm: float = bounded(0, 1e6, 15.0)
-    reach_mm: float = bounded(1, 1e6, 110.0)
-    finger_mm: float = bounded(1, 1e6, 25.0)
-    clearance_mm: float = bounded(0, 1e6, 5.0)
-    lift_mm: float = bounded(1, 1e6, 180.0)
+    jitter_mm: NonNegative = 1.0
+    floor_mm: NonNegative = 10.0
+    top_margin_mm: NonNegative = 15.0
+    reach_mm: Annotated[float, Meta(ge=1)] = 110.0
+    finger_mm: Annotated[float, Meta(ge=1)] = 25.0
+    clearance_mm: NonNegative = 5.0
+    lift_mm: Annotated[float, Meta(ge=1)] = 180.0
 
     def __post_init__(self) -> None:
         """Raise RobotConfigError for a setting of another type or out of range."""
@@ -74,15 +77,15 @@ class AttemptSettings(TypedSettings):
 
     grasp: GraspSettings = field(default_factory=GraspSettings)
     outputs: tuple[str, ...] = OUTPUTS
-    travel_mm_s: float = bounded(1e-3, 1e6, 200.0)
-    approach_mm_s: float = bounded(1e-3, 1e6, 50.0)
-    closing_mm_s: float = bounded(1e-3, 1e6, 80.0)
-    settle_s: float = bounded(0, 1e6, 1.0)
-    hold_s: float = bounded(0, 1e6, 1.0)
-    release_mm: float = bounded(0, 1e6, 5.0)
-    table_share: float = bounded(0, 1, 0.7)
-    retries: int = bounded(0, 1000, 2)
-    jpeg_quality: int = bounded(0, 100, 95)
+    travel_mm_s: Positive = 200.0
+    approach_mm_s: Positive = 50.0
+    closing_mm_s: Positive = 80.0
+    settle_s: NonNegative = 1.0
+    hold_s: NonNegative = 1.0
+    release_mm: NonNegative = 5.0
+    table_share: Annotated[float, Meta(ge=0, le=1)] = 0.7
+    retries: Annotated[int, Meta(ge=0, le=1000)] = 2
+    jpeg_quality: Annotated[int, Meta(ge=0, le=100)] = 95
 
     def __post_init__(self) -> None:
         """Raise RobotConfigError for a setting of another type or out of range."""

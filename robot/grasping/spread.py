@@ -4,12 +4,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from robot.errors import PlanError, UngraspableError
+from _touch_retrieval.documents import Count, typed
+from robot.errors import PlanError, RobotConfigError, UngraspableError
 from robot.grasping.planner import GraspPlan, GraspPlanner
 from robot.grasping.settings import GraspSettings
 from robot.readings import RGBD
 from robot.rig import Rig
-from robot.settings import check_range
 
 
 class SpreadPlanner(GraspPlanner):
@@ -28,7 +28,7 @@ class SpreadPlanner(GraspPlanner):
     """
 
     def __init__(self, planner: GraspPlanner, heights_mm: Sequence[float], *, draws: int = 8) -> None:
-        check_range("draws", draws, 1, 1000, "")
+        typed(draws, Count, "draws", error=RobotConfigError)
         self.planner, self.heights_mm, self.draws = planner, heights_mm, draws
         self.needs_depth = planner.needs_depth
 

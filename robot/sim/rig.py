@@ -5,11 +5,13 @@ import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Meta
 
+from _touch_retrieval.documents import Seed, typed
 from robot.devices import Arm, Camera, Gripper, TactileSensor, VirtualDevice
 from robot.errors import DeviceError, RobotConfigError
 from robot.gel_settings import parse_gel_settings
@@ -17,8 +19,8 @@ from robot.grasping.planner import load_planner
 from robot.grasping.settings import GraspSettings, parse_attempt_settings
 from robot.readings import RGBD, Frame, GripperState, Intrinsics, Pose, Region
 from robot.recording.folder import UNITS
-from robot.rig import Rig, check_seed
-from robot.settings import TypedSettings, bounded
+from robot.rig import Rig
+from robot.settings import TypedSettings
 from robot.sim.camera import PinholeCamera, Placement
 from robot.sim.gel.sensor import draw_sensor
 from robot.sim.objects.draw import STROKE_MM, SimObject, draw_object
@@ -105,12 +107,12 @@ class SimSettings(TypedSettings):
 
     fingers: tuple[str, ...] = ("a", "b")
     optics: str = "led"
-    gels: int = bounded(1, 1000, 1, unit="pairs")
+    gels: Annotated[int, Meta(ge=1, le=1000)] = 1
     families: tuple[str, ...] = ()
     meshes: str = ""
     contact_grid: tuple[int, int] = (120, 160)
-    contact_tolerance: float = bounded(1e-12, 0.999, 1e-2)
-    focal_px: float = bounded(300, 10_000, 860.0, unit="px")
+    contact_tolerance: Annotated[float, Meta(ge=1e-12, le=0.999)] = 1e-2
+    focal_px: Annotated[float, Meta(ge=300, le=10_000)] = 860.0
     localisation_mm: tuple[float, float] = (5.0, 10.0)
     grasp: Mapping[str, Any] = field(default_factory=dict)
     attempt: Mapping[str, Any] = field(default_factory=dict)
@@ -151,7 +153,7 @@ class SimRig(Rig):
     can_run_jobs: ClassVar[bool] = True
 
     def __init__(self, seed: int = 0, **settings: Any) -> None:
-        check_seed(seed)
+        typed(seed, Seed, "seed", error=RobotConfigError)
         options = SimSettings(**settings)
         self._seed, self._families = seed, tuple(sorted(options.families))
         attempt = parse_attempt_settings(options.attempt, options.grasp)

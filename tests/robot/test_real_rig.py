@@ -154,10 +154,7 @@ BAD = {
     "an unknown attempt setting": ({"attempt": "speed = 3"}, r"\[attempt\] has no setting 'speed'"),
     "an infinite speed": ({"attempt": "travel_mm_s = inf"}, r"attempt\.travel_mm_s must be a finite number"),
     "a gel of no finger": ({"gel.b": "thickness_mm = 4"}, r"a finger with a sensor: \[gel\.a\]; got 'b'"),
-    "a gel of no thickness": (
-        {"gel.a": "thickness_mm = 0"},
-        r"\[gel\.a\]: thickness_mm must be from 0.01 to",
-    ),
+    "a gel of no thickness": ({"gel.a": "thickness_mm = 0"}, r"\[gel\.a\]: thickness_mm must be a number >= 0\.01"),
     "an unknown planner": (
         {"planner": 'name = "sphere"'},
         r"\[planner\]: name must be one of cylinder, mesh; got 'sphere'. Give module:Class .* touch_retrieval.planners",
@@ -168,14 +165,14 @@ BAD = {
     ),
     "a planner with a negative margin": (
         {"planner": "search_margin_mm = -1"},
-        r"\[planner\]: search_margin_mm must be from 0 to",
+        r"\[planner\]: search_margin_mm must be a number >= 0",
     ),
     "a planner that is another object": ({"planner": 'name = "json:dumps"'}, "'json:dumps' must be a GraspPlanner"),
     "meshes of a real rig": ({"planner": 'name = "mesh"'}, "plans for meshes of the simulated rig only"),
     "no time to settle": ({"attempt": "settle_s = 0"}, r"\[attempt\]: settle_s must be at least 0\.1 s"),
     "an object of no size": (
         {"object": "x_mm = 0\ny_mm = 0\nheight_mm = 0\nradius_mm = 3"},
-        r"\[object\]: height_mm must be from 0.001",
+        r"\[object\]: height_mm must be a number > 0",
     ),
 }
 

@@ -135,5 +135,5 @@ def test_a_wrong_file_raises_with_the_reason(tmp_path, text):
 
 @pytest.mark.parametrize("seed", [-1, 1.5, None, "0"])
 def test_a_seed_must_be_a_whole_number_from_0(seed):
-    with pytest.raises(RobotConfigError, match=r"^seed must be a whole number from 0, got"):
+    with pytest.raises(RobotConfigError, match=r"^seed must be a whole number"):
         load_rig("sim", seed=seed)

@@ -19,9 +19,10 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 
 from robot.devices import Arm, Clock
 from robot.drivers.sawyer import codec
@@ -29,7 +30,7 @@ from robot.drivers.sawyer.codec import Joints, JointTrajectory, Mount, is_still,
 from robot.drivers.sawyer.link import ReceivedMessage, RosbridgeLink
 from robot.errors import DeviceError
 from robot.readings import Pose, Region
-from robot.settings import TypedSettings, bounded, check_range
+from robot.settings import TypedSettings
 
 _LOG = logging.getLogger(__name__)
 _STATE_TOPICS = (codec.JOINT_STATES, codec.ROBOT_STATE, codec.TIP_STATES, codec.COLLISION)
@@ -55,6 +56,9 @@ _MARGIN_MM = 20.0
 """A motion may begin this far outside the workspace, after a stop or a push."""
 
 
+_Coordinate = Annotated[float, Meta(ge=-1e4, le=1e4)]
+
+
 @dataclass(frozen=True, kw_only=True)
 class SawyerSettings(TypedSettings):
     """Settings of a Sawyer's right arm through rosbridge at host:port.
@@ -69,25 +73,19 @@ class SawyerSettings(TypedSettings):
     """
 
     host: str
-    base_xyz_mm: tuple[float, float, float]
-    tool_mm: float = bounded(0, 1000)
-    port: int = bounded(1, 65535, 9090)
+    base_xyz_mm: tuple[_Coordinate, _Coordinate, _Coordinate]
+    tool_mm: Annotated[float, Meta(ge=0, le=1000)]
+    port: Annotated[int, Meta(ge=1, le=65535)] = 9090
     tip: str = "right_hand"
-    base_yaw_deg: float = bounded(-360, 360, 0.0)
-    tool_yaw_deg: float = bounded(-360, 360, 0.0)
-    speed_ratio: float = bounded(0.01, 1, 0.3)
-    joint_speed_rad_s: float = bounded(0.01, 1.5, 0.5)
-    timeout_s: float = bounded(0.05, 60, 2.0)
-    reconnect_tries: int = bounded(1, 20, 5)
+    base_yaw_deg: Annotated[float, Meta(ge=-360, le=360)] = 0.0
+    tool_yaw_deg: Annotated[float, Meta(ge=-360, le=360)] = 0.0
+    speed_ratio: Annotated[float, Meta(ge=0.01, le=1)] = 0.3
+    joint_speed_rad_s: Annotated[float, Meta(ge=0.01, le=1.5)] = 0.5
+    timeout_s: Annotated[float, Meta(ge=0.05, le=60)] = 2.0
+    reconnect_tries: Annotated[int, Meta(ge=1, le=20)] = 5
     enable: bool = False
     max_speed_mm_s: float = 200.0
-    max_state_age_s: float = bounded(0.02, 5, 0.5)
-
-    def __post_init__(self) -> None:
-        """Raise RobotConfigError for a setting of another type or out of range."""
-        super().__post_init__()
-        for value in self.base_xyz_mm:
-            check_range("base_xyz_mm", value, -1e4, 1e4, "mm")
+    max_state_age_s: Annotated[float, Meta(ge=0.02, le=5)] = 0.5
 
 
 class Sawyer(Arm):

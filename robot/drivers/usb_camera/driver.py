@@ -7,11 +7,12 @@ images of equal presses.
 
 import time
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from msgspec import Meta
 
 from robot.devices import Camera, Clock, Device, TactileSensor
 from robot.drivers.usb_camera.stream import (
@@ -23,7 +24,6 @@ from robot.drivers.usb_camera.stream import (
 )
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import RGBD, Frame
-from robot.settings import bounded
 
 Picture = npt.NDArray[np.uint8]
 _MAX_PX = 20_000
@@ -218,7 +218,7 @@ class UvcSettings(UsbCameraSettings):
 
     auto_exposure: bool = True
     auto_white_balance: bool = True
-    keep: int = bounded(1, 1000, 1, unit="pictures")
+    keep: Annotated[int, Meta(ge=1, le=1000)] = 1
     upside_down: bool = False
 
 

@@ -23,16 +23,18 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
+from msgspec import Meta
 
+from _touch_retrieval.documents import NonNegative
 from robot.devices import Clock
 from robot.drivers import discover
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import Frame
-from robot.settings import TypedSettings, bounded
+from robot.settings import TypedSettings
 
 log = logging.getLogger(__name__)
 MAX_CAMERA_WAIT_S = 600.0
@@ -70,28 +72,28 @@ class CaptureSettings(TypedSettings):
         led: Red, green and blue of a DIGIT, each 0 to 15.
     """
 
-    width: int = 0
-    height: int = 0
-    fps: float = bounded(0, 1000, 0.0)
+    width: Annotated[int, Meta(ge=0, le=20_000)] = 0
+    height: Annotated[int, Meta(ge=0, le=20_000)] = 0
+    fps: Annotated[float, Meta(ge=0, le=1000)] = 0.0
     fourcc: str = ""
     auto_exposure: bool = False
-    exposure_ms: float | None = bounded(0, 1e9, None)
+    exposure_ms: NonNegative | None = None
     auto_white_balance: bool = False
-    white_balance_k: float | None = bounded(0, 1e9, None)
-    gain: float | None = bounded(0, 1e9, None)
-    led: tuple[int, ...] = ()
+    white_balance_k: NonNegative | None = None
+    gain: NonNegative | None = None
+    led: tuple[Annotated[int, Meta(ge=0, le=15)], ...] = ()
 
     def __post_init__(self) -> None:
         """Raise RobotConfigError for a setting out of range."""
         super().__post_init__()
         size, text, led = (self.width, self.height), self.fourcc, self.led
-        is_size = size == (0, 0) or 1 <= min(size) <= max(size) <= 20000
-        _require("width and height must be given together, up to 20000 pixels", size, is_size)
+        is_size = size == (0, 0) or min(size) > 0
+        _require("width and height must be given together", size, is_size)
         _require('fourcc must be four letters, such as "MJPG"', text, not text or bool(re.fullmatch(r"[ -~]{4}", text)))
         for name, automatic in (("exposure_ms", self.auto_exposure), ("white_balance_k", self.auto_white_balance)):
             value = getattr(self, name)
             _require(f"{name} must be left out if it is automatic", value, not automatic or value is None)
-        _require("led must be three numbers, 0 to 15", led, len(led) in (0, 3) and all(0 <= each <= 15 for each in led))
+        _require("led must be three numbers, 0 to 15", led, len(led) in (0, 3))
 
     def requested(self) -> dict[str, Any]:
         """Return the settings to write, in order of writing."""
@@ -114,10 +116,10 @@ class ReaderSettings(TypedSettings):
         frozen_s: Duration of equal frames after which the stream is opened again; they are stale long before.
     """
 
-    keep: int = bounded(1, 1000, 4, unit="pictures")
-    warmup_s: float = bounded(0, MAX_CAMERA_WAIT_S, 1.0, unit="s")
-    timeout_s: float = bounded(1e-3, MAX_CAMERA_WAIT_S, 3.0, unit="s")
-    frozen_s: float = bounded(1e-3, MAX_CAMERA_WAIT_S, 2.0, unit="s")
+    keep: Annotated[int, Meta(ge=1, le=1000)] = 4
+    warmup_s: Annotated[float, Meta(ge=0, le=MAX_CAMERA_WAIT_S)] = 1.0
+    timeout_s: Annotated[float, Meta(ge=1e-3, le=MAX_CAMERA_WAIT_S)] = 3.0
+    frozen_s: Annotated[float, Meta(ge=1e-3, le=MAX_CAMERA_WAIT_S)] = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,9 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Annotated, Any
+
+from msgspec import Meta
 
 from robot.devices import Clock, Gripper
 from robot.drivers.wsg50 import codec
@@ -35,7 +37,7 @@ from robot.drivers.wsg50.codec import (
 from robot.drivers.wsg50.link import CommandFailed, Link, LinkLost, NoReply
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import GripperState, GripperStatus
-from robot.settings import TypedSettings, bounded
+from robot.settings import TypedSettings
 
 _log = logging.getLogger(__name__)
 
@@ -111,19 +113,20 @@ class WSG50Settings(TypedSettings):
     """
 
     port: str
-    baud: int = bounded(28_000, 4_000_000, 115200)  # updates take at most half of the line: 2 x 25 x 11 x 50 bits/s
-    stop_bits: int = bounded(1, 2, 1)
-    timeout_s: float = bounded(1e-3, 600, 1.0)
+    # The updates take at most half of the line: 2 x 25 x 11 x 50 bits/s.
+    baud: Annotated[int, Meta(ge=28_000, le=4_000_000)] = 115200
+    stop_bits: Annotated[int, Meta(ge=1, le=2)] = 1
+    timeout_s: Annotated[float, Meta(ge=1e-3, le=600)] = 1.0
     acknowledge_faults: bool = False
-    grasp_width_mm: float = bounded(0, 1000, 0.0)
-    min_part_mm: float = bounded(0, 1000, 1.0)
-    opening_speed_mm_s: float = bounded(1e-3, 1e4, 80.0)
-    finger_share: float = bounded(0.1, 1.0, 0.5)
-    reconnect_tries: int = bounded(1, 20, 5)
-    reconnect_s: float = bounded(0, 5, 0.2)
-    max_force_n: float = bounded(1e-3, 1e4, 40.0)
-    max_speed_mm_s: float = bounded(1e-3, 1e4, 420.0)
-    max_state_age_s: float = bounded(0.04, 60, 0.5)
+    grasp_width_mm: Annotated[float, Meta(ge=0, le=1000)] = 0.0
+    min_part_mm: Annotated[float, Meta(ge=0, le=1000)] = 1.0
+    opening_speed_mm_s: Annotated[float, Meta(ge=1e-3, le=1e4)] = 80.0
+    finger_share: Annotated[float, Meta(ge=0.1, le=1.0)] = 0.5
+    reconnect_tries: Annotated[int, Meta(ge=1, le=20)] = 5
+    reconnect_s: Annotated[float, Meta(ge=0, le=5)] = 0.2
+    max_force_n: Annotated[float, Meta(ge=1e-3, le=1e4)] = 40.0
+    max_speed_mm_s: Annotated[float, Meta(ge=1e-3, le=1e4)] = 420.0
+    max_state_age_s: Annotated[float, Meta(ge=0.04, le=60)] = 0.5
 
     def to_finger_force(self, gripper_n: float) -> float:
         """Convert the gripper's force (N) to the force on each finger (N).

@@ -6,10 +6,13 @@ Values are typical of the class at room temperature; each object draws its own a
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 
-from robot.settings import TypedSettings, bounded
+from _touch_retrieval.documents import Positive
+from robot.settings import TypedSettings
 
 
 @dataclass(frozen=True)
@@ -17,12 +20,12 @@ class ObjectMaterial(TypedSettings):
     """Isotropic linear elasticity, density, friction against gel, and gloss and roughness for shading (0 to 1)."""
 
     name: str
-    modulus_mpa: float = bounded(1e-3, 1e6)
-    poisson: float = bounded(-1.0, 0.5)
-    density_kg_m3: float = bounded(1.0, 25000.0)
-    friction: float = bounded(0.0, 5.0)
-    gloss: float = bounded(0.0, 1.0)
-    roughness: float = bounded(0.0, 1.0)
+    modulus_mpa: Positive
+    poisson: Annotated[float, Meta(ge=-1.0, le=0.5)]
+    density_kg_m3: Annotated[float, Meta(ge=1.0, le=25000.0)]
+    friction: Annotated[float, Meta(ge=0.0, le=5.0)]
+    gloss: Annotated[float, Meta(ge=0.0, le=1.0)]
+    roughness: Annotated[float, Meta(ge=0.0, le=1.0)]
 
 
 _TABLE = (

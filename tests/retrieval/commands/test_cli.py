@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -197,16 +198,13 @@ def required_words(command):
 @pytest.mark.parametrize(("words", "command", "option"), numeric_options())
 def test_the_command_line_rejects_numbers_out_of_range(words, command, option, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    low, high = option.type.func.low, option.type.func.high
-    wrong = [low - 1, high + 1, "1" * 31, f"-{'1' * 31}", "inf", "-inf", "nan", "1e400"]
-    for value in wrong:
+    for value in ("-1", "1" * 31, f"-{'1' * 31}", "inf", "-inf", "nan", "1e400"):
         assert main([*words, *required_words(command), f"{option.opts[0]}={value}"]) == 2
         output = capsys.readouterr()
         (line,) = output.err.splitlines()
         assert f"Invalid value for '{option.opts[0]}'" in line
-        assert line.endswith(
-            (f"must be from {low} to {high}, got {value}; see --help", f"{value!r} is not a valid int; see --help")
-        )
+        assert re.search(r"it must (be .*|fit into 64 bits), got|is not a valid int", line)
+        assert line.endswith("; see --help")
         assert output.out == ""
     assert not list(tmp_path.iterdir())
 

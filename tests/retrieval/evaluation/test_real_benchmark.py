@@ -154,7 +154,7 @@ def test_a_stopped_run_resumes(data, out, tmp_path, monkeypatch, capsys):
         (["--protocols", "ycb"], "protocol must be one of"),
         (["--methods", "mine"], "method must be one of"),
         (["--model", "alone"], "NAME=FILE"),
-        (["--seeds", "0"], "must be from 1 to 1000000000, got 0"),
+        (["--seeds", "0"], "must be a whole number >= 1, got 0"),
     ],
 )
 def test_wrong_use_is_one_line(data, tmp_path, options, message, capsys):

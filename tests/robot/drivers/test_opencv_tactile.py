@@ -164,7 +164,7 @@ def test_the_zoom_control_of_a_digit_sets_its_brightness(plug):
     ("setting", "message"),
     [
         ({"width": 640}, "width and height"),
-        ({"width": -1, "height": -1}, "width and height"),
+        ({"width": -1, "height": -1}, "width must be"),
         ({"fps": -1.0}, "fps"),
         ({"fps": math.nan}, "fps"),
         ({"fourcc": "MJPEG"}, "fourcc"),

@@ -149,7 +149,7 @@ def test_a_pose_that_is_incomplete_is_an_error():
 
 
 def test_a_smallest_force_above_the_limit_of_the_rig_is_refused():
-    with pytest.raises(RobotConfigError, match=r"min_force_n must be from 0.001 to 20 N, got 30"):
+    with pytest.raises(RobotConfigError, match=r"min_force_n must be at most max_force_n, got 30"):
         OwnGripper(stroke_mm=80.0, min_force_n=30.0, max_force_n=20.0, **WORKING)
 
 
