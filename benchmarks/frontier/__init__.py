@@ -5,18 +5,30 @@ training. `python -m benchmarks.frontier --out report/` measures and plots them 
 search.
 """
 
-APPROXIMATIONS = {
-    "reduced": "benchmarks.frontier.large_photos:reduced",
-    "training_formats": "benchmarks.frontier.training:training_formats",
-    "cca_solver": "benchmarks.frontier.correlation:cca_solver",
-    "cca_components": "benchmarks.frontier.correlation:cca_components",
-    "rays": "benchmarks.frontier.rays:rays",
-    "sky_occlusion": "benchmarks.frontier.light:sky",
-    "contact": "benchmarks.frontier.contact:contact",
-    "contact_products": "benchmarks.frontier.contact:contact_products",
-    "gel_optics": "benchmarks.frontier.optics:gel_optics",
-}
-"""Name -> the function that measures it, as in `retrieval.frontier`."""
+from typing import TYPE_CHECKING
+
+from _touch_retrieval.registry import Registry
+from retrieval.errors import ConfigError
+
+if TYPE_CHECKING:
+    from retrieval.frontier import Approximations
+
+APPROXIMATIONS: "Approximations" = Registry(
+    "approximation",
+    "approximations",
+    {
+        "reduced": "benchmarks.frontier.large_photos:reduced",
+        "training_formats": "benchmarks.frontier.training:training_formats",
+        "cca_solver": "benchmarks.frontier.correlation:cca_solver",
+        "cca_components": "benchmarks.frontier.correlation:cca_components",
+        "rays": "benchmarks.frontier.rays:rays",
+        "sky_occlusion": "benchmarks.frontier.light:sky",
+        "contact": "benchmarks.frontier.contact:contact",
+        "contact_products": "benchmarks.frontier.contact:contact_products",
+        "gel_optics": "benchmarks.frontier.optics:gel_optics",
+    },
+    error=ConfigError,
+)
 
 NEED_NO_MODEL = frozenset({"cca_solver", "rays", "sky_occlusion", "contact", "contact_products", "gel_optics"})
 """Approximations that need neither a model nor a recording."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.frontier.closed_forms import BALL_MM, HALF_SPACE, Grid, hertz, percent, pressed_ball
 from retrieval.frontier.clock import time_points
-from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, smallest_error
+from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff
 from retrieval.frontier.sample import Sample
 from robot.sim.contact.kernels import Floats
 from robot.sim.contact.layer import SINGLE_PRECISION_TOLERANCE, Contact, Layer, press
@@ -110,7 +110,7 @@ def _panel(
     repeats: int,
 ) -> Panel:
     title, timed = f"contact grid and tolerance, {surface}", time_points(points, works, repeats)
-    return Panel(title, "one contact", unit, reference, tolerance, timed, smallest_error(timed))
+    return Panel(title, "one contact", unit, reference, tolerance, timed)
 
 
 def _pressed_ridges(grid: Grid, tolerance: float) -> Contact:
@@ -172,9 +172,7 @@ def products_panel(repeats: int, rows: int | None = None, tolerances: Sequence[f
             points.append(Tradeoff(series, f"tolerance {tolerance:g}", error, is_default=is_default))
     timed = time_points(points, works, repeats)
     reference = "float64, tolerance 1e-08"
-    return Panel(
-        "precision of contact", "one contact", "um rms of surface", reference, 0.1, timed, smallest_error(timed)
-    )
+    return Panel("precision of contact", "one contact", "um rms of surface", reference, 0.1, timed)
 
 
 def _pressed(gap: Floats, pixel_mm: float, tolerance: float, single_precision: bool, force_n: float = 3.0) -> Floats:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.frontier.clock import time_points
-from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, miss_rate_point, smallest_error
+from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, miss_rate_point
 from retrieval.frontier.sample import Sample
 from retrieval.methods.cca import Cca, canonical_correlations, cosine, decompose, unit_rows
 from retrieval.methods.method import MethodSettings
@@ -68,7 +68,6 @@ def cca_solver(sample: Sample) -> ApproximationResult:
         reference="correlations known by construction",
         tolerance=1e-6,
         points=points,
-        resolution=smallest_error(points),
     )
     return ApproximationResult(
         "CCA: solver",

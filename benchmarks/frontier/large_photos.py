@@ -14,7 +14,7 @@ from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import RgbImage
 from retrieval.data.views import tile_views
 from retrieval.frontier.clock import time_points
-from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, miss_rate_point, smallest_error
+from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, miss_rate_point
 from retrieval.frontier.sample import Array, Sample
 from retrieval.model.encode import encode_photos
 from robot.sim.camera import PinholeCamera
@@ -91,7 +91,7 @@ def _panels(
         ("change of match logits", "nats, mean", logit_changes),
     ):
         made = tuple(dataclasses.replace(point, error=error) for point, error in zip(points, errors[:-1], strict=True))
-        yield Panel(title, time, unit, reference, float(f"{errors[-1]:.2g}"), made, smallest_error(made))
+        yield Panel(title, time, unit, reference, float(f"{errors[-1]:.2g}"), made)
     flips = tuple(
         dataclasses.replace(
             miss_rate_point(point.series, point.setting, wrong, point.is_default), seconds=point.seconds

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.frontier.clock import time_points
-from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, smallest_error
+from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff
 from retrieval.frontier.sample import Sample
 from robot.sim.camera import (
     NOISE,
@@ -50,15 +50,7 @@ def sky_panel(repeats: int, px: int = 512, steps: Sequence[int] = (1, 2, 4, 8)) 
         error = 100.0 * _SKY_FRACTION * float(np.abs(work() - exact)[~mask].max())
         points.append(Tradeoff("", f"{count} steps", error, is_default=count == SKY_STEPS))
     timed = time_points(points, works, repeats)
-    return Panel(
-        "sky occlusion",
-        f"a photo of {px} px",
-        "% of light",
-        "the full grid",
-        1.0,
-        timed,
-        smallest_error(timed),
-    )
+    return Panel("sky occlusion", f"a photo of {px} px", "% of light", "the full grid", 1.0, timed)
 
 
 # Arithmetic ------------------------------------------------------------------------------------------------
@@ -80,7 +72,7 @@ def light_panel(repeats: int, objects: int = 8, px: int = 256) -> Panel:
     ]
     timed = time_points(points, works, repeats)
     time, reference = f"shading and developing {objects} photos of {px} px", "float64, array by array"
-    return Panel("arithmetic of light", time, "grey levels at most", reference, 1.0, timed, smallest_error(timed))
+    return Panel("arithmetic of light", time, "grey levels at most", reference, 1.0, timed)
 
 
 def _shading_inputs(number: int, px: int) -> tuple[GBuffer, Lamps]:

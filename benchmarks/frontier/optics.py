@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.optics.photometric import DEGREES, by_degree
 from retrieval.frontier.clock import time_points
-from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, smallest_error
+from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff
 from retrieval.frontier.sample import Sample
 from robot.sim.gel.fitted_optics import FittedOptics, feature_count, fitted_document, load_fitted
 from robot.sim.gel.surface import Field, Surface
@@ -46,7 +46,6 @@ def optics_panel(repeats: int, name: str = "gelsight") -> Panel:
         reference="real presses held out",
         tolerance=3.5,
         points=timed,
-        resolution=smallest_error(timed),
     )
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from benchmarks.frontier.light import light_panel
 from retrieval.frontier.clock import time_points
-from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, smallest_error
+from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff
 from retrieval.frontier.sample import Sample
 from robot.readings import Pose
 from robot.sim.camera import NOISE, PinholeCamera
@@ -114,7 +114,7 @@ def gel_panel(repeats: int, rows: int = 48, steps_mm: Sequence[float] = (1.6, 0.
         points.append(Tradeoff("", f"{step:g} mm", error, is_default=step == GEL_STEP_MM))
     timed = time_points(points, works, repeats)
     reference, time = "equal steps of 0.01 mm", f"{len(exact):,} rays"
-    return Panel("step of a gel's rays", time, "um rms of depth", reference, 2.0, timed, smallest_error(timed))
+    return Panel("step of a gel's rays", time, "um rms of depth", reference, 2.0, timed)
 
 
 def _wall(relief: str) -> SdfBody:
@@ -163,7 +163,7 @@ def photo_panel(
     ]
     timed = time_points(points, [casts for _, casts in taken], repeats)
     time, reference = f"rays of {objects} photos of {px} px, shadows included", f"equal steps of {_EXACT:g} px"
-    return Panel("step of a photo's rays", time, "grey levels rms", reference, NOISE, timed, smallest_error(timed))
+    return Panel("step of a photo's rays", time, "grey levels rms", reference, NOISE, timed)
 
 
 def _photos(marcher: type[RayMarcher], stride: float, objects: int, px: int) -> tuple[Vectors, Callable[[], object]]:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from retrieval.data.pairs import PairBatch, PairSampler
 from retrieval.frontier.clock import time_points
 from retrieval.frontier.formats import load_touch
-from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, smallest_error
+from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff
 from retrieval.frontier.sample import Sample
 from retrieval.model.encode import autocast, has_fast_bfloat16, to_batch, touch_batch
 from retrieval.model.fusion import Matcher
@@ -43,7 +43,7 @@ def training_formats(sample: Sample) -> ApproximationResult:
         f"two batches have a cosine of {between:.2f} with each other. Gel images differ by a few grey levels, which "
         "bfloat16 rounds away, so training computes the first layers of some towers in float32."
         + ("" if fast else " Left out here: this processor multiplies no bfloat16, and trains in float32."),
-        (Panel("rotation of the gradient", time, "1 - cosine", "float32", TOLERANCE, timed, smallest_error(timed)),),
+        (Panel("rotation of the gradient", time, "1 - cosine", "float32", TOLERANCE, timed),),
     )
 
 

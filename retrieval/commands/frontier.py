@@ -1,10 +1,10 @@
 """`retrieve frontier`: measure the error and the run time of each approximation, for one model and recording."""
 
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,6 +12,9 @@ from retrieval.commands.options import Json, Model, OptionValues
 from retrieval.console.interruption import resumable
 from retrieval.console.output import print_json, say
 from retrieval.frontier import APPROXIMATIONS
+
+if TYPE_CHECKING:
+    from retrieval.frontier import Approximations
 
 SEED = 40_000
 """Seed of the collected objects; the shipped checkpoint was trained on other seeds."""
@@ -46,7 +49,7 @@ def run_frontier(
     recording: Path | None,
     only: Sequence[str] = (),
     quick: bool = False,
-    table: Mapping[str, str] = APPROXIMATIONS,
+    table: "Approximations" = APPROXIMATIONS,
     model_free: Collection[str] = (),
 ) -> dict[str, Any]:
     """Measure, and write frontier.json, frontier.html and figures/.

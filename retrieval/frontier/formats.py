@@ -1,7 +1,6 @@
 """Number formats of the towers' arithmetic, and of the partial activations in an index."""
 
 import copy
-import dataclasses
 from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.util import find_spec
@@ -17,7 +16,7 @@ from torch import Tensor
 from retrieval.data.dataset import Grasp
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.frontier.clock import time_points
-from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, miss_rate_point, smallest_error
+from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff
 from retrieval.frontier.sample import Array, Sample
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import batches, for_inference, has_fast_bfloat16, touch_batch
@@ -27,7 +26,6 @@ from retrieval.model.onnx_encoder import OnnxEncoder
 
 LOGIT_TOLERANCE = 0.05
 """Largest negligible error of a match logit: the probability changes by about one percentage point at most."""
-FLIP_TOLERANCE = 1.0
 MAX_TOUCHES = 20
 """Number of touches that each tower format encodes: emulated bfloat16 is slow on processors without it."""
 _BATCH = 16
@@ -37,54 +35,40 @@ _BATCH = 16
 
 def towers(sample: Sample) -> ApproximationResult:
     """Measure formats of the touch tower: errors of match logits against float64, and the time of one touch."""
-    rows = sample.touch_rows[: 2 if sample.scale.quick else min(MAX_TOUCHES, sample.scale.touches)]
+    rows = sample.touch_rows[: min(MAX_TOUCHES, sample.scale.queries)]
     settings = sample.checkpoint.config.preprocessing
     images = [load_touch(settings, sample.grasps[row]) for row in rows]
     photos = sample.real_photo_codes["partial"]
-    whole = copy.deepcopy(sample.checkpoint.matcher).double()
-    exact = _logits(sample, np.concatenate([_touch_partials(whole, part) for part in batches(images, _BATCH)]), photos)
-    errors, flips, works = list[Tradeoff](), list[Tradeoff](), list[Callable[[], object]]()
+
+    def logits(encode: Encode) -> Array:
+        return _logits(sample, np.concatenate([encode(part) for part in batches(images, _BATCH)]), photos)
+
+    exact = logits(partial(_touch_partials, copy.deepcopy(sample.checkpoint.matcher).double()))
+    points, works = list[Tradeoff](), list[Callable[[], object]]()
     for name, encode, is_default in encoders(sample.checkpoint):
-        logits = _logits(sample, np.concatenate([encode(part) for part in batches(images, _BATCH)]), photos)
-        errors.append(Tradeoff(name, "", float(np.abs(logits - exact).max()), is_default=is_default))
-        flips.append(miss_rate_point(name, "", logits.argmax(1) != exact.argmax(1), is_default))
+        points.append(Tradeoff(name, "", _largest_error(logits(encode), exact), is_default=is_default))
         works.append(partial(encode, images[:1]))
     return ApproximationResult(
         "Number format of the towers",
         f"{len(images)} touches, each with {len(photos)} photos, whose partial activations do not change. A query "
         "encodes with ONNX Runtime instead if the file of `retrieve export` is next to the model.",
-        _panels(
-            sample, errors, flips, works, len(images), ("the touch tower in float64", "encoding one touch, one thread")
-        ),
+        (_panel(sample, points, works, "the touch tower in float64", "encoding one touch, one thread"),),
     )
 
 
-def _panels(
-    sample: Sample,
-    errors: list[Tradeoff],
-    flips: list[Tradeoff],
-    works: list[Callable[[], object]],
-    queries: int,
-    words: tuple[str, str],
-) -> tuple[Panel, Panel]:
-    """Return the panels of logit errors and of changed top-1; `words` are the reference and the timed work."""
-    reference, time = words
-    of_errors = time_points(errors, works, sample.scale.repeats)
-    of_flips = tuple(
-        dataclasses.replace(flip, seconds=point.seconds) for flip, point in zip(flips, of_errors, strict=True)
-    )
-    return (
-        Panel(
-            "largest error of a match logit",
-            time,
-            "nats",
-            reference,
-            LOGIT_TOLERANCE,
-            of_errors,
-            smallest_error(errors),
-        ),
-        Panel("changed top-1 photo", time, "% of touches", reference, FLIP_TOLERANCE, of_flips, 100 / queries),
-    )
+def _logits(sample: Sample, touch_partials: Array, photos: NDArray[Any]) -> Array:
+    return np.array([sample.logits(touch_partial, photos) for touch_partial in touch_partials])
+
+
+def _largest_error(logits: Array, exact: Array) -> float:
+    return float(np.abs(logits - exact).max())
+
+
+def _panel(
+    sample: Sample, points: list[Tradeoff], works: list[Callable[[], object]], reference: str, time: str
+) -> Panel:
+    timed = time_points(points, works, sample.scale.repeats)
+    return Panel("largest error of a match logit", time, "nats", reference, LOGIT_TOLERANCE, timed)
 
 
 def load_touch(settings: Preprocessing, grasp: Grasp) -> list[Array]:
@@ -107,7 +91,7 @@ def encoders(checkpoint: Checkpoint) -> Iterator[tuple[str, Encode, bool]]:
     yield "float32, as trained", partial(_touch_partials, matcher), False
     yield "float32, folded", partial(_touch_partials, fast), True
     emulated = "" if has_fast_bfloat16(torch.device("cpu")) else " (emulated here)"
-    yield f"bfloat16, folded{emulated}", partial(_bfloat16, fast), False
+    yield f"bfloat16, folded{emulated}", partial(_touch_partials, fast, bfloat16=True), False
     if all(find_spec(name) for name in ("onnx", "onnxruntime")):
         yield "float32, ONNX Runtime", _onnx(checkpoint), False
 
@@ -122,22 +106,15 @@ def _onnx(checkpoint: Checkpoint) -> Encode:
 
 
 @torch.inference_mode()
-def _touch_partials(matcher: Matcher, images: list[Any]) -> Array:
-    """Return partial activations (B, partial_width) of touches, computed in the dtype of the matcher's weights."""
-    features: Tensor = matcher.touch_tower(touch_batch(images).flatten(0, 1))
-    return matcher.touch_encoding(features.reshape(len(images), -1)).partial.float().numpy()
+def _touch_partials(matcher: Matcher, images: list[Any], bfloat16: bool = False) -> Array:
+    """Return partial activations (B, partial_width) of touches, computed in the dtype of the matcher's weights.
 
-
-@torch.inference_mode()
-def _bfloat16(matcher: Matcher, images: list[Any]) -> Array:
-    """Run the tower in bfloat16 and the following layers in float32."""
-    with torch.autocast("cpu", torch.bfloat16):
+    With `bfloat16`, the tower runs in bfloat16 and the following layers in float32.
+    """
+    with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
         features: Tensor = matcher.touch_tower(touch_batch(images).flatten(0, 1))
-    return matcher.touch_encoding(features.float().reshape(len(images), -1)).partial.numpy()
-
-
-def _logits(sample: Sample, partials: Array, photos: NDArray[Any]) -> Array:
-    return np.array([sample.logits(touch_partial, photos) for touch_partial in partials])
+    features = features.float() if bfloat16 else features
+    return matcher.touch_encoding(features.reshape(len(images), -1)).partial.float().numpy()
 
 
 # Partial activations --------------------------------------------------------------------------------------
@@ -145,29 +122,21 @@ def _logits(sample: Sample, partials: Array, photos: NDArray[Any]) -> Array:
 
 def partials(sample: Sample) -> ApproximationResult:
     """Measure formats of stored partial activations: logit errors against float32, and the time of 1,000 photos."""
-    queries = sample.touch_encodings(sample.touch_rows[: sample.scale.touches])["partial"]
+    queries = sample.queries["partial"]
     whole = sample.real_photo_codes["partial"]
     exact = _logits(sample, queries, whole)
     many = np.tile(whole, (1 + 1000 // len(whole), 1))[:1000]
-    errors, flips, works = list[Tradeoff](), list[Tradeoff](), list[Callable[[], object]]()
+    points, works = list[Tradeoff](), list[Callable[[], object]]()
     for name, store, read, is_default in FORMATS:
-        logits = _logits(sample, queries, read(store(whole)))
         setting = f"{sum(part.nbytes for part in store(many)) // len(many)} bytes a photo"
-        errors.append(Tradeoff(name, setting, float(np.abs(logits - exact).max()), is_default=is_default))
-        flips.append(miss_rate_point(name, setting, logits.argmax(1) != exact.argmax(1), is_default))
+        error = _largest_error(_logits(sample, queries, read(store(whole))), exact)
+        points.append(Tradeoff(name, setting, error, is_default=is_default))
         works.append(partial(lambda read, stored: sample.logits(queries[0], read(stored)), read, store(many)))
     return ApproximationResult(
         "Number format of stored partial activations",
         f"{len(queries)} touches, each with {len(whole)} photos. Arithmetic is in float32 for every format, so a "
         "smaller one saves memory but no time. An index stores float16: half the bytes, and no answer changes.",
-        _panels(
-            sample,
-            errors,
-            flips,
-            works,
-            len(queries),
-            ("partial activations in float32", "scoring 1,000 photos, one thread"),
-        ),
+        (_panel(sample, points, works, "partial activations in float32", "scoring 1,000 photos, one thread"),),
     )
 
 

@@ -11,9 +11,9 @@ from indexes.kinds.faiss_index import FaissIndex
 from indexes.kinds.measure import recall_against_exact
 from indexes.kinds.vector_index import VectorIndex
 from retrieval.console.progress import Bar
-from retrieval.frontier.candidates import default_k, is_used
+from retrieval.frontier.candidates import default_k
 from retrieval.frontier.clock import time_points
-from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, miss_rate_point, smallest_error
+from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, miss_rate_point
 from retrieval.frontier.sample import Array, Sample
 
 NEIGHBOURS = 10
@@ -27,56 +27,45 @@ STRUCTURES = {
     "HNSW32": ("efSearch", (16, 64, 256, 1024)),
 }
 """Factory strings of FAISS, with the search setting that trades time for recall and its values, the fastest first."""
-TimedPoint = tuple[Tradeoff, Callable[[], object]]
 
 
 def index_kinds(sample: Sample) -> ApproximationResult:
-    """Measure every kind with several settings on the blended catalogue, with the embedding in use."""
-    used = [name for name in sample.catalogue.embeddings if is_used(sample, name)]
-    if not used:
+    """Measure every kind with several settings on the blended catalogue, with the embedding that search uses."""
+    name = sample.search_embedding
+    if name is None:
         return ApproximationResult("Kind of index", "", skipped="this model has no trained embeddings")
-    embeddings, queries = sample.catalogue.embeddings[used[0]], sample.queries[used[0]]
+    embeddings, queries = sample.catalogue[name], sample.queries[name]
     k = min(default_k(sample), len(embeddings) // 4)
-    near, far = list[TimedPoint](), list[TimedPoint]()
+    misses, lacking = list[Tradeoff](), list[Tradeoff]()
+    measured = list[VectorIndex]()
     settings = sum(len(values) for _, values in STRUCTURES.values())
     with Bar("kinds of index", 1 + settings, "settings", quiet=sample.quiet) as bar:
         for series, setting, index in _indexes(embeddings, sample.scale.quick):
             is_default = series == DEFAULT
-            rows = index.search(queries, k)[1]
-            lost = ~(rows == sample.exhaustive_top1[:, None]).any(1)
-            far.append((miss_rate_point(series, setting, lost, is_default), _query_work(index, queries, k)))
-            lacking = 100 * (1 - recall_against_exact(index, queries, NEIGHBOURS))
-            near.append(
-                (Tradeoff(series, setting, lacking, is_default=is_default), _query_work(index, queries, NEIGHBOURS))
-            )
+            missed = ~(index.search(queries, k)[1] == sample.exhaustive_top1[:, None]).any(1)
+            misses.append(miss_rate_point(series, setting, missed, is_default))
+            lack = 100 * (1 - recall_against_exact(index, queries, NEIGHBOURS))
+            lacking.append(Tradeoff(series, setting, lack, is_default=is_default))
+            measured.append(index)
             bar.advance()
-    of_top1, of_neighbours = (_time_all(sample, each) for each in (far, near))
+
+    def panel(points: list[Tradeoff], title: str, k: int, unit: str, reference: str, resolution: float | None) -> Panel:
+        timed = time_points(points, [_query_work(index, queries, k) for index in measured], sample.scale.repeats)
+        time = f"search of one query for k = {k:,}, one thread"
+        return Panel(title, time, unit, reference, TOLERANCE, timed, resolution)
+
+    top1, neighbours = f"missed exhaustive top-1, k = {k:,} candidates", f"missed nearest {NEIGHBOURS}"
     return ApproximationResult(
         "Kind of index",
-        f"Search over {len(embeddings):,} blended photos by the {used[0]}. An answer needs the exhaustive top-1 of the "
+        f"Search over {len(embeddings):,} blended photos by the {name}. An answer needs the exhaustive top-1 of the "
         "fusion head among the candidates. The usual measure of such indexes is another one: recall of nearest "
         "neighbours. Exact search is the default: it needs no training, and its recall does not depend on the "
         "catalogue. `build-index --kind` takes the name and the setting of a point, such as HNSW32;efSearch=64.",
         (
-            _panel(
-                f"missed exhaustive top-1, k = {k:,} candidates", k, "every photo reranked", 100 / len(queries), of_top1
-            ),
-            _panel(
-                f"missed nearest {NEIGHBOURS}", NEIGHBOURS, "exact search", smallest_error(of_neighbours), of_neighbours
-            ),
+            panel(misses, top1, k, "% of queries", "every photo reranked", 100 / len(queries)),
+            panel(lacking, neighbours, NEIGHBOURS, "% of neighbours", "exact search", None),
         ),
     )
-
-
-def _time_all(sample: Sample, measured: list[TimedPoint]) -> tuple[Tradeoff, ...]:
-    points, works = zip(*measured, strict=True)
-    return time_points(points, works, sample.scale.repeats)
-
-
-def _panel(title: str, k: int, reference: str, resolution: float, points: tuple[Tradeoff, ...]) -> Panel:
-    unit = "% of neighbours" if reference == "exact search" else "% of queries"
-    time = f"search of one query for k = {k:,}, one thread"
-    return Panel(title, time, unit, reference, TOLERANCE, points, resolution)
 
 
 def _indexes(embeddings: Array, quick: bool) -> Iterator[tuple[str, str, VectorIndex]]:

@@ -1,14 +1,16 @@
 """Results of a measurement: points of error and time, the Pareto front, and the recommended point."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.metrics.k_way import binomial_interval
+from retrieval.report.numbers import format_number
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,22 @@ class Tradeoff:
         return ", ".join(part for part in (self.series, self.setting) if part)
 
 
+def miss_rate_point(
+    series: str, setting: str, wrong: Sequence[bool] | NDArray[np.bool_], is_default: bool = False
+) -> Tradeoff:
+    """Return a point whose error is the percentage of wrong queries.
+
+    Args:
+        series: As in `Tradeoff`.
+        setting: As in `Tradeoff`.
+        wrong: Whether each query is wrong; the 95 % interval is exact for independent queries.
+        is_default: As in `Tradeoff`.
+    """
+    count, bad = len(wrong), int(np.count_nonzero(wrong))
+    low, high = binomial_interval(bad, count)
+    return Tradeoff(series, setting, 100 * bad / count, 100 * low, 100 * high, is_default)
+
+
 @dataclass(frozen=True)
 class Panel:
     """The points of one plot: one kind of error against one reference, one kind of time.
@@ -50,7 +68,7 @@ class Panel:
         reference: The reference of the error.
         tolerance: Accepted error; the recommended point is the fastest within it.
         points: The points.
-        resolution: Smallest measurable error above 0.
+        resolution: Smallest measurable error above 0, such as 100 / queries; None for the smallest of the points.
     """
 
     title: str
@@ -59,7 +77,7 @@ class Panel:
     reference: str
     tolerance: float
     points: tuple[Tradeoff, ...]
-    resolution: float
+    resolution: float | None = None
 
     @property
     def recommended(self) -> Tradeoff:
@@ -85,38 +103,16 @@ class Panel:
     def line(self) -> str:
         """Return the panel as one line of text."""
         best, used = self.recommended, self.default
-        within = f"cheapest within {self.tolerance:g}"
-        label = within if best.error <= self.tolerance else f"none within {self.tolerance:g}, smallest error"
-        parts = [f"{self.title} (against {self.reference})", f"{label}: {self.describe(best)}"]
-        if used is None:
-            parts.append("no default")
-        elif used == best:
-            parts.append("this is the default")
-        else:
-            parts.append(f"default {self.describe(used)}")
-        return "; ".join(parts)
+        within = f"within {self.tolerance:g}"
+        found = f"cheapest {within}" if best.error <= self.tolerance else f"none {within}, smallest error"
+        default = "no default" if used is None else f"default {self.describe(used)}"
+        if used == best:
+            default = "this is the default"
+        return f"{self.title} (against {self.reference}); {found}: {self.describe(best)}; {default}"
 
     def describe(self, point: Tradeoff) -> str:
         """Return name, error and time of a point as text."""
         return f"{point.name}: {format_number(point.error)} {self.unit}, {format_duration(point.seconds)}"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON types: the fields, with marks of recommended points and of the Pareto front."""
-        front = self.pareto()
-        points = [
-            asdict(point) | {"recommended": point == self.recommended, "pareto": point in front}
-            for point in self.points
-        ]
-        return asdict(self) | {"points": points}
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> "Panel":
-        """Return the panel of `to_dict`."""
-        derived = {"recommended", "pareto"}
-        points = tuple(
-            Tradeoff(**{key: value for key, value in point.items() if key not in derived}) for point in data["points"]
-        )
-        return cls(**{**data, "points": points})
 
 
 @dataclass(frozen=True)
@@ -140,47 +136,16 @@ class ApproximationResult:
         return [panel.line() for panel in self.panels] or [f"{self.title}: left out, {self.skipped}"]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return JSON types."""
-        return asdict(self) | {"panels": [panel.to_dict() for panel in self.panels], "lines": self.lines()}
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> "ApproximationResult":
-        """Return the result of `to_dict`."""
-        panels = tuple(Panel.from_dict(panel) for panel in data["panels"])
-        return cls(data["title"], data["text"], panels, data["skipped"])
-
-
-def miss_rate_point(
-    series: str, setting: str, wrong: Sequence[bool] | NDArray[np.bool_], is_default: bool = False
-) -> Tradeoff:
-    """Return a point whose error is the percentage of wrong queries.
-
-    Args:
-        series: As in `Tradeoff`.
-        setting: As in `Tradeoff`.
-        wrong: Whether each query is wrong; the 95 % interval is exact for independent queries.
-        is_default: As in `Tradeoff`.
-    """
-    count, bad = len(wrong), int(np.count_nonzero(wrong))
-    low, high = binomial_interval(bad, count)
-    return Tradeoff(series, setting, 100 * bad / count, 100 * low, 100 * high, is_default)
-
-
-def smallest_error(points: Iterable[Tradeoff]) -> float:
-    """Return the smallest error above 0, the resolution of errors that are no fractions; 1 if all are 0."""
-    return min((point.error for point in points if point.error > 0), default=1.0)
-
-
-def format_number(value: float) -> str:
-    """Format a number with two or three digits, without an exponent if it stays short."""
-    if value == 0:
-        return "0"
-    return f"{value:.3g}" if 1e-3 <= abs(value) < 1e5 else f"{value:.1e}"
+        """Return JSON types: the fields, the lines, and marks of recommended points and of the Pareto front."""
+        found: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(self)) | {"lines": self.lines()}
+        for panel, entry in zip(self.panels, found["panels"], strict=True):
+            best, front = panel.recommended, panel.pareto()
+            for point, one in zip(panel.points, entry["points"], strict=True):
+                one |= {"recommended": point == best, "pareto": point in front}
+        return found
 
 
 def format_duration(seconds: float) -> str:
     """Format a duration in s, ms or us with three digits."""
-    for unit, scale in (("s", 1.0), ("ms", 1e3)):
-        if seconds * scale >= 1:
-            return f"{seconds * scale:.3g} {unit}"
-    return f"{1e6 * seconds:.3g} us" if math.isfinite(seconds) else "-"
+    unit, scale = next((one for one in (("s", 1.0), ("ms", 1e3)) if seconds * one[1] >= 1), ("us", 1e6))
+    return f"{format_number(seconds * scale)} {unit}"

@@ -4,12 +4,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
-from retrieval.console.files import text_bytes, write_output
-from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, format_duration, format_number
-from retrieval.report.canvas import MUTED_COLOUR, Axes, Figure, canvas, draw, logarithmic
-from retrieval.report.document import Block, Details, Document, Picture, Section, Table, Text, to_html
+from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, format_duration
+from retrieval.report.canvas import MUTED_COLOUR, Axes, Figure, canvas, logarithmic
+from retrieval.report.document import Block, Details, Document, Picture, Section, Table, Text, write_document
+from retrieval.report.numbers import format_number, interval
 from retrieval.report.results import capitalized
 
 # Palette of Okabe and Ito; the markers distinguish series without colour.
@@ -23,14 +24,13 @@ _FLOOR = 0.5
 
 LEGEND = (
     "Lower left is better. The line is the Pareto front: for its points, no other point is better in both time and "
-    "error. The star marks "
-    "the recommended point, the fastest within the tolerance (dashed); the ring marks the default. An open marker at "
-    "the lower edge is a measured error of 0. Whiskers are 95 % intervals."
+    "error. The star marks the recommended point, the fastest within the tolerance (dashed); the ring marks the "
+    "default. An open marker at the lower edge is a measured error of 0. Whiskers are 95 % intervals."
 )
 
 
 def write_frontier(out: Path, document: Mapping[str, Any]) -> list[Path]:
-    """Write `out`/frontier.html and `out`/figures/NAME.png.
+    """Write frontier.html, frontier.md and figures/.
 
     Args:
         out: Folder of the report.
@@ -42,31 +42,24 @@ def write_frontier(out: Path, document: Mapping[str, Any]) -> list[Path]:
     Raises:
         RetrievalError: matplotlib is missing.
     """
-    rows = {name: ApproximationResult.from_dict(row) for name, row in document["rows"].items()}
-    figures = {out / "figures" / f"{name}.png": row.panels for name, row in rows.items() if row.panels}
-    for path, panels in figures.items():
-        draw(path, figure, panels)
-    page = out / "frontier.html"
+    rows = msgspec.convert(document["rows"], dict[str, ApproximationResult])
     sections = tuple(Section(row.title, tuple(_section(name, row))) for name, row in rows.items())
-    html = to_html(Document("Error against run time", tuple(_lead(document, rows)), sections), out)
-    write_output(page, text_bytes(html))
-    return [page, *figures]
+    page = Document("Error against run time", tuple(_lead(document, rows)), sections)
+    return write_document(page, out, "frontier")
 
 
 def _lead(document: Mapping[str, Any], rows: Mapping[str, ApproximationResult]) -> Iterator[Block]:
-    machine, scale = document["machine"], document["scale"]
+    machine = document["machine"]
     yield Text(
         "The error of each approximation against its reference and its run time were measured in one run on this "
-        f"machine: {machine['processor']}, {machine['cores']} core(s), "
-        f"{machine['system']}. Times are medians."
+        f"machine: {machine['processor']}, {machine['cores']} core(s), {machine['system']}. Times are medians."
     )
     yield Text(LEGEND)
-    if scale["quick"]:
+    if document["scale"]["quick"]:
         yield Text("A quick run: too few queries and repetitions for conclusions.", warn=True)
-    found = [(row.title, panel) for row in rows.values() for panel in row.panels]
     yield Table(
         ("approximation", "error", "reference", "tolerance", "recommended", "default"),
-        tuple(_summary(title, panel) for title, panel in found),
+        tuple(_summary(row.title, panel) for row in rows.values() for panel in row.panels),
         words=frozenset({1, 2, 3, 4, 5}),
     )
 
@@ -83,35 +76,24 @@ def _section(name: str, row: ApproximationResult) -> Iterator[Block]:
     if row.skipped:
         yield Text(f"Left out: {row.skipped}.", warn=True)
     if row.panels:
-        lines = [panel.line() for panel in row.panels]
-        yield Picture(
-            f"figures/{name}.png", ". ".join(lines), " ".join(f"{line[0].upper()}{line[1:]}." for line in lines)
-        )
+        lines = row.lines()
+        caption = " ".join(f"{capitalized(line)}." for line in lines)
+        yield Picture(name, ". ".join(lines), caption, lambda: figure(row.panels))
         yield Details("Every point", tuple(_points(panel) for panel in row.panels))
 
 
 def _points(panel: Panel) -> Table:
-    front = panel.pareto()
-    rows = tuple(
-        (
-            point.name,
-            format_duration(point.seconds),
-            format_number(point.error),
-            "" if point.low is None or point.high is None else f"{point.low:.3g} to {point.high:.3g}",
-            ", ".join(word for word, holds in _marks(panel, point, front) if holds),
+    best, front, rows = panel.recommended, panel.pareto(), []
+    for point in panel.points:
+        error = format_number(point.error)
+        if point.low is not None and point.high is not None:
+            error = interval(point.error, point.low, point.high, format_number)
+        marks = {"recommended": point == best, "default": point.is_default, "Pareto": point in front}
+        rows.append(
+            (point.name, format_duration(point.seconds), error, ", ".join(mark for mark in marks if marks[mark]))
         )
-        for point in panel.points
-    )
-    header = (panel.title, panel.time, f"error, {panel.unit}", "95 % interval", "")
-    return Table(header, rows, (f"Against: {panel.reference}.",), frozenset({4}))
-
-
-def _marks(panel: Panel, point: Tradeoff, front: Sequence[Tradeoff]) -> tuple[tuple[str, bool], ...]:
-    return (
-        ("recommended", point == panel.recommended),
-        ("default", point.is_default),
-        ("Pareto", point in front),
-    )
+    header = (panel.title, panel.time, f"error, {panel.unit}", "")
+    return Table(header, tuple(rows), (f"Against: {panel.reference}.",), frozenset({3}))
 
 
 # Figures -----------------------------------------------------------------------------------------------
@@ -129,10 +111,10 @@ def _draw(axes: Axes, panel: Panel) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.margins(x=0.12, y=0.1)
-    floor = _FLOOR * min([panel.resolution, *(point.error for point in panel.points if point.error > 0)])
-    series = list(dict.fromkeys(point.series for point in panel.points))
-    for place, name in enumerate(series):
-        _series(axes, [point for point in panel.points if point.series == name], place, floor, name)
+    measurable = [error for error in (panel.resolution, *(point.error for point in panel.points)) if error]
+    floor = _FLOOR * min(measurable, default=1.0)
+    for number, name in enumerate(dict.fromkeys(point.series for point in panel.points)):
+        _series(axes, [point for point in panel.points if point.series == name], number, floor)
     _front(axes, panel, floor)
     axes.axhline(max(panel.tolerance, floor), color="#333333", ls="--", lw=1, zorder=0, label="tolerance")
     axes.set_title(f"{capitalized(panel.title)}, against {panel.reference}", fontsize=9.5, loc="left")
@@ -144,41 +126,35 @@ def _draw(axes: Axes, panel: Panel) -> None:
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)
 
 
-def _series(axes: Axes, points: Sequence[Tradeoff], place: int, floor: float, name: str) -> None:
-    colour, marker = _COLOURS[place % len(_COLOURS)], _MARKERS[place % len(_MARKERS)]
-    positive = [point for point in points if point.error > 0]
-    axes.plot([], [], marker, color=colour, label=name or None, ls="")
-    for point in positive:
-        if point.low is not None and point.high is not None:
-            at = 1e3 * point.seconds
+def _series(axes: Axes, points: Sequence[Tradeoff], number: int, floor: float) -> None:
+    colour, marker = _COLOURS[number % len(_COLOURS)], _MARKERS[number % len(_MARKERS)]
+    axes.plot([], [], marker, color=colour, label=points[0].series or None, ls="")
+    for point in points:
+        at, error = _place(point, floor)
+        fill = colour if point.error else "white"
+        axes.plot(at, error, marker, mfc=fill, mec=colour, ms=5, clip_on=point.error > 0)
+        if point.error and point.low is not None and point.high is not None:
             axes.plot([at, at], [max(point.low, floor), point.high], color=colour, lw=1, alpha=0.35, zorder=1)
-    axes.plot(
-        [1e3 * point.seconds for point in positive], [point.error for point in positive], marker, color=colour, ms=5
-    )
-    none = [1e3 * point.seconds for point in points if point.error == 0]
-    if none:  # an empty unclipped line would extend the figure to its corner
-        axes.plot(none, np.full(len(none), floor), marker, mfc="white", mec=colour, ms=5, clip_on=False)
 
 
 def _front(axes: Axes, panel: Panel, floor: float) -> None:
-    front = [_place(point, floor) for point in panel.pareto()]
-    axes.plot(*zip(*front, strict=True), color=MUTED_COLOUR, lw=1.2, zorder=0)
-    if (used := panel.default) is not None:
+    front, best, used = panel.pareto(), panel.recommended, panel.default
+    axes.plot(*zip(*(_place(point, floor) for point in front), strict=True), color=MUTED_COLOUR, lw=1.2, zorder=0)
+    if used:
         axes.plot(*_place(used, floor), "o", ms=14, mfc="none", mec="#222222", mew=1.3, clip_on=False, label="default")
-    best = panel.recommended
-    axes.plot(
-        *_place(best, floor), "*", ms=11, color="#c8382e", mec="white", mew=0.6, clip_on=False, label="recommended"
-    )
+    star: Any = {"ms": 11, "color": "#c8382e", "mec": "white", "mew": 0.6, "clip_on": False, "label": "recommended"}
+    axes.plot(*_place(best, floor), "*", **star)
     step = 1 if len(front) < 8 else 2  # a long front has a label at every second point
     axes.get_xlim(), axes.get_ylim()  # fixes the limits, so that pixel positions are final
     previous = np.full(2, np.inf)
-    for point in {id(one): one for one in (*panel.pareto()[::step], best)}.values():
-        at = axes.transData.transform(_place(point, floor))
+    for point in {id(one): one for one in (*front[::step], best)}.values():
+        place = _place(point, floor)
+        at = axes.transData.transform(place)
         side = _BELOW if np.abs(at - previous).max() < _NEAR_PX else _ABOVE
-        label = axes.annotate(point.setting or point.series, _place(point, floor), xytext=side, **_LABEL)
-        label.set_in_layout(False)
+        axes.annotate(point.setting or point.series, place, xytext=side, **_LABEL).set_in_layout(False)
         previous = at
 
 
 def _place(point: Tradeoff, floor: float) -> tuple[float, float]:
+    """Return time in ms and error of a point, in the plot's coordinates."""
     return 1e3 * point.seconds, max(point.error, floor)

@@ -1,10 +1,10 @@
-"""Inputs of the frontier measurements: a model, grasps of unseen objects, and catalogues blended from them.
+"""Inputs of the frontier measurements: a model, grasps of unseen objects, and a catalogue blended from them.
 
 Everything is computed on first use: a row without a recording collects none.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from retrieval.errors import DatasetError
 from retrieval.evaluation.cache import cached_document
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.fusion import ImageEncoding, score_partials
+from retrieval.training.distil import blend
 from retrieval.training.features import Features, encode_recording
 
 Array = NDArray[np.float32]
@@ -31,40 +32,26 @@ class Scale:
 
     Attributes:
         photos: Photos of the blended catalogue.
-        queries: Query touches for that catalogue.
-        touches: Touches whose images are encoded in every setting.
+        queries: Query touches.
         repeats: Timings of each point; the result is their median.
         quick: Whether to use the smallest grids.
     """
 
     photos: int = 100_000
     queries: int = 200
-    touches: int = 240
     repeats: int = 7
     quick: bool = False
 
 
-QUICK = Scale(photos=2000, queries=12, touches=12, repeats=2, quick=True)
-
-
-@dataclass(frozen=True, eq=False)
-class BlendedCatalogue:
-    """A catalogue of N blended photos.
-
-    Attributes:
-        partials: (N, partial_width) float16 partial activations, as in an index.
-        embeddings: Name of the embedding -> (N, d).
-    """
-
-    partials: NDArray[np.float16]
-    embeddings: Mapping[str, Array]
+QUICK = Scale(photos=2000, queries=12, repeats=2, quick=True)
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
     """Grasps of unseen objects: photos of the first half of each object's grasps, touches of the second half.
 
-    No grasp provides both a photo and a touch.
+    No grasp provides both a photo and a touch. Codes of images are dictionaries: "partial" (n, partial_width) is the
+    partial activations, every other name an embedding (n, d).
 
     Attributes:
         model: File of the checkpoint.
@@ -80,7 +67,7 @@ class Sample:
     folder: Path
     scale: Scale
     quiet: bool = False
-    seed: int = field(default=0)
+    seed: int = 0
 
     @cached_property
     def checkpoint(self) -> Checkpoint:
@@ -118,6 +105,12 @@ class Sample:
         return encode_recording(self.grasps, checkpoint.matcher, checkpoint.config, self.folder, quiet=self.quiet)
 
     @cached_property
+    def _is_photo(self) -> NDArray[np.bool_]:
+        owner = np.unique([grasp.object_id for grasp in self.grasps], return_inverse=True)[1]
+        place = np.arange(len(owner)) - np.searchsorted(owner, owner)  # among the grasps of its object
+        return np.asarray(place < np.bincount(owner)[owner] // 2)
+
+    @cached_property
     def photo_rows(self) -> NDArray[np.int64]:
         """Rows of `grasps` whose photos are in the catalogue."""
         return np.flatnonzero(self._is_photo)
@@ -125,71 +118,58 @@ class Sample:
     @cached_property
     def touch_rows(self) -> NDArray[np.int64]:
         """Rows of `grasps` whose touches are queries, in random order, so that the first n have many objects."""
-        rows = np.flatnonzero(~self._is_photo)
-        return np.random.default_rng([self.seed, 1]).permutation(rows)
-
-    @cached_property
-    def _is_photo(self) -> NDArray[np.bool_]:
-        names = np.array([grasp.object_id for grasp in self.grasps])
-        first = np.array([int(np.argmax(names == name)) for name in names])
-        counts = np.array([int(np.count_nonzero(names == name)) for name in names])
-        return np.asarray(np.arange(len(names)) - first < counts // 2)
-
-    @cached_property
-    def owner(self) -> NDArray[np.int64]:
-        """Object number of each of `grasps`."""
-        return np.unique([grasp.object_id for grasp in self.grasps], return_inverse=True)[1].astype(np.int64)
+        return np.random.default_rng([self.seed, 1]).permutation(np.flatnonzero(~self._is_photo))
 
     # Codes -------------------------------------------------------------------------------------------------
 
-    def touch_encodings(self, rows: NDArray[np.int64]) -> dict[str, Array]:
-        """Return "partial" (n, partial_width) and embeddings by name of the touches at these rows of `grasps`."""
+    @cached_property
+    def queries(self) -> dict[str, Array]:
+        """Codes of the query touches."""
+        rows = self.touch_rows[: self.scale.queries]
         return self._codes(self.features.touch[rows].reshape(len(rows), -1), photo=False)
-
-    def photo_encodings(self, rows: NDArray[np.int64]) -> dict[str, Array]:
-        """Return the same as `touch_encodings` for the photos at these rows."""
-        return self._codes(self.features.photo[rows], photo=True)
-
-    @torch.inference_mode()
-    def _codes(self, features: Array, photo: bool) -> dict[str, Array]:
-        matcher, config = self.checkpoint.matcher, self.checkpoint.config
-        inputs = torch.from_numpy(features)
-        code: ImageEncoding = matcher.photo_encoding(inputs) if photo else matcher.touch_encoding(inputs)
-        codes = {"partial": code.partial.numpy()}
-        if matcher.candidate_encoder is not None:
-            encoder = matcher.candidate_encoder
-            encoded = encoder.photo(code.partial) if photo else encoder.touch(code.partial)
-            codes["candidate encoder"] = encoded.numpy()
-        if config.training.trains_embeddings:
-            codes["contrastive embedding"] = code.embedding.numpy()
-        return codes
 
     @cached_property
     def real_photo_codes(self) -> dict[str, Array]:
         """Codes of the photos of `photo_rows`."""
-        return self.photo_encodings(self.photo_rows)
-
-    # Catalogue ---------------------------------------------------------------------------------------------
+        return self._codes(self.features.photo[self.photo_rows], photo=True)
 
     @cached_property
-    def catalogue(self) -> BlendedCatalogue:
-        """Blended photos: each is w A + (1 - w) B of the features of two photos, w uniform in 1/2..1.
+    def catalogue(self) -> dict[str, NDArray[Any]]:
+        """Codes of blends of two photos each; partial activations are float16, as in an index.
 
         Blends are clustered around real photos, unlike white noise.
         """
-        rng = np.random.default_rng([self.seed, 2])
-        blocks: dict[str, list[Array]] = {}
+        generator, features = torch.Generator().manual_seed(self.seed), torch.from_numpy(self.features.photo)
+        blocks: dict[str, list[NDArray[Any]]] = {}
         for start in range(0, self.scale.photos, _BLOCK):
-            blended = blend(self.features.photo, min(_BLOCK, self.scale.photos - start), rng)
-            for name, part in self._codes(blended, photo=True).items():
-                blocks.setdefault(name, []).append(part)
-        partials = np.concatenate([part.astype(np.float16) for part in blocks.pop("partial")])
-        return BlendedCatalogue(partials, {name: np.concatenate(parts) for name, parts in blocks.items()})
+            blended = blend(features, min(_BLOCK, self.scale.photos - start), generator)
+            for name, codes in self._codes(blended.numpy(), photo=True).items():
+                blocks.setdefault(name, []).append(codes.astype(np.float16) if name == "partial" else codes)
+        return {name: np.concatenate(parts) for name, parts in blocks.items()}
 
-    @cached_property
-    def queries(self) -> dict[str, Array]:
-        """Codes of the query touches for `catalogue`."""
-        return self.touch_encodings(self.touch_rows[: self.scale.queries])
+    @torch.inference_mode()
+    def _codes(self, features: Array, photo: bool) -> dict[str, Array]:
+        matcher = self.checkpoint.matcher
+        inputs = torch.from_numpy(features)
+        code: ImageEncoding = matcher.photo_encoding(inputs) if photo else matcher.touch_encoding(inputs)
+        codes = {"partial": code.partial.numpy()}
+        if (encoder := matcher.candidate_encoder) is not None:
+            codes["candidate encoder"] = (encoder.photo if photo else encoder.touch)(code.partial).numpy()
+        if self.checkpoint.config.training.trains_embeddings:
+            codes["contrastive embedding"] = code.embedding.numpy()
+        return codes
+
+    @property
+    def embeddings(self) -> list[str]:
+        """Names of the model's embeddings, first that in which search finds its candidates."""
+        return [name for name in self.queries if name != "partial"]
+
+    @property
+    def search_embedding(self) -> str | None:
+        """The embedding in which search finds its candidates; None for a model without trained embeddings."""
+        return next(iter(self.embeddings), None)
+
+    # Logits ------------------------------------------------------------------------------------------------
 
     @cached_property
     def exhaustive_top1(self) -> NDArray[np.int64]:
@@ -208,25 +188,16 @@ class Sample:
         partials, found = self.queries["partial"], list[int]()
         with Bar("exhaustive rerank", len(partials), "queries", quiet=self.quiet) as bar:
             for touch_partial in partials:
-                found.append(int(self.logits(touch_partial, self.catalogue.partials).argmax()))
+                found.append(int(self.logits(touch_partial, self.catalogue["partial"]).argmax()))
                 bar.advance()
         return found
 
-    def logits(self, touch_partials: Array, photos: NDArray[Any], rows: NDArray[np.int64] | None = None) -> Array:
-        """Return match logits of one touch, or summed over several, with photos.
+    def logits(self, touch_partial: Array, photos: NDArray[Any], rows: NDArray[np.int64] | None = None) -> Array:
+        """Return match logits of one touch with photos.
 
         Args:
-            touch_partials: (partial_width,) of one touch or (G, partial_width) of several.
+            touch_partial: (partial_width,) of the touch.
             photos: (N, partial_width) of the photos.
             rows: Rows of `photos` to score; None for all.
         """
-        return score_partials(
-            self.checkpoint.matcher.head, torch.from_numpy(np.atleast_2d(touch_partials)), photos, rows
-        )
-
-
-def blend(features: Array, count: int, rng: np.random.Generator) -> Array:
-    """Return blends (count, F): w A + (1 - w) B of random rows A and B of (n, F), w uniform in 1/2..1."""
-    one, other = rng.integers(len(features), size=(2, count))
-    weight = rng.uniform(0.5, 1.0, size=(count, 1)).astype(np.float32)
-    return np.asarray(weight * features[one] + (1 - weight) * features[other])
+        return score_partials(self.checkpoint.matcher.head, torch.from_numpy(touch_partial)[None], photos, rows)

@@ -1,45 +1,25 @@
 """Builder of the sections of an evaluation's report."""
 
 from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
 
-from retrieval.report.canvas import draw
-from retrieval.report.document import Block, Details, Picture
-from retrieval.report.results import Results, capitalized, measure_label, method_label, percent
+from retrieval.report.document import Block, Details
+from retrieval.report.numbers import percent
+from retrieval.report.results import Results, capitalized, measure_label, method_label
 
 
 class Builder:
-    """Results and folder of one report; it writes the figures while the sections are built.
+    """Results of one report.
 
     Args:
         results: Results of the evaluation.
-        out: Folder of the report.
 
     Attributes:
         main: The method that the report shows in detail.
-        figures: The figures written so far.
     """
 
-    def __init__(self, results: Results, out: Path) -> None:
-        self.results, self.out = results, out
+    def __init__(self, results: Results) -> None:
+        self.results = results
         self.main = (results.learned or results.methods)[0]
-        self.figures: list[Path] = []
-
-    def picture(self, name: str, alt: str, caption: str, make: Callable[..., Any], *arguments: Any) -> Picture:
-        """Write a figure and return its block.
-
-        Args:
-            name: File name.
-            alt: Text alternative.
-            caption: Caption.
-            make: Function that draws the figure.
-            *arguments: Arguments of `make`.
-        """
-        path = self.out / "figures" / name
-        draw(path, make, *arguments)
-        self.figures.append(path)
-        return Picture(f"figures/{name}", alt, caption)
 
     def any(self, *measures: str) -> bool:
         """Return whether any method has one of these measures."""

@@ -83,13 +83,8 @@ def logarithmic(axis: Any, steps: tuple[int, ...]) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def draw(path: Path, make: Callable[..., Figure], *arguments: Any) -> None:
-    """Write the figure that `make(*arguments)` returns.
-
-    Args:
-        path: PNG file to write.
-        make: Function that draws the figure.
-        *arguments: Arguments of `make`.
+def draw(path: Path, make: Callable[[], Figure]) -> None:
+    """Write the figure that `make()` returns as a PNG file.
 
     Raises:
         RetrievalError: matplotlib is not installed.
@@ -104,7 +99,7 @@ def draw(path: Path, make: Callable[..., Figure], *arguments: Any) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with rc_context(_RC), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # names in scripts that the font lacks
-        agg: Any = FigureCanvasAgg(make(*arguments))
+        agg: Any = FigureCanvasAgg(make())
         agg.draw()
     image, data = Image.fromarray(np.ascontiguousarray(np.asarray(agg.buffer_rgba())[..., :3])), io.BytesIO()
     # A palette of 256 colours makes the file three times smaller.

@@ -1,19 +1,20 @@
-"""Documents of headings, paragraphs, tables and pictures, written as Markdown and as one HTML page.
+"""Documents of headings, paragraphs, tables and figures, written as Markdown and as one HTML page.
 
-Both are made from the same blocks, so their contents agree.
+Both are made from the same blocks, so their contents agree. Every report is such a document: of an evaluation, of error
+against run time, of hard cases.
 """
 
 import json
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 from PIL import Image
 
 from retrieval.console.files import text_bytes, write_output
-from retrieval.report.canvas import FIGURE_DPI
+from retrieval.report.canvas import FIGURE_DPI, Figure, draw
 from retrieval.report.pages import data_uri, render, script
 
 _PAGE_DPI = 96
@@ -63,12 +64,25 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture in a file under the document's folder; `alt` is its text alternative."""
+    """A figure, written to figures/NAME.png next to the document.
+
+    Attributes:
+        name: Name of the file.
+        alt: Text alternative.
+        caption: Text below the figure.
+        figure: Function that draws it.
+    """
 
     kind: ClassVar[str] = "picture"
-    file: str
+    name: str
     alt: str
     caption: str
+    figure: Callable[[], Figure]
+
+    @property
+    def file(self) -> str:
+        """Path of the file, relative to the document."""
+        return f"figures/{self.name}.png"
 
 
 @dataclass(frozen=True)
@@ -97,50 +111,62 @@ class Document:
 
     title: str
     lead: tuple[Block, ...]
-    sections: tuple[Section, ...] = field(default=())
+    sections: tuple[Section, ...]
+
+    def pictures(self) -> list[Picture]:
+        """Return all pictures, also those in folded blocks."""
+        return list(_pictures([*self.lead, *(block for section in self.sections for block in section.blocks)]))
 
 
-def write_document(document: Document, out: Path) -> list[Path]:
-    """Write a document as report.md and report.html.
+def _pictures(blocks: Iterable[Block]) -> Iterator[Picture]:
+    for block in blocks:
+        if isinstance(block, Picture):
+            yield block
+        elif isinstance(block, Details):
+            yield from _pictures(block.blocks)
+
+
+def write_document(document: Document, out: Path, name: str = "report") -> list[Path]:
+    """Write a document as NAME.md, NAME.html and figures/.
 
     Args:
         document: The document.
-        out: Folder to write to; it contains the document's pictures.
+        out: Folder to write to.
+        name: Name of the files.
 
     Returns:
-        The paths of both files.
+        The paths: Markdown, page, figures.
+
+    Raises:
+        RetrievalError: The document has pictures, and matplotlib is not installed.
     """
-    text, page = out / "report.md", out / "report.html"
+    figures = {out / picture.file: picture for picture in document.pictures()}
+    for path, picture in figures.items():
+        draw(path, picture.figure)
+    text, page = out / f"{name}.md", out / f"{name}.html"
     write_output(text, text_bytes(to_markdown(document)))
     write_output(page, text_bytes(to_html(document, out)))
-    return [text, page]
+    return [text, page, *figures]
 
 
 # HTML ------------------------------------------------------------------------------------------------
 
 
 def to_html(document: Document, folder: Path) -> str:
-    """Return one HTML page that embeds the pictures under `folder`."""
+    """Return one HTML page that embeds the figures under `folder`."""
 
-    def uri(file: str) -> str:
-        return data_uri((folder / file).read_bytes(), "png")
+    def uri(picture: Picture) -> str:
+        return data_uri((folder / picture.file).read_bytes(), "png")
 
-    def width(file: str) -> int:
+    def width(picture: Picture) -> int:
         """Return the width of a figure on the page, so that the letters of all figures have one size."""
-        with Image.open(folder / file) as image:
+        with Image.open(folder / picture.file) as image:
             return round(image.width * _PAGE_DPI / FIGURE_DPI)
 
     def anchor(title: str) -> str:
         return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
 
-    return render(
-        "evaluation.html",
-        document=document,
-        uri=uri,
-        width=width,
-        anchor=anchor,
-        script=script("tables.js"),
-    )
+    return render("document.html", document=document, uri=uri, width=width, anchor=anchor, script=script("tables.js"))
 
 
 # Markdown --------------------------------------------------------------------------------------------

@@ -1,12 +1,14 @@
 """Report sections on single objects, queries and decisions: accuracy, confusions, calibration, rejection."""
 
 from collections.abc import Iterator
+from functools import partial
 
 from retrieval.model.verification import ERRORS_NEEDED
 from retrieval.report import plots, tables
 from retrieval.report.builder import Builder
-from retrieval.report.document import Block, Details, Listing, Table, Text
-from retrieval.report.results import file_name, method_label, percent
+from retrieval.report.document import Block, Details, Listing, Picture, Table, Text
+from retrieval.report.numbers import percent
+from retrieval.report.results import file_name, method_label
 
 TOO_FEW = "Not evaluated: the open-set decision requires at least three validation objects and three test objects."
 
@@ -26,14 +28,11 @@ def _per_object_blocks(builder: Builder, name: str) -> Iterator[Block]:
             continue
         best, worst = max(accuracy, key=accuracy.__getitem__), min(accuracy, key=accuracy.__getitem__)
         low, high = percent(accuracy[worst]), percent(accuracy[best])
-        yield builder.picture(
-            f"objects-{key}-{file_name(name)}.png",
+        yield Picture(
+            f"objects-{key}-{file_name(name)}",
             f"Bars, {label}, {candidates}: {high} % ({best}) to {low} % ({worst}).",
             f"Top-1 accuracy among five objects for each object, {label}; {candidates}.",
-            plots.objects,
-            builder.results,
-            name,
-            key,
+            partial(plots.objects, builder.results, name, key),
         )
 
 
@@ -68,14 +67,12 @@ def _reliability(builder: Builder, name: str) -> Iterator[Block]:
     descriptions = [
         f"{text}: ECE {percent(diagrams[key]['ece'])} %" for key, text in plots.RELIABILITIES.items() if key in diagrams
     ]
-    yield builder.picture(
-        f"reliability-{file_name(name)}.png",
+    yield Picture(
+        f"reliability-{file_name(name)}",
         f"Reliability diagrams, {method_label(name)}. {'; '.join(descriptions)}.",
         f"Fraction of right answers against the probability that {method_label(name)} stated; a calibrated method is "
         "on the diagonal. Below: number of answers (logarithmic).",
-        plots.reliability,
-        builder.results,
-        name,
+        lambda: plots.reliability(builder.results, name),
     )
 
 
@@ -88,15 +85,14 @@ def reject(builder: Builder) -> Iterator[Block | None]:
             f"({percent(one['risk_coverage'][-1][1])} % wrong if all queries are answered)"
             for name, one in found.items()
         ]
-        yield builder.picture(
-            "reject.png",
+        yield Picture(
+            "reject",
             f"ROC curves, and risk against coverage; areas under the ROC curves: {', '.join(descriptions)}.",
             "Each query is used twice: with its object in the gallery, and without it. Left: ROC curve of the decision "
             "that the gallery contains the object; the grey line marks 95 % true accepts. Right: fraction of wrong "
             "top-1 answers; half of the queries have no right answer, so a method that answers all of them ends on or "
             "above the grey line.",
-            plots.reject,
-            builder.results,
+            lambda: plots.reject(builder.results),
         )
         yield tables.rejects(builder.results)
     elif any("reject" in one for one in builder.results.data["methods"].values()):

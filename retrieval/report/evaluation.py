@@ -9,16 +9,8 @@ from pathlib import Path
 from retrieval.report import error_analysis, method_comparison, tables
 from retrieval.report.builder import Builder
 from retrieval.report.document import Block, Details, Document, Listing, Section, Table, Text, write_document
-from retrieval.report.results import (
-    FEW_OBJECTS_MARK,
-    FEW_OBJECTS_NOTE,
-    capitalized,
-    measure_label,
-    method_label,
-    percent,
-    read_results,
-    with_interval,
-)
+from retrieval.report.numbers import FEW_OBJECTS_MARK, FEW_OBJECTS_NOTE, percent, with_interval
+from retrieval.report.results import capitalized, measure_label, method_label, read_results
 
 PAPER = (
     "For orientation only: on its own data (98 real objects, real GelSight fingers) the paper reports a pair accuracy "
@@ -55,14 +47,14 @@ def write_report(out: Path) -> list[Path]:
     ['report.md', 'report.html']
     """
     results = read_results(out)
-    builder = Builder(results, out)
+    builder = Builder(results)
     sections = [Section(title, tuple(block for block in build(builder) if block)) for title, build in SECTIONS.items()]
     document = Document(
         f"Which object was touched? Evaluation on {results.data['recording']['path_name']}",
         tuple(_lead(builder)),
         tuple(section for section in sections if section.blocks),
     )
-    return [*write_document(document, out), *builder.figures]
+    return write_document(document, out)
 
 
 def _lead(builder: Builder) -> Iterator[Block]:

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from retrieval.metrics.registry import SET_SIZES, grasps_metric_name
 from retrieval.report import plots, tables
 from retrieval.report.builder import Builder
-from retrieval.report.document import Block, Details, Text
+from retrieval.report.document import Block, Details, Picture, Text
 
 INTERVALS = (
     "Brackets contain 95 % intervals of a bootstrap that resamples objects, because queries of one object are "
@@ -19,12 +19,11 @@ def method_overview(builder: Builder) -> Iterator[Block | None]:
     """Yield the main measures of all methods."""
     if builder.any(*plots.OVERVIEW):
         keys = [key for key in plots.OVERVIEW if builder.any(key)]
-        yield builder.picture(
-            "overview.png",
+        yield Picture(
+            "overview",
             f"Dots with intervals. {'. '.join(builder.values(key) for key in keys)}.",
             "Value and 95 % interval of each method; dashed: chance in closed form.",
-            plots.overview,
-            builder.results,
+            lambda: plots.overview(builder.results),
         )
     yield tables.section(builder.results, "main")
     yield Text(INTERVALS)
@@ -34,13 +33,12 @@ def topn_curves(builder: Builder) -> Iterator[Block | None]:
     """Yield the top-N accuracy: how often the object is among the first N answers."""
     if not builder.any("topn_k5", "topn_k10"):
         return
-    yield builder.picture(
-        "guess-curves.png",
+    yield Picture(
+        "guess-curves",
         f"Rising curves. {builder.values('topn_k5')}. {builder.values('topn_k10')}.",
         "How often the object is among the first N answers, with K − 1 other objects as candidates. Bands: 95 % "
         "intervals.",
-        plots.topn_curves,
-        builder.results,
+        lambda: plots.topn_curves(builder.results),
     )
     for k in (5, 10):
         if table := tables.ranks(builder.results, f"topn_k{k}"):
@@ -51,12 +49,11 @@ def grasps(builder: Builder) -> Iterator[Block | None]:
     """Yield the effect of several grasps of one object."""
     keys = [key for key in map(grasps_metric_name, SET_SIZES) if builder.any(key)]
     if keys:
-        yield builder.picture(
-            "grasps.png",
+        yield Picture(
+            "grasps",
             f"Top-1 accuracy against grasps in a query. {'. '.join(map(builder.values, keys))}.",
             "A query of several grasps of one object against three photos of each of five objects. Dashed: chance.",
-            plots.grasps,
-            builder.results,
+            lambda: plots.grasps(builder.results),
         )
         yield tables.section(builder.results, "grasps")
 
@@ -65,12 +62,11 @@ def time(builder: Builder) -> Iterator[Block | None]:
     """Yield accuracy against run time, and all run times."""
     if builder.results.timings.get("methods"):
         if builder.any("topn_k5"):
-            yield builder.picture(
-                "time.png",
+            yield Picture(
+                "time",
                 f"Accuracy against time on a logarithmic scale. {builder.values('topn_k5')}. Times in the table.",
                 "Upper left is better. The grey steps join the methods on the Pareto front; dashed: chance.",
-                plots.accuracy_and_time,
-                builder.results,
+                lambda: plots.accuracy_and_time(builder.results),
             )
         yield tables.times(builder.results)
 

@@ -19,7 +19,8 @@ from retrieval.report.canvas import (
     percent_axis,
     style_of,
 )
-from retrieval.report.results import Results, measure_label, method_label, percent, shortened
+from retrieval.report.numbers import percent
+from retrieval.report.results import Results, measure_label, method_label, shortened
 
 OVERVIEW = ("pair_accuracy", "topn_k5", "topn_k10", grasps_metric_name(5), "map")
 _LABELLED_OBJECTS = 130

@@ -8,18 +8,16 @@ from retrieval.console.output import show
 from retrieval.evaluation.real import PROTOCOLS, SCHEMA_VERSION
 from retrieval.evaluation.real.verdict import CONTROL_NAMES, RULE
 from retrieval.report.document import Block, Details, Document, Listing, Section, Table, Text, write_document
-from retrieval.report.results import (
+from retrieval.report.numbers import (
     FEW_OBJECTS_MARK,
     FEW_OBJECTS_NOTE,
-    METHOD_LABELS,
     MISSING_VALUE,
-    method_label,
     percent,
     points,
-    read_results_file,
+    probability,
     with_interval,
 )
-from retrieval.report.tables import probability
+from retrieval.report.results import METHOD_LABELS, method_label, read_results_file
 from retrieval.report.terminal import print_columns
 
 Entry = Mapping[str, Any]

@@ -1,4 +1,4 @@
-"""Reader of results.json and timings.json, and the report's labels of methods, measures and numbers."""
+"""Reader of results.json and timings.json, and the report's labels of methods and measures."""
 
 import re
 from collections.abc import Mapping
@@ -10,10 +10,8 @@ from _touch_retrieval.files import read_json
 from retrieval.errors import BadInput
 from retrieval.evaluation import SCHEMA_VERSION
 from retrieval.methods import CHANCE
-from retrieval.metrics.intervals import FEW_OBJECTS
 from retrieval.metrics.registry import METRICS
-
-MISSING_VALUE = "–"
+from retrieval.report.numbers import Summary
 
 # Order of every table and figure. Other methods come last, under their own names.
 METHOD_LABELS = {
@@ -26,7 +24,6 @@ METHOD_LABELS = {
 }
 IMPOSTORS = {"random": "random", "similar": "most similar object"}
 """Labels of the impostors of verification."""
-Summary = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -115,47 +112,6 @@ def capitalized(label: str) -> str:
 def measure_label(name: str) -> str:
     """Return the report's label of a measure."""
     return METRICS[name].label if name in METRICS else name.replace("_", " ")
-
-
-def percent(fraction: float | None, digits: int = 1) -> str:
-    """Return a fraction in percent, without the percent sign."""
-    return MISSING_VALUE if fraction is None else f"{100 * fraction:.{digits}f}"
-
-
-FEW_OBJECTS_MARK = " †"
-FEW_OBJECTS_NOTE = (
-    f"† Fewer than {FEW_OBJECTS} objects: the interval is too narrow. In simulated samples it contained the true value "
-    "in 50 % of cases for 2 objects, 74 % for 3 and 87 % for 4, instead of 95 %."
-)
-
-
-def with_interval(summary: Summary | None, place: int = 0) -> str:
-    """Return value and interval in percent, as in "71.2 [65.0, 77.1]", with a mark if there are too few objects."""
-    if summary is None or summary["value"][place] is None:
-        return MISSING_VALUE
-    return interval(*(summary[key][place] for key in ("value", "low", "high"))) + few_objects_mark(summary)
-
-
-def interval(value: float, low: float, high: float) -> str:
-    """Return a value and its interval in percent, as in "71.2 [65.0, 77.1]"."""
-    return f"{percent(value)} [{percent(low)}, {percent(high)}]"
-
-
-def points(one: Mapping[str, Any]) -> str:
-    """Return a difference and its interval in percent points, with a mark if there are too few objects."""
-    return f"{100 * one['difference']:+.1f} [{100 * one['low']:+.1f}, {100 * one['high']:+.1f}]{few_objects_mark(one)}"
-
-
-def few_objects_mark(summary: Mapping[str, Any]) -> str:
-    """Return the mark of an interval from too few objects, else an empty text."""
-    return FEW_OBJECTS_MARK if summary.get("few_objects") else ""
-
-
-def format_number(value: float | None) -> str:
-    """Return a number with three significant digits; integers and numbers from 100 on without decimals."""
-    if value is None:
-        return MISSING_VALUE
-    return f"{value:,.0f}" if abs(value) >= 99.95 or value == int(value) else f"{value:#.3g}"
 
 
 def file_name(name: str) -> str:

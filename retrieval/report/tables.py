@@ -7,21 +7,19 @@ from typing import Any
 from retrieval.metrics.registry import METRICS
 from retrieval.model.posterior import FORMULA
 from retrieval.report.document import Table
-from retrieval.report.results import (
+from retrieval.report.numbers import (
     FEW_OBJECTS_MARK,
     FEW_OBJECTS_NOTE,
-    IMPOSTORS,
     MISSING_VALUE,
-    Results,
     Summary,
     format_number,
     interval,
-    measure_label,
-    method_label,
     percent,
     points,
+    probability,
     with_interval,
 )
+from retrieval.report.results import IMPOSTORS, Results, measure_label, method_label
 
 Column = tuple[str, str, int]
 """Heading, measure, index in the measure's list of values."""
@@ -113,11 +111,6 @@ def comparisons(results: Results) -> Table:
     ]
     note = "Same queries for both. Interval: bootstrap over objects; p: two-sided sign-flip test over objects."
     return _with_notes(Table(("methods", "measure", "difference, points", "p"), tuple(rows), (note,), frozenset({1})))
-
-
-def probability(value: float) -> str:
-    """Return a p-value as text, never 0."""
-    return "< 0.0001" if value < 0.0001 else f"{value:.2g}" if value < 0.1 else f"{value:.2f}"
 
 
 def controls(results: Results) -> Table:

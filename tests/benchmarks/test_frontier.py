@@ -6,11 +6,10 @@ import pytest
 from benchmarks.frontier import APPROXIMATIONS, NEED_NO_MODEL
 from benchmarks.frontier.__main__ import main
 from benchmarks.frontier.correlation import _by_covariance, _by_svd, known_problem
-from retrieval.frontier import load_approximation
 from retrieval.frontier.sample import Sample, Scale
 from tests import synthetic
 
-TINY = Scale(photos=700, queries=6, touches=6, repeats=1, quick=True)
+TINY = Scale(photos=700, queries=6, repeats=1, quick=True)
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +18,7 @@ def rows(model, tmp_path_factory):
     folder = tmp_path_factory.mktemp("unseen")
     unseen = synthetic.write_recording(folder / "recording", synthetic.make_objects(8, seed=77), 4)
     sample = Sample(model, lambda: unseen, folder / "features", TINY, quiet=True)
-    return {name: load_approximation(name, APPROXIMATIONS)(sample) for name in APPROXIMATIONS}
+    return {name: APPROXIMATIONS.load(name)(sample) for name in APPROXIMATIONS}
 
 
 @pytest.mark.parametrize("name", sorted(APPROXIMATIONS))

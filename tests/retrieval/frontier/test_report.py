@@ -33,7 +33,7 @@ def points(errors):
 @pytest.mark.parametrize("errors", [(3.0, 1.0, 0.0), (0.0, 0.0), (5.0,)], ids=["falling", "no errors", "one point"])
 def test_a_page_has_the_plot_the_lines_and_every_point(errors, tmp_path):
     made = Panel("missed", "one query", "%", "every photo reranked", 1.5, points(errors), 0.5)
-    page, plot = write_frontier(tmp_path, document(made))
+    _, page, plot = write_frontier(tmp_path, document(made))
     text = page.read_text()
     assert plot.read_bytes().startswith(b"\x89PNG")
     assert text.count("data:image/png;base64,") == 1
@@ -44,7 +44,7 @@ def test_a_page_has_the_plot_the_lines_and_every_point(errors, tmp_path):
 
 
 def test_a_skipped_row_has_a_reason_and_no_plot(tmp_path):
-    (page,) = write_frontier(tmp_path, document(skipped="nothing to measure"))
+    _, page = write_frontier(tmp_path, document(skipped="nothing to measure"))
     assert "Left out: nothing to measure." in page.read_text()
 
 
@@ -76,7 +76,7 @@ def test_the_command_writes_a_page_and_prints_a_line_for_each_panel(model, recor
 
 def test_wrong_names_are_one_line_and_exit_code_2(model, tmp_path, capsys):
     assert main(["frontier", "--out", str(tmp_path), "--model", str(model), "--only", "speed"]) == 2
-    assert capsys.readouterr().err.splitlines()[-1].startswith("retrieve frontier: an approximation must be one of")
+    assert capsys.readouterr().err.splitlines()[-1].startswith("retrieve frontier: approximation must be one of")
 
 
 def test_without_a_recording_a_small_one_is_collected_once(model, tmp_path, capsys):

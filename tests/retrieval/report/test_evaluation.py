@@ -11,8 +11,7 @@ from retrieval.errors import BadInput
 from retrieval.model.posterior import FORMULA
 from retrieval.report.document import Details, Document, Listing, Picture, Section, Table, Text, to_html, to_markdown
 from retrieval.report.evaluation import write_report
-from retrieval.report.results import format_number, percent, with_interval
-from retrieval.report.tables import probability
+from retrieval.report.numbers import format_number, percent, probability, with_interval
 from tests import synthetic
 from tests.pages import HtmlPage
 from tests.synthetic_evaluation import write_synthetic_results
@@ -36,11 +35,11 @@ def report(folder, tmp_path_factory):
 def text_only(monkeypatch):
     """Replace figures by single pixels, for tests that read the text."""
 
-    def draw(path, make, *arguments):
+    def draw(path, make):
         path.parent.mkdir(exist_ok=True)
         Image.new("RGB", (1, 1)).save(path)
 
-    monkeypatch.setattr("retrieval.report.builder.draw", draw)
+    monkeypatch.setattr("retrieval.report.document.draw", draw)
 
 
 def remake(report, tmp_path, change=None):
@@ -246,15 +245,16 @@ def test_numbers_are_written_for_readers():
 
 
 def test_markdown_and_html_have_the_same_content(tmp_path):
-    Image.new("RGB", (144, 10)).save(tmp_path / "p.png")
+    (tmp_path / "figures").mkdir()
+    Image.new("RGB", (144, 10)).save(tmp_path / "figures" / "p.png")
     table = Table(
         ("a", "b", "c"), (("1|2", "3", "x"), ("<4>", "5", "y")), ("note",), frozenset({2}), frozenset({(1, 1)})
     )
     blocks = (Text("one *two*", warn=True), table, Listing("{\n}"), Details("more", (Text("inside"),)))
-    document = Document("T", (Text("lead"),), (Section("S", (*blocks, Picture("p.png", "alt", "caption"))),))
+    document = Document("T", (Text("lead"),), (Section("S", (*blocks, Picture("p", "alt", "caption", None))),))
     assert to_markdown(document) == (
         "# T\n\nlead\n\n## S\n\n> one \\*two\\*\n\n| a | b | c |\n| --- | ---: | --- |\n| 1\\|2 | 3 | x |\n"
-        "| \\<4\\> | **5** | y |\n\nnote\n\n    {\n    }\n\n### more\n\ninside\n\n![alt](p.png)\n\ncaption\n"
+        "| \\<4\\> | **5** | y |\n\nnote\n\n    {\n    }\n\n### more\n\ninside\n\n![alt](figures/p.png)\n\ncaption\n"
     )
     page = to_html(document, tmp_path)
     for part in (
