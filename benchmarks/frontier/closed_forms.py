@@ -1,8 +1,7 @@
 """The contact solver compared with closed forms: exact solutions without a grid, and the error of the grid.
 
-Formulae: Johnson, Contact Mechanics (1985), chapters 3 to 5 and 13.2 (Westergaard's wavy surface); thin bonded layers
-from the long-wave limits of robot.sim.contact.kernels (compressible: springs of M/h; incompressible: u = -h^3 lap p /
-(3 G)).
+Formulae: Johnson, Contact Mechanics (1985), chapters 3 to 5; thin bonded layers from the long-wave limits of
+robot.sim.contact.kernels (compressible: springs of M/h; incompressible: u = -h^3 lap p / (3 G)).
 """
 
 import math
@@ -78,7 +77,7 @@ class Grid:
 
 def closed_form_table() -> tuple[Check, ...]:
     """Check every closed form, in about two seconds."""
-    sources = (_hertz(), _punch(), _cone(), _line_contacts(), _thin_compressible(), _thin_incompressible())
+    sources = (_hertz(), _punch(), _cone(), _thin_compressible(), _thin_incompressible())
     return tuple(check for source in (*sources, _identities()) for check in source)
 
 
@@ -96,9 +95,9 @@ def hertz(force_n: float, radius_mm: float, modulus_mpa: float) -> tuple[float, 
     return a, a * a / radius_mm, 1.5 * force_n / (math.pi * a * a)
 
 
-def pressed_ball(grid: Grid, layer: Layer, force_n: float, tolerance: float, padded: bool = True) -> Contact:
+def pressed_ball(grid: Grid, layer: Layer, force_n: float, tolerance: float) -> Contact:
     """Press a paraboloid of BALL_MM into the middle of the field."""
-    return press(_ball(grid), grid.pixel_mm, layer, force_n=force_n, tolerance=tolerance, padded=padded)
+    return press(_ball(grid), grid.pixel_mm, layer, force_n=force_n, tolerance=tolerance)
 
 
 def _ball(grid: Grid) -> Floats:
@@ -165,38 +164,6 @@ def _cone() -> Iterator[Check]:
     contact = press(slope * grid.radius(), grid.pixel_mm, HALF_SPACE, force_n=force, tolerance=1e-6)
     yield Check("cone", "depth", str(grid), percent(contact.approach_mm, math.pi / 2.0 * a * slope), 0.015)
     yield Check("cone", "radius from area", str(grid), percent(math.sqrt(contact.area_mm2 / math.pi), a), 0.75)
-
-
-def _line_contacts() -> Iterator[Check]:
-    """Check Westergaard's wavy surface and a cylinder (nearly Hertz's line) on one row, which is plane strain."""
-    cols, period, wave = 512, 10.0, 0.1
-    grid, modulus = Grid(1, cols, period / cols), HALF_SPACE.plane_modulus_mpa
-    x = grid.axes()[1]
-    a = period / 5.0
-    part = math.sin(math.pi * a / period) ** 2
-    mean = math.pi * modulus * wave / period * part
-    wavy = wave * (1.0 - np.cos(2.0 * math.pi * x / period))
-    force = mean * period * grid.pixel_mm
-    contact = press(wavy, grid.pixel_mm, HALF_SPACE, force_n=force, tolerance=1e-6, padded=False)
-    inside = np.sqrt(np.maximum(part - np.sin(math.pi * x / period) ** 2, 0.0))
-    exact = 2.0 * mean * np.cos(math.pi * x / period) / part * inside
-    difference = float(np.linalg.norm(contact.pressure_mpa - exact) / np.linalg.norm(exact))
-    yield Check("wavy surface (Westergaard)", "pressure, L2", str(grid), 100.0 * difference, 1.0)
-    peak = percent(float(contact.pressure_mpa.max()), float(exact.max()))
-    yield Check("wavy surface (Westergaard)", "peak pressure", str(grid), peak, 0.1)
-    yield from _cylinder(grid, modulus)
-
-
-def _cylinder(grid: Grid, modulus: float) -> Iterator[Check]:
-    """Check a^2 = 4 F'R/(pi E*), p0 = 2F'/(pi a); its neighbours are 25 contact radii away."""
-    radius, a, x = 4.0, 0.4, grid.axes()[1]
-    force = math.pi * modulus * a * a / (4.0 * radius)
-    gap = x * x / (2.0 * radius)
-    contact = press(gap, grid.pixel_mm, HALF_SPACE, force_n=force * grid.pixel_mm, tolerance=1e-6, padded=False)
-    peak = 2.0 * force / (math.pi * a)
-    yield Check("cylinder", "peak pressure", str(grid), percent(float(contact.pressure_mpa.max()), peak), 0.5)
-    width = contact.area_mm2 / grid.pixel_mm / 2.0
-    yield Check("cylinder", "half width (to a pixel)", str(grid), percent(width, a), 100.0 * grid.pixel_mm / a)
 
 
 # Thin bonded layers ----------------------------------------------------------------------------------------

@@ -43,7 +43,7 @@ def contact_panels(
     tolerances: Sequence[float] = (1e-1, 1e-2, 1e-3, 1e-4),
     reference_rows: int = 480,
 ) -> tuple[Panel, Panel, Panel]:
-    """Return the panels for grid, tolerance and padding of the contact solver.
+    """Return the panels for grid and tolerance of the contact solver.
 
     A ball of 4 mm on the half-space is compared with Hertz; on a layer of 2 mm with `reference_rows` at a tolerance of
     1e-6, a multiple by an even factor of each number of rows. Then the gel image of a ridged ball is compared with that
@@ -71,11 +71,10 @@ def _layer(repeats: int, rows: Sequence[int], tolerances: Sequence[float], refer
     points, works = list[Tradeoff](), list[Callable[[], Contact]]()
     for grid in map(Grid.of_field, rows):
         exact = _at_centres(fine.displacement_mm, reference_rows // grid.rows)
-        for padded in (False, True):
-            for tolerance in tolerances:
-                works.append(partial(pressed_ball, grid, LAYER, 1.0, tolerance, padded))
-                error = 1e3 * math.sqrt(float(np.mean((works[-1]().displacement_mm - exact) ** 2)))
-                points.append(_point(grid, tolerance, error, padded))
+        for tolerance in tolerances:
+            works.append(partial(pressed_ball, grid, LAYER, 1.0, tolerance))
+            error = 1e3 * math.sqrt(float(np.mean((works[-1]().displacement_mm - exact) ** 2)))
+            points.append(_point(grid, tolerance, error))
     reference = f"{Grid.of_field(reference_rows)}, tolerance 1e-06"
     return _panel("layer", "um rms of surface", reference, 0.1, points, works, repeats)
 
@@ -93,11 +92,10 @@ def _gel_image(repeats: int, rows: Sequence[int], tolerances: Sequence[float], r
     return _panel("gel image of ridges", "grey levels rms", reference, CAMERA_NOISE, points, works, repeats)
 
 
-def _point(grid: Grid, tolerance: float, error: float, padded: bool = True) -> Tradeoff:
+def _point(grid: Grid, tolerance: float, error: float) -> Tradeoff:
     """Return one setting of the solver; the default is that of the gripper's contacts."""
-    hand, series = Hand(), f"{grid}" if padded else f"{grid} periodic"
-    is_default = padded and ((grid.rows, grid.cols), tolerance) == (hand.grid, hand.tolerance)
-    return Tradeoff(series, f"tolerance {tolerance:g}", abs(error), is_default=is_default)
+    is_default = ((grid.rows, grid.cols), tolerance) == (Hand.grid, Hand.tolerance)
+    return Tradeoff(f"{grid}", f"tolerance {tolerance:g}", abs(error), is_default=is_default)
 
 
 def _panel(
@@ -178,6 +176,6 @@ def products_panel(repeats: int, rows: int | None = None, tolerances: Sequence[f
 def _pressed(gap: Floats, pixel_mm: float, tolerance: float, single_precision: bool, force_n: float = 3.0) -> Floats:
     """Return the displacement (rows, cols) in mm under this force."""
     scale = force_n / LAYER.plane_modulus_mpa / pixel_mm**2
-    surface = ElasticSurface(LAYER.thickness_mm / pixel_mm, LAYER.poisson, 0.0, False, single_precision)
+    surface = ElasticSurface(LAYER.thickness_mm / pixel_mm, LAYER.poisson, 0.0, single_precision)
     solution = ScaledProblem(surface, gap / pixel_mm / scale, 1.0, 1.0, tolerance, 1000).solve()
     return np.asarray(solution.displacement * scale * pixel_mm)

@@ -15,8 +15,7 @@ from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff
 from retrieval.frontier.sample import Sample
 from robot.readings import Pose
 from robot.sim.camera import NOISE, PinholeCamera
-from robot.sim.objects.body import GEL_STEP_MM, ClippedRays, SdfBody, Vectors
-from robot.sim.objects.boxes import clip_to_box
+from robot.sim.objects.body import GEL_STEP_MM, ClippedRays, SdfBody, Vectors, clip_to_box
 from robot.sim.objects.draw import draw_object
 from robot.sim.objects.packets import MAX_STEPS, first_hits, hits
 from robot.sim.pinch import Grip

@@ -14,11 +14,11 @@ padding to at least 2 n - 1, hence without wrap-around (Liu, Wang & Liu 2000).
 import copy
 import functools
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
+from scipy.interpolate import CubicHermiteSpline
 from scipy.special import j0, j1
 
 Floats = npt.NDArray[np.float64]
@@ -81,38 +81,13 @@ def love_patch(shape: Quadrant) -> Floats:
     return np.asarray(total / np.pi)
 
 
-@dataclass(frozen=True)
-class LayerCorrection:
-    """C(rho) = integral of (1 - S(x)) J0(x rho) dx over x >= 0, for 0 <= rho <= REACH (+ a pixel).
-
-    A point force F on a layer h thick displaces F (1/rho - C(rho)) / (pi E* h) at rho = r/h. The interpolation is cubic
-    between values and slopes at rho + 1 = exp(k _RHO_STEP).
-
-    Attributes:
-        rho: the grid points.
-        value: C at the grid points.
-        slope: dC/drho at the grid points.
-    """
-
-    rho: Floats
-    value: Floats
-    slope: Floats
-
-    def __call__(self, rho: npt.ArrayLike) -> Floats:
-        """Interpolate C at `rho`."""
-        place = np.asarray(rho, np.float64)
-        left = np.minimum((np.log1p(place) / _RHO_STEP).astype(np.intp), len(self.rho) - 2)
-        step = self.rho[left + 1] - self.rho[left]
-        u = (place - self.rho[left]) / step
-        v = 1.0 - u
-        from_left = (1.0 + 2.0 * u) * self.value[left] + u * step * self.slope[left]
-        from_right = (1.0 + 2.0 * v) * self.value[left + 1] - v * step * self.slope[left + 1]
-        return np.asarray(v * v * from_left + u * u * from_right)
-
-
 @functools.lru_cache(maxsize=1024)
-def layer_correction(poisson: float) -> LayerCorrection:
-    """Compute the correction for this Poisson's ratio, by Gauss-Legendre quadrature over x."""
+def layer_correction(poisson: float) -> CubicHermiteSpline:
+    """Return C(rho) = integral of (1 - S(x)) J0(x rho) dx over x >= 0, for 0 <= rho <= REACH (+ a pixel).
+
+    A point force F on a layer h thick displaces F (1/rho - C(rho)) / (pi E* h) at rho = r/h. Values and slopes are from
+    Gauss-Legendre quadrature over x, at rho + 1 = exp(k _RHO_STEP).
+    """
     nodes, weights = np.polynomial.legendre.leggauss(_PANEL_POINTS)
     edges = np.linspace(0.0, _X_MAX, _X_PANELS + 1)
     half = 0.5 * (edges[1] - edges[0])
@@ -120,7 +95,7 @@ def layer_correction(poisson: float) -> LayerCorrection:
     weight = np.tile(half * weights, _X_PANELS) * (1.0 - layer_symbol(x, poisson))
     rho = np.expm1(np.arange(0.0, math.log1p(REACH + 1.0) + _RHO_STEP, _RHO_STEP))
     angle = rho[:, None] * x
-    return LayerCorrection(rho, j0(angle) @ weight, -j1(angle) @ (weight * x))
+    return CubicHermiteSpline(rho, j0(angle) @ weight, -j1(angle) @ (weight * x))
 
 
 @functools.lru_cache(maxsize=512)
@@ -155,26 +130,18 @@ def _corrected_influence(shape: Quadrant, thickness: float, poisson: float) -> F
 def _sampled_influence(shape: Quadrant, thickness: float, poisson: float) -> Floats:
     """Sample the closed form at the wave numbers of a grid twice as wide plus REACH thicknesses."""
     margin = math.ceil(REACH * thickness)
-    rows, cols = (2 * scipy.fft.next_fast_len(n + margin, real=True) for n in shape)
-    return np.ascontiguousarray(periodic_influence((rows, cols), thickness, poisson)[: shape[0], : shape[1]])
-
-
-def periodic_influence(shape: Quadrant, thickness: float, poisson: float) -> Floats:
-    """Return the displacement (rows, cols) of a periodic surface by unit pressure on pixel (0, 0).
-
-    It is the closed form at the wave numbers of scipy.fft.rfft2.
-    """
-    q = 2.0 * np.pi * np.hypot(np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1]))
-    return np.asarray(scipy.fft.irfft2(layer_compliance(q, thickness, poisson), shape))
+    size = tuple(2 * scipy.fft.next_fast_len(n + margin, real=True) for n in shape)
+    q = 2.0 * np.pi * np.hypot(np.fft.fftfreq(size[0])[:, None], np.fft.rfftfreq(size[1]))
+    table = scipy.fft.irfft2(layer_compliance(q, thickness, poisson), size)
+    return np.ascontiguousarray(table[: shape[0], : shape[1]])
 
 
 class Operator:
     """Displacement (rows, cols) of a pressure (rows, cols): one real FFT each way, skipping rows of zeros.
 
     Args:
-        table: influence; a quadrant at least as large as `shape`, or of the size of `shape` if `periodic`.
+        table: influence, a quadrant at least as large as `shape`.
         shape: rows and columns of the pressure.
-        periodic: whether the surface wraps around at the border of `shape`.
         single_precision: whether the FFT is in float32, accurate to about 1e-7 of the largest displacement.
 
     Attributes:
@@ -183,20 +150,16 @@ class Operator:
         rounding: relative error of an energy.
     """
 
-    def __init__(
-        self,
-        table: Floats,
-        shape: Quadrant,
-        *,
-        periodic: bool = False,
-        single_precision: bool = False,
-    ) -> None:
+    def __init__(self, table: Floats, shape: Quadrant, *, single_precision: bool = False) -> None:
         self.shape, self.single_precision = shape, single_precision
         self.rounding = 1e-6 if single_precision else 1e-12
-        self._size = shape if periodic else tuple(scipy.fft.next_fast_len(2 * n - 1, real=True) for n in shape)
-        whole = table if periodic else _mirrored(table, shape, self._size)
+        self._size = tuple(scipy.fft.next_fast_len(2 * n - 1, real=True) for n in shape)
+        # The quadrant laid out circularly; entries beyond shape - 1 multiply only zeros.
+        rows, cols = (np.minimum(np.arange(period), period - np.arange(period)) for period in self._size)
+        inside = (rows < shape[0])[:, None] & (cols < shape[1])
+        corner = table[np.minimum(rows, shape[0] - 1)[:, None], np.minimum(cols, shape[1] - 1)]
         # The influence is even, so its transform is real.
-        transform = np.ascontiguousarray(scipy.fft.rfft2(whole).real)
+        transform = np.ascontiguousarray(scipy.fft.rfft2(np.where(inside, corner, 0.0)).real)
         self._transform = transform.astype(np.float32) if single_precision else transform
         self.bound, self.peak = _largest(transform), float(table[0, 0])
 
@@ -222,10 +185,3 @@ class Operator:
 def _largest(transform: npt.NDArray[np.floating]) -> float:
     """Return the largest eigenvalue, or 1 for a rigid surface, so that a step of 1/bound is finite."""
     return float(np.abs(transform).max()) or 1.0
-
-
-def _mirrored(table: Floats, shape: Quadrant, size: tuple[int, ...]) -> Floats:
-    """Lay out the quadrant circularly over `size`; entries beyond shape - 1 multiply only zeros."""
-    rows, cols = (np.minimum(np.arange(period), period - np.arange(period)) for period in size)
-    inside = (rows < shape[0])[:, None] & (cols < shape[1])
-    return np.where(inside, table[np.minimum(rows, shape[0] - 1)[:, None], np.minimum(cols, shape[1] - 1)], 0.0)

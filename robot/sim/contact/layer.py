@@ -69,8 +69,6 @@ class Contact:
         large_strain      a displacement exceeds half the thickness: linear elasticity does not hold
         steep             a slope exceeds one half: linear elasticity does not hold
         iteration_cap     the solver stopped before it reached the tolerance; `converged` is False
-        rigid_volume      a periodic gel that is incompressible or a half-space cannot be pressed to this depth; the
-                          problem is not solved, and `converged` is False
     """
 
     pressure_mpa: Floats
@@ -95,7 +93,6 @@ def press(
     object_poisson: float = 0.3,
     tolerance: float = 1e-3,
     max_iterations: int = 1000,
-    padded: bool = True,
 ) -> Contact:
     """Press an object into the gel with a force or to a depth.
 
@@ -109,7 +106,6 @@ def press(
         object_poisson: Poisson's ratio of the object.
         tolerance: upper bound on the solver's residual.
         max_iterations: maximum number of solver steps.
-        padded: If false, the surface is periodic (the mean displacement of a half-space is then 0).
 
     Raises:
         SceneError: The gap is not a number or +inf in each pixel, or force or depth is not computable.
@@ -121,42 +117,27 @@ def press(
         )
     lowest = float(gap.min())
     if math.isinf(lowest) or force_n == 0.0 or (depth_mm is not None and depth_mm <= lowest):
-        return _no_contact(gap, force_n or 0.0, depth_mm, ())
+        approach = depth_mm if depth_mm is not None else 0.0 if math.isinf(lowest) else lowest
+        nothing = np.zeros(gap.shape)
+        return Contact(nothing, nothing.copy(), approach, 0.0, 0.0, 0, 0.0, not force_n, ("no_contact",))
     softness = layer.plane_modulus_mpa * (1.0 - object_poisson**2) / object_modulus_mpa
-    # On a periodic half-space, uniform pressure causes no displacement; float32 would give rounding errors instead, so
-    # periodic problems use float64.
-    single_precision = padded and tolerance >= SINGLE_PRECISION_TOLERANCE
-    surface = ElasticSurface(layer.thickness_mm / pixel_mm, layer.poisson, softness, not padded, single_precision)
-    if depth_mm is not None and not surface.can_change_volume() and depth_mm > gap.mean():
-        return _no_contact(gap, math.inf, depth_mm, ("rigid_volume",))
-    scale = _scale(pixel_mm, layer.plane_modulus_mpa, force_n, 0.0 if depth_mm is None else depth_mm - lowest)
-    with np.errstate(over="ignore"):  # surfaces at such a distance never touch
-        scaled = (gap - lowest) / pixel_mm / scale
-        scaled[scaled > _SCALED_RANGE[1]] = math.inf
-    load = None if force_n is None else 1.0
-    solution = ScaledProblem(surface, scaled, load, 1.0, tolerance, max_iterations).solve()
-    return _contact(solution, surface, layer, pixel_mm, scale, lowest)
-
-
-def _scale(pixel_mm: float, modulus_mpa: float, force_n: float | None, depth_mm: float) -> float:
-    """Return load or depth in units of pixels and the gel's E*; raise SceneError if it is not computable."""
-    scale = depth_mm / pixel_mm if force_n is None else force_n / modulus_mpa / pixel_mm / pixel_mm
+    single_precision = tolerance >= SINGLE_PRECISION_TOLERANCE
+    surface = ElasticSurface(layer.thickness_mm / pixel_mm, layer.poisson, softness, single_precision)
+    # Load or depth in units of pixels and the gel's E*.
+    depth = 0.0 if depth_mm is None else (depth_mm - lowest) / pixel_mm
+    scale = depth if force_n is None else force_n / layer.plane_modulus_mpa / pixel_mm / pixel_mm
     if not _SCALED_RANGE[0] < scale < _SCALED_RANGE[1]:
         raise SceneError(
             f"force / (E* pixel^2), with E* = E / (1 - nu^2) of the gel, or depth / pixel must be between "
             f"{_SCALED_RANGE[0]} and {_SCALED_RANGE[1]}, got {scale}; give force, modulus and lengths in "
             "consistent units"
         )
-    return scale
-
-
-def _no_contact(gap: Floats, force_n: float, depth_mm: float | None, flags: tuple[str, ...]) -> Contact:
-    """Return a contact without pressure; `converged` is False if force_n > 0."""
-    lowest = float(gap.min())
-    approach = depth_mm if depth_mm is not None else lowest if math.isfinite(lowest) else 0.0
-    nothing = np.zeros(gap.shape)
-    flags = flags or ("no_contact",)
-    return Contact(nothing, nothing.copy(), approach, 0.0, 0.0, 0, 0.0, force_n == 0.0, flags)
+    with np.errstate(over="ignore"):  # surfaces at such a distance never touch
+        scaled = (gap - lowest) / pixel_mm / scale
+        scaled[scaled > _SCALED_RANGE[1]] = math.inf
+    load = None if force_n is None else 1.0
+    solution = ScaledProblem(surface, scaled, load, 1.0, tolerance, max_iterations).solve()
+    return _contact(solution, surface, layer, pixel_mm, scale, lowest)
 
 
 def _contact(
@@ -167,10 +148,12 @@ def _contact(
     if surface.softness > 0.0:
         displacement = surface.gel_operator(pressure.shape, pressure.shape)(pressure)
     touching = pressure > 0.0
+    padded = np.pad(touching, 1, mode="edge")
+    around = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
     displacement_mm = displacement * (scale * pixel_mm)
     flags = {
         "no_contact": not touching.any(),
-        "unresolved": _is_narrow(touching),
+        "unresolved": touching.any() and not (touching & around).any(),
         "at_border": bool(touching[[0, -1]].any() or touching[:, [0, -1]].any()),
         "large_strain": float(displacement_mm.max()) > STRAIN_LIMIT * layer.thickness_mm,
         "steep": _max_slope(displacement * scale) > STRAIN_LIMIT,
@@ -187,13 +170,6 @@ def _contact(
         converged=solution.converged,
         flags=tuple(name for name, raised in flags.items() if raised),
     )
-
-
-def _is_narrow(touching: npt.NDArray[np.bool_]) -> bool:
-    """Return whether every contact pixel has a neighbour without contact; outside pixels are treated as contact."""
-    padded = np.pad(touching, 1, mode="edge")
-    around = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
-    return bool(touching.any()) and not bool((touching & around).any())
 
 
 def _max_slope(height: Floats) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.sim.contact.constrained_cg import GAP_WEIGHT, ContactProblem, Solution
-from robot.sim.contact.kernels import Floats, Operator, Quadrant, influence, layer_compliance, periodic_influence
+from robot.sim.contact.kernels import Floats, Operator, Quadrant, influence
 
 _COARSENING = 4
 _MIN_NESTED_PIXELS = 48  # along the shorter side; below this a coarser grid saves nothing
@@ -33,19 +33,17 @@ class ElasticSurface:
         thickness: thickness of the layer in pixels.
         poisson: Poisson's ratio of the layer.
         softness: E* of the layer over E* of the object; 0 for a rigid object.
-        periodic: whether the surface wraps around at the border.
         single_precision: whether products are in float32.
     """
 
     thickness: float
     poisson: float
     softness: float
-    periodic: bool
     single_precision: bool = False
 
     def gel_operator(self, grid: Quadrant, window: Quadrant) -> Operator:
         """Return the displacement of the gel by a pressure on a window of the grid."""
-        return _operator(grid, window, self.thickness, self.poisson, self.periodic, self.single_precision)
+        return _operator(grid, window, self.thickness, self.poisson, self.single_precision)
 
     def combined_operator(self, grid: Quadrant, window: Quadrant) -> Operator:
         """Return the displacement of the gel plus that of the object, a half-space."""
@@ -53,20 +51,13 @@ class ElasticSurface:
         if self.softness == 0.0:
             return gel_operator
         # A half-space in scaled units does not depend on Poisson's ratio, so all gels share the operator.
-        half_space = _operator(grid, window, math.inf, 0.0, self.periodic, self.single_precision)
+        half_space = _operator(grid, window, math.inf, 0.0, self.single_precision)
         return gel_operator.plus(half_space, self.softness)
-
-    def can_change_volume(self) -> bool:
-        """Return whether the mean displacement can differ from 0."""
-        return not self.periodic or float(layer_compliance(np.zeros(1), self.thickness, self.poisson)[0]) > 0.0
 
 
 @functools.lru_cache(maxsize=128)
-def _operator(
-    grid: Quadrant, window: Quadrant, thickness: float, poisson: float, periodic: bool, single_precision: bool
-) -> Operator:
-    table = periodic_influence(grid, thickness, poisson) if periodic else influence(grid, thickness, poisson)
-    return Operator(table, window, periodic=periodic, single_precision=single_precision)
+def _operator(grid: Quadrant, window: Quadrant, thickness: float, poisson: float, single_precision: bool) -> Operator:
+    return Operator(influence(grid, thickness, poisson), window, single_precision=single_precision)
 
 
 @dataclass(frozen=True)
@@ -120,9 +111,7 @@ class ScaledProblem:
         """Solve on a window around `start` and enlarge it until nothing touches outside it."""
         active, iterations = start > 0.0, 0
         while True:
-            window = _full_window(self.gap.shape)
-            if not self.surface.periodic:  # around the active pixels
-                window = _padded_span(np.asarray(active.any(axis=1))), _padded_span(np.asarray(active.any(axis=0)))
+            window = _padded_span(np.asarray(active.any(axis=1))), _padded_span(np.asarray(active.any(axis=0)))
             part = self._problem(window).solve(start[window], self.tolerance, self.max_iterations - iterations)
             iterations += part.iterations
             solution, missed = self._extend_to_grid(part, window)

@@ -11,12 +11,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from robot.sim.objects.boxes import clip_to_box
+from robot.sim.jit import jit
 from robot.sim.objects.formula import trace_formula
-from robot.sim.objects.packets import DisplacedSolid, Formula, Rays, first_hits, gradients, hits
+from robot.sim.objects.packets import DisplacedSolid, Formula, Rays, ReliefLevel, first_hits, gradients, hits
 from robot.sim.objects.relief import Relief
 from robot.sim.objects.shapes.shape import Floats, Points, Shape
-from robot.sim.objects.wall import ReliefLevel, ReliefLevels, bake
+from robot.sim.objects.wall import bake, level_of
 
 Vectors = NDArray[np.float64]
 GEL_STEP_MM = 0.1
@@ -94,6 +94,26 @@ class Body(ABC):
         """Return outward normals of any length."""
 
 
+def clip_to_box(origins: Vectors, directions: Vectors, lower: Vectors, upper: Vectors) -> tuple[Vectors, Vectors]:
+    """Return where rays (n, 3) enter and leave a box, (n,) each, at least 0; a miss enters after it leaves."""
+    near, far = np.empty(len(origins)), np.empty(len(origins))
+    _clip(origins, directions, lower, upper, near, far)
+    return near, far
+
+
+@jit
+def _clip(origins, directions, lower, upper, near, far):  # type: ignore[no-untyped-def]
+    for number in range(len(near)):
+        enters, leaves = 0.0, np.inf
+        for axis in range(3):
+            start, along = origins[number, axis], directions[number, axis]
+            # A direction of 0 becomes tiny, so that 0 * inf cannot make NaN.
+            speed = 1e-300 if abs(along) < 1e-300 else along
+            one, two = (lower[axis] - start) / speed, (upper[axis] - start) / speed
+            enters, leaves = max(enters, min(one, two)), min(leaves, max(one, two))
+        near[number], far[number] = enters, leaves
+
+
 def _contiguous(array: Points) -> Vectors:
     """Return a C-contiguous float64 array, so that packets are compiled for one layout."""
     return np.require(array, np.float64, ["C", "W"])
@@ -109,8 +129,8 @@ class SdfBody(Body):
         self.lower, self.upper = shape.lower - outwards, shape.upper + outwards
 
     @cached_property
-    def wall(self) -> ReliefLevels | None:
-        """The baked relief; None for a smooth shape. Computed on first use."""
+    def wall(self) -> list[ReliefLevel]:
+        """The baked relief, from fine to coarse; empty for a smooth shape. Computed on first use."""
         return bake(self.shape, self.relief)
 
     @cached_property
@@ -124,15 +144,12 @@ class SdfBody(Body):
 
     def volumes_mm3(self, shell_mm: float) -> tuple[float, float]:
         """Count cells on a 28^3 grid, without relief: within about 3 % of the true volume."""
-        axes = [low + (high - low) * (np.arange(28) + 0.5) / 28 for low, high in zip(*self._shape_bounds, strict=True)]
+        lower, upper = self.shape.lower, self.shape.upper
+        axes = [low + (high - low) * (np.arange(28) + 0.5) / 28 for low, high in zip(lower, upper, strict=True)]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         distance = self.shape.distance(grid)
-        cell = float(np.prod(self._shape_bounds[1] - self._shape_bounds[0])) / len(grid)
+        cell = float(np.prod(upper - lower)) / len(grid)
         return cell * int((distance < 0).sum()), cell * int(((distance < 0) & (distance > -shell_mm)).sum())
-
-    @property
-    def _shape_bounds(self) -> tuple[Vectors, Vectors]:
-        return self.shape.lower, self.shape.upper
 
     def field(self, x: Floats, y: Floats, z: Floats, step_mm: float = GEL_STEP_MM) -> Floats:
         """Return f in mm at float32 points: below 0 inside, above 0 outside; near the surface close to the distance.
@@ -140,23 +157,15 @@ class SdfBody(Body):
         This is plain numpy; rays use compiled formulas of the same functions.
         """
         base = self.shape.distance_xyz(x, y, z)
-        if self.wall is None:
+        if not self.wall:
             return base
         s, t, weight = self.chart_coordinates(x, y, z)
-        return base - self.wall.level(step_mm).at(s, t) * weight
+        return base - level_of(self.wall, step_mm).at(s, t) * weight
 
     def displaced_solid(self, step_mm: float) -> DisplacedSolid:
         """Return the body as compiled formulas and arrays, at the relief level for detail of `step_mm`."""
-        level = self.wall.level(step_mm) if self.wall else _NO_RELIEF
-        return DisplacedSolid(
-            self.shape.formula,
-            self._chart_formula,
-            level.height_mm,
-            level.per_s,
-            level.per_t,
-            level.max_height_mm,
-            level.slope,
-        )
+        level = level_of(self.wall, step_mm) if self.wall else _NO_RELIEF
+        return DisplacedSolid(self.shape.formula, self._chart_formula, level)
 
     def _normals(self, points: Vectors, step_mm: float) -> Vectors:
         return gradients(self.displaced_solid(step_mm), points, step_mm)

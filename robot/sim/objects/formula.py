@@ -14,25 +14,7 @@ import numpy as np
 from robot.errors import SceneError
 from robot.sim.objects.packets import OPERATIONS, Formula
 
-_UFUNCS = {
-    np.add: "add",
-    np.subtract: "subtract",
-    np.multiply: "multiply",
-    np.divide: "divide",
-    np.maximum: "maximum",
-    np.minimum: "minimum",
-    np.absolute: "absolute",
-    np.sqrt: "sqrt",
-    np.rint: "rint",
-    np.floor: "floor",
-    np.copysign: "copysign",
-    np.greater: "greater",
-    np.sin: "sin",
-    np.cos: "cos",
-    np.exp: "exp",
-    np.log: "log",
-    np.log1p: "log1p",
-}
+_UFUNCS = {getattr(np, name): name for name in OPERATIONS if name != "where"}
 
 
 def trace_formula(function: Callable[..., Any], operands: int) -> Formula:
@@ -56,12 +38,7 @@ class _Symbol(np.lib.mixins.NDArrayOperatorsMixin):
     """Placeholder for an array: numpy operations on it are recorded on the tape."""
 
     def __init__(self, tape: "_Tape", number: int) -> None:
-        self._tape, self._number = tape, number
-
-    @property
-    def number(self) -> int:
-        """Number of its value on the tape."""
-        return self._number
+        self._tape, self.number = tape, number
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> "_Symbol":
         options.pop("out", None)  # an in-place operation gives a new value under the old name

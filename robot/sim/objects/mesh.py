@@ -22,10 +22,11 @@ from robot.sim.objects.appearance import draw_appearance
 from robot.sim.objects.body import Body, ClippedRays, Vectors
 from robot.sim.objects.draw import SimObject
 from robot.sim.objects.materials import draw_material
+from robot.sim.objects.packets import ReliefLevel
 from robot.sim.objects.relief import RELIEFS, Relief, draw_relief
 from robot.sim.objects.resting import UP, rotation_to_up
 from robot.sim.objects.shapes.shape import CylindricalChart, Floats, relief_limit
-from robot.sim.objects.wall import ReliefLevels, bake_plain, ends_weight, smoothstep
+from robot.sim.objects.wall import bake_plain, ends_weight, level_of, smoothstep
 
 FORMATS = ("stl", "obj", "ply")
 MIN_THICKNESS_MM = 2.0
@@ -133,8 +134,8 @@ class MeshBody(Body):
         self.chart = CylindricalChart(radius, float(self.upper[2]))
 
     @cached_property
-    def wall(self) -> ReliefLevels | None:
-        """The relief on a cylinder around the mesh."""
+    def wall(self) -> list[ReliefLevel]:
+        """The relief on a cylinder around the mesh, from fine to coarse; empty for a smooth mesh."""
         return bake_plain(self.chart, self.relief)
 
     @cached_property
@@ -187,7 +188,7 @@ class MeshBody(Body):
 
     def _lift(self, face: Faces, origins: Vectors, directions: Vectors, distance: Vectors, step_mm: float) -> Vectors:
         """Return how much earlier (or, if engraved, later) rays meet the relief than the mesh."""
-        if self.wall is None:
+        if not self.wall:
             return np.zeros(len(face))
         normals = self.mesh.normals_at(face, origins + distance[:, None] * directions)
         cosine = np.maximum(-np.einsum("ij,ij->i", directions, normals), 0.35)
@@ -200,9 +201,8 @@ class MeshBody(Body):
 
     def _height(self, points: Vectors, normals: Vectors, step_mm: float) -> Vectors:
         """Return relief in mm, faded at foot and top and where the surface turns away from the cylinder."""
-        assert self.wall is not None
         x, y, z = np.ascontiguousarray(points.T, np.float32)
-        height: Floats = self.wall.level(step_mm).at(*self.chart.locate(x, y, z))
+        height: Floats = level_of(self.wall, step_mm).at(*self.chart.locate(x, y, z))
         radius = np.maximum(np.hypot(x, y), 1e-6)
         facing = (x * normals[:, 0] + y * normals[:, 1]) / radius
         weight = smoothstep(facing, 0.3, 0.75) * np.clip(2.2 * radius / self.chart.radius_mm - 0.2, 0, 1)
@@ -212,7 +212,7 @@ class MeshBody(Body):
     def _normals(self, points: Vectors, step_mm: float) -> Vectors:
         """Return the mesh's normal n, tilted by the relief: n - (grad h - n (n . grad h))."""
         normals = self._mesh_normals(points)
-        if self.wall is None:
+        if not self.wall:
             return normals
         sides = np.eye(3) * step_mm / 2
         columns = [

@@ -41,26 +41,44 @@ class Formula(NamedTuple):
     results: NDArray[np.int64]
 
 
+class ReliefLevel(NamedTuple):
+    """One height map of relief.
+
+    Attributes:
+        height_mm: (rows, columns) heights; empty for none.
+        per_s: columns per mm along s.
+        per_t: rows per mm along t.
+        max_height_mm: greatest height.
+        slope: upper bound on the slope of the relief, mm per mm.
+        pixel_mm: size of a pixel.
+    """
+
+    height_mm: Floats
+    per_s: float
+    per_t: float
+    max_height_mm: float
+    slope: float
+    pixel_mm: float
+
+    def at(self, s: Floats, t: Floats) -> Floats:
+        """Interpolate heights at map coordinates in mm, (N,) each; clamped at the border."""
+        out = np.empty(len(s), np.float32)
+        _interpolate_heights(self.height_mm, s * np.float32(self.per_s), t * np.float32(self.per_t), out)
+        return out
+
+
 class DisplacedSolid(NamedTuple):
     """A solid with relief: f = distance(x, y, z) - height(s, t) * mask, in mm.
 
     Attributes:
         distance: formula of (x, y, z).
         place: formula of (x, y, z) to map coordinates s, t and the mask.
-        height_mm: height map (rows, columns), empty for none.
-        per_s: pixels of the map per mm along s.
-        per_t: pixels of the map per mm along t.
-        max_height_mm: greatest height of the map.
-        slope: upper bound on the slope of the relief, mm per mm.
+        relief: the height map.
     """
 
     distance: Formula
     place: Formula
-    height_mm: Floats
-    per_s: float
-    per_t: float
-    max_height_mm: float
-    slope: float
+    relief: ReliefLevel
 
 
 def evaluate_formula(formula: Formula, *operands: Floats) -> tuple[Floats, ...]:
@@ -153,13 +171,6 @@ def _evaluate(code, r, count):  # type: ignore[no-untyped-def]
 # A solid with relief -----------------------------------------------------------------------------------------
 
 
-def interpolate_heights(height_mm: Floats, u: Floats, v: Floats) -> Floats:
-    """Interpolate the map (rows, columns) at columns u and rows v, (n,) each; clamped at its border."""
-    out = np.empty(len(u), np.float32)
-    _interpolate_heights(height_mm, u, v, out)
-    return out
-
-
 def gradients(solid: DisplacedSolid, points: Vectors, step_mm: float) -> Vectors:
     """Return differences of f, (n, 3), over the corners of a tetrahedron of that size, by four evaluations."""
     out = np.zeros(points.shape)
@@ -229,21 +240,21 @@ def _relief_heights(solid, rows, count):  # type: ignore[no-untyped-def]
     """Write relief at the points in the rows into the first row."""
     _evaluate(solid.place.code, rows, count)
     s, t, mask = solid.place.results[0], solid.place.results[1], solid.place.results[2]
-    per_s, per_t = np.float32(solid.per_s), np.float32(solid.per_t)
+    per_s, per_t = np.float32(solid.relief.per_s), np.float32(solid.relief.per_t)
     for i in range(count):
-        rows[0, i] = _bilinear(solid.height_mm, rows[s, i] * per_s, rows[t, i] * per_t) * rows[mask, i]
+        rows[0, i] = _bilinear(solid.relief.height_mm, rows[s, i] * per_s, rows[t, i] * per_t) * rows[mask, i]
 
 
 @jit
 def _evaluate_field(solid, rows, count):  # type: ignore[no-untyped-def]
     """Write f at the points in the first rows of rows[0] into its row of results."""
     base, relief_rows = rows
-    if solid.height_mm.size:
+    if solid.relief.height_mm.size:
         for row in range(3):
             for i in range(count):
                 relief_rows[row, i] = base[row, i]
     _evaluate(solid.distance.code, base, count)
-    if solid.height_mm.size:
+    if solid.relief.height_mm.size:
         _relief_heights(solid, relief_rows, count)
         for i in range(count):
             base[solid.distance.results[0], i] -= relief_rows[0, i]
@@ -280,9 +291,9 @@ def _march(solid, rows, origins, directions, near, far, finest, max_steps, found
     lane's ray ends, the lane takes the next ray, so packets stay full.
     """
     base, relief_rows = rows
-    result, has_relief = solid.distance.results[0], solid.height_mm.size > 0
-    highest = np.float32(solid.max_height_mm)
-    bound = np.float32(1 + solid.slope) if has_relief else np.float32(1)
+    result, has_relief = solid.distance.results[0], solid.relief.height_mm.size > 0
+    highest = np.float32(solid.relief.max_height_mm)
+    bound = np.float32(1 + solid.relief.slope) if has_relief else np.float32(1)
     lanes = np.zeros((_LANE_ROWS, LANES), np.float32)
     gaps = np.empty(LANES, np.float32)
     ray, low = np.empty(LANES, np.int64), np.empty(LANES, np.int64)

@@ -4,13 +4,13 @@ A height map is computed once per object and interpolated bilinearly. Where the 
 caps, poles, the far side of a handle), relief fades out, so that it never tears at an edge.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from robot.sim.objects.packets import interpolate_heights
+from robot.sim.objects.packets import ReliefLevel
 from robot.sim.objects.relief import Relief, Sheet
 from robot.sim.objects.shapes.shape import Chart, Floats, Points, Shape
 
@@ -20,59 +20,28 @@ _LEVELS = 4
 _CELL_MM = 1.5
 
 
-@dataclass(frozen=True)
-class ReliefLevel:
-    """One height map.
-
-    Attributes:
-        height_mm: (rows, columns) heights.
-        per_s: columns per mm.
-        per_t: rows per mm.
-        max_height_mm: greatest height.
-        slope: upper bound on the slope of the relief, mm per mm.
-        pixel_mm: size of a pixel.
-    """
-
-    height_mm: Floats
-    per_s: float
-    per_t: float
-    max_height_mm: float
-    slope: float
-    pixel_mm: float
-
-    def at(self, s: Floats, t: Floats) -> Floats:
-        """Interpolate heights at map coordinates in mm, (N,) each."""
-        return interpolate_heights(self.height_mm, s * np.float32(self.per_s), t * np.float32(self.per_t))
+def level_of(levels: Sequence[ReliefLevel], step_mm: float) -> ReliefLevel:
+    """Return the coarsest level whose pixels are at most `step_mm` wide, or the finest level."""
+    fitting = [level for level in levels if level.pixel_mm <= step_mm]
+    return fitting[-1] if fitting else levels[0]
 
 
-@dataclass(frozen=True)
-class ReliefLevels:
-    """The baked relief of a shape; each level has half the resolution of the one before."""
-
-    levels: tuple[ReliefLevel, ...]
-
-    def level(self, step_mm: float) -> ReliefLevel:
-        """Return the coarsest level whose pixels are at most `step_mm` wide, or the finest level."""
-        fitting = [level for level in self.levels if level.pixel_mm <= step_mm]
-        return fitting[-1] if fitting else self.levels[0]
-
-
-def bake(shape: Shape, relief: Relief) -> ReliefLevels | None:
-    """Draw relief and the shape's own pattern on its wall; return None for a smooth shape."""
+def bake(shape: Shape, relief: Relief) -> list[ReliefLevel]:
+    """Draw relief and the shape's own pattern on its wall; return height maps from fine to coarse, none if smooth."""
     sheet = _sheet(shape.chart)
     height, wall_pattern = relief.height(sheet), shape.wall_pattern(sheet.s, sheet.t)
     if height is None and wall_pattern is None:
-        return None
+        return []
     weight, stretch = _relief_weights(shape, sheet, relief.amplitude_mm)
     total = np.asarray(sum(part for part in (height, wall_pattern) if part is not None) * weight, np.float32)
-    return ReliefLevels(tuple(_levels(total, sheet, stretch, shape.mask_slope)))
+    return _levels(total, sheet, stretch, shape.mask_slope)
 
 
-def bake_plain(chart: Chart, relief: Relief) -> ReliefLevels | None:
-    """Draw only the relief, everywhere; return None for a smooth one."""
+def bake_plain(chart: Chart, relief: Relief) -> list[ReliefLevel]:
+    """Draw only the relief, everywhere; return height maps from fine to coarse, none if smooth."""
     sheet = _sheet(chart)
     height = relief.height(sheet)
-    return None if height is None else ReliefLevels(tuple(_levels(height, sheet, np.ones(2, np.float32), 0.0)))
+    return [] if height is None else _levels(height, sheet, np.ones(2, np.float32), 0.0)
 
 
 def _sheet(chart: Chart) -> Sheet:

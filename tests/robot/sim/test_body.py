@@ -165,7 +165,7 @@ def test_large_steps_miss_thin_ribs_and_ours_do_not():
 
 def test_sphere_tracing_without_the_slope_of_the_relief_passes_through_it():
     """The naive step is f itself; the safe one is f / L. A ray along the wall enters ribs whose flanks are steep."""
-    body, level = thin_ribs(), thin_ribs().wall.levels[0]
+    body, level = thin_ribs(), thin_ribs().wall[0]
     assert level.slope > 1.5
     start, direction = np.array([-41.5, -20.5, 50.0]), np.array([1.0, 0.0, 0.0])
     exact = slow_first_hits(body, start[None], direction[None])[0]
@@ -196,7 +196,7 @@ def test_casting_agrees_with_a_slow_march(index):
 @pytest.mark.parametrize("index", [1, 4, 6, 9, 16, 20])
 def test_the_slope_of_a_level_bounds_how_fast_its_field_changes(index):
     body = draw_object(5, index).body
-    bound = 1 + max((level.slope for level in body.wall.levels[:1]), default=0) if body.wall else 1
+    bound = 1 + max((level.slope for level in body.wall[:1]), default=0) if body.wall else 1
     origins, directions = random_rays(body, 1500, seed=index)
     t = body.cast(origins, directions)
     p = (origins + t[:, None] * directions)[np.isfinite(t)]

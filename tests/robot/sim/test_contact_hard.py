@@ -9,20 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robot.sim.contact.constrained_cg import GAP_WEIGHT, ContactProblem, project_to_simplex
-from robot.sim.contact.kernels import Operator, influence, periodic_influence
+from robot.sim.contact.kernels import Operator, influence
 from robot.sim.contact.layer import SINGLE_PRECISION_TOLERANCE, Layer, press
 from tests.robot.sim.hard_contact import hard_gaps, hard_layers, is_finite, naive_solve
 
 # Contact conditions, checked independently of the solver ---------------------------------------------------
 
 
-def conditions(gap, layer, contact, padded):
+def conditions(gap, layer, contact):
     """Return relative errors of s = 0 in the contact, s >= 0 outside and p >= 0, with u on the whole grid."""
-    thickness = layer.thickness_mm  # pixels of 1 mm
-    table = influence(gap.shape, thickness, layer.poisson)
-    if not padded:
-        table = periodic_influence(gap.shape, thickness, layer.poisson)
-    operator = Operator(table, gap.shape, periodic=not padded)
+    operator = Operator(influence(gap.shape, layer.thickness_mm, layer.poisson), gap.shape)  # pixels of 1 mm
     displacement = operator(contact.pressure_mpa) / layer.plane_modulus_mpa
     distance = displacement + gap - contact.approach_mm
     touching = contact.pressure_mpa > 0.0
@@ -42,21 +38,20 @@ def test_hard_shapes_meet_the_conditions_to_the_tolerance_with_float32_products(
         assert contact.converged
         assert contact.force_n == pytest.approx(force, rel=1e-9)
         rounding = 1e-13 * abs(contact.approach_mm) / max(contact.displacement_mm.max(), 1e-300)
-        assert max(conditions(gap, layer, contact, True)) <= rough / GAP_WEIGHT + 1e-6 + rounding
+        assert max(conditions(gap, layer, contact)) <= rough / GAP_WEIGHT + 1e-6 + rounding
 
 
-@pytest.mark.parametrize("padded", [True, False])
 @pytest.mark.parametrize("name", hard_gaps())
-def test_hard_shapes_meet_the_contact_conditions(name, padded):
+def test_hard_shapes_meet_the_contact_conditions(name):
     gap = hard_gaps()[name]
     for layer, force in itertools.product(hard_layers(), (1e-6, 0.1, 1e4)):
-        contact = press(gap, 1.0, layer, force_n=force, tolerance=1e-4, padded=padded)
+        contact = press(gap, 1.0, layer, force_n=force, tolerance=1e-4)
         assert is_finite(contact)
         assert contact.converged
         assert contact.force_n == pytest.approx(force, rel=1e-9)
         # The difference of gap and approach, both metres, has a rounding error.
         rounding = 1e-13 * abs(contact.approach_mm) / max(contact.displacement_mm.max(), 1e-300)
-        assert max(conditions(gap, layer, contact, padded)) <= 1e-5 + rounding
+        assert max(conditions(gap, layer, contact)) <= 1e-5 + rounding
 
 
 @pytest.mark.parametrize("softness", [1e-6, 1.0, 1e6])
@@ -77,7 +72,7 @@ def test_every_depth_is_reached(name, depth):
         contact = press(hard_gaps()[name], 1.0, layer, depth_mm=depth, tolerance=1e-4)
         assert is_finite(contact)
         assert contact.converged
-        assert max(conditions(hard_gaps()[name], layer, contact, True)) <= 1e-5
+        assert max(conditions(hard_gaps()[name], layer, contact)) <= 1e-5
 
 
 def test_gaps_too_large_for_float64_are_treated_as_infinite():
@@ -99,13 +94,12 @@ def test_any_small_map_is_solved(data):
     gap = gap.reshape(shape)
     layer = data.draw(st.sampled_from(hard_layers()))
     force = 10.0 ** data.draw(st.floats(-6.0, 4.0))
-    padded = data.draw(st.booleans())
-    contact = press(gap, 1.0, layer, force_n=force, padded=padded)
+    contact = press(gap, 1.0, layer, force_n=force)
     assert is_finite(contact)
     assert contact.converged == bool(np.isfinite(gap).any())
     if contact.converged:
         assert contact.force_n == pytest.approx(force, rel=1e-9)
-        assert max(conditions(gap, layer, contact, padded)) <= 2e-4
+        assert max(conditions(gap, layer, contact)) <= 2e-4
 
 
 # A pin that yields -----------------------------------------------------------------------------------------

@@ -15,7 +15,6 @@ from robot.sim.contact.kernels import (
     layer_correction,
     layer_symbol,
     love_patch,
-    periodic_influence,
 )
 from tests.robot.sim.hard_contact import naive_symbol
 
@@ -120,16 +119,6 @@ def test_a_window_does_not_wrap_around_and_is_a_corner_of_the_grid():
     large[4:7, 2:7] = pressure
     inside = Operator(table, (9, 11))(large)[4:7, 2:7]
     assert Operator(table, (3, 5))(pressure) == pytest.approx(inside, abs=1e-13)
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (1, 6), (5, 4), (6, 6)])
-def test_the_periodic_operator_wraps_around(shape):
-    table = periodic_influence(shape, 3.0, 0.4)
-    pressure = np.random.default_rng([3]).random(shape)
-    shifted = sum(
-        pressure[i, j] * np.roll(table, (i, j), axis=(0, 1)) for i in range(shape[0]) for j in range(shape[1])
-    )
-    assert Operator(table, shape, periodic=True)(pressure) == pytest.approx(shifted, abs=1e-13)
 
 
 @pytest.mark.parametrize("thickness", [math.inf, 20.0, 2.0, 1.0, 0.05])

@@ -1,7 +1,6 @@
 """Outlines extruded from the table: boxes, prisms, ovals; tapered or twisted."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,7 +19,10 @@ from robot.sim.objects.shapes.shape import (
 
 
 class Outline(ABC):
-    """A flat closed curve around the origin, with a signed distance, extents and an arc length, in mm."""
+    """A flat closed curve around the origin, in mm.
+
+    Subclasses set the extents along x and y, the distance of the farthest point from the origin, and the arc length.
+    """
 
     reach_x_mm: float
     reach_y_mm: float
@@ -40,43 +42,19 @@ class Outline(ABC):
         """Return points of the curve at arc length s and outward normals there, (N, 2) each."""
 
 
-@dataclass(frozen=True)
 class RoundedRectangle(Outline):
     """2 half_x by 2 half_y with corners of radius `corner_mm` > 0; an oval if the radius equals the smaller half."""
 
-    half_x_mm: float
-    half_y_mm: float
-    corner_mm: float
-
-    @property
-    def reach_x_mm(self) -> float:  # type: ignore[override]
-        """Extent along x."""
-        return self.half_x_mm
-
-    @property
-    def reach_y_mm(self) -> float:  # type: ignore[override]
-        """Extent along y."""
-        return self.half_y_mm
-
-    @property
-    def radius_mm(self) -> float:  # type: ignore[override]
-        """Distance of the farthest point from the origin."""
-        return float(np.hypot(*self._inner)) + self.corner_mm
-
-    @property
-    def _inner(self) -> tuple[float, float]:
-        return self.half_x_mm - self.corner_mm, self.half_y_mm - self.corner_mm
-
-    @property
-    def length_mm(self) -> float:  # type: ignore[override]
-        """Arc length of the curve."""
-        return 4 * sum(self._inner) + 2 * np.pi * self.corner_mm
+    def __init__(self, half_x_mm: float, half_y_mm: float, corner_mm: float) -> None:
+        self.reach_x_mm, self.reach_y_mm, self.corner_mm = half_x_mm, half_y_mm, corner_mm
+        self._inner = half_x_mm - corner_mm, half_y_mm - corner_mm
+        self.radius_mm = float(np.hypot(*self._inner)) + corner_mm
+        self.length_mm = 4 * sum(self._inner) + 2 * np.pi * corner_mm
 
     def distance(self, x: Floats, y: Floats) -> Floats:
         """Return the signed distance in mm."""
-        return rounded_corner(
-            np.abs(x) - np.float32(self.half_x_mm), np.abs(y) - np.float32(self.half_y_mm), self.corner_mm
-        )
+        p, q = np.abs(x) - np.float32(self.reach_x_mm), np.abs(y) - np.float32(self.reach_y_mm)
+        return rounded_corner(p, q, self.corner_mm)
 
     def locate(self, x: Floats, y: Floats) -> Floats:
         """Return the arc length from the middle of the back (+y) over the left; s grows to the right in front."""
@@ -105,44 +83,22 @@ class RoundedRectangle(Outline):
         return sign * (core + self.corner_mm * normal), sign * normal
 
 
-@dataclass(frozen=True)
 class Polygon(Outline):
     """A regular polygon with rounded corners.
 
-    Attributes:
+    Args:
         sides: number of sides.
         apothem_mm: distance from its middle to a face.
         corner_mm: radius of the corners, above 0.
     """
 
-    sides: int
-    apothem_mm: float
-    corner_mm: float
-
-    @property
-    def reach_x_mm(self) -> float:  # type: ignore[override]
-        """Extent along x."""
-        return float((self.apothem_mm - self.corner_mm) / np.cos(np.pi / self.sides) + self.corner_mm)
-
-    @property
-    def reach_y_mm(self) -> float:  # type: ignore[override]
-        """Extent along y."""
-        return self.reach_x_mm
-
-    @property
-    def radius_mm(self) -> float:  # type: ignore[override]
-        """Distance of the farthest point from the origin."""
-        return self.reach_x_mm
-
-    @property
-    def _half(self) -> float:
-        """Half the length of a face's straight part."""
-        return float((self.apothem_mm - self.corner_mm) * np.tan(np.pi / self.sides))
-
-    @property
-    def length_mm(self) -> float:  # type: ignore[override]
-        """Arc length of the curve."""
-        return self.sides * 2 * self._half + 2 * np.pi * self.corner_mm
+    def __init__(self, sides: int, apothem_mm: float, corner_mm: float) -> None:
+        self.sides, self.apothem_mm, self.corner_mm = sides, apothem_mm, corner_mm
+        self.radius_mm = float((apothem_mm - corner_mm) / np.cos(np.pi / sides) + corner_mm)
+        self.reach_x_mm = self.reach_y_mm = self.radius_mm
+        # Half the length of a face's straight part.
+        self._half = float((apothem_mm - corner_mm) * np.tan(np.pi / sides))
+        self.length_mm = sides * 2 * self._half + 2 * np.pi * corner_mm
 
     def _fold(self, x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
         """Return the face's number, and coordinates along and across it; face 0 is in front (-y)."""

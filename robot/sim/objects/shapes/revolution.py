@@ -18,7 +18,7 @@ from robot.sim.objects.shapes.shape import (
 
 
 class Profile(ABC):
-    """A flat signed distance in the half-plane r >= 0."""
+    """A flat signed distance in the half-plane r >= 0, with its highest point and greatest distance from the axis."""
 
     top_mm: float
     radius_mm: float
@@ -40,48 +40,28 @@ class Drum(Profile):
     def distance(self, r: Floats, z: Floats) -> Floats:
         """Return the signed distance in mm."""
         middle, half = (self.top_mm + self.bottom_mm) / 2, (self.top_mm - self.bottom_mm) / 2
-        return rounded_corner(
-            r - np.float32(self.radius_mm), np.abs(z - np.float32(middle)) - np.float32(half), self.rim_mm
-        )
+        ends = np.abs(z - np.float32(middle)) - np.float32(half)
+        return rounded_corner(r - np.float32(self.radius_mm), ends, self.rim_mm)
 
 
-@dataclass(frozen=True)
 class Ball(Profile):
     """A sphere centred on the axis; with `ring_mm`, a horizontal torus of that radius."""
 
-    size_mm: float
-    height_mm: float
-    ring_mm: float = 0.0
-
-    @property
-    def top_mm(self) -> float:  # type: ignore[override]
-        """Height of the highest point."""
-        return self.height_mm + self.size_mm
-
-    @property
-    def radius_mm(self) -> float:  # type: ignore[override]
-        """Greatest distance from the axis."""
-        return self.ring_mm + self.size_mm
+    def __init__(self, size_mm: float, height_mm: float, *, ring_mm: float = 0.0) -> None:
+        self.size_mm, self.height_mm, self.ring_mm = size_mm, height_mm, ring_mm
+        self.top_mm, self.radius_mm = height_mm + size_mm, ring_mm + size_mm
 
     def distance(self, r: Floats, z: Floats) -> Floats:
         """Return the signed distance in mm."""
         return length(r - np.float32(self.ring_mm), z - np.float32(self.height_mm)) - np.float32(self.size_mm)
 
 
-@dataclass(frozen=True)
 class Cone(Profile):
     """A frustum: radius `base_mm` at the bottom, `head_mm` at the top; `rim_mm` rounds its edges."""
 
-    base_mm: float
-    head_mm: float
-    bottom_mm: float
-    top_mm: float
-    rim_mm: float = 0.0
-
-    @property
-    def radius_mm(self) -> float:  # type: ignore[override]
-        """Greatest distance from the axis."""
-        return max(self.base_mm, self.head_mm)
+    def __init__(self, base_mm: float, head_mm: float, bottom_mm: float, top_mm: float, *, rim_mm: float = 0.0) -> None:
+        self.base_mm, self.head_mm, self.bottom_mm, self.top_mm = base_mm, head_mm, bottom_mm, top_mm
+        self.rim_mm, self.radius_mm = rim_mm, max(base_mm, head_mm)
 
     def distance(self, r: Floats, z: Floats) -> Floats:
         """Return a lower bound on the signed distance."""
