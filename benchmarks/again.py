@@ -33,7 +33,7 @@ from indexes.kinds.faiss_index import load_faiss
 from indexes.store.codes import CodeCache
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import batches, encode_photos
-from retrieval.model.stored_partials import to_stored
+from retrieval.model.fusion_scorer import to_stored
 from retrieval.search.build.build_index import build_index
 from retrieval.search.build.codes import code_layout, code_model
 from retrieval.search.defaults import shipped_model

@@ -20,9 +20,9 @@ from retrieval.model.config import Config
 from retrieval.model.encode import TorchEncoder, touch_batch
 from retrieval.model.export import touch_encoder_to_onnx
 from retrieval.model.fusion import Matcher
+from retrieval.model.fusion_scorer import to_stored
 from retrieval.model.onnx_encoder import OnnxEncoder
 from retrieval.model.posterior import Posterior
-from retrieval.model.stored_partials import to_stored
 from retrieval.model.touch_reader import TouchEncoder
 from retrieval.search.defaults import shipped_model
 from retrieval.search.query.searcher import Searcher

@@ -17,7 +17,7 @@ from retrieval.model.checkpoint_info import read_checkpoint_info
 from retrieval.model.config import Config
 from retrieval.model.encode import encode_photos, encode_touches, to_batch, touch_batch
 from retrieval.model.fusion import FusionHead, scorer_of
-from retrieval.model.stored_partials import StoredPartials, to_stored
+from retrieval.model.fusion_scorer import StoredPartials, to_stored
 from retrieval.search.defaults import shipped_model
 
 BATCH = 16

@@ -35,13 +35,14 @@ from retrieval.methods.method import MethodSettings
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint, write_tensors
 from retrieval.model.config import Config, load_config
 from retrieval.model.encode import default_device, one_thread
-from retrieval.model.verification import fit_verification
 from retrieval.search import defaults
 from retrieval.training import distil
 from retrieval.training.batches import FrozenFeatures, recorded_features
+from retrieval.training.calibration.calibrate import calibrate_checkpoint
+from retrieval.training.calibration.touches import calibration_touches
+from retrieval.training.calibration.verification import fit_verification
 from retrieval.training.features import Features, encode_recording, features_by_image
 from retrieval.training.state import finish_training, unfinished_path
-from retrieval.training.verdicts import calibration_touches, with_verdicts
 
 RIGS = Path(__file__).parent
 RIG, TOUCH_RIG, GELS_RIG = (RIGS / f"shipped_{name}.toml" for name in ("rig", "touches", "gels"))
@@ -292,7 +293,7 @@ def calibrated(made: Checkpoint, folder: Path, fingers: int) -> Checkpoint:
     features = encode_recording(every, made.matcher, made.config, folder / "features")
     source = FrozenFeatures(made.config, device, features_by_image(every, features, device))
     known = [*verification, *gels]
-    made = with_verdicts(made, source, known, validation, foreign=FOREIGN, max_grasps=len(every))
+    made = calibrate_checkpoint(made, source, known, validation, foreign=FOREIGN, max_grasps=len(every))
     touches, photos = recorded_features(made.matcher, source, verification, what="verification")
     trials = calibration_touches(made.matcher, verification, touches, photos)
     assert trials is not None

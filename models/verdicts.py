@@ -36,9 +36,10 @@ from retrieval.metrics.k_way import binomial_interval
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import for_inference, photo_features, touch_batch
 from retrieval.model.fusion import scorer_of
-from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL
-from retrieval.model.posterior import IdentificationTrials, ScoredTouches
+from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
 from retrieval.search.defaults import shipped_model
+from retrieval.training.calibration.posterior import IdentificationTrials
+from retrieval.training.calibration.touches import ScoredTouches
 from retrieval.training.features import encode_recording
 from retrieval.training.foreign_images import draw_foreign
 from robot.collection import CollectSettings, collect

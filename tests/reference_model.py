@@ -8,7 +8,7 @@ from retrieval.model.checkpoint import load_checkpoint, save_checkpoint
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
 from retrieval.model.posterior import Posterior
-from retrieval.model.reference_calibration import ReferenceCalibration
+from retrieval.model.references import ReferenceCalibration
 from tests import synthetic
 from tests.conftest import TINY
 

@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from retrieval.adaptation.folds import FoldAccuracy, score_accuracy
 from retrieval.data.dataset import Grasp
-from retrieval.model.calibration_touches import CalibrationTouches
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import one_thread
 from retrieval.model.fusion import ImageEncoding, Matcher, score_partials
-from retrieval.model.posterior import ScoredTouches
-from retrieval.model.reference_calibration import unit_embeddings
+from retrieval.model.references import unit_embeddings
+from retrieval.training.calibration.touches import CalibrationTouches, ScoredTouches
 from retrieval.training.features import Features, encode_recording
 
 

@@ -18,11 +18,11 @@ from retrieval.metrics.pairs import fit_calibration
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import default_device, one_thread
 from retrieval.model.fusion import Matcher
-from retrieval.model.posterior import ScoredTouches
-from retrieval.model.verification import fit_verification
 from retrieval.training.batches import FrozenFeatures
+from retrieval.training.calibration.calibrate import fit_calibrations, with_gel_check
+from retrieval.training.calibration.touches import ScoredTouches
+from retrieval.training.calibration.verification import fit_verification
 from retrieval.training.features import Features, features_by_image
-from retrieval.training.verdicts import fit_calibrations, with_gel_check
 
 
 @one_thread()

@@ -138,7 +138,7 @@ class _Run:
 
     def is_enough(self, grasps: Sequence["RecordedGrasp"]) -> bool:
         """Answer from all grasps so far, print the answer, and return whether it is final."""
-        from retrieval.model.fusion_scorer import NOT_A_GEL
+        from retrieval.model.gel_check import NOT_A_GEL
         from retrieval.model.verification import ACCEPT, REJECT
 
         self.heights_mm[:] = [grasp.pose[2] for grasp in grasps if grasp.pose is not None]

@@ -16,13 +16,9 @@ from numpy.typing import NDArray
 from retrieval.errors import BadInput
 from retrieval.metrics.pairs import Calibration, fit_calibration, reliability_bins
 from retrieval.metrics.table import ScoreTable, object_scores
-from retrieval.model.posterior import (
-    MIN_OBJECTS,
-    IdentificationTrials,
-    Posterior,
-    ScoredTouches,
-    fit_posterior_to_trials,
-)
+from retrieval.model.posterior import Posterior
+from retrieval.training.calibration.posterior import MIN_OBJECTS, IdentificationTrials, fit_posterior_to_trials
+from retrieval.training.calibration.touches import ScoredTouches
 
 MIN_THRESHOLD_OBJECTS = 10
 """Minimum number of validation objects for fitting a pair threshold."""

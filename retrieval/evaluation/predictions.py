@@ -13,7 +13,7 @@ from retrieval.evaluation.cache import CacheKey, read_cached, write_cached
 from retrieval.evaluation.queries import Queries
 from retrieval.methods.method import Method, sum_over_sets
 from retrieval.model.encode import one_thread
-from retrieval.model.posterior import ScoredTouches
+from retrieval.training.calibration.touches import ScoredTouches
 from retrieval.training.features import Features
 
 Scores = NDArray[np.float32]

@@ -19,13 +19,11 @@ from numpy.typing import NDArray
 from retrieval.evaluation.experiment import Experiment
 from retrieval.evaluation.predictions import Predictions, scored_touches
 from retrieval.model.checkpoint import Checkpoint
-from retrieval.model.posterior import MIN_OBJECTS, Posterior, ScoredTouches, fit_posterior
-from retrieval.model.verification import (
-    ERRORS_NEEDED,
-    error_rate,
-    objects_needed,
-    verification_sequences,
-)
+from retrieval.model.posterior import Posterior
+from retrieval.model.verification import ERRORS_NEEDED, error_rate, objects_needed
+from retrieval.training.calibration.posterior import MIN_OBJECTS, fit_posterior
+from retrieval.training.calibration.touches import ScoredTouches
+from retrieval.training.calibration.verification import verification_sequences
 
 GRASPS = (1, 2, 3, 5)
 """Numbers of grasps of the sequences."""

@@ -30,11 +30,11 @@ from retrieval.methods.method import Array, Method
 from retrieval.methods.reduced_features import AffineMap, ReducedFeatures
 from retrieval.methods.selection import Validator, held_out_folds, validation_rows
 from retrieval.methods.standardise import Standardiser
-from retrieval.model.calibration_touches import CalibrationTouches
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
-from retrieval.model.posterior import ScoredTouches, fit_posterior
 from retrieval.model.towers.concatenated import feature_counts_of
+from retrieval.training.calibration.posterior import fit_posterior
+from retrieval.training.calibration.touches import CalibrationTouches, ScoredTouches
 
 if TYPE_CHECKING:
     from retrieval.training.features import Features

@@ -32,10 +32,9 @@ from retrieval.model.checkpoint_info import (
     unusable,
 )
 from retrieval.model.config import Config
-from retrieval.model.fusion import Matcher
-from retrieval.model.gel_head import GelHead
+from retrieval.model.fusion import GelHead, Matcher
 from retrieval.model.posterior import Posterior
-from retrieval.model.reference_calibration import ReferenceCalibration
+from retrieval.model.references import ReferenceCalibration
 from retrieval.model.verification import CARD_FAR, VerificationCalibration
 from retrieval.version import __version__
 

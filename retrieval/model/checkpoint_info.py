@@ -10,7 +10,8 @@ from safetensors import SafetensorError, safe_open
 from _touch_retrieval.files import file_digest, open_regular, parse_json
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.config import Config
-from retrieval.model.fusion_scorer import FusionScorer, GelCheck
+from retrieval.model.fusion_scorer import FusionScorer
+from retrieval.model.gel_check import GelCheck
 from retrieval.model.verification import VerificationCalibration
 
 FORMAT = 2

@@ -21,11 +21,9 @@ from torch.nn import functional
 from retrieval.errors import BadInput
 from retrieval.model.candidate_encoder import CandidateEncoder
 from retrieval.model.config import MatcherConfig
-from retrieval.model.fusion_scorer import FusionScorer
-from retrieval.model.gel_head import GelHead
+from retrieval.model.fusion_scorer import FusionScorer, Partials
 from retrieval.model.late_interaction import CellEncoder, cell_scores, paired_cell_scores
 from retrieval.model.losses.contrastive import LOG_SCALE_INIT, LOG_SCALE_MAX
-from retrieval.model.stored_partials import Partials
 from retrieval.model.towers import build_tower
 
 COSINE_SCALE_INIT = 4.0
@@ -147,6 +145,28 @@ class FusionHead(nn.Module):
         return cells.reshape(*cells.shape[:-1], -1, self.cell_dim)
 
 
+GEL_CLASSES = ("contact", "no_contact", "foreign")
+"""Classes of the gel head."""
+
+
+class GelHead(nn.Module):
+    """A linear layer to one logit for each of `GEL_CLASSES`."""
+
+    def __init__(self, features: int) -> None:
+        super().__init__()
+        self.classifier = nn.Linear(features, len(GEL_CLASSES))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Return readings (B, fingers, 2) of features (B, fingers, F).
+
+        The first is the log-odds of "no gel image" against both other classes, the second that of contact against a
+        no-contact gel.
+        """
+        contact, no_contact, foreign = self.classifier(features).unbind(-1)
+        gel = torch.logsumexp(torch.stack([contact, no_contact], dim=-1), dim=-1)  # ONNX has no logaddexp
+        return torch.stack([foreign - gel, contact - no_contact], dim=-1)
+
+
 class Matcher(nn.Module):
     """Maps touches and photos to partial activations and embeddings, and partial activations to match logits."""
 
@@ -187,7 +207,7 @@ class Matcher(nn.Module):
         self.log_scale = nn.Parameter(torch.tensor(LOG_SCALE_INIT))
         self.cosine_scale = nn.Parameter(torch.tensor(COSINE_SCALE_INIT)) if config.cosine else None
         self.candidate_encoder = candidate_encoder_of(config) if config.candidate_width else None
-        self.gel_head: GelHead | None = None  # fitted after training (`retrieval.training.verdicts`)
+        self.gel_head: GelHead | None = None  # fitted after training (`retrieval.training.calibration.gel_check`)
 
     def touch_features(self, touches: Tensor) -> Tensor:
         """Return features (B, fingers * output_count) of touches (B, fingers, 3, H, W) in 0..1, fingers in order a, b.

@@ -1,98 +1,107 @@
-"""The gel check (`GelCheck`) and the match logits of the fusion head (`FusionScorer`), in numpy.
+"""Match logits of the fusion head from stored partial activations, in numpy.
 
-The gel check comes first: is this a gel image, and is there contact? A linear layer on the touch tower's features
-(`retrieval.model.gel_head.GelHead`) classifies each finger's image: gel in contact, gel without contact, or a picture
-that is not a gel image. With a no-contact frame, contact is the difference from that frame, which needs no model.
-
-Pairs are scored from stored partial activations, with the photos in blocks. The head's layers after the partial
-activations are one matrix product for all photos of a block. The rest is done in place, so the product takes most of
-the time.
+An index stores the partial activations of photos as float16, and the vectors of cells as 8-bit integers: a cell's
+vector has unit length, so a component c is stored as round(127 c), with an error of at most 1/254. Arithmetic is in
+float32. Photos are scored in blocks. The head's layers after the partial activations are one matrix product for all
+photos of a block. The rest is done in place, so the product takes most of the time.
 """
 
-import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from msgspec import Meta
 from numpy.typing import NDArray
 
-from _touch_retrieval.documents import typed
-from retrieval.data.resize import RgbImage, resize
-from retrieval.errors import BadInput, NumericalError
-from retrieval.model.stored_partials import Partials, as_float32
-
-CONTACT, NO_CONTACT, NOT_A_GEL = "contact", "no contact", "not a gel image"
-BLOCKS = 16
-"""Image blocks along each side for `contact_level`."""
-Bounded = Annotated[float, Meta(ge=-1e6, le=1e6)]
-
-
-@dataclass(frozen=True)
-class GelCheck:
-    """Thresholds of the gel check, chosen on validation objects; None if the recording had no examples.
-
-    Attributes:
-        foreign_above: An image is foreign (not a gel image), and its grasp is refused, if a finger's log-odds of "no
-            gel image" exceed this.
-        contact_above: A grasp has contact if the largest log-odds of contact over its fingers is at least this.
-        level_above: A grasp has contact if the largest difference of a finger's gel image from its no-contact frame
-            (`contact_level`, in grey levels of 255) is at least this. Used instead of `contact_above` if available.
-        rates: Fractions of validation touches and foreign pictures that were refused, and of no-contact gels that were
-            accepted.
-    """
-
-    foreign_above: Bounded | None
-    contact_above: Bounded | None
-    level_above: Bounded | None
-    rates: Mapping[str, Bounded]
-
-    def classify(self, readings: NDArray[np.float32], levels: NDArray[np.float32] | None = None) -> list[str]:
-        """Classify each grasp as CONTACT, NO_CONTACT or NOT_A_GEL.
-
-        Args:
-            readings: (G, fingers, 2) log-odds of "no gel image" and of contact.
-            levels: (G, fingers) differences of the images from their no-contact frames in grey levels, if available.
-        """
-        if levels is not None and self.level_above is not None:
-            has_contact = levels.max(1) >= self.level_above
-        elif self.contact_above is not None:
-            has_contact = readings[..., 1].max(1) >= self.contact_above
-        else:
-            has_contact = np.ones(len(readings), dtype=bool)
-        is_gel = np.ones(len(readings), dtype=bool)
-        if self.foreign_above is not None:
-            is_gel = readings[..., 0].max(1) <= self.foreign_above
-        return [
-            (CONTACT if contact else NO_CONTACT) if gel else NOT_A_GEL
-            for gel, contact in zip(is_gel, has_contact, strict=True)
-        ]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return a plain dictionary, as stored in checkpoints."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: Any) -> "GelCheck":
-        """Inverse of `to_dict`. Raises BadInput for anything else."""
-        return typed(data, cls, "gel_check", complete=True, error=BadInput)
-
-
-def contact_level(touch: RgbImage, no_contact: RgbImage) -> float:
-    """Return the largest difference of a gel image from its no-contact frame, in grey levels of 255.
-
-    Both images are (H, W, 3) in 0..1. They are compared in 16 x 16 blocks, whose means suppress pixel noise.
-    """
-    size = (BLOCKS, BLOCKS)
-    return 255 * float(np.abs(resize(touch, size) - resize(no_contact, size)).max())
-
+from retrieval.errors import NumericalError
 
 Floats = NDArray[np.float32]
 BLOCK = 2048
 """Number of photos that are scored together."""
 CELL_BLOCK = 64
 """The same for scores of cells, whose vectors then fit into the processor's cache."""
+PARTIALS, CELLS = "partials", "cells"
+"""Names of the two arrays of an index."""
+_LARGEST = 127
+_BLOCK_ROWS = 8192
+Layout = dict[str, tuple[np.dtype[Any], tuple[int, ...]]]
+
+
+class StoredPartials:
+    """Partial activations (N, partial) over the arrays of an index; a selection of rows is float32."""
+
+    def __init__(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Use the arrays `PARTIALS` (N, pooled) and, with cells, `CELLS` (N, cells * cell_dim)."""
+        self._pooled, self._cells = arrays[PARTIALS], arrays.get(CELLS)
+        self.pooled_width = self._pooled.shape[1]
+        self.shape = (len(self._pooled), self.pooled_width + (0 if self._cells is None else self._cells.shape[1]))
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, rows: slice | NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return the partial activations (n, partial) of some rows."""
+        pooled = as_float32(self._pooled[rows])
+        if self._cells is None:
+            return pooled
+        found = np.empty((len(pooled), self.shape[1]), dtype=np.float32)
+        found[:, : self.pooled_width] = pooled
+        cells = self._cells[rows]
+        np.multiply(cells, np.float32(1 / _LARGEST), out=found[:, self.pooled_width :], dtype=np.float32)
+        return found
+
+
+def stored_layout(pooled_width: int, partial_width: int) -> Layout:
+    """Return the type and shape of a row of each array."""
+    layout: Layout = {PARTIALS: (np.dtype(np.float16), (pooled_width,))}
+    if partial_width > pooled_width:
+        layout[CELLS] = (np.dtype(np.int8), (partial_width - pooled_width,))
+    return layout
+
+
+def to_stored(partials: NDArray[np.float32], pooled_width: int) -> dict[str, NDArray[Any]]:
+    """Return the arrays of partial activations (N, partial), rounded; those beyond float16 become infinite."""
+    with np.errstate(over="ignore"):
+        arrays: dict[str, NDArray[Any]] = {PARTIALS: partials[:, :pooled_width].astype(np.float16)}
+    if partials.shape[1] > pooled_width:
+        arrays[CELLS] = np.rint(_LARGEST * partials[:, pooled_width:]).astype(np.int8)
+    return arrays
+
+
+def largest_rounding(partials: NDArray[np.float16]) -> float:
+    """Return the largest possible rounding error of stored partial activations (N, pooled), read block by block.
+
+    It is half a unit in the last of the eleven bits of float16's fraction.
+    """
+    starts = range(0, len(partials), _BLOCK_ROWS)
+    return max(float(np.abs(partials[start : start + _BLOCK_ROWS]).max()) for start in starts) * 2.0**-11
+
+
+Partials = NDArray[np.floating[Any]] | StoredPartials
+
+
+def as_float32(values: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+    """Return `values` in float32, exactly.
+
+    Partial activations are finite float16. numpy converts these one by one, which takes longer than the arithmetic on
+    them. Shifting the five exponent bits and ten fraction bits gives the number divided by 2^112, also for subnormals.
+    """
+    if values.dtype != np.float16:
+        return np.ascontiguousarray(values, dtype=np.float32)
+    bits = np.ascontiguousarray(values).view(np.int16)
+    if ((bits & _EXPONENT) == _EXPONENT).any():  # NaN or infinite
+        return values.astype(np.float32)
+    wide = bits.astype(np.int32)  # copies the sign to all upper bits
+    wide <<= 13
+    wide &= _SIGN_AND_VALUE
+    floats: NDArray[np.float32] = wide.view(np.float32)
+    floats *= _UNSHIFT
+    return floats
+
+
+_EXPONENT = np.int16(0x7C00)
+_SIGN_AND_VALUE = np.int32(0x8FFFE000 - 2**32)
+_UNSHIFT = np.float32(2.0**112)
 
 
 @dataclass(frozen=True)

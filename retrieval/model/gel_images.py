@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from retrieval.data.images import check_pixels, decode, picture_size
 from retrieval.data.resize import RgbImage, Samples, check_rgb, resize_unchecked, to_unit
-from retrieval.model.fusion_scorer import BLOCKS
+from retrieval.model.gel_check import BLOCKS
 
 
 @dataclass(frozen=True, eq=False)

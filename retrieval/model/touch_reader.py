@@ -14,7 +14,7 @@ from retrieval.data.resize import RgbImage
 from retrieval.errors import BadInput, IncompleteSearch, NumericalError
 from retrieval.model.config import Config
 from retrieval.model.fork_guard import fork_guard
-from retrieval.model.fusion_scorer import contact_level
+from retrieval.model.gel_check import contact_level
 from retrieval.model.gel_images import GelImage
 from retrieval.model.touches import AnyImage, InputImage, parse_grasps
 

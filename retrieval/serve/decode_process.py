@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from retrieval.errors import ImageError
-from retrieval.model.fusion_scorer import BLOCKS
+from retrieval.model.gel_check import BLOCKS
 from retrieval.model.gel_images import GelImage, PictureSize, read_gel_image
 
 DECODE_CPU_S = 5

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from retrieval.data.images import decode, encode_image
-from retrieval.model.fusion_scorer import CONTACT
+from retrieval.model.gel_check import CONTACT
 from retrieval.search.query.answer import QueryResult
 from retrieval.serve.settings import ServiceSettings
 from retrieval.serve.store import BACKGROUND, HistoryStore, new_id

@@ -46,6 +46,7 @@ from retrieval.model.fusion import Matcher
 from retrieval.model.towers.tower import Tower
 from retrieval.training import distributed
 from retrieval.training.batches import FeatureSource, FrozenFeatures, LoadedBatch, TrainedFeatures
+from retrieval.training.calibration.calibrate import calibrate_checkpoint
 from retrieval.training.distil import add_candidate_encoder
 from retrieval.training.features import Features, features_by_image
 from retrieval.training.fit import RATE, Plan, fit, freeze_batch_norm
@@ -53,7 +54,6 @@ from retrieval.training.initial_weights import TOWER_WEIGHTS, build_matcher
 from retrieval.training.licences import training_licences
 from retrieval.training.state import code_digest, load_state, require_no_unfinished_state, save_state, state_path
 from retrieval.training.step import WeightedLosses, batch_loss, pair_logits, shuffle_fingers
-from retrieval.training.verdicts import with_verdicts
 
 
 def train(
@@ -263,7 +263,7 @@ class Trainer:
         if self.config.matcher.candidate_width:
             made = add_candidate_encoder(made, self.config, self.features, train, held_out, quiet=quiet)
         if self.has_images:
-            made = with_verdicts(made, self.features, train, held_out, quiet=quiet)
+            made = calibrate_checkpoint(made, self.features, train, held_out, quiet=quiet)
         store_checkpoint(made, self.out)
 
     def _validate_and_save(self) -> None:

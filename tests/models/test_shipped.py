@@ -13,7 +13,7 @@ from models.pictures import METADATA, ObjectLabels, collect_pictures
 from retrieval.data.images import to_float
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import touch_features
-from retrieval.model.fusion_scorer import NOT_A_GEL
+from retrieval.model.gel_check import NOT_A_GEL
 from retrieval.model.towers import build_tower
 from retrieval.search import defaults
 from robot.rig import load_rig

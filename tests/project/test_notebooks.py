@@ -8,7 +8,7 @@ from importlib import import_module
 import pytest
 
 from benchmarks.notebooks import FOLDER, execute, kinds
-from retrieval.model.fusion_scorer import CONTACT, GelCheck
+from retrieval.model.gel_check import CONTACT, GelCheck
 from tests import synthetic
 
 TINY = {

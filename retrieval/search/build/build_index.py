@@ -21,8 +21,8 @@ from retrieval.data.naming import FOLDER, Naming, naming_warnings
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.checkpoint_info import fingerprint
-from retrieval.model.reference_calibration import REFERENCE_CALIBRATION, REFERENCE_ROWS
-from retrieval.model.stored_partials import CELLS, PARTIALS, StoredPartials, largest_rounding
+from retrieval.model.fusion_scorer import CELLS, PARTIALS, StoredPartials, largest_rounding
+from retrieval.model.references import REFERENCE_CALIBRATION, REFERENCE_ROWS
 from retrieval.search.build.build_report import BuildReport
 from retrieval.search.build.candidates import (
     can_measure,

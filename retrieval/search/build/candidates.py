@@ -24,7 +24,7 @@ from retrieval.errors import BadInput
 from retrieval.metrics.k_way import binomial_interval
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.fusion import score_partials
-from retrieval.model.stored_partials import Partials
+from retrieval.model.fusion_scorer import Partials
 
 TARGET = 0.99
 """Agreement@k that the chosen number of candidates reaches."""

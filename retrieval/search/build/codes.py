@@ -31,8 +31,8 @@ from retrieval.errors import NoReadablePhoto, NumericalError
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.checkpoint_info import fingerprint
 from retrieval.model.encode import Image, batches, one_thread
+from retrieval.model.fusion_scorer import stored_layout, to_stored
 from retrieval.model.photo_encoder import PhotoEncoder, choose_photo_encoder, torch_photo_encoder
-from retrieval.model.stored_partials import stored_layout, to_stored
 
 T = TypeVar("T")
 R = TypeVar("R")

@@ -20,11 +20,8 @@ from retrieval.data.images import decode_rgb
 from retrieval.errors import BadInput, ImageError
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, batches, touch_features
-from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL
-from retrieval.model.reference_calibration import (
-    REFERENCE_PARTIALS,
-    REFERENCE_ROWS,
-)
+from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
+from retrieval.model.references import REFERENCE_PARTIALS, REFERENCE_ROWS
 from retrieval.search.build.codes import code_model
 
 Partials = NDArray[np.float16]

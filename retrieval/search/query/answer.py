@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.errors import BadInput
-from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck
+from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck
 from retrieval.model.posterior import PosteriorProbabilities
 from retrieval.model.touch_reader import TouchEncodings
 

@@ -11,8 +11,8 @@ from indexes.errors import AGAIN, CorruptIndex
 from indexes.store.generation import Generation
 from indexes.store.rows import Row
 from retrieval.data.text import is_inside
+from retrieval.model.fusion_scorer import Layout
 from retrieval.model.posterior import Posterior
-from retrieval.model.stored_partials import Layout
 
 Floats = NDArray[np.float32]
 Rows = NDArray[np.int64]

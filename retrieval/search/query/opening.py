@@ -10,8 +10,7 @@ from indexes.store.generation import Generation, check_fingerprint
 from indexes.store.manifest import Manifest
 from indexes.store.sharded import ShardedManifest, is_sharded, open_shard, read_sharded_manifest
 from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_checkpoint_info, read_scorer
-from retrieval.model.fusion_scorer import FusionScorer
-from retrieval.model.stored_partials import CELLS, stored_layout
+from retrieval.model.fusion_scorer import CELLS, FusionScorer, stored_layout
 from retrieval.model.touch_reader import TouchEncoder
 from retrieval.search import defaults
 from retrieval.search.query.objects import check_usable

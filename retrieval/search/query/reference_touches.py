@@ -14,7 +14,7 @@ from indexes.store.generation import Generation
 from retrieval.data.text import is_inside
 from retrieval.errors import BadInput
 from retrieval.model.posterior import Posterior
-from retrieval.model.reference_calibration import (
+from retrieval.model.references import (
     REFERENCE_CALIBRATION,
     REFERENCE_PARTIALS,
     REFERENCE_ROWS,
@@ -51,7 +51,7 @@ class References:
     """Reference touches of a generation's objects, which are numbered as in `Objects`.
 
     `similarities` (count,) is the value C of each object with the grasps of a query, NaN without a reference
-    (`retrieval.model.reference_calibration`).
+    (`retrieval.model.references`).
     """
 
     def __init__(self, generation: Generation, objects: Objects, columns: slice) -> None:

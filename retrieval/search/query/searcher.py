@@ -13,10 +13,11 @@ from indexes.errors import UnsupportedFormat
 from indexes.store.generation import Generation
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint_info import CheckpointInfo
-from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL, FusionScorer
+from retrieval.model.fusion_scorer import FusionScorer
+from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
 from retrieval.model.onnx_encoder import find_export
 from retrieval.model.posterior import NONE_PRIOR, Posterior, PosteriorProbabilities, require_prior
-from retrieval.model.reference_calibration import REFERENCE_ROWS
+from retrieval.model.references import REFERENCE_ROWS
 from retrieval.model.touch_reader import EncodedTouches, Stopwatch, TouchEncoder, TouchReader
 from retrieval.model.touches import AnyImage, AnyTouches, InputImage, parse_grasps
 from retrieval.model.verification import MAX_GRASPS, DecisionBounds

@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 
 from indexes.store.generation import Generation
 from retrieval.errors import BadInput
-from retrieval.model.fusion_scorer import FusionScorer
+from retrieval.model.fusion_scorer import FusionScorer, StoredPartials
 from retrieval.model.posterior import EvidenceMass, Posterior
-from retrieval.model.reference_calibration import REFERENCE_ROWS
-from retrieval.model.stored_partials import StoredPartials
+from retrieval.model.references import REFERENCE_ROWS
 from retrieval.model.touch_reader import Stopwatch
 from retrieval.search.query.answer import NearestReference
 from retrieval.search.query.objects import ListedPhoto, Objects, ScoredObjects, listed_photo

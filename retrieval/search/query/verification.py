@@ -3,7 +3,7 @@
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from retrieval.model.fusion_scorer import NO_CONTACT, NOT_A_GEL
+from retrieval.model.gel_check import NO_CONTACT, NOT_A_GEL
 from retrieval.model.verification import ACCEPT, ANOTHER_GRASP, REJECT, DecisionBounds
 
 VERIFY_EXIT_CODES = {ACCEPT: 0, REJECT: 3, NO_CONTACT: 4, NOT_A_GEL: 5, ANOTHER_GRASP: 6}

@@ -35,8 +35,8 @@ from retrieval.data.naming import Naming, naming_warnings
 from retrieval.errors import BadInput, NoReadablePhoto
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.checkpoint_info import fingerprint
-from retrieval.model.reference_calibration import REFERENCE_CALIBRATION, REFERENCE_ROWS
-from retrieval.model.stored_partials import CELLS
+from retrieval.model.fusion_scorer import CELLS
+from retrieval.model.references import REFERENCE_CALIBRATION, REFERENCE_ROWS
 from retrieval.search.build.build_index import BuildOptions, build_listed, naming_by, stores_cells
 from retrieval.search.build.build_report import BuildReport
 from retrieval.search.build.codes import no_photo

@@ -20,13 +20,13 @@ from retrieval.errors import BadInput, CheckpointError
 from retrieval.methods import cca_towers
 from retrieval.methods.cca_towers import GRID, CcaSettings, TowerWidths, fit_projections, select_settings
 from retrieval.methods.selection import Validator
-from retrieval.model.calibration_touches import CalibrationTouches
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.fusion import Matcher
-from retrieval.model.posterior import ScoredTouches, fit_posterior
 from retrieval.model.towers import build_tower
 from retrieval.model.towers.weights import initialise_tower
-from retrieval.model.verification import fit_verification, verification_sequences
+from retrieval.training.calibration.posterior import fit_posterior
+from retrieval.training.calibration.touches import CalibrationTouches, ScoredTouches
+from retrieval.training.calibration.verification import fit_verification, verification_sequences
 from retrieval.training.features import Features
 from retrieval.training.initial_weights import build_matcher
 from tests.verification import calibration

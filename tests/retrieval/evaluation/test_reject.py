@@ -10,7 +10,8 @@ from retrieval.evaluation.reject import _false_accepts, galleries, reject, stati
 from retrieval.metrics.intervals import summarise
 from retrieval.metrics.measure import object_means
 from retrieval.metrics.table import ScoreTable
-from retrieval.model.posterior import Posterior, fit_posterior_to_trials
+from retrieval.model.posterior import Posterior
+from retrieval.training.calibration.posterior import fit_posterior_to_trials
 
 
 def table_of(scores, owner):

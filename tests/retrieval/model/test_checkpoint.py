@@ -27,9 +27,8 @@ from retrieval.model.checkpoint import (
     write_tensors,
 )
 from retrieval.model.checkpoint_info import FORMAT, read_checkpoint_info
-from retrieval.model.fusion import Matcher
-from retrieval.model.fusion_scorer import GelCheck
-from retrieval.model.gel_head import GelHead
+from retrieval.model.fusion import GelHead, Matcher
+from retrieval.model.gel_check import GelCheck
 from retrieval.model.posterior import Posterior
 from tests.conftest import TINY
 

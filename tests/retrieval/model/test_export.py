@@ -19,8 +19,7 @@ from retrieval.model.checkpoint import load_checkpoint, save_checkpoint
 from retrieval.model.config import Config, MatcherConfig
 from retrieval.model.encode import TorchEncoder, encode_touches, touch_features
 from retrieval.model.export import export
-from retrieval.model.fusion import Matcher
-from retrieval.model.gel_head import GelHead
+from retrieval.model.fusion import GelHead, Matcher
 from retrieval.model.onnx_encoder import OnnxEncoder
 from retrieval.model.towers import OUTPUTS, TOWERS
 from retrieval.search.build.build_index import build_index

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from retrieval.model.fusion_scorer import CELL_BLOCK, FusionScorer
-from retrieval.model.stored_partials import StoredPartials, as_float32, to_stored
+from retrieval.model.fusion_scorer import CELL_BLOCK, FusionScorer, StoredPartials, as_float32, to_stored
 
 
 def random_scorer(hidden, seed=0):

@@ -9,9 +9,9 @@ from retrieval.data.preprocessing import Preprocessing
 from retrieval.model.config import MatcherConfig
 from retrieval.model.encode import touch_features
 from retrieval.model.fusion import Matcher
-from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck, contact_level
+from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck, contact_level
+from retrieval.training.calibration.gel_check import GelCheckFeatures, contact_threshold, fit_gel_check, fit_gel_head
 from retrieval.training.foreign_images import SYNTHETIC_KINDS, draw_foreign
-from retrieval.training.verdicts import GelCheckFeatures, contact_threshold, fit_gel_check, fit_gel_head
 
 CHECK = GelCheck(foreign_above=1.0, contact_above=0.5, level_above=4.0, rates={"touches_rejected_as_foreign": 0.0})
 

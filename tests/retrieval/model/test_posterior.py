@@ -8,15 +8,9 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from retrieval.errors import BadInput, NumericalError
-from retrieval.model.posterior import (
-    MAX_GRASPS,
-    SLOPE_BOUNDS,
-    EvidenceMass,
-    Posterior,
-    ScoredTouches,
-    fit_posterior,
-    require_prior,
-)
+from retrieval.model.posterior import MAX_GRASPS, SLOPE_BOUNDS, EvidenceMass, Posterior, require_prior
+from retrieval.training.calibration.posterior import fit_posterior
+from retrieval.training.calibration.touches import ScoredTouches
 
 ADDING = Posterior(slope=1.0, offset=0.0, dependence=0.0)
 

@@ -7,14 +7,9 @@ import numpy as np
 import pytest
 
 from retrieval.errors import BadInput
-from retrieval.model.calibration_touches import CalibrationTouches
-from retrieval.model.posterior import ScoredTouches
-from retrieval.model.reference_calibration import (
-    SHARPNESS,
-    ReferenceCalibration,
-    fit_reference_calibration,
-    reference_similarity,
-)
+from retrieval.model.references import SHARPNESS, ReferenceCalibration, reference_similarity
+from retrieval.training.calibration.references import fit_references
+from retrieval.training.calibration.touches import CalibrationTouches, ScoredTouches
 from tests.reference_model import REFERENCE_CALIBRATION
 
 
@@ -59,8 +54,8 @@ def reference_touches(objects=10, touches=4, noise=0.3, photos=True, seed=0):
 
 def test_near_touches_get_a_large_weight_and_noise_a_small_one():
     near, far = (
-        fit_reference_calibration(reference_touches(noise=0.1)),
-        fit_reference_calibration(reference_touches(noise=50.0)),
+        fit_references(reference_touches(noise=0.1)),
+        fit_references(reference_touches(noise=50.0)),
     )
     assert near.touch_only.slope > 5 > far.touch_only.slope
     assert near.weight * near.with_photos.slope > 5 * far.weight * far.with_photos.slope
@@ -68,26 +63,23 @@ def test_near_touches_get_a_large_weight_and_noise_a_small_one():
 
 
 def test_without_photos_only_the_touches_are_fitted():
-    found = fit_reference_calibration(reference_touches(photos=False))
+    found = fit_references(reference_touches(photos=False))
     assert found.with_photos is None
     assert found.weight is None
     assert found.touch_only.slope > 1
 
 
 def test_too_few_objects_touches_or_dimensions_give_no_calibration():
-    assert fit_reference_calibration(reference_touches(objects=2)) is None
-    assert fit_reference_calibration(reference_touches(touches=1)) is None
+    assert fit_references(reference_touches(objects=2)) is None
+    assert fit_references(reference_touches(touches=1)) is None
     touches = reference_touches()
-    assert (
-        fit_reference_calibration(dataclasses.replace(touches, touch_embeddings=touches.touch_embeddings[:, :0]))
-        is None
-    )
+    assert fit_references(dataclasses.replace(touches, touch_embeddings=touches.touch_embeddings[:, :0])) is None
 
 
 @pytest.mark.parametrize("references", [1, 3])
 def test_one_reference_and_three_are_both_calibrated(references):
     """On other objects, the mean probability of the best object equals its accuracy."""
-    calibration = fit_reference_calibration(reference_touches(objects=80, touches=8, noise=0.2, photos=False))
+    calibration = fit_references(reference_touches(objects=80, touches=8, noise=0.2, photos=False))
     others = reference_touches(objects=80, touches=8, noise=0.2, photos=False, seed=1)
     embeddings = others.touch_embeddings.reshape(80, 8, -1)
     shown, queries = embeddings[:, :references].reshape(80 * references, -1), embeddings[:, 4:].reshape(320, -1)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from retrieval.errors import BadInput
-from retrieval.model.calibration_touches import CalibrationTouches
-from retrieval.model.posterior import Posterior, ScoredTouches
+from retrieval.model.posterior import Posterior
 from retrieval.model.verification import (
     ACCEPT,
     ANOTHER_GRASP,
@@ -18,9 +17,9 @@ from retrieval.model.verification import (
     QUANTILES,
     REJECT,
     VerificationCalibration,
-    fit_verification,
-    verification_sequences,
 )
+from retrieval.training.calibration.touches import CalibrationTouches, ScoredTouches
+from retrieval.training.calibration.verification import fit_verification, verification_sequences
 
 POSTERIOR = Posterior(slope=1.0, offset=-2.0, dependence=0.5)
 EMBEDDING_DIM = 4

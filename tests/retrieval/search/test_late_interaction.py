@@ -16,12 +16,14 @@ from retrieval.model.checkpoint import load_checkpoint, read_tensors, save_check
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
 from retrieval.model.posterior import Posterior
-from retrieval.model.reference_calibration import ReferenceCalibration
+from retrieval.model.references import ReferenceCalibration
 from retrieval.search.build import candidates
 from retrieval.search.build.build_index import build_index
 from retrieval.search.query.searcher import Searcher
 from retrieval.search.sharding.build_sharded import build_sharded
-from retrieval.training import verdicts
+from retrieval.training.calibration import calibrate
+from retrieval.training.calibration.posterior import fit_posterior
+from retrieval.training.calibration.touches import calibration_touches
 from tests.conftest import TINY
 from tests.reference_model import REFERENCE_CALIBRATION, write_reference_model
 
@@ -205,13 +207,13 @@ def test_the_pooled_posterior_is_fitted_on_the_logits_of_the_matcher_without_cel
     each, count = pooled.touch_tower.feature_count, pooled.photo_feature_count
     short = {photo: features[:count] for photo, features in photos.items()}
     short_touches = touches.reshape(12, 2, -1)[..., :each].reshape(12, -1)
-    expected = verdicts.calibration_touches(pooled, grasps, short_touches, short)
-    found = verdicts.calibration_touches(matcher, grasps, touches, photos, pooled=True)
+    expected = calibration_touches(pooled, grasps, short_touches, short)
+    found = calibration_touches(matcher, grasps, touches, photos, pooled=True)
     np.testing.assert_allclose(found.scored.logits, expected.scored.logits, atol=1e-5)
-    monkeypatch.setattr(verdicts, "recorded_features", lambda *_, **__: (touches, photos))
-    monkeypatch.setattr(verdicts, "_sample_grasps", lambda some, _: some)  # keeps their order
-    made = verdicts.with_verdicts(checkpoint, None, grasps, grasps)
-    assert made.pooled_posterior.slope == pytest.approx(verdicts.fit_posterior(expected.scored).slope, rel=1e-3)
+    monkeypatch.setattr(calibrate, "recorded_features", lambda *_, **__: (touches, photos))
+    monkeypatch.setattr(calibrate, "_sample_grasps", lambda some, _: some)  # keeps their order
+    made = calibrate.calibrate_checkpoint(checkpoint, None, grasps, grasps)
+    assert made.pooled_posterior.slope == pytest.approx(fit_posterior(expected.scored).slope, rel=1e-3)
     assert made.posterior != made.pooled_posterior
 
 

@@ -10,7 +10,7 @@ import pytest
 from indexes.errors import CorruptIndex
 from indexes.store.folder import IndexStore
 from retrieval.errors import BadInput
-from retrieval.model.reference_calibration import SHARPNESS, ReferenceCalibration, unit_embeddings
+from retrieval.model.references import SHARPNESS, ReferenceCalibration, unit_embeddings
 from retrieval.report.query import query_html
 from retrieval.report.terminal import print_table
 from retrieval.search.build.build_index import build_index

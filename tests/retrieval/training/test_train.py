@@ -234,7 +234,7 @@ def test_a_power_cut_after_the_last_step_changes_no_bit(where, recording, tmp_pa
             cut.setattr(Path, "unlink", power_cut_before_deleting(state_path(broken.out)))
         else:
             in_distillation = where == "while the candidate encoder is trained"
-            step = "distil.distillation_loss" if in_distillation else "train.with_verdicts"
+            step = "distil.distillation_loss" if in_distillation else "train.calibrate_checkpoint"
             cut.setattr(f"retrieval.training.{step}", power_cut)
         with pytest.raises(RuntimeError, match="power cut"):
             broken.run(quiet=True)
@@ -249,7 +249,7 @@ def test_a_power_cut_after_the_last_step_changes_no_bit(where, recording, tmp_pa
     assert not state_path(broken.out).exists()
 
 
-@pytest.mark.parametrize("step", ["distil.distillation_loss", "train.with_verdicts"])
+@pytest.mark.parametrize("step", ["distil.distillation_loss", "train.calibrate_checkpoint"])
 def test_ctrl_c_after_the_last_step_leaves_a_usable_checkpoint_that_resuming_completes(
     step, recording, tmp_path, monkeypatch
 ):

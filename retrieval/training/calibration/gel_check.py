@@ -1,10 +1,7 @@
-"""Fit the parts of a checkpoint that verdicts need, after training: calibrations and the gel check.
+"""Fit the gel check: is this a gel image, and does it show contact (`retrieval.model.gel_check`)?
 
-The posterior (`retrieval.model.posterior`) is fitted on touches and photos of validation objects; a model with late
-interaction has a second one, for an index without cells. The gel check
-(`retrieval.model.fusion_scorer`) uses the touch tower's features. Its linear layer is fitted on touches and no-contact
-frames of training objects and on foreign pictures. Its thresholds are chosen on touches and no-contact frames of
-validation objects.
+The gel head is fitted on features of touches and no-contact frames of training objects and on foreign pictures. The
+thresholds are chosen on touches and no-contact frames of validation objects.
 """
 
 import dataclasses
@@ -22,28 +19,11 @@ from retrieval.data.dataset import Grasp
 from retrieval.data.images import read_rgb
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import RgbImage, resize
-from retrieval.model.calibration_touches import CalibrationTouches
-from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, touch_features
-from retrieval.model.fusion import MIN_RELATIVE_DEVIATION, Matcher, scorer_of
-from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck, contact_level
-from retrieval.model.gel_head import GEL_CLASSES, GelHead
-from retrieval.model.posterior import Posterior, ScoredTouches, fit_posterior
-from retrieval.model.reference_calibration import (
-    ReferenceCalibration,
-    fit_reference_calibration,
-    unit_embeddings,
-)
-from retrieval.model.verification import fit_verification
-from retrieval.training.batches import FeatureSource, recorded_features
+from retrieval.model.fusion import GEL_CLASSES, MIN_RELATIVE_DEVIATION, GelHead, Matcher
+from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck, contact_level
 from retrieval.training.foreign_images import draw_foreign
 
-MAX_GRASPS = 400
-"""Largest number of grasps from each part of the split."""
-MIN_GRASPS = 40
-"""Number of validation grasps that the gel check needs; thresholds from fewer grasps would reject too many touches."""
-FOREIGN_COUNT = 700
-"""Number of foreign pictures for fitting; half as many others are drawn for validation."""
 FALSE_ALARM_RATE = 0.005
 """At most this fraction of validation gel images may be classified as foreign. At most this fraction of no-contact
 frames may be classified as touches."""
@@ -59,137 +39,6 @@ _MAX_PHOTOS, _PHOTO_PX = 400, 256
 """Largest number of photos, and of gel images, for foreign pictures; shorter side of these photos in pixels."""
 
 Readings = NDArray[np.float32]
-
-
-def with_verdicts(
-    made: Checkpoint,
-    source: FeatureSource,
-    train: Sequence[Grasp],
-    validation: Sequence[Grasp],
-    *,
-    foreign: int = FOREIGN_COUNT,
-    max_grasps: int = MAX_GRASPS,
-    quiet: bool = False,
-) -> Checkpoint:
-    """Return the checkpoint `made` with calibrations and a gel check, if there are enough validation grasps.
-
-    A posterior needs three validation objects, and a touch with a second photo of its object. A gel check needs
-    `MIN_GRASPS` validation grasps. At most `max_grasps` grasps of each part are used, and `foreign` foreign pictures
-    for fitting. The matcher of `made` is reused and modified.
-    """
-    seed, matcher = made.config.training.seed, made.matcher
-    grasps = _sample_grasps(validation, seed)[:max_grasps]
-    if not train or not grasps:
-        return made
-    touches, photos = recorded_features(matcher, source, grasps, what="posterior", quiet=quiet)
-    queries = calibration_touches(matcher, grasps, touches, photos)
-    posterior, references = fit_calibrations([queries], seed) if queries else (None, None)
-    made = dataclasses.replace(made, posterior=posterior, references=references)
-    if queries is not None and posterior is not None:
-        made = dataclasses.replace(made, verification=fit_verification([queries], posterior, seed))
-    if matcher.config.cell_dim:
-        queries = calibration_touches(matcher, grasps, touches, photos, pooled=True)
-        posterior, references = fit_calibrations([queries], seed) if queries else (None, None)
-        made = dataclasses.replace(made, pooled_posterior=posterior, pooled_references=references)
-    return with_gel_check(
-        made,
-        source,
-        train,
-        validation,
-        foreign=foreign,
-        max_grasps=max_grasps,
-        quiet=quiet,
-    )
-
-
-def with_gel_check(
-    made: Checkpoint,
-    source: FeatureSource,
-    train: Sequence[Grasp],
-    validation: Sequence[Grasp],
-    *,
-    foreign: int = FOREIGN_COUNT,
-    max_grasps: int = MAX_GRASPS,
-    quiet: bool = False,
-) -> Checkpoint:
-    """Return the checkpoint `made` with a gel check, if there are enough validation grasps; see `with_verdicts`."""
-    seed, matcher, settings = made.config.training.seed, made.matcher, made.config.preprocessing
-    train, validation = (_sample_grasps(part, seed)[:max_grasps] for part in (train, validation))
-    if len(validation) < MIN_GRASPS:
-        return made
-    fitting, test = (
-        GelCheckFeatures.of(
-            matcher,
-            settings,
-            grasps,
-            recorded_features(matcher, source, grasps, what="gel check", quiet=quiet)[0],
-            count,
-            seed + number,
-        )
-        for number, (grasps, count) in enumerate(((train, foreign), (validation, foreign // 2)))
-    )
-    matcher.gel_head = fit_gel_head(fitting, PENALTY * FOREIGN_COUNT / foreign)
-    check = fit_gel_check(matcher.gel_head, test, contact_levels(validation))
-    return dataclasses.replace(made, gel_check=check)
-
-
-def _sample_grasps(grasps: Sequence[Grasp], seed: int) -> list[Grasp]:
-    """Return the grasps object by object, in random order of the objects."""
-    by_object: dict[str, list[Grasp]] = {}
-    for grasp in grasps:
-        by_object.setdefault(grasp.object_id, []).append(grasp)
-    names = sorted(by_object)
-    order = np.random.default_rng([seed, 5]).permutation(len(names))
-    return [grasp for index in order for grasp in by_object[names[index]]]
-
-
-# The posterior ---------------------------------------------------------------------------------------------
-
-
-def fit_calibrations(
-    parts: Sequence[CalibrationTouches], seed: int = 0
-) -> tuple[Posterior, ReferenceCalibration | None]:
-    """Return the posterior and the calibration of reference touches; `parts` come from one matcher or several."""
-    return fit_posterior(*(part.scored for part in parts), seed=seed), fit_reference_calibration(*parts, seed=seed)
-
-
-def calibration_touches(
-    matcher: Matcher,
-    grasps: Sequence[Grasp],
-    touches: Tensor,
-    photos: dict[Path, Tensor],
-    *,
-    pooled: bool = False,
-) -> CalibrationTouches | None:
-    """Return the data of the calibrations; None if there are too few objects or photos.
-
-    Args:
-        matcher: The matcher.
-        grasps: G grasps.
-        touches: Touch features (G, fingers * F).
-        photos: Features of each photo by file.
-        pooled: Score without late interaction, as an index without cells does.
-    """
-    objects = sorted({grasp.object_id for grasp in grasps})
-    object_of = {grasp.photo: grasp.object_id for grasp in grasps}
-    own = np.array([[grasp.photo == photo for photo in photos] for grasp in grasps])
-    touch_owner = np.array([objects.index(grasp.object_id) for grasp in grasps])
-    photo_owner = np.array([objects.index(object_of[photo]) for photo in photos])
-    if len(objects) < 3 or not ((touch_owner[:, None] == photo_owner) & ~own).any():
-        return None
-    with torch.inference_mode():
-        touch_partials = matcher.touch_encoding(touches).partial.cpu().numpy()
-        encoded = matcher.photo_encoding(torch.stack(list(photos.values())))
-    photo_partials, photo_embeddings = encoded.partial.cpu().numpy(), encoded.embedding.cpu().numpy()
-    if pooled:
-        photo_partials = photo_partials[:, : matcher.config.pooled_width]
-    scorer = scorer_of(matcher.head)
-    logits = np.stack([scorer.logits(partial[None], photo_partials) for partial in touch_partials])
-    embeddings = unit_embeddings(touch_partials, matcher.config.cosine_columns)
-    return CalibrationTouches(ScoredTouches(logits, touch_owner, photo_owner, own), embeddings, photo_embeddings)
-
-
-# The gel check ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)

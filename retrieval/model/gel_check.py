@@ -1,0 +1,83 @@
+"""The gel check: is this a gel image, and is there contact?
+
+A linear layer on the touch tower's features (`retrieval.model.fusion.GelHead`) classifies each finger's image: gel in
+contact, gel without contact, or a picture that is not a gel image. With a no-contact frame, contact is the difference
+from that frame, which needs no model.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from _touch_retrieval.documents import typed
+from retrieval.data.resize import RgbImage, resize
+from retrieval.errors import BadInput
+
+CONTACT, NO_CONTACT, NOT_A_GEL = "contact", "no contact", "not a gel image"
+BLOCKS = 16
+"""Image blocks along each side for `contact_level`."""
+Bounded = Annotated[float, Meta(ge=-1e6, le=1e6)]
+
+
+@dataclass(frozen=True)
+class GelCheck:
+    """Thresholds of the gel check, chosen on validation objects; None if the recording had no examples.
+
+    Attributes:
+        foreign_above: An image is foreign (not a gel image), and its grasp is refused, if a finger's log-odds of "no
+            gel image" exceed this.
+        contact_above: A grasp has contact if the largest log-odds of contact over its fingers is at least this.
+        level_above: A grasp has contact if the largest difference of a finger's gel image from its no-contact frame
+            (`contact_level`, in grey levels of 255) is at least this. Used instead of `contact_above` if available.
+        rates: Fractions of validation touches and foreign pictures that were refused, and of no-contact gels that were
+            accepted.
+    """
+
+    foreign_above: Bounded | None
+    contact_above: Bounded | None
+    level_above: Bounded | None
+    rates: Mapping[str, Bounded]
+
+    def classify(self, readings: NDArray[np.float32], levels: NDArray[np.float32] | None = None) -> list[str]:
+        """Classify each grasp as CONTACT, NO_CONTACT or NOT_A_GEL.
+
+        Args:
+            readings: (G, fingers, 2) log-odds of "no gel image" and of contact.
+            levels: (G, fingers) differences of the images from their no-contact frames in grey levels, if available.
+        """
+        if levels is not None and self.level_above is not None:
+            has_contact = levels.max(1) >= self.level_above
+        elif self.contact_above is not None:
+            has_contact = readings[..., 1].max(1) >= self.contact_above
+        else:
+            has_contact = np.ones(len(readings), dtype=bool)
+        is_gel = np.ones(len(readings), dtype=bool)
+        if self.foreign_above is not None:
+            is_gel = readings[..., 0].max(1) <= self.foreign_above
+        return [
+            (CONTACT if contact else NO_CONTACT) if gel else NOT_A_GEL
+            for gel, contact in zip(is_gel, has_contact, strict=True)
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a plain dictionary, as stored in checkpoints."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: Any) -> "GelCheck":
+        """Inverse of `to_dict`. Raises BadInput for anything else."""
+        return typed(data, cls, "gel_check", complete=True, error=BadInput)
+
+
+def contact_level(touch: RgbImage, no_contact: RgbImage) -> float:
+    """Return the largest difference of a gel image from its no-contact frame, in grey levels of 255.
+
+    Both images are (H, W, 3) in 0..1. They are compared in 16 x 16 blocks, whose means suppress pixel noise.
+    """
+    size = (BLOCKS, BLOCKS)
+    return 255 * float(np.abs(resize(touch, size) - resize(no_contact, size)).max())

@@ -1,0 +1,128 @@
+"""Fit the error rates of verification (`retrieval.model.verification`) on sequences of grasps."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.model.posterior import Posterior
+from retrieval.model.verification import LEVELS, MAX_GRASPS, QUANTILES, VerificationCalibration, supports_calibration
+from retrieval.training.calibration.posterior import IdentificationTrials
+from retrieval.training.calibration.touches import CalibrationTouches, ScoredTouches
+
+SEQUENCES = 8
+"""Sequences of grasps of each validation object."""
+Floats = NDArray[np.float64]
+
+
+class VerificationSequences(NamedTuple):
+    """Log likelihood ratios of sequences of G grasps.
+
+    Attributes:
+        owner: (S,) object of each sequence.
+        ratios: (S, G) ratios of the right object after 1, 2, ... grasps.
+        genuine: (G, S) the largest of them so far.
+        impostor_ratios: (S, O - 1, G) ratios of each other object.
+        similar: (S,) largest ratio of the most similar other object.
+    """
+
+    owner: NDArray[np.int64]
+    ratios: Floats
+    genuine: Floats
+    impostor_ratios: Floats
+    similar: Floats
+
+    @property
+    def impostor(self) -> Floats:
+        """(S, O - 1) largest ratio of each other object."""
+        return np.asarray(self.impostor_ratios.max(axis=2))
+
+
+def verification_sequences(
+    scored: ScoredTouches,
+    embeddings: NDArray[np.floating[Any]],
+    posterior: Posterior,
+    seed: int = 0,
+    grasps: int = MAX_GRASPS,
+) -> VerificationSequences:
+    """Draw and score `SEQUENCES` sequences of each object that has `grasps` grasps and a photo of another grasp.
+
+    Args:
+        scored: Match logits of the touches with the photos.
+        embeddings: (N, d) embeddings of the photos, by which the most similar object is found.
+        posterior: The posterior of the model.
+        seed: Seed of the sequences. Shorter sequences of the same seed are the first grasps of longer ones.
+        grasps: Number of grasps, G.
+    """
+    rng = np.random.default_rng([seed, 7])
+    sequences = []
+    for name in np.unique(scored.touch_owner):
+        touches, photos = np.flatnonzero(scored.touch_owner == name), scored.photo_owner == name
+        drawn = [rng.permutation(touches)[:grasps] for _ in range(SEQUENCES)]
+        sequences += [rows for rows in drawn if len(rows) == grasps and (photos & ~scored.own[rows].any(0)).any()]
+    sets = np.array(sequences, dtype=np.int64).reshape(-1, grasps)
+    owner, objects = scored.touch_owner[sets[:, 0]], np.unique(scored.photo_owner)
+    if not len(sets):
+        none = np.zeros((0, grasps))
+        return VerificationSequences(owner, none, none.T, np.zeros((0, len(objects) - 1, grasps)), none[:, 0])
+    ratios = np.stack(
+        [IdentificationTrials.of(scored, sets[:, :count], seed).log_ratios(posterior) for count in range(1, grasps + 1)]
+    )
+    rows, true = np.arange(len(sets)), np.searchsorted(objects, owner)
+    highest = np.maximum.accumulate(ratios, axis=0)
+    is_impostor = np.arange(len(objects)) != true[:, None]
+    similar = _nearest_objects(objects, scored.photo_owner, embeddings)[true]
+    return VerificationSequences(
+        owner,
+        ratios[:, rows, true].T,
+        highest[:, rows, true],
+        ratios[:, is_impostor].T.reshape(len(sets), -1, grasps),
+        highest[-1][rows, similar],
+    )
+
+
+def fit_verification(
+    parts: Sequence[CalibrationTouches], posterior: Posterior, seed: int = 0
+) -> VerificationCalibration | None:
+    """Return the calibration from touches and photos of validation objects.
+
+    Args:
+        parts: Touches and photos of one matcher or several. Objects are compared only within a part.
+        posterior: The posterior of the model.
+        seed: Seed of the sequences of grasps.
+
+    Returns:
+        The calibration; None if fewer than `MIN_OBJECTS` objects have sequences (`verification_sequences`), or if
+        their pairs do not support `CARD_FAR`.
+    """
+    found = [verification_sequences(part.scored, part.photo_embeddings, posterior, seed) for part in parts]
+    found = [each for each in found if len(each.owner)]
+    sizes = tuple(len(np.unique(each.owner)) for each in found)
+    if not supports_calibration(sizes):
+        return None
+    impostors = np.concatenate([each.impostor.ravel() for each in found])
+    genuine = np.concatenate([each.genuine for each in found], axis=1)
+    lowest = np.concatenate([each.ratios[:, :-1].min(1) for each in found])
+    return VerificationCalibration(
+        sizes,
+        _quantiles(impostors, 1 - np.array(LEVELS)),
+        _quantiles(np.concatenate([each.similar for each in found])),
+        tuple(map(_quantiles, genuine)),
+        _quantiles(lowest),
+    )
+
+
+def _quantiles(values: Floats, at: Sequence[float] | Floats = QUANTILES) -> tuple[float, ...]:
+    return tuple(np.quantile(values, at).tolist())
+
+
+def _nearest_objects(
+    objects: NDArray[np.int64], owner: NDArray[np.int64], embeddings: NDArray[np.floating[Any]]
+) -> NDArray[np.int64]:
+    """Return for each object the place (O,) of the other object with the most similar mean embedding."""
+    means = np.stack([embeddings[owner == name].mean(0) for name in objects])
+    means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-9)
+    cosines = means @ means.T
+    np.fill_diagonal(cosines, -np.inf)
+    return np.asarray(cosines.argmax(1))
