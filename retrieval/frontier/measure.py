@@ -4,16 +4,17 @@ Each finished row is stored, so a stopped run continues with the missing rows.
 """
 
 import dataclasses
+import json
 from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from _touch_retrieval.files import file_digest
+from _touch_retrieval.cache import cache_key
+from _touch_retrieval.files import file_digest, write_atomically
 from retrieval.console.output import say
 from retrieval.data.dataset import AnyRecording, folder_of
-from retrieval.evaluation.cache import cached_document, write_document
 from retrieval.frontier import APPROXIMATIONS
 from retrieval.frontier.clock import machine
 from retrieval.frontier.points import ApproximationResult
@@ -78,7 +79,7 @@ def measure_frontier(
     if quick:
         scale = dataclasses.replace(QUICK, photos=min(QUICK.photos, photos), queries=min(QUICK.queries, queries))
     grasps = recording if callable(recording) else lambda: folder_of(recording)
-    sample = Sample(Path(model or shipped_model()), grasps, out / "features", scale, quiet)
+    sample = Sample(Path(model or shipped_model()), grasps, out, scale, quiet)
     rows = {}
     for name, work in works.items():
         rows[name] = _row(sample, out, name, work, name in model_free)
@@ -92,7 +93,7 @@ def measure_frontier(
         "scale": dataclasses.asdict(scale),
         "rows": {name: row.to_dict() for name, row in rows.items()},
     }
-    write_document(out / "frontier.json", document)
+    write_atomically(out / "frontier.json", f"{json.dumps(document, indent=1, allow_nan=False)}\n".encode())
     write_frontier(out, document)
     return document
 
@@ -101,14 +102,13 @@ def _row(
     sample: Sample, out: Path, name: str, work: Callable[[Sample], ApproximationResult], is_model_free: bool
 ) -> ApproximationResult:
     """Return the stored result of an approximation, or measure and store it."""
-    cache_key: dict[str, Any] = {"name": name, "format": FORMAT, "software": __version__, "machine": machine()}
-    cache_key["scale"] = dataclasses.asdict(sample.scale)
+    inputs: list[Any] = [name, FORMAT, __version__, machine(), dataclasses.asdict(sample.scale)]
     if not is_model_free:
-        cache_key |= {"model": file_digest(sample.model), "grasps": sample.digest}
+        inputs += [file_digest(sample.model), sample.digest]
 
     def make() -> dict[str, Any]:
         if not sample.quiet:
             say(f"frontier: measuring {name}")
         return work(sample).to_dict()
 
-    return msgspec.convert(cached_document(out / "parts" / f"{name}.json", cache_key, make), ApproximationResult)
+    return msgspec.convert(sample.stored(cache_key("frontier", *inputs), make), ApproximationResult)

@@ -3,6 +3,7 @@
 Everything is computed on first use: a row without a recording collects none.
 """
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,10 +14,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from _touch_retrieval.cache import Cache, cache_key
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, data_digest, load_grasps
 from retrieval.errors import DatasetError
-from retrieval.evaluation.cache import cached_document
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.fusion import ImageEncoding, score_partials
 from retrieval.training.distil import blend
@@ -56,7 +57,7 @@ class Sample:
     Attributes:
         model: File of the checkpoint.
         recording: Function that returns the folder of the recording, and may collect it first.
-        folder: Folder of encoded features.
+        folder: Folder of the cache.
         scale: Scale of the measurements.
         quiet: No output on stderr.
         seed: Seed of the random draws.
@@ -102,7 +103,9 @@ class Sample:
     def features(self) -> Features:
         """Tower features of `grasps`."""
         checkpoint = self.checkpoint
-        return encode_recording(self.grasps, checkpoint.matcher, checkpoint.config, self.folder, quiet=self.quiet)
+        return encode_recording(
+            self.grasps, checkpoint.matcher, checkpoint.config, self.folder / "features", quiet=self.quiet
+        )
 
     @cached_property
     def _is_photo(self) -> NDArray[np.bool_]:
@@ -175,14 +178,11 @@ class Sample:
     def exhaustive_top1(self) -> NDArray[np.int64]:
         """The photo of `catalogue` that the fusion head ranks first, for each of `queries`.
 
-        It is stored in `folder`, because it takes the longest.
+        It is stored, because it takes the longest.
         """
-        scale = self.scale
-        cache_key = {"model": self.checkpoint.digest, "grasps": self.digest, "seed": self.seed, "photos": scale.photos}
-        path = self.folder / "exhaustive_top1.json"
-        return np.array(
-            cached_document(path, cache_key | {"queries": scale.queries}, self._find_exhaustive_top1), dtype=np.int64
-        )
+        inputs = self.checkpoint.digest, self.digest, self.seed, self.scale.photos, self.scale.queries
+        key = cache_key("exhaustive-top1", *inputs)
+        return np.array(self.stored(key, self._find_exhaustive_top1), dtype=np.int64)
 
     def _find_exhaustive_top1(self) -> list[int]:
         partials, found = self.queries["partial"], list[int]()
@@ -201,3 +201,14 @@ class Sample:
             rows: Rows of `photos` to score; None for all.
         """
         return score_partials(self.checkpoint.matcher.head, torch.from_numpy(touch_partial)[None], photos, rows)
+
+    def stored(self, key: str, make: Callable[[], Any]) -> Any:
+        """Return the JSON value `make()`, or the one that an earlier run stored under this key."""
+        path = self.folder / "cache.sqlite"
+        with Cache(path) as cache:
+            content = cache.get(key)
+        if content is None:
+            content = json.dumps(make(), allow_nan=False).encode()
+            with Cache(path) as cache:
+                cache.add({key: content})
+        return json.loads(content)

@@ -271,7 +271,7 @@ def test_a_row_is_measured_again_only_if_its_inputs_change(measure):
 
 def test_a_damaged_part_is_measured_again(measure, tmp_path):
     measure("one")
-    (tmp_path / "parts" / "one.json").write_text("[")
+    (tmp_path / "cache.sqlite").write_bytes(b"damaged")
     measure("one")
     assert CALLS == ["one"] * 2
 
