@@ -6,12 +6,12 @@ import time
 from pathlib import Path
 
 from retrieval.data.images import MAX_PIXELS
-from retrieval.serve import decode_process
+from retrieval.serve import decoders
 
 HANG = "from tests.decoding import hang_on_large; hang_on_large()"
 DIE = "from tests.decoding import die_of_large; die_of_large()"
 FAIL = "raise SystemExit"
-read_gel_image = decode_process.read_gel_image
+read_gel_image = decoders.read_gel_image
 
 
 def die_of_large():
@@ -22,8 +22,8 @@ def die_of_large():
             os.kill(os.getpid(), signal.SIGKILL)
         return read_gel_image(data, name, px, compares_contact, max_pixels)
 
-    decode_process.read_gel_image = read
-    decode_process.serve_pictures()
+    decoders.read_gel_image = read
+    decoders.serve_pictures()
 
 
 def hang_on_large():
@@ -35,5 +35,5 @@ def hang_on_large():
             time.sleep(600)
         return read_gel_image(data, name, px, compares_contact, max_pixels)
 
-    decode_process.read_gel_image = read
-    decode_process.serve_pictures()
+    decoders.read_gel_image = read
+    decoders.serve_pictures()

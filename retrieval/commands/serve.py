@@ -15,7 +15,6 @@ from retrieval.commands.options import (
     WORKERS,
     Index,
     IndexModel,
-    NoVerify,
     NumberParser,
     refuse_options,
 )
@@ -80,7 +79,6 @@ def serve(
         ),
     ] = None,
     open_page: Annotated[bool, typer.Option("--open-page", help="open the page in a browser")] = False,
-    no_verify: NoVerify = False,
 ) -> None:
     """Answer queries over HTTP and serve a page, until Ctrl-C or SIGTERM."""
     try:
@@ -104,7 +102,6 @@ def serve(
     settings = ServiceSettings(
         index=path,
         model=Path(model) if model else None,
-        verify=not no_verify,
         host=host,
         port=port,
         token=_read_token(token_file),
@@ -114,7 +111,7 @@ def serve(
     )
     with ExitStack() as stack:
         writer = _feedback_writer(settings.history, path, stack) if settings.history else None
-        open_shards = _ray_shards(path, stack, cluster_options, not no_verify) if cluster else None
+        open_shards = _ray_shards(path, stack, cluster_options) if cluster else None
         app = create_app(
             settings, load_live_rig(rig, path) if rig else simulated_live_rig(path), writer, trials, open_shards
         )
@@ -128,14 +125,13 @@ def serve(
         run(app, on_start)
 
 
-def _ray_shards(index: str | Path, stack: ExitStack, options: Mapping[str, Any], verify: bool) -> "OpenShards":
+def _ray_shards(index: str | Path, stack: ExitStack, options: Mapping[str, Any]) -> "OpenShards":
     """Return the function that opens shards on Ray; join or start Ray first.
 
     Args:
         index: Folder of the index.
         stack: Closes the session and the deployments.
         options: Values of the options of `--cluster`; None for those left out.
-        verify: Whether to check the index files against their checksums.
 
     Raises:
         BadInput: The index is not sharded.
@@ -148,7 +144,7 @@ def _ray_shards(index: str | Path, stack: ExitStack, options: Mapping[str, Any],
         raise BadInput(f"{index} has no shards; build a sharded index with `retrieve build-index --shards`")
     values = {name.replace("shard_timeout", "wait_s"): value for name, value in options.items() if value is not None}
     settings = ReplicaSettings(**values)
-    deployments = Deployments(stack.enter_context(ray_session()), settings, verify)
+    deployments = Deployments(stack.enter_context(ray_session()), settings)
     stack.callback(deployments.close)
     return deployments.open
 

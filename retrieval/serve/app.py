@@ -11,11 +11,10 @@ from starlette.staticfiles import StaticFiles
 from threadpoolctl import threadpool_limits
 
 from retrieval.search.query.opening import OpenShards
-from retrieval.serve import catalogue, errors, health, history, human_baseline, live, queries
-from retrieval.serve.history_writer import Recorder
-from retrieval.serve.security import Guard
+from retrieval.serve import catalogue, errors, history, human_baseline, queries, security
 from retrieval.serve.service import LiveRig, Service
 from retrieval.serve.settings import ServiceSettings
+from retrieval.serve.store import Recorder
 from retrieval.serve.uploads import BodyLimit
 from retrieval.version import __version__
 
@@ -53,11 +52,11 @@ def create_app(
     )
     app.state.service = Service(settings, rig, recorder, trials, shards)
     errors.install_handlers(app)
-    for module in (queries, catalogue, live, history, human_baseline, health):
+    for module in (queries, catalogue, history, human_baseline, security):
         app.include_router(module.router)
     app.mount("/", StaticFiles(directory=Path(__file__).parent / "page", html=True))
     app.add_middleware(BodyLimit, seconds=settings.body_s)
-    app.add_middleware(Guard, settings=settings)
+    app.add_middleware(security.Guard, settings=settings)
     return app
 
 

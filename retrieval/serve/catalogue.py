@@ -15,11 +15,9 @@ from retrieval.data.images import read_bytes
 from retrieval.data.text import replace_surrogates
 from retrieval.errors import ImageError
 from retrieval.report.pages import jpeg, thumbnail
-from retrieval.search.query.objects import ListedPhoto
 from retrieval.serve.errors import HttpProblem
-from retrieval.serve.generations import ServedGeneration
-from retrieval.serve.history_writer import as_png_or_jpeg
 from retrieval.serve.service import Parts
+from retrieval.serve.store import as_png_or_jpeg
 from retrieval.version import __version__
 
 router = APIRouter(tags=["catalogue"])
@@ -50,13 +48,6 @@ class CatalogueDocument(BaseModel):
     items: list[PhotoDocument]
 
 
-def _listed(generation: ServedGeneration, photo: str) -> ListedPhoto:
-    (found,) = generation.shard.photos([photo])
-    if found is None:
-        raise HttpProblem("unknown", f"The index has no photo {photo!r}. /v1/catalogue lists the photos.")
-    return found
-
-
 Offset = Annotated[int, Query(ge=0, le=2**31)]
 Limit = Annotated[int, Query(ge=1, le=500, description="Photos per page.")]
 Search = Annotated[
@@ -78,12 +69,8 @@ def catalogue(
         total=found.total,
         offset=offset,
         next=end if offset < end < found.total else None,
-        items=[_document(listed) for listed in found.photos],
+        items=[PhotoDocument(id=one.path, object_id=one.object_id, metadata=one.metadata) for one in found.photos],
     )
-
-
-def _document(photo: ListedPhoto) -> PhotoDocument:
-    return PhotoDocument(id=photo.path, object_id=photo.object_id, metadata=photo.metadata)
 
 
 @router.get("/v1/photos/{photo:path}", response_class=Response, responses=IMAGE_RESPONSES)
@@ -98,7 +85,9 @@ def photo(
     Formats that browsers lack are converted to JPEG.
     """
     generation = parts.generations.current
-    listed = _listed(generation, photo)
+    (listed,) = generation.shard.photos([photo])
+    if listed is None:
+        raise HttpProblem("unknown", f"The index has no photo {photo!r}. /v1/catalogue lists the photos.")
     headers = {"etag": f'"{listed.digest}-{px}"', "cache-control": "private, no-cache"}
     if request.headers.get("if-none-match") == headers["etag"]:
         return Response(status_code=304, headers=headers)

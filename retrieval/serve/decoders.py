@@ -4,26 +4,43 @@ A decoder in a thread cannot be stopped: it occupies a core and its memory until
 if a picture exceeds the limits of CPU time or memory, and the service kills the process of a finished request. The next
 picture gets a new process. Small pictures, such as those of sensors, are decoded in parallel; large ones one at a time,
 so that small ones do not wait for them and their memory does not add up.
+
+A request to a process and its answer are one frame each: the lengths of a JSON document and of a byte string, then
+both. This module imports little, because each process repeats the imports.
 """
 
 import asyncio
 import json
+import math
+import os
+import resource
+import signal
+import struct
 import sys
+import time
 from collections.abc import Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
 
 from retrieval.data.images import MAX_PIXELS
 from retrieval.errors import ImageError, RetrievalError
-from retrieval.model.gel_images import GelImage, PictureSize
-from retrieval.serve.decode_process import DECODE_BYTES, DECODE_CPU_S, LENGTHS, READY, frame, image_of
-from retrieval.serve.errors import HttpProblem
+from retrieval.model.gel_check import BLOCKS
+from retrieval.model.gel_images import GelImage, PictureSize, read_gel_image
 from retrieval.serve.settings import MAX_BODY_PIXELS
 
-PROGRAM = "from retrieval.serve.decode_process import serve_pictures; serve_pictures()"
+PROGRAM = "from retrieval.serve.decoders import serve_pictures; serve_pictures()"
 _BUFFER_BYTES = 1 << 20
 PROCESSES = 2  # the number of images of a touch
 SMALL_PIXELS = 1 << 21
 """Maximum pixels of a picture that is decoded in parallel; a sensor of 1920 x 1080 pixels has fewer."""
+DECODE_CPU_S = 5
+"""Maximum CPU time for one picture. The slowest picture of maximum size that we could construct takes 2 s."""
+DECODE_BYTES = 200_000_000
+"""Maximum memory for one picture. PNG, JPEG, BMP and TIFF pictures of maximum size need less, some formats more."""
+_LENGTHS = struct.Struct(">II")
+READY: dict[str, Any] = {"ready": True}
 
 
 class Decoders:
@@ -64,8 +81,12 @@ class Decoders:
             ImageError: A picture cannot be used; the first one is reported.
             HttpProblem: The pictures are too large together.
         """
-        small = (self._read_small(name, data, px, compares_contact) for name, data in named_files)
-        found = await asyncio.gather(*small, return_exceptions=True)
+
+        async def read_small(name: str, data: bytes) -> GelImage | PictureSize:
+            async with self._small:
+                return await self._run(name, data, px, compares_contact, SMALL_PIXELS)
+
+        found = await asyncio.gather(*(read_small(*one) for one in named_files), return_exceptions=True)
         for (name, _), one in zip(named_files, found, strict=True):
             if isinstance(one, BaseException):
                 raise one
@@ -75,6 +96,8 @@ class Decoders:
         first = [one for one in found if not isinstance(one, BaseException)]
         total = sum(one.pixels for one in first if isinstance(one, PictureSize))
         if total > MAX_BODY_PIXELS:
+            from retrieval.serve.errors import HttpProblem  # slow to import
+
             raise HttpProblem(
                 "too-large",
                 f"The pictures of a request may have {MAX_BODY_PIXELS:,} pixels in total; "
@@ -88,11 +111,6 @@ class Decoders:
             assert isinstance(one, GelImage), "the picture has at most MAX_PIXELS"
             images.append(one)
         return images
-
-    async def _read_small(self, name: str, data: bytes, px: int, compares_contact: bool) -> GelImage | PictureSize:
-        """Decode a small picture, or return the size of a large one."""
-        async with self._small:
-            return await self._run(name, data, px, compares_contact, SMALL_PIXELS)
 
     async def _run(
         self, name: str, data: bytes, px: int, compares_contact: bool, max_pixels: int
@@ -161,7 +179,7 @@ class _Process:
     async def _answer(self) -> tuple[dict[str, Any], bytes]:
         assert self._process.stdout is not None
         read = self._process.stdout.readexactly
-        text, content = LENGTHS.unpack(await read(LENGTHS.size))
+        text, content = _LENGTHS.unpack(await read(_LENGTHS.size))
         return json.loads(await read(text)), await read(content)
 
     async def end(self) -> None:
@@ -173,3 +191,86 @@ class _Process:
         self._process.stdin.close()
         await self._process.stdout.read()
         await self._process.wait()
+
+
+# The process -----------------------------------------------------------------------------------------------------
+
+
+def serve_pictures() -> None:
+    """Decode pictures until standard input ends."""
+    for number in (signal.SIGINT, signal.SIGTERM):  # the service handles them and ends its processes
+        signal.signal(number, signal.SIG_IGN)
+    _one_thread()
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # keep output of libraries out of the answers
+    answers.write(frame(READY))
+    answers.flush()
+    while lengths := sys.stdin.buffer.read(_LENGTHS.size):
+        answers.write(_answer(sys.stdin.buffer, *_LENGTHS.unpack(lengths)))
+        answers.flush()
+
+
+def frame(document: dict[str, Any], *contents: bytes | memoryview) -> bytes:
+    """Return a request or an answer as bytes."""
+    text = json.dumps(document).encode()
+    return b"".join((_LENGTHS.pack(len(text), sum(map(len, contents))), text, *contents))
+
+
+def image_of(document: dict[str, Any], content: bytes) -> GelImage | PictureSize:
+    """Return the picture, or the picture's size, from an answer.
+
+    Raises:
+        ImageError: The picture cannot be decoded.
+        MemoryError: The process ran out of memory.
+    """
+    match document:
+        case {"size": size}:
+            return PictureSize(*size)
+        case {"error": str(reason), "name": str(name)}:
+            raise ImageError(name, reason)
+        case {"px": int(px), "file_bytes": int(file_bytes)}:
+            numbers = np.frombuffer(content, np.float32)
+            touch, blocks = np.split(numbers, [px * px * 3])
+            shape = (BLOCKS, BLOCKS, 3)
+            return GelImage(file_bytes, touch.reshape(px, px, 3), blocks.reshape(shape) if len(blocks) else None)
+        case _:
+            raise MemoryError
+
+
+def _answer(requests: BinaryIO, text: int, content: int) -> bytes:
+    options, data = json.loads(requests.read(text)), requests.read(content)
+    try:
+        _limit(resource.RLIMIT_CPU, math.ceil(time.process_time()) + DECODE_CPU_S)
+        if sys.platform == "linux":  # other systems do not enforce the limit
+            pages = int(Path("/proc/self/statm").read_text().split()[5])
+            _limit(resource.RLIMIT_DATA, pages * resource.getpagesize() + DECODE_BYTES)
+        found = read_gel_image(data, **options)
+    except ImageError as error:
+        if isinstance(error.__cause__, MemoryError):
+            return frame({"memory": DECODE_BYTES})
+        return frame({"error": error.reason, "name": error.path})
+    except MemoryError:
+        return frame({"memory": DECODE_BYTES})
+    if isinstance(found, PictureSize):
+        return frame({"size": found})
+    arrays = [found.touch] if found.blocks is None else [found.touch, found.blocks]
+    contents = [np.ascontiguousarray(image, np.float32).tobytes() for image in arrays]
+    return frame({"px": len(found.touch), "file_bytes": found.file_bytes}, *contents)
+
+
+def _one_thread() -> None:
+    """Decode each picture in one thread, because the memory of further threads counts towards the limit."""
+    from PIL import AvifImagePlugin
+
+    AvifImagePlugin.DEFAULT_MAX_THREADS = 1
+    try:
+        import pillow_heif
+    except ImportError:
+        return
+    pillow_heif.options.DECODE_THREADS = 1
+
+
+def _limit(kind: int, value: int) -> None:
+    """Set a soft resource limit, capped by the hard limit."""
+    hard = resource.getrlimit(kind)[1]
+    resource.setrlimit(kind, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))

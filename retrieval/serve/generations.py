@@ -72,16 +72,9 @@ class Generations:
     def open(self) -> None:
         """Open the newest generation; raises the errors of `Searcher.open`."""
         settings = self._settings
-        generation = ServedGeneration(
-            Searcher.open(
-                settings.index,
-                model=settings.model,
-                verify=settings.verify,
-                threads=settings.threads,
-                shards=self._shards,
-            )
+        self._current = ServedGeneration(
+            Searcher.open(settings.index, model=settings.model, threads=settings.threads, shards=self._shards)
         )
-        self._current = generation
         gc.collect()  # free reference cycles of the previous generation
 
     async def watch(self) -> None:

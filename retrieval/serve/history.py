@@ -14,9 +14,8 @@ from retrieval.search.query.answer import MATCH, NONE_OF_THESE, UNCALIBRATED
 from retrieval.serve.catalogue import IMAGE_RESPONSES, image_response
 from retrieval.serve.errors import HttpProblem
 from retrieval.serve.generations import ServedGeneration
-from retrieval.serve.history_writer import HistoryWriter
 from retrieval.serve.service import Parts, Service
-from retrieval.serve.store import NONE, OBJECT, RIGHT, StoredQuery
+from retrieval.serve.store import NONE, OBJECT, RIGHT, HistoryWriter, StoredQuery
 from retrieval.serve.uploads import RequestBody
 
 router = APIRouter(tags=["history"])

@@ -13,7 +13,6 @@ from starlette.concurrency import run_in_threadpool
 from retrieval.data.images import read_bytes
 from retrieval.serve.catalogue import IMAGE_RESPONSES, image_response
 from retrieval.serve.errors import HttpProblem
-from retrieval.serve.history_writer import HistoryWriter
 from retrieval.serve.service import Parts, Service
 from retrieval.serve.store import HistoryStore, TrialChoice, TrialRun, new_id
 from retrieval.serve.trials import CHOICES, Trial, Trials, trial_accuracy
@@ -45,12 +44,11 @@ def _require_trials(parts: Service) -> tuple[Trials, HistoryStore]:
         raise HttpProblem(
             "unknown", "This service has no recording for the human baseline. Start it with --trials RECORDING."
         )
-    history_writer: HistoryWriter | None = parts.history_writer
-    if history_writer is None:
+    if parts.history_writer is None:
         raise HttpProblem(
             "unknown", "This service stores no history, which trials require. Start it without --no-history."
         )
-    return parts.trials, history_writer.store
+    return parts.trials, parts.history_writer.store
 
 
 def _document(run: TrialRun, store: HistoryStore) -> dict[str, Any]:

@@ -60,11 +60,16 @@ class Queue:
             ImageError: A picture cannot be decoded.
             Exception: The errors of `work`.
         """
+
+        async def until_disconnected() -> None:
+            while (await request.receive())["type"] != "http.disconnect":
+                pass
+
         self.require_capacity()
         self.in_flight += 1
         answer = asyncio.ensure_future(self._answer(work, pictures))
         answer.add_done_callback(self._release)
-        disconnected: asyncio.Future[None] = asyncio.ensure_future(_wait_for_disconnect(request))
+        disconnected: asyncio.Future[None] = asyncio.ensure_future(until_disconnected())
         either: set[asyncio.Future[Any]] = {answer, disconnected}
         seconds = self._settings.deadline_s
         try:
@@ -97,8 +102,3 @@ class Queue:
         self.in_flight -= 1
         if not answer.cancelled():
             answer.exception()  # mark as retrieved: the client may have disconnected
-
-
-async def _wait_for_disconnect(request: Request) -> None:
-    while (await request.receive())["type"] != "http.disconnect":
-        pass

@@ -11,9 +11,9 @@ from fastapi import Depends, Request
 from retrieval.search.query.opening import OpenShards
 from retrieval.serve.decoders import Decoders
 from retrieval.serve.generations import Generations
-from retrieval.serve.history_writer import HistoryWriter, Recorder
 from retrieval.serve.queue import Queue
 from retrieval.serve.settings import ServiceSettings
+from retrieval.serve.store import HistoryWriter, Recorder
 from retrieval.serve.trials import Trials
 
 MAX_RIG_GRASPS = 4
@@ -85,7 +85,7 @@ class Service:
         self.frames = {name: self._queue(frames) for name in self.rig.sensors}
         self.history_writer = None
         if settings.history and recorder:
-            self.history_writer = HistoryWriter(settings.history, recorder, settings)
+            self.history_writer = HistoryWriter(settings.history, recorder, settings.history_max_queries)
         self.trials = Trials(trials) if trials else None
         self.stopping = Event()
 

@@ -32,7 +32,6 @@ class ServiceSettings:
     Attributes:
         index: Index folder.
         model: Checkpoint; None for the one that the index names.
-        verify: Whether to verify checksums when the index opens.
         host: Host to listen on; a host other than this machine requires a `token`.
         port: Port to listen on; 0: any free port.
         token: Access token of at least 16 ASCII characters; None for a service without one.
@@ -50,7 +49,6 @@ class ServiceSettings:
 
     index: Path
     model: Path | None = None
-    verify: bool = True
     host: str = "127.0.0.1"
     port: Port = 8000
     token: str | None = None

@@ -36,26 +36,15 @@ class Trial:
     truth: int
 
 
-@dataclass(frozen=True)
-class TrialAccuracy:
-    """Accuracy with its exact 95 % confidence interval (Clopper and Pearson 1934).
+def trial_accuracy(right: Sequence[bool]) -> dict[str, float | None]:
+    """Return the accuracy of choices with its exact 95 % confidence interval (Clopper and Pearson 1934).
 
-    `accuracy`, `low` and `high` are null before the first trial.
+    accuracy, low, high: null before the first trial.
     """
-
-    right: int
-    trials: int
-    accuracy: float | None
-    low: float | None
-    high: float | None
-
-
-def trial_accuracy(right: Sequence[bool]) -> TrialAccuracy:
-    """Return the accuracy of choices and its confidence interval."""
-    if not right:
-        return TrialAccuracy(0, 0, None, None, None)
-    low, high = binomial_interval(sum(right), len(right))
-    return TrialAccuracy(sum(right), len(right), sum(right) / len(right), low, high)
+    count, trials = sum(right), len(right)
+    low, high = binomial_interval(count, trials) if right else (None, None)
+    accuracy = count / trials if right else None
+    return {"right": count, "trials": trials, "accuracy": accuracy, "low": low, "high": high}
 
 
 class Trials:

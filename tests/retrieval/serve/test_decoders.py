@@ -20,8 +20,7 @@ from retrieval.data.images import MAX_PIXELS, decode
 from retrieval.data.resize import resize_unchecked
 from retrieval.errors import ImageError, RetrievalError
 from retrieval.serve import decoders
-from retrieval.serve.decode_process import frame
-from retrieval.serve.decoders import SMALL_PIXELS, Decoders
+from retrieval.serve.decoders import SMALL_PIXELS, Decoders, frame
 from retrieval.serve.errors import HttpProblem
 from tests import decoding
 from tests.hostile_pictures import jpeg_of_scans, png_of_zeros
@@ -126,9 +125,9 @@ def test_a_process_that_cannot_start_is_not_reported_as_a_bad_picture(monkeypatc
 
 LIMITS = """
 import sys
-from retrieval.serve import decode_process
-decode_process.DECODE_CPU_S, decode_process.DECODE_BYTES = int(sys.argv[1]), int(sys.argv[2])
-decode_process.serve_pictures()
+from retrieval.serve import decoders
+decoders.DECODE_CPU_S, decoders.DECODE_BYTES = int(sys.argv[1]), int(sys.argv[2])
+decoders.serve_pictures()
 """
 
 

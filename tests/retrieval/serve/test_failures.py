@@ -11,7 +11,7 @@ from contextlib import ExitStack
 import httpx
 import pytest
 
-from retrieval.serve import history_writer
+from retrieval.serve import store
 from retrieval.serve.service import MAX_RIG_GRASPS, GraspResult, LiveRig
 from tests.retrieval.serve.test_connections import opened
 from tests.serving import listening, problem, with_history
@@ -53,8 +53,8 @@ def test_a_query_is_answered_without_an_id_while_the_disk_is_full(client, body, 
 
 
 def test_queries_are_answered_without_an_id_while_the_disk_hangs(client, body, monkeypatch):
-    monkeypatch.setattr(history_writer, "STORE_S", 0.1)
-    monkeypatch.setattr(history_writer, "MAX_PENDING_WRITES", 2)
+    monkeypatch.setattr(store, "STORE_S", 0.1)
+    monkeypatch.setattr(store, "MAX_PENDING_WRITES", 2)
     go, writer = threading.Event(), client.app.state.service.history_writer
     add_query = writer.store.add_query
     monkeypatch.setattr(writer.store, "add_query", lambda *row: go.wait(60) and add_query(*row))
