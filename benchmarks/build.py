@@ -21,7 +21,7 @@ from retrieval.data.resize import RgbImage
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from retrieval.model.config import Config
 from retrieval.model.encode import batches, encode_photos, one_thread
-from retrieval.model.photo_encoder import choose_photo_encoder
+from retrieval.model.export import choose_photo_encoder
 from retrieval.search.build.build_index import build_index
 from retrieval.search.build.codes import BATCH, MIN_PHOTOS_FOR_ONNX, map_ahead
 from retrieval.search.defaults import shipped_model

@@ -1,9 +1,10 @@
-"""`retrieve export`: the touch encoder as ONNX, for queries without PyTorch."""
+"""Encoders as ONNX: that of touches for queries without PyTorch (`retrieve export`), that of photos for long builds."""
 
 import copy
 import json
 import logging
 import warnings
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,9 +16,16 @@ from torch import Tensor, nn
 from _touch_retrieval.files import write_atomically
 from retrieval.console.files import require_output
 from retrieval.data.licences import LICENCES
-from retrieval.errors import BadInput, RetrievalError
+from retrieval.errors import BadInput, CheckpointError, RetrievalError
 from retrieval.model.checkpoint import Checkpoint
-from retrieval.model.encode import TorchEncoder, for_inference
+from retrieval.model.encode import (
+    Image,
+    PhotoEncoder,
+    PhotoEncodings,
+    TorchEncoder,
+    for_inference,
+    torch_photo_encoder,
+)
 from retrieval.model.fusion import Matcher, Standardise
 from retrieval.model.late_interaction import CellEncoder
 from retrieval.model.onnx_encoder import (
@@ -26,12 +34,14 @@ from retrieval.model.onnx_encoder import (
     LICENCES_KEY,
     OnnxEncoder,
     cached_export_path,
-    is_private,
+    open_session,
 )
+from retrieval.model.touch_reader import TouchEncodings
 
 log = logging.getLogger(__name__)
-TOLERANCE = 1e-3
-"""Largest accepted difference from PyTorch: of partial activations relative to the largest, of embeddings absolute."""
+TOLERANCE = 5e-4
+"""Largest accepted difference from PyTorch: of partial activations relative to the largest, of embeddings absolute.
+Storage as float16 rounds by as much."""
 
 
 def export(checkpoint: Checkpoint, out: Path | None = None) -> Path:
@@ -51,10 +61,10 @@ def export(checkpoint: Checkpoint, out: Path | None = None) -> Path:
     path = out or checkpoint.path.with_suffix(EXPORT_SUFFIX)
     require_output(path, EXPORT_SUFFIX)
     model = touch_encoder_to_onnx(checkpoint)
-    with TemporaryDirectory() as folder:
-        unverified = Path(folder, path.name)
-        unverified.write_bytes(model)
-        difference = _difference(checkpoint, OnnxEncoder(unverified, checkpoint.digest))
+    side, fingers = checkpoint.config.preprocessing.touch_px, checkpoint.config.matcher.fingers
+    touch = list(np.random.default_rng(0).random((fingers, side, side, 3), dtype=np.float32))
+    encoders = TorchEncoder(checkpoint.matcher), OnnxEncoder(model, checkpoint.digest)
+    difference = _difference(*(encoder.encode([touch]) for encoder in encoders))
     if not difference <= TOLERANCE:
         raise RetrievalError(
             f"nothing is exported, because ONNX Runtime gives other numbers than PyTorch: they differ by "
@@ -73,17 +83,41 @@ def export_to_cache(checkpoint: Checkpoint) -> Path | None:
         The file; None if an export exists already or cannot be written. Queries work without it.
     """
     path = cached_export_path(checkpoint.digest)
-    if path is None or checkpoint.path.with_suffix(EXPORT_SUFFIX).is_file():
+    if path is None or path.is_file() or checkpoint.path.with_suffix(EXPORT_SUFFIX).is_file():
         return None
     try:
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if not is_private(path.parent):
-            log.warning("%s must have mode 0700 to take exports for queries; run `chmod 700` on it", path.parent)
-            return None
-        return None if path.is_file() else export(checkpoint, path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return export(checkpoint, path)
     except (OSError, RetrievalError) as error:
         log.info("no export for queries: %s", error)
         return None
+
+
+def choose_photo_encoder(checkpoint: Checkpoint) -> PhotoEncoder:
+    """Return the photo encoder of a long build: ONNX Runtime's if it is installed and agrees with PyTorch's on the CPU.
+
+    Do not call this while other threads encode: the export would also record their operations.
+    """
+    encode = torch_photo_encoder(checkpoint.matcher)
+    is_installed = all(find_spec(name) for name in ("onnx", "onnxruntime"))
+    if not is_installed or next(checkpoint.matcher.parameters()).device.type != "cpu":
+        return encode
+    try:
+        session = open_session(photo_encoder_to_onnx(checkpoint), checkpoint.digest, threads=1)
+    except CheckpointError as error:
+        log.warning("%s; PyTorch encodes the photos", error)
+        return encode
+
+    def encode_by_onnx(images: Sequence[Image]) -> PhotoEncodings:
+        return PhotoEncodings(*session.run(None, {"images": np.stack(images)}))
+
+    settings = checkpoint.config.preprocessing
+    shape = settings.photo_px, len(settings.views) * settings.photo_px, 3
+    images = list(np.random.default_rng(0).random((4, *shape), dtype=np.float32))
+    if not _difference(encode(images), encode_by_onnx(images)) <= TOLERANCE:
+        log.warning("ONNX Runtime gives other partial activations than PyTorch; PyTorch encodes the photos")
+        return encode
+    return encode_by_onnx
 
 
 def touch_encoder_to_onnx(checkpoint: Checkpoint) -> bytes:
@@ -182,11 +216,8 @@ class _FrozenNorm(nn.Module):
         return (x - self.mean) * self.scale
 
 
-def _difference(checkpoint: Checkpoint, exported: OnnxEncoder) -> float:
-    """Return the largest difference of a random touch's encoding from PyTorch's, as `TOLERANCE` states it."""
-    side, fingers = checkpoint.config.preprocessing.touch_px, checkpoint.config.matcher.fingers
-    touch = list(np.random.default_rng(0).random((fingers, side, side, 3), dtype=np.float32))
-    partial, embedding, *_ = TorchEncoder(checkpoint.matcher).encode([touch])
-    other_partial, other_embedding, *_ = exported.encode([touch])
+def _difference(by_torch: TouchEncodings | PhotoEncodings, by_onnx: TouchEncodings | PhotoEncodings) -> float:
+    """Return the largest difference of two encodings, as `TOLERANCE` states it."""
+    (partial, embedding), (other_partial, other_embedding) = by_torch[:2], by_onnx[:2]
     relative = np.abs(partial - other_partial).max() / np.abs(partial).max()
     return float(max(relative, np.abs(embedding - other_embedding).max()))

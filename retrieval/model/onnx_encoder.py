@@ -1,12 +1,7 @@
-"""The touch encoder on ONNX Runtime, from a file of `retrieve export`: a query without PyTorch.
-
-An export next to a checkpoint is trusted as the checkpoint is. An export that was made automatically is in the user's
-cache, in a folder that nobody else can enter.
-"""
+"""The touch encoder on ONNX Runtime, from a file of `retrieve export`: a query without PyTorch."""
 
 import logging
 import os
-import stat
 from collections.abc import Sequence
 from functools import partial
 from importlib.util import find_spec
@@ -15,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from _touch_retrieval.files import read_regular
 from retrieval.data.resize import RgbImage
 from retrieval.errors import CheckpointError
 from retrieval.model.checkpoint_info import CheckpointInfo
@@ -33,18 +27,9 @@ class OnnxEncoder:
 
     name = "onnx"
 
-    def __init__(self, path: Path, checkpoint: str, threads: int | None = None) -> None:
-        """Open the export of the checkpoint with that digest.
-
-        Args:
-            path: The file.
-            checkpoint: SHA-256 of the checkpoint's file, in hexadecimal.
-            threads: Threads of ONNX Runtime; None for its own choice.
-
-        Raises:
-            CheckpointError: The file cannot be read or opened, or is the export of another checkpoint.
-        """
-        self._open = partial(_open_file, path, checkpoint, threads)
+    def __init__(self, model: Path | bytes, checkpoint: str, threads: int | None = None) -> None:
+        """Open the export of the checkpoint with that digest; the arguments and errors are those of `open_session`."""
+        self._open = partial(open_session, model, checkpoint, threads)
         self._session = self._open()
         fork_guard.sessions.add(self)
 
@@ -63,21 +48,12 @@ class OnnxEncoder:
         return TouchEncodings(partials, embedding, more[0] if more else None)
 
 
-def _open_file(path: Path, checkpoint: str, threads: int | None) -> Any:
-    try:
-        model = read_regular(path)
-    except OSError as error:
-        raise CheckpointError(f"{path} cannot be read ({error.strerror})") from error
-    return open_session(model, str(path), checkpoint, threads)
-
-
-def open_session(model: bytes, name: str, checkpoint: str, threads: int | None) -> Any:
-    """Open ONNX Runtime on a model in memory.
+def open_session(model: Path | bytes, checkpoint: str, threads: int | None = None) -> Any:
+    """Open ONNX Runtime on an export.
 
     Args:
-        model: The bytes of the ONNX file.
-        name: Its name in messages.
-        checkpoint: Digest of the checkpoint that it must be exported from.
+        model: The ONNX file, or its bytes.
+        checkpoint: SHA-256 (hexadecimal) of the file of the checkpoint that it must be exported from.
         threads: Threads of ONNX Runtime; None for its own choice.
 
     Raises:
@@ -86,12 +62,13 @@ def open_session(model: bytes, name: str, checkpoint: str, threads: int | None) 
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # nothing is sent, and no fork waits for its thread
     import onnxruntime
 
+    name, source = ("the export", model) if isinstance(model, bytes) else (model, str(model))
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads or 0
     # Spinning threads would occupy the cores that decode the next images or score candidates.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
-        session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # the exceptions of ONNX Runtime have no common base
         raise CheckpointError(f"{name} cannot be opened by ONNX Runtime ({type(error).__name__})") from error
     exported_from = session.get_modelmeta().custom_metadata_map.get(CHECKPOINT_KEY, "unknown")
@@ -115,11 +92,6 @@ def cached_export_path(digest: str) -> Path | None:
     return Path(cache, "touch-retrieval", f"{digest}{EXPORT_SUFFIX}")
 
 
-def is_private(folder: Path) -> bool:
-    """Whether a folder exists and has mode 0700: nobody else can enter it."""
-    return folder.is_dir() and stat.S_IMODE(folder.stat().st_mode) == 0o700
-
-
 def find_export(checkpoint: CheckpointInfo, threads: int | None = None) -> OnnxEncoder | None:
     """Open the export of a checkpoint, if there is one and ONNX Runtime is installed.
 
@@ -133,7 +105,7 @@ def find_export(checkpoint: CheckpointInfo, threads: int | None = None) -> OnnxE
     path = checkpoint.path.with_suffix(EXPORT_SUFFIX)
     if not path.is_file():
         cached = cached_export_path(checkpoint.digest)
-        if cached is None or not cached.is_file() or not is_private(cached.parent):
+        if cached is None or not cached.is_file():
             return None
         path = cached
     if find_spec("onnxruntime") is None:

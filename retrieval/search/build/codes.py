@@ -30,9 +30,9 @@ from retrieval.data.loading import map_in_order
 from retrieval.errors import NoReadablePhoto, NumericalError
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.checkpoint_info import fingerprint
-from retrieval.model.encode import Image, batches, one_thread
+from retrieval.model.encode import Image, PhotoEncoder, batches, one_thread, torch_photo_encoder
+from retrieval.model.export import choose_photo_encoder
 from retrieval.model.fusion_scorer import stored_layout, to_stored
-from retrieval.model.photo_encoder import PhotoEncoder, choose_photo_encoder, torch_photo_encoder
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -180,8 +180,8 @@ def code_blocks(cache: CodeCache, checkpoint: Checkpoint, digests: Sequence[str]
 
 
 def _photo_encoder(checkpoint: Checkpoint, photos: int) -> PhotoEncoder:
-    choose = choose_photo_encoder if photos >= MIN_PHOTOS_FOR_ONNX else torch_photo_encoder
-    return choose(checkpoint)
+    many = photos >= MIN_PHOTOS_FOR_ONNX
+    return choose_photo_encoder(checkpoint) if many else torch_photo_encoder(checkpoint.matcher)
 
 
 def _encode(

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from torch import nn
-from torch.nn.utils import parameters_to_vector
 
 from retrieval.errors import NumericalError
 from retrieval.model.checkpoint import load_checkpoint
@@ -22,7 +21,6 @@ from retrieval.model.towers import TOWERS
 from retrieval.search.defaults import shipped_model
 
 SIDE = 48
-SMALL = MatcherConfig(tower="small", tower_output="pooled", hidden=8)
 
 
 def matcher_with_statistics(tower, output):
@@ -85,51 +83,6 @@ def test_encoding_leaves_the_matcher_unchanged():
     for name, tensor in before.items():
         assert torch.equal(after[name], tensor)
         assert after[name].stride() == tensor.stride()
-
-
-def test_a_tower_is_prepared_once():
-    matcher = Matcher(SMALL).eval()
-    first = for_inference(matcher)
-    assert for_inference(matcher).photo_tower is first.photo_tower
-    assert for_inference(matcher).touch_tower is first.touch_tower
-
-
-def written_in_place(matcher):
-    with torch.no_grad():
-        next(matcher.photo_tower.parameters()).mul_(2)
-
-
-def loaded(matcher):
-    matcher.load_state_dict({name: tensor + 1 for name, tensor in matcher.state_dict().items()})
-
-
-def replaced(matcher):
-    matcher.photo_tower.stages[0].weight = nn.Parameter(2 * matcher.photo_tower.stages[0].weight.detach())
-
-
-def given_other_data(matcher):
-    weight = matcher.photo_tower.stages[0].weight
-    weight.data = 2 * weight.data
-
-
-def one_step_of_training(matcher):
-    optimiser = torch.optim.SGD(matcher.parameters(), lr=1.0)
-    matcher.photo_features(to_batch(images(2))).sum().backward()
-    optimiser.step()
-
-
-@pytest.mark.parametrize("change", [written_in_place, loaded, replaced, given_other_data, one_step_of_training])
-def test_changed_weights_are_used_in_the_next_encoding(change):
-    torch.manual_seed(0)
-    matcher = Matcher(SMALL).eval()
-    before = photo_features(matcher, images(2))
-    vector = parameters_to_vector(matcher.photo_tower.parameters()).detach().clone()
-    change(matcher)
-    assert not torch.equal(parameters_to_vector(matcher.photo_tower.parameters()).detach(), vector)
-    with torch.inference_mode():
-        expected = matcher.photo_features(to_batch(images(2)))
-    torch.testing.assert_close(photo_features(matcher, images(2)), expected, rtol=1e-5, atol=1e-5)
-    assert not torch.equal(before, expected)
 
 
 def test_a_tower_in_training_mode_is_not_folded_because_its_normalisation_depends_on_the_batch():

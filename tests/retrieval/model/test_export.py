@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from indexes.store.folder import IndexStore
 from retrieval.commands.main import main
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import BadInput, CheckpointError, NumericalError, RetrievalError
@@ -17,12 +18,13 @@ from retrieval.model import export as exporting
 from retrieval.model import onnx_encoder
 from retrieval.model.checkpoint import load_checkpoint, save_checkpoint
 from retrieval.model.config import Config, MatcherConfig
-from retrieval.model.encode import TorchEncoder, encode_touches, touch_features
-from retrieval.model.export import export
+from retrieval.model.encode import TorchEncoder, encode_touches, torch_photo_encoder, touch_features
+from retrieval.model.export import choose_photo_encoder, export
 from retrieval.model.fusion import GelHead, Matcher
 from retrieval.model.onnx_encoder import OnnxEncoder
 from retrieval.model.towers import OUTPUTS, TOWERS
 from retrieval.search.build.build_index import build_index
+from retrieval.search.defaults import shipped_model
 from retrieval.search.query.searcher import Searcher
 from tests.project.test_imports import run_blocked
 from tests.project.test_project import PROJECT
@@ -162,6 +164,53 @@ def test_an_encoder_that_gives_a_nan_is_refused_with_the_touch_named(part, model
         searcher.query([touch, touch])
 
 
+# Photos of a long build -----------------------------------------------------------------------------------------
+
+
+def pictures(checkpoint, count=3):
+    settings = checkpoint.config.preprocessing
+    shape = (settings.photo_px, len(settings.views) * settings.photo_px, 3)
+    return list(np.random.default_rng(0).random((count, *shape), dtype=np.float32))
+
+
+def test_onnx_runtime_gives_the_partial_activations_and_embeddings_of_several_views():
+    shipped = load_checkpoint(shipped_model())
+    encoders = torch_photo_encoder(shipped.matcher), choose_photo_encoder(shipped)
+    ours, theirs = (encode(pictures(shipped)) for encode in encoders)
+    assert not np.array_equal(ours.partial, theirs.partial)  # another library
+    assert np.abs(ours.partial - theirs.partial).max() <= exporting.TOLERANCE * np.abs(ours.partial).max()
+    assert np.allclose(ours.embedding, theirs.embedding, atol=1e-4)
+
+
+def test_pytorch_encodes_if_onnx_runtime_is_missing_or_wrong(model, monkeypatch, caplog):
+    checkpoint = load_checkpoint(model)
+    images = pictures(checkpoint)
+    expected = torch_photo_encoder(checkpoint.matcher)(images).partial
+    with monkeypatch.context() as patch:
+        patch.setattr(exporting, "find_spec", lambda name: None)
+        assert np.array_equal(choose_photo_encoder(checkpoint)(images).partial, expected)
+    monkeypatch.setattr(exporting, "TOLERANCE", -1.0)
+    assert np.array_equal(choose_photo_encoder(checkpoint)(images).partial, expected)
+    assert "gives other partial activations" in caplog.text
+
+
+def test_a_long_build_gives_the_same_index_with_either_encoder(catalogue, model, tmp_path, monkeypatch):
+    checkpoint = load_checkpoint(model)
+    build_index(catalogue, checkpoint, tmp_path / "torch", quiet=True)
+    calls = []
+    monkeypatch.setattr("retrieval.search.build.codes.MIN_PHOTOS_FOR_ONNX", 1)
+    monkeypatch.setattr(
+        "retrieval.search.build.codes.choose_photo_encoder",
+        lambda made: calls.append(1) or choose_photo_encoder(made),
+    )
+    build_index(catalogue, checkpoint, tmp_path / "onnx", quiet=True)
+    assert calls == [1]  # once per build
+    ours, theirs = (IndexStore(tmp_path / name).open() for name in ("torch", "onnx"))
+    assert [row.path for row in ours.rows] == [row.path for row in theirs.rows]
+    partials = [np.asarray(each.arrays["partials"], np.float32) for each in (ours, theirs)]
+    assert np.allclose(*partials, atol=2e-3 * np.abs(partials[0]).max())
+
+
 # The user's cache ------------------------------------------------------------------------------------------------
 
 
@@ -178,19 +227,6 @@ def test_the_export_next_to_a_checkpoint_comes_first(model_copy):
     export(checkpoint)
     assert exporting.export_to_cache(checkpoint) is None
     assert not onnx_encoder.cached_export_path(checkpoint.digest).exists()
-
-
-def test_a_cache_folder_that_others_can_enter_is_neither_read_nor_written(model_copy, index, touch, caplog):
-    """Who can write there could make an export of this checkpoint that gives other partial activations."""
-    checkpoint = load_checkpoint(model_copy)
-    path = onnx_encoder.cached_export_path(checkpoint.digest)
-    exporting.export_to_cache(checkpoint)
-    assert path.parent.stat().st_mode & 0o777 == 0o700
-    path.parent.chmod(0o770)
-    assert Searcher.open(index).query([touch]).index["encoder"] == "torch"
-    path.unlink()
-    assert exporting.export_to_cache(checkpoint) is None
-    assert "must have mode 0700" in caplog.text
 
 
 @pytest.mark.parametrize("trouble", ["a file in the way", "no home"])
@@ -264,6 +300,7 @@ class Guard:
 
 sys.meta_path.insert(0, Guard())
 sys.stdout.isatty = lambda: True  # a terminal gets a title
+from indexes.store.folder import IndexStore
 from retrieval.commands.main import main
 code = main({arguments!r})
 used = set().union(*(theirs.get(name.partition(".")[0], set()) for name in set(sys.modules) - before))

@@ -20,7 +20,7 @@ from retrieval.data import preprocessing
 from retrieval.data.catalogue import list_catalogue, read_photo
 from retrieval.errors import DatasetError, NumericalError
 from retrieval.model.checkpoint import load_checkpoint, save_checkpoint
-from retrieval.model.encode import encode_photos, for_inference
+from retrieval.model.encode import encode_photos
 from retrieval.search.build import codes
 from retrieval.search.build.build_index import build_index
 from retrieval.search.build.codes import map_ahead
@@ -394,7 +394,7 @@ def test_a_nan_or_overflow_never_reaches_an_index(part, value, catalogue_copy, c
     def corrupt(module, inputs, output):
         return output.index_fill(0, torch.tensor([3]), value) if len(output) == 16 else output
 
-    for_inference(checkpoint.matcher).get_submodule(part).register_forward_hook(corrupt)
+    checkpoint.matcher.get_submodule(part).register_forward_hook(corrupt)
     with pytest.raises((NumericalError, VectorError), match=list_catalogue(catalogue_copy).photos[3].path):
         build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert IndexStore(index).current() == "gen-000001"
