@@ -28,20 +28,19 @@ from _touch_retrieval.files import atomic_file, write_atomically
 from models.labels import LabelHead
 from models.pictures import LabelledPicture, collect_pictures
 from models.random_surfaces import RandomSurface, presses
-from retrieval.console.interruption import interruption
 from retrieval.console.memory import keep_freed_memory
 from retrieval.console.output import say
 from retrieval.console.progress import Bar
 from retrieval.data.images import read_rgb, to_float
 from retrieval.data.resize import resize
+from retrieval.errors import JobInterrupted
 from retrieval.model.checkpoint import write_tensors
 from retrieval.model.encode import autocast, default_device
 from retrieval.model.towers import build_tower
 from retrieval.model.towers.tower import Tower
 from retrieval.model.towers.weights import initialise_tower
 from retrieval.training.augmentation import sample_grid
-from retrieval.training.fit import RATE, Plan, fit, freeze_batch_norm
-from retrieval.training.state import load_state, save_state, state_path
+from retrieval.training.loop import RATE, Plan, StateFile, freeze_batch_norm, state_path, train_loop
 from robot.sim.gel.sensor import draw_sensor
 from robot.workers import Work, WorkerPool
 
@@ -84,11 +83,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     size: dict[str, Any] = {"objects": arguments.labelled, "seed": SEED_LABELLED, "rig": str(RIG)}
     labelled = collect_pictures("touch", folder / "labelled", jobs=arguments.jobs, **size)
     training = GelTowerTraining(files, labelled, str(arguments.init))
-    out = folder / "gel-tower.safetensors"
-    if training.run(out, arguments.steps):
-        return 0
-    say(f"stopped at step {training.step} of {arguments.steps}; run the command again to continue")
-    return 1
+    try:
+        training.run(folder / "gel-tower.safetensors", arguments.steps)
+    except JobInterrupted as stopped:
+        say(str(stopped))
+        return 1
+    return 0
 
 
 # Presses of random surfaces ------------------------------------------------------------------------------------
@@ -241,7 +241,7 @@ class GelTowerTraining(Dataset[Batch]):
             init: Initial weights.
         """
         self.sensors = [np.load(file, mmap_mode="r", allow_pickle=False) for file in files]
-        self.labelled, self.step, self.device = labelled, 0, default_device()
+        self.labelled, self.device = labelled, default_device()
         self.published, tower = (build_tower("mobilenet_v2", "stages").to(self.device).eval() for _ in range(2))
         for each in (self.published, tower):
             initialise_tower(each, init)
@@ -255,41 +255,28 @@ class GelTowerTraining(Dataset[Batch]):
         groups = ((early, EARLY_RATE), (late, 1.0), (heads, HEAD_RATE))
         parameters: list[dict[str, Any]] = [{"params": list(part.parameters()), RATE: rate} for part, rate in groups]
         self.optimizer = torch.optim.AdamW(parameters, weight_decay=WEIGHT_DECAY)
+        self.optimizer.register_step_pre_hook(lambda *_: self._clip_gradients())
 
-    def run(self, out: Path, steps: int) -> bool:
-        """Train to the last step, write the tower in float16 to `out`, and return whether this was reached."""
+    def run(self, out: Path, steps: int) -> None:
+        """Train to the last step, and write the tower in float16 to `out`."""
         identity = {"steps": steps, "sensors": len(self.sensors), "labelled": len(self.labelled)}
-        if state_path(out).exists():
-            self.step = load_state(out, self.modules, self.optimizer, identity)["step"]
-
-        def count(done: int) -> None:
-            self.step = done
-
-        def save(_: int) -> None:
-            save_state(out, self.modules, self.optimizer, {"step": self.step, **identity})
-
-        plan = Plan(steps, LEARNING_RATE, "warmup", SAVE_EVERY)
-        batches = DataLoader(self, batch_size=None, sampler=range(self.step, steps), num_workers=WORKERS)
-        with interruption() as stop, Bar("train", steps, "steps", done=self.step) as bar:
-            fit(
-                self.optimizer,
-                plan,
-                batches,
-                self.loss,
-                bar=bar,
-                done=self.step,
-                before_step=lambda: nn.utils.clip_grad_norm_(self.tower.parameters(), 5.0),  # type: ignore[arg-type]
-                after_step=count,
-                validate=save,
-                should_stop=stop.is_set,
-            )
-        if self.step < steps:
-            return False
+        state = StateFile(state_path(out), identity)
+        train_loop(
+            self.modules,
+            self.optimizer,
+            Plan(steps, LEARNING_RATE, "warmup", SAVE_EVERY),
+            lambda left: DataLoader(self, batch_size=None, sampler=left, num_workers=WORKERS),
+            lambda _, batch: self.loss(batch),
+            title="train",
+            state=state,
+        )
         weights = self.tower.half().state_dict()
         write_tensors(out, weights, {"tower": "mobilenet_v2", "tower_output": "stages", **identity})
         write_atomically(out.with_suffix(".md"), self.card(steps).encode())
-        state_path(out).unlink(missing_ok=True)
-        return True
+        state.path.unlink()
+
+    def _clip_gradients(self) -> None:
+        nn.utils.clip_grad_norm_(self.tower.parameters(), 5.0)
 
     def card(self, steps: int) -> str:
         """Return the text that describes the tower."""

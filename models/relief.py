@@ -17,19 +17,15 @@ from torch.utils.data import DataLoader, Dataset
 
 from models.labels import LabelHead
 from models.pictures import FAMILIES, LabelledPicture
-from retrieval.console.interruption import interruption
-from retrieval.console.progress import Bar
 from retrieval.data.images import to_float
 from retrieval.data.preprocessing import Preprocessing
-from retrieval.errors import JobInterrupted
 from retrieval.model.checkpoint import write_tensors
 from retrieval.model.config import Config
 from retrieval.model.encode import autocast, default_device, to_batch
 from retrieval.model.towers import build_tower
 from retrieval.model.towers.weights import initialise_tower
 from retrieval.training.augmentation import augment, sample_grid
-from retrieval.training.fit import RATE, Plan, fit, freeze_batch_norm
-from retrieval.training.state import load_state, save_state, state_path
+from retrieval.training.loop import RATE, Plan, StateFile, freeze_batch_norm, state_path, train_loop
 
 BATCH, LEARNING_RATE, WEIGHT_DECAY, SAVE_EVERY = 32, 4e-4, 0.03, 200
 WORKERS = 2
@@ -59,37 +55,21 @@ def pretrain(kind: str, pictures: Sequence[LabelledPicture], out: Path, config: 
     Raises:
         JobInterrupted: After Ctrl-C.
     """
-    training = ReliefTraining(kind, pictures, config, steps)
-    identity = {"config": config.to_dict(), "steps": steps, "pictures": len(pictures)}
-    if state_path(out).exists():
-        training.step = load_state(out, training.modules, training.optimizer, identity)["step"]
-
-    def count(done: int) -> None:
-        training.step = done
-
-    def save(_: int) -> None:
-        save_state(out, training.modules, training.optimizer, {"step": training.step, **identity})
-
-    left = range(training.step, steps)
-    batches = DataLoader(training, batch_size=None, sampler=left, num_workers=WORKERS)
-    with interruption() as stop, Bar(f"pretrain {kind} tower", steps, "steps", done=training.step) as bar:
-        fit(
-            training.optimizer,
-            Plan(steps, LEARNING_RATE, "cosine", SAVE_EVERY),
-            batches,
-            training.loss,
-            bar=bar,
-            done=training.step,
-            after_step=count,
-            validate=save,
-            should_stop=stop.is_set,
-        )
-    if training.step < steps:
-        raise JobInterrupted(f"stopped at step {training.step} of {steps}; run the command again to continue")
+    training = ReliefTraining(kind, pictures, config)
+    state = StateFile(state_path(out), {"config": config.to_dict(), "steps": steps, "pictures": len(pictures)})
+    train_loop(
+        training.modules,
+        training.optimizer,
+        Plan(steps, LEARNING_RATE, "cosine", SAVE_EVERY),
+        lambda left: DataLoader(training, batch_size=None, sampler=left, num_workers=WORKERS),
+        training.loss,
+        title=f"pretrain {kind} tower",
+        state=state,
+    )
     accuracies = training.accuracies()
     about = {"tower": config.matcher.tower, "tower_output": config.matcher.tower_output}
     write_tensors(out, training.tower.state_dict(), about | {"kind": kind, "steps": steps, "accuracies": accuracies})
-    state_path(out).unlink(missing_ok=True)
+    state.path.unlink()
     return f"{kind} tower on held-out objects: " + ", ".join(
         f"{name} {value:.3f}" for name, value in accuracies.items()
     )
@@ -98,8 +78,8 @@ def pretrain(kind: str, pictures: Sequence[LabelledPicture], out: Path, config: 
 class ReliefTraining(Dataset[tuple[list[int], Tensor]]):
     """A tower and a head that predicts labels from its features. As a data set: the batch of each step."""
 
-    def __init__(self, kind: str, pictures: Sequence[LabelledPicture], config: Config, steps: int) -> None:
-        self.kind, self.config, self.step, self.device = kind, config, 0, default_device()
+    def __init__(self, kind: str, pictures: Sequence[LabelledPicture], config: Config) -> None:
+        self.kind, self.config, self.device = kind, config, default_device()
         seed, matcher = config.training.seed, config.matcher
         objects = sorted({picture.object_id for picture in pictures})
         held_out = max(1, min(round(VALIDATION * len(objects)), MAX_VALIDATION_OBJECTS))
@@ -137,12 +117,12 @@ class ReliefTraining(Dataset[tuple[list[int], Tensor]]):
             image = dataclasses.replace(settings, background=background).load_touch(picture.file, picture.before)
         return to_float(np.rint(255 * image).astype(np.uint8))
 
-    def loss(self, batch: tuple[list[int], Tensor]) -> Tensor:
-        """Return the loss of a batch."""
+    def loss(self, step: int, batch: tuple[list[int], Tensor]) -> Tensor:
+        """Return the loss of a step and its batch."""
         rows, images = batch
         self.modules.train()
         freeze_batch_norm(self.tower)  # a batch of 32 is too small for new statistics
-        torch.manual_seed(self.config.training.seed * 1_000_003 + self.step)  # the dropout mask
+        torch.manual_seed(self.config.training.seed * 1_000_003 + step)  # the dropout mask
         return self.head.loss(self._features(images), [self.pictures[row].labels for row in rows])
 
     def _features(self, images: Tensor) -> Tensor:

@@ -42,7 +42,6 @@ from retrieval.training.calibration.calibrate import calibrate_checkpoint
 from retrieval.training.calibration.touches import calibration_touches
 from retrieval.training.calibration.verification import fit_verification
 from retrieval.training.features import Features, encode_recording, features_by_image
-from retrieval.training.state import finish_training, unfinished_path
 
 RIGS = Path(__file__).parent
 RIG, TOUCH_RIG, GELS_RIG = (RIGS / f"shipped_{name}.toml" for name in ("rig", "touches", "gels"))
@@ -164,11 +163,11 @@ def train_towers(
         dataclasses.replace(config, training=training),
         split_of(train, validation),
         [*train, *validation],
-        unfinished_path(done),
+        done,
         source="simulated rigs",
         labels=labels,
     )
-    return finish_training(trainer, done, quiet=False)
+    return trainer.run_or_reuse(quiet=False)
 
 
 def head_config(folder: Path, towers: Checkpoint) -> Config:

@@ -15,8 +15,7 @@ from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff
 from retrieval.frontier.sample import Sample
 from retrieval.model.encode import autocast, has_fast_bfloat16, to_batch, touch_batch
 from retrieval.model.fusion import Matcher
-from retrieval.training.step import WeightedLosses, batch_loss
-from retrieval.training.train import set_training_mode
+from retrieval.training.train import WeightedLosses, batch_loss, set_training_mode
 
 TOLERANCE = 0.1
 """Tolerance of 1 - cosine: a tenth of the value for two batches, whose gradients have little in common."""
@@ -64,7 +63,7 @@ class _Step:
             features = matcher.touch_features(self.touches), matcher.photo_features(self.photos)
         batch_loss(
             matcher, WeightedLosses(self.settings.weights, matcher, len(self.batch.grasps)), self.batch, *features
-        )[0].backward()  # type: ignore[no-untyped-call]
+        ).backward()  # type: ignore[no-untyped-call]
         grads = [weight.grad for weight in matcher.parameters() if weight.grad is not None]
         return torch.cat([grad.flatten() for grad in grads])
 

@@ -14,7 +14,6 @@ from retrieval.data.dataset import Split
 from retrieval.errors import BadInput, JobInterrupted, RetrievalError
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable
 from retrieval.model.config import Config
-from retrieval.training.state import require_no_unfinished_state, state_path
 from retrieval.training.train import train
 
 MAX_RESTARTS = 3
@@ -27,7 +26,6 @@ def train_on_ray(
     config: Config,
     *,
     split: Split | None = None,
-    resume: bool = False,
     workers: int = 2,
     cpus: int | None = None,
 ) -> Checkpoint:
@@ -38,7 +36,6 @@ def train_on_ray(
         out: As for `train`.
         config: As for `train`.
         split: As for `train`.
-        resume: As for `train`.
         workers: Number of ranks.
         cpus: CPUs of a Ray that is started here; None for all.
 
@@ -50,14 +47,11 @@ def train_on_ray(
     if workers < 1:
         raise BadInput(f"workers must be 1 or more; got {workers}")
     require_writable(out)
-    if not resume:
-        require_no_unfinished_state(out)
     settings = {
         "recording": recording.resolve(),
         "out": out.resolve(),
         "config": config,
         "split": split,
-        "resume": resume,
     }
     with ray_session(cpus) as ray, tempfile.TemporaryDirectory() as notes:
         from ray.train import FailureConfig, RunConfig, ScalingConfig, TrainingFailedError
@@ -74,18 +68,18 @@ def train_on_ray(
         try:
             trainer.fit()
         except KeyboardInterrupt as error:
-            raise JobInterrupted(f"stopped; --resume continues from {state_path(out)}, if it exists") from error
+            raise JobInterrupted("Stopped; run the same command to continue from the last state.") from error
         except TrainingFailedError as error:
-            lost = RetrievalError(f"ranks were lost more than {MAX_RESTARTS} times; --resume continues: {error}")
+            lost = RetrievalError(
+                f"ranks were lost {MAX_RESTARTS + 1} times; run the same command to continue: {error}"
+            )
             raise _error_of_rank(error) or lost from error
     return load_checkpoint(out)
 
 
 def _rank(settings: dict[str, Any]) -> None:
     """Train in a process of Ray Train, which has joined the ranks."""
-    resume = settings["resume"] or state_path(settings["out"]).exists()
-    recording, out, config, split = (settings[name] for name in ("recording", "out", "config", "split"))
-    train(recording, out, config, split=split, resume=resume)
+    train(**settings)
 
 
 def _error_of_rank(error: BaseException) -> RetrievalError | None:

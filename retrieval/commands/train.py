@@ -48,7 +48,6 @@ def train(
         typer.Option(parser=SEED, help="seed of split, pairs and weights (default: that of the configuration)"),
     ] = None,
     split: SplitFile = None,
-    resume: Annotated[bool, typer.Option("--resume", help="continue an unfinished training run of --out")] = False,
     cluster: Annotated[
         bool,
         typer.Option(
@@ -64,7 +63,7 @@ def train(
     if (cluster and task != "match") or (workers is not None and not cluster):
         raise BadInput("--cluster needs --task match, and --workers needs --cluster")
     if task == "grasp-success":
-        others = {"config": config, "split": split, "resume": resume, "init": init, "start": start}
+        others = {"config": config, "split": split, "init": init, "start": start}
         refuse_options("does not apply to --task grasp-success, which takes --iterations and --seed", **others)
         from retrieval.data.dataset import recording_licence
         from retrieval.model.checkpoint import require_writable
@@ -86,7 +85,7 @@ def train(
         settings = training_config(config, iterations, seed=seed, init=init, start=start)
         require_writable(out)
         _show_licences(training_licences(recording, settings.training))
-        options: dict[str, Any] = {"split": read_split(split), "resume": resume}
+        options: dict[str, Any] = {"split": read_split(split)}
         if cluster:
             from retrieval.cluster.training import train_on_ray
 

@@ -13,7 +13,6 @@ from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writ
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
 from retrieval.training.licences import training_licences
-from retrieval.training.state import finish_training, unfinished_path
 from retrieval.training.train import Trainer
 
 
@@ -75,11 +74,11 @@ def prepare(
     split, split_from = _split(grasps, config, checkpoint, split)
     if checkpoint is None and not config.training.freeze_towers:
         done = out / "model.safetensors"
-        require_writable(unfinished_path(done))
+        require_writable(done)
         licences = training_licences(recording, config.training)
         source = recording_source(recording)
-        trainer = Trainer(config, split, grasps, unfinished_path(done), source=source, licences=licences)
-        checkpoint = finish_training(trainer, done, quiet)
+        trainer = Trainer(config, split, grasps, done, source=source, licences=licences)
+        checkpoint = trainer.run_or_reuse(quiet)
         config = _of_model(checkpoint, config)
     return EvaluationData(
         name=recording.resolve().name,

@@ -21,7 +21,7 @@ from retrieval.model.encode import one_thread
 from retrieval.model.fusion import Matcher
 from retrieval.model.losses import LOSSES
 from retrieval.training.features import Features
-from retrieval.training.state import code_digest
+from retrieval.training.loop import code_digest
 from retrieval.version import __version__
 
 

@@ -8,12 +8,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from retrieval.console.progress import Bar
 from retrieval.methods.method import Array, Method
 from retrieval.methods.selection import Validator
 from retrieval.methods.standardise import Standardiser
 from retrieval.model.losses.contrastive import LOG_SCALE_INIT, LOG_SCALE_MAX, contrastive_loss
-from retrieval.training.fit import BestStep, Plan, fit_best
+from retrieval.training.loop import BestStep, Plan, train_loop
 
 if TYPE_CHECKING:
     from retrieval.training.features import Features
@@ -53,9 +52,8 @@ class ContrastiveEmbedding(Method):
         self._touch, self._photo = Standardiser.fit(train.touch), Standardiser.fit(train.photo)
         validator = Validator.of(validation)
         steps = min(self.settings.config.training.iterations, MAX_STEPS)
-        with Bar("fit contrastive", steps * len(REGULARISATIONS), "steps", quiet=self.settings.quiet) as bar:
-            fits = [self._train(train, validator, *cell, steps, bar) for cell in REGULARISATIONS]
-        aucs = [best.value for _, best in fits]
+        fits = [self._train(train, validator, steps, place) for place in range(len(REGULARISATIONS))]
+        aucs = [best.metrics["validation_auc"] for _, best in fits]
         place = aucs.index(max(aucs))
         self._module, best = fits[place]
         self._scale = self._module.log_scale.exp().item()
@@ -63,40 +61,42 @@ class ContrastiveEmbedding(Method):
             "dropout": REGULARISATIONS[place][0],
             "weight_decay": REGULARISATIONS[place][1],
             "steps": best.step,
-            "validation_auc": best.value,
+            "validation_auc": aucs[place],
             "scale": self._scale,
         }
 
-    def _train(
-        self, train: "Features", validator: Validator, dropout: float, weight_decay: float, steps: int, bar: Bar
-    ) -> tuple[Projections, BestStep]:
+    def _train(self, train: "Features", validator: Validator, steps: int, place: int) -> tuple[Projections, BestStep]:
         """Return projections trained with one regularisation, at their best step."""
+        dropout, weight_decay = REGULARISATIONS[place]
         with seeded_generator(self.settings.seed) as generator:
             dim = self.settings.config.matcher.embedding_dim
             module = Projections(len(self._touch.columns), len(self._photo.columns), dim, dropout)
-            plan = Plan(steps, LEARNING_RATE, validate_every=VALIDATE_EVERY)
-            loss, validation_auc = (
-                self._training_loss(module, train, generator),
-                self._validation_auc(module, validator),
+            optimizer = torch.optim.AdamW(  # biases and the temperature need not be small
+                [
+                    {"params": [module.touch.bias, module.photo.bias, module.log_scale], "weight_decay": 0.0},
+                    {"params": [module.touch.weight, module.photo.weight], "weight_decay": weight_decay},
+                ]
             )
-            best = fit_best(
+            optimizer.register_step_post_hook(lambda *_: module.clamp_scale())
+            best = train_loop(
                 module,
-                plan,
-                loss,
-                validation_auc,
-                bar=bar,
-                weight_decay=weight_decay,
-                after_step=lambda _: module.clamp_scale(),
+                optimizer,
+                Plan(steps, LEARNING_RATE, validate_every=VALIDATE_EVERY),
+                lambda left: left,
+                self._training_loss(module, train, generator),
+                title=f"fit contrastive, {place + 1} of {len(REGULARISATIONS)}",
+                quiet=self.settings.quiet,
+                validate=self._validation(module, validator),
             )
-        return module, best
+        return module.eval(), best
 
     def _training_loss(
         self, module: Projections, train: "Features", generator: torch.Generator
-    ) -> Callable[[int], Tensor]:
+    ) -> Callable[[int, int], Tensor]:
         touch, photo = self._touch.tensor(train.touch), self._photo.tensor(train.photo)
         draws = ObjectSampler(torch.from_numpy(train.owner), generator)
 
-        def loss(_: int) -> Tensor:
+        def loss(_: int, __: int) -> Tensor:
             objects = draws.distinct_objects(OBJECTS_PER_BATCH).repeat(IMAGES_PER_OBJECT)
             touches = module(touch[draws.rows(objects)], module.touch)
             photos = module(photo[draws.rows(objects)], module.photo)
@@ -104,10 +104,18 @@ class ContrastiveEmbedding(Method):
 
         return loss
 
-    def _validation_auc(self, module: Projections, validator: Validator) -> Callable[[], float]:
+    def _validation(self, module: Projections, validator: Validator) -> Callable[[], dict[str, float]]:
         touch = self._touch.tensor(validator.features.touch)
         photo = self._photo.tensor(validator.features.photo)
-        return lambda: validator.touch_auc((module(touch, module.touch) @ module(photo, module.photo).T).numpy())
+
+        @torch.inference_mode()
+        def validate() -> dict[str, float]:
+            module.eval()
+            scores = (module(touch, module.touch) @ module(photo, module.photo).T).numpy()
+            module.train()
+            return {"validation_auc": validator.touch_auc(scores)}
+
+        return validate
 
     @torch.inference_mode()
     def _encode_touch(self, touch: Array) -> Array:

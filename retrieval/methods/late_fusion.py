@@ -17,7 +17,6 @@ from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher, score_partials
 from retrieval.training.features import Features
 from retrieval.training.initial_weights import build_matcher
-from retrieval.training.state import finish_training, unfinished_path
 from retrieval.training.train import Trainer
 
 SOURCE = "features of a recording"
@@ -87,7 +86,7 @@ def trained_checkpoint(settings: MethodSettings, train: Features, validation: Fe
     )
     with nullcontext(settings.folder) if settings.folder else tempfile.TemporaryDirectory() as folder:
         path = checkpoint_path(Path(folder), settings.seed)
-        trainer = Trainer(config, split, grasps, unfinished_path(path), SOURCE, known)
+        trainer = Trainer(config, split, grasps, path, SOURCE, known)
         expected, got = _feature_counts(trainer.matcher), (*known.touch.shape[1:], *known.photo.shape[1:])
         if expected != got:
             raise BadInput(
@@ -97,7 +96,7 @@ def trained_checkpoint(settings: MethodSettings, train: Features, validation: Fe
         towers = frozen_matcher(settings.config)
         trainer.matcher.touch_tower.load_state_dict(towers.touch_tower.state_dict())
         trainer.matcher.photo_tower.load_state_dict(towers.photo_tower.state_dict())
-        return finish_training(trainer, path, settings.quiet)
+        return trainer.run_or_reuse(settings.quiet)
 
 
 def checkpoint_path(folder: Path, seed: int) -> Path:

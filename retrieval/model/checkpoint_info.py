@@ -69,7 +69,7 @@ def checkpoint_info(path: Path, header: dict[str, Any]) -> CheckpointInfo:
     if lacking := [name for name in ("config", "split", "provenance") if name not in header]:
         raise CheckpointError(
             f"{path} is not a checkpoint: its header has no {lacking[0]}; a .state.safetensors file is the state of "
-            "an unfinished training, and the checkpoint is in the same folder"
+            "an unfinished training; `retrieve train` continues it and writes the checkpoint"
         )
     try:
         config = Config.from_dict(header["config"])

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp
 from retrieval.model.candidate_encoder import CandidateEncoder, PartialStatistics
 from retrieval.model.checkpoint import Checkpoint
@@ -31,7 +30,7 @@ from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher, candidate_encoder_of
 from retrieval.training.batches import FeatureSource, recorded_features
 from retrieval.training.features import Features
-from retrieval.training.fit import Plan, fit
+from retrieval.training.loop import Plan, train_loop
 
 ROWS = 2048
 """Grasps of `feature_partials` at a time."""
@@ -88,7 +87,7 @@ def distil(
     generator, head = torch.Generator().manual_seed(seed), matcher.head.eval()
     sampler = _PhotoSampler(candidate_encoder, photo_partials, photo_statistics, generator)
 
-    def loss(step: int) -> Tensor:
+    def loss(step: int, _: int) -> Tensor:
         touches = blend(touch_partials, BATCH_TOUCHES, generator)
         standardised = touch_statistics(touches)
         photos = sampler.photos(step - steps // WARMUP_DIVISOR, standardised)
@@ -97,9 +96,9 @@ def distil(
             logits = head.all_logits(touches, photos)
         return distillation_loss(scores, logits)
 
-    optimizer, plan = torch.optim.Adam(candidate_encoder.parameters()), Plan(steps, LEARNING_RATE)
-    with Bar("distil candidate encoder", steps, "steps", quiet=quiet) as bar:
-        fit(optimizer, plan, range(steps), loss, bar=bar)
+    optimizer, plan = torch.optim.Adam(candidate_encoder.parameters()), Plan(steps, LEARNING_RATE, validate_every=steps)
+    title = "distil candidate encoder"
+    train_loop(candidate_encoder, optimizer, plan, lambda left: left, loss, title=title, quiet=quiet)
     candidate_encoder.fold_statistics(touch_statistics, photo_statistics)
     matcher.config, matcher.candidate_encoder = config, candidate_encoder.eval()
 

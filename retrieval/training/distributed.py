@@ -119,15 +119,15 @@ def synchronise_batch_norm(tower: nn.Module, device: torch.device) -> None:
 class _Loss(nn.Module):
     """A loss as a module that holds the trained parameters, as PyTorch's data parallelism requires."""
 
-    def __init__(self, modules: nn.Module, loss: Callable[[Any], Tensor]) -> None:
+    def __init__(self, modules: nn.Module, loss: Callable[..., Tensor]) -> None:
         super().__init__()
         self.modules_of_loss, self.loss = modules, loss
 
-    def forward(self, batch: Any) -> Tensor:
-        return self.loss(batch)
+    def forward(self, *arguments: Any) -> Tensor:
+        return self.loss(*arguments)
 
 
-def averaging_gradients(modules: nn.Module, loss: Callable[[Any], Tensor]) -> Callable[[Any], Tensor]:
+def averaging_gradients(modules: nn.Module, loss: Callable[..., Tensor]) -> Callable[..., Tensor]:
     """Return the loss such that its `backward` averages the gradients of `modules` over the ranks."""
     if world_size() == 1:
         return loss

@@ -44,9 +44,9 @@ from retrieval.metrics.k_way import grouped_interval
 from retrieval.model.checkpoint import require_writable, write_tensors
 from retrieval.model.encode import batches, one_thread, touch_batch
 from retrieval.model.losses.match import match_loss
-from retrieval.training.fit import Plan, fit
 from retrieval.training.gate import TASK, GateSettings, GraspNet, GraspSuccessGate
 from retrieval.training.gate import load_gate as load_gate
+from retrieval.training.loop import Plan, train_loop
 
 BATCH = 32
 LEARNING_RATE = 3e-3  # halved after each quarter of the steps, as the authors do
@@ -208,19 +208,13 @@ def _train_net(
     first = touch_batch(differences(draw_batch(attempts, 0, seed)[0]))
     net.scale.fill_(max(float(first.square().mean().sqrt()), _GREY_LEVEL))
 
-    def loss(step: int) -> Tensor:
+    def loss(step: int, _: int) -> Tensor:
         batch, rng = draw_batch(attempts, step, seed)
         images = augment(touch_batch(differences(batch)), rng)
         return gate_loss(net(images), torch.tensor([float(attempt.held) for attempt in batch]))
 
-    with Bar("train", iterations, "steps", quiet=quiet) as bar:
-        fit(
-            torch.optim.Adam(net.parameters()),
-            Plan(iterations, LEARNING_RATE, "halving"),
-            range(iterations),
-            loss,
-            bar=bar,
-        )
+    optimizer, plan = torch.optim.Adam(net.parameters()), Plan(iterations, LEARNING_RATE, "halving")
+    train_loop(net, optimizer, plan, lambda steps: steps, loss, title="train", quiet=quiet)
     return net
 
 

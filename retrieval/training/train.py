@@ -1,22 +1,17 @@
-"""Train a matcher: steps, validation, checkpoints, interruption and resumption.
+"""Train a matcher: from a recording to a checkpoint.
 
-Every step depends only on the seed, the step number and the state. So a run that is stopped and resumed on the same
-machine gives the same bits as an uninterrupted run.
+recording -> grasps -> split -> images or cached features -> `train_loop` -> candidate encoder, calibrations -> file
 """
 
 import dataclasses
-import math
-import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.autograd.graph import increment_version
 
 from retrieval.console.interruption import interruption
-from retrieval.console.progress import Bar
 from retrieval.data.check.split import require_fit
 from retrieval.data.dataset import (
     AnyRecording,
@@ -31,29 +26,34 @@ from retrieval.data.dataset import (
 )
 from retrieval.data.licences import LICENCES, DataLicence
 from retrieval.data.pairs import PairBatch, PairSampler
-from retrieval.errors import CheckpointError, JobInterrupted
+from retrieval.errors import JobInterrupted
 from retrieval.metrics.pairs import negative_log_likelihood, pair_accuracy, pair_auc
-from retrieval.model.checkpoint import (
-    Checkpoint,
-    load_checkpoint,
-    require_writable,
-    save_checkpoint,
-    store_checkpoint,
-)
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable, store_checkpoint
 from retrieval.model.config import Config, TrainingConfig, named_config
 from retrieval.model.encode import default_device
 from retrieval.model.fusion import Matcher
+from retrieval.model.losses import LOSSES
+from retrieval.model.losses.loss import EncodedBatch, Loss
+from retrieval.model.losses.match import match_loss
 from retrieval.model.towers.tower import Tower
 from retrieval.training import distributed
 from retrieval.training.batches import FeatureSource, FrozenFeatures, LoadedBatch, TrainedFeatures
 from retrieval.training.calibration.calibrate import calibrate_checkpoint
 from retrieval.training.distil import add_candidate_encoder
 from retrieval.training.features import Features, features_by_image
-from retrieval.training.fit import RATE, Plan, fit, freeze_batch_norm
 from retrieval.training.initial_weights import TOWER_WEIGHTS, build_matcher
 from retrieval.training.licences import training_licences
-from retrieval.training.state import code_digest, load_state, require_no_unfinished_state, save_state, state_path
-from retrieval.training.step import WeightedLosses, batch_loss, pair_logits, shuffle_fingers
+from retrieval.training.loop import (
+    RATE,
+    BestStep,
+    Plan,
+    StateFile,
+    TrainingInterrupted,
+    code_digest,
+    freeze_batch_norm,
+    state_path,
+    train_loop,
+)
 
 
 def train(
@@ -62,23 +62,23 @@ def train(
     config: Config | str = "small",
     *,
     split: Split | None = None,
-    resume: bool = False,
     quiet: bool = False,
 ) -> Checkpoint:
     """Train on a recording and write the checkpoint with the best validation score to `out`.
 
-    Ctrl-C ends after the current step with a usable checkpoint; a second Ctrl-C stops immediately.
+    An unfinished run of `out` continues from the state file next to it. Ctrl-C ends after the current step with a
+    usable checkpoint; a second Ctrl-C stops immediately.
 
     Args:
         recording: A folder, or the result of `robot.read_recording`. It decides the number of fingers.
         out: The checkpoint (.safetensors).
         config: A `Config` (`Config.using` accepts your own towers and losses), or an argument of `load_config`.
         split: Objects of each part. Default: a random split as the configuration sets it.
-        resume: Continue from the state next to `out`.
         quiet: No progress on stderr.
 
     Raises:
-        DatasetError, ConfigError, CheckpointError: Training is not possible with the data or settings.
+        DatasetError, ConfigError, CheckpointError: Training is not possible with the data or settings, or the state
+            file next to `out` belongs to another run.
         JobInterrupted: After Ctrl-C.
 
     >>> import dataclasses
@@ -102,17 +102,22 @@ def train(
     else:
         require_fit(split, grasps)
     source, licences = recording_source(recording), training_licences(recording, settings)
-    trainer = Trainer(config, split, grasps, out, source, licences=licences)
-    if not resume:
-        require_no_unfinished_state(out)
-    else:
-        trainer.resume()
-    trainer.run(quiet)
-    return load_checkpoint(out)
+    return Trainer(config, split, grasps, out, source, licences=licences).run(quiet)
+
+
+_DATA_AND_CODE = ("data_digest", "code")
 
 
 class Trainer:
-    """The state of one training run."""
+    """One training run of a matcher.
+
+    Attributes:
+        matcher: The model.
+        modules: All that is trained: the matcher and the losses.
+        sampler: The pairs of each step.
+        features: Source of the features of images.
+        out: The checkpoint.
+    """
 
     def __init__(
         self,
@@ -130,9 +135,7 @@ class Trainer:
         data.
         """
         settings = config.training
-        self.config, self.split, self.out, self.source = config, split, out, source
-        self.licences = [dataclasses.asdict(licence) for licence in licences]
-        self.data_digest = known.digest if known else data_digest(grasps)
+        self.config, self.split, self.out = config, split, out
         self.device = default_device()
         torch.manual_seed(settings.seed)
         self.config_without_encoder = config.without_candidate_encoder()
@@ -141,27 +144,32 @@ class Trainer:
         self.sampler = self._sampler(split.select(grasps, "train"))
         self.losses = WeightedLosses(settings.weights, self.matcher, len(self.sampler.grasps)).to(self.device)
         self.modules = nn.ModuleDict({"matcher": self.matcher, "losses": self.losses})
-        towers = (module for module in self.matcher.modules() if isinstance(module, Tower))
-        self.code = code_digest(*map(type, (*self.losses.terms, *towers)))
         groups: list[dict[str, Any]] = [{"params": []}, {"params": [], RATE: settings.tower_rate}]
-        for name, parameter in self.modules.named_parameters():
+        for name, parameter in self.matcher.named_parameters():
             if parameter.requires_grad:
-                groups[name.startswith(TOWERS)]["params"].append(parameter)
+                groups[name.startswith(TOWER_WEIGHTS)]["params"].append(parameter)
+        groups[0]["params"] += self.losses.parameters()
         # On a CPU, PyTorch's default optimizer reads every tensor eight times. The fused optimizer reads it once. On
         # CUDA the default optimizer is fast.
         self.optimizer = torch.optim.Adam(groups, lr=settings.learning_rate, fused=self.device.type == "cpu")
+        self.optimizer.register_step_post_hook(lambda *_: self._clamp())
         held_out = split.select(grasps, "validation")
         self.validation = self._sampler(held_out).evaluation_pairs() if split.validation else None
-        stored = features_by_image(grasps, known, self.device) if known else {}
         self.features: FeatureSource = (
-            FrozenFeatures(config, self.device, stored)
+            FrozenFeatures(config, self.device, features_by_image(grasps, known, self.device) if known else {})
             if settings.freeze_towers
             else TrainedFeatures(config, self.device)
         )
         set_training_mode(self.matcher, settings)
+        own = [module for module in self.matcher.modules() if isinstance(module, Tower)]
         for tower in (self.matcher.touch_tower, self.matcher.photo_tower):
             distributed.synchronise_batch_norm(tower, self.device)
-        self.step, self.best = 0, -math.inf
+        self.provenance = {
+            "source": source,
+            LICENCES: [dataclasses.asdict(licence) for licence in licences],
+            "data_digest": known.digest if known else data_digest(grasps),
+            **code_digest(*map(type, (*self.losses.terms, *own))),
+        }
 
     def _sampler(self, chosen: list[Grasp]) -> PairSampler:
         settings = self.config.training
@@ -175,44 +183,77 @@ class Trainer:
             share_photos=shared,
         )
 
-    def run(self, quiet: bool = False) -> None:
-        """Train from the current step to the last."""
-        total = self.config.training.iterations
-        quiet = quiet or distributed.rank() > 0
-        if self.step < total:
-            with interruption() as stop:
-                self._steps(stop, quiet)
-        self._finish(quiet)
+    def _clamp(self) -> None:
+        self.matcher.clamp_scale()
+        self.losses.clamp()
 
-    def _steps(self, stop: threading.Event, quiet: bool) -> None:
-        settings = self.config.training
-        plan = Plan(settings.iterations, settings.learning_rate, settings.schedule, settings.validate_every)
-        steps, touches = range(self.step, plan.steps), settings.touches_per_batch
-        batches = ((step, self.sampler.batch(step, touches)) for step in steps)
-        with Bar("train", plan.steps, "steps", done=self.step, quiet=quiet) as bar:
-            fit(
+    def run(self, quiet: bool = False, *, replace: bool = False) -> Checkpoint:
+        """Train from the first step, or from that of the state file, to the last; write the checkpoint and return it.
+
+        `replace`: replace the state of another run, which is else an error.
+
+        Raises:
+            CheckpointError: The state file belongs to another run.
+            JobInterrupted: After Ctrl-C.
+        """
+        settings, provenance = self.config.training, self.provenance
+        touches, quiet = settings.touches_per_batch, quiet or distributed.rank() > 0
+        identity: dict[str, Any] = {"config": self.config.to_dict(), "split": self.split.to_dict()}
+        identity |= {name: provenance.get(name) for name in _DATA_AND_CODE}
+        state = StateFile(state_path(self.out), identity, is_replaceable=replace)
+        interrupted = None
+        try:
+            best = train_loop(
+                self.modules,
                 self.optimizer,
-                plan,
-                self.features.batches(self.matcher, batches),
+                Plan(settings.iterations, settings.learning_rate, settings.schedule, settings.validate_every),
+                lambda steps: self.features.batches(
+                    self.matcher, ((step, self.sampler.batch(step, touches)) for step in steps)
+                ),
                 distributed.averaging_gradients(self.modules, self.loss),
-                bar=bar,
-                done=self.step,
+                title="train",
+                quiet=quiet,
+                validate=self.validate,
+                state=state,
                 step_context=self.features.step_context,
-                after_step=self._after_step,
-                note=self._note,
-                validate=lambda _: self._validate_and_save(),
-                # All ranks must stop after the same step, or the remaining ranks would wait forever.
-                should_stop=lambda: distributed.any_rank(stop.is_set(), self.device),
             )
-        if self.step < plan.steps:
-            raise JobInterrupted(
-                f"stopped at step {self.step} of {plan.steps}; {self.out} is usable, --resume continues from here"
-            )
+        except TrainingInterrupted as stopped:
+            best, interrupted = stopped.best, f"{stopped} {self.out} can already rank photos."
+        if not distributed.rank():
+            try:
+                made = self._checkpoint(best)
+                store_checkpoint(made, self.out)
+                if not interrupted:
+                    store_checkpoint(self._completed(made, quiet), self.out)
+                    state.path.unlink()
+            except KeyboardInterrupt:
+                interrupted = (
+                    f"Stopped before the last parts were fitted. {self.out} can already rank photos; run the same "
+                    "command to add these parts."
+                )
+        with interruption():
+            is_interrupted = distributed.any_rank(bool(interrupted), self.device)  # wait until the files exist
+        if is_interrupted:
+            raise JobInterrupted(interrupted or "Stopped by another rank; run the same command to continue.")
+        return load_checkpoint(self.out)
 
-    def loss(self, loaded: LoadedBatch) -> Tensor:
-        """Return the loss of a prepared batch."""
+    def run_or_reuse(self, quiet: bool) -> Checkpoint:
+        """Return the finished checkpoint of this run, or run; files of another run are replaced.
+
+        Raises:
+            JobInterrupted: After Ctrl-C; the next call continues.
+        """
+        if self.out.is_file() and not state_path(self.out).exists():
+            stored = load_checkpoint(self.out)
+            same = all(stored.provenance.get(name) == self.provenance.get(name) for name in _DATA_AND_CODE)
+            if same and (stored.config, stored.split) == (self.config, self.split):
+                return stored
+        return self.run(quiet, replace=True)
+
+    def loss(self, step: int, loaded: LoadedBatch) -> Tensor:
+        """Return the loss of a step and its prepared batch."""
         settings = self.config.training
-        torch.manual_seed(settings.seed * 1_000_003 + self.step)  # the dropout mask, the same on every rank
+        torch.manual_seed(settings.seed * 1_000_003 + step)  # the dropout mask, the same on every rank
         touch, photo = self.features.train_features(self.matcher, loaded)
         if settings.shuffle_fingers:
             touch = shuffle_fingers(touch, self.matcher.config.fingers)
@@ -220,113 +261,47 @@ class Trainer:
 
     def feature_loss(self, batch: PairBatch, touch: Tensor, photo: Tensor) -> Tensor:
         """Return the loss of a batch and the features of its touches and photos (`Matcher.touch_features`)."""
-        loss, logits = batch_loss(self.matcher, self.losses, batch, touch, photo)
-        self._last_logits = logits.detach(), batch.labels
-        return loss
+        return batch_loss(self.matcher, self.losses, batch, touch, photo)
 
-    def _after_step(self, done: int) -> None:
-        # Fused steps do not increment the versions of the weights. Without this line, values that were cached from old
-        # weights would seem up to date.
-        increment_version(list(self.matcher.parameters()))
-        self.matcher.clamp_scale()
-        self.losses.clamp()
-        self.step = done
+    @torch.inference_mode()
+    def validate(self) -> dict[str, float]:
+        """Return the metrics of the fixed validation pairs; empty without validation objects."""
+        pairs, matcher = self.validation, self.matcher
+        if pairs is None:
+            return {}
+        matcher.eval()
+        features = self.features.eval_features(matcher, pairs)
+        with self.features.step_context():
+            touch, photo = matcher.touch_encoding(features[0]), matcher.photo_encoding(features[1])
+            logits = matcher.head(touch.partial[pairs.touch_index], photo.partial[pairs.photo_index]).cpu().numpy()
+        set_training_mode(matcher, self.config.training)
+        return {
+            "validation_auc": pair_auc(logits, pairs.labels),
+            "validation_pair_accuracy": pair_accuracy(logits, pairs.labels),
+            "validation_nll": negative_log_likelihood(logits, pairs.labels),
+        }
 
-    def _note(self) -> str:
-        logits, labels = self._last_logits
-        best = "" if math.isinf(self.best) else f"  validation AUC {self.best:.3f}"
-        return f"  accuracy {pair_accuracy(logits.cpu().numpy(), labels):.2f}{best}"
+    def _checkpoint(self, best: BestStep) -> Checkpoint:
+        return Checkpoint(
+            self.out,
+            digest="",
+            config=self.config_without_encoder,
+            provenance={"step": best.step, **self.provenance, "metrics": best.metrics},
+            gel_check=None,
+            verification=None,
+            matcher=self.matcher.eval(),
+            split=self.split,
+        )
 
-    def _finish(self, quiet: bool) -> None:
-        """Complete the best checkpoint on the first rank; after Ctrl-C all ranks stop."""
-        interrupted = False
-        if not distributed.rank():
-            try:
-                self._complete(quiet)
-                state_path(self.out).unlink(missing_ok=True)
-            except KeyboardInterrupt:
-                interrupted = True
-        with interruption():
-            interrupted = distributed.any_rank(interrupted, self.device)  # all ranks wait here until the files exist
-        if interrupted:
-            raise JobInterrupted(
-                f"stopped before the last parts were fitted; {self.out} can rank photos but is not complete. Run the "
-                "same command with --resume to add these parts"
-            )
-
-    def _complete(self, quiet: bool) -> None:
+    def _completed(self, made: Checkpoint, quiet: bool) -> Checkpoint:
         """Add the parts that are fitted after training: candidate encoder, calibrations and gel check."""
         train = [grasp for part in self.sampler.grasps for grasp in part]
         held_out = self.validation.grasps if self.validation else []
-        made = load_checkpoint(self.out)
-        made.matcher.to(self.device)
         if self.config.matcher.candidate_width:
             made = add_candidate_encoder(made, self.config, self.features, train, held_out, quiet=quiet)
         if self.has_images:
             made = calibrate_checkpoint(made, self.features, train, held_out, quiet=quiet)
-        store_checkpoint(made, self.out)
-
-    def _validate_and_save(self) -> None:
-        metrics = self.validate()
-        better = metrics.get("validation_auc", 0.0) > self.best or self.validation is None
-        self.best = max(self.best, metrics.get("validation_auc", -math.inf))
-        if not distributed.rank():
-            if better:
-                self._save_best(metrics)
-            self._save_state()
-        distributed.any_rank(False, self.device)  # all ranks wait here until the files are written
-
-    def validate(self) -> dict[str, float]:
-        """Return the metrics of the fixed validation pairs; empty without validation objects."""
-        if self.validation is None:
-            return {}
-        logits, labels = pair_logits(self.matcher, self.validation, self.features), self.validation.labels
-        set_training_mode(self.matcher, self.config.training)
-        return {
-            "validation_auc": pair_auc(logits, labels),
-            "validation_pair_accuracy": pair_accuracy(logits, labels),
-            "validation_nll": negative_log_likelihood(logits, labels),
-        }
-
-    def _save_best(self, metrics: dict[str, float]) -> None:
-        provenance = {
-            "step": self.step,
-            "source": self.source,
-            LICENCES: self.licences,
-            "data_digest": self.data_digest,
-            "metrics": metrics,
-            **self.code,
-        }
-        save_checkpoint(self.out, self.matcher, self.config_without_encoder, split=self.split, provenance=provenance)
-
-    def _identity(self) -> dict[str, Any]:
-        """Return the settings that must not change between a run and its resumption."""
-        return {
-            "config": self.config.to_dict(),
-            "split": self.split.to_dict(),
-            "data_digest": self.data_digest,
-            **self.code,
-        }
-
-    def _save_state(self) -> None:
-        header = {"step": self.step, "best": None if self.validation is None else self.best, **self._identity()}
-        save_state(self.out, self.modules, self.optimizer, header)
-
-    def resume(self) -> None:
-        """Continue from the state next to `out`. Raises CheckpointError if it belongs to another run."""
-        header = load_state(self.out, self.modules, self.optimizer, self._identity())
-        stored = load_checkpoint(self.out)  # the best checkpoint so far is part of the state
-        mine = (stored.split, stored.provenance.get("data_digest")) == (self.split, self.data_digest)
-        # The configuration changes when the candidate encoder is added.
-        if not mine or stored.config not in (self.config_without_encoder, self.config):
-            raise CheckpointError(
-                f"{self.out} does not belong to the training run to resume; restore its checkpoint or start a new run"
-            )
-        self.step, self.best = header["step"], -math.inf if header["best"] is None else header["best"]
-
-
-TOWERS = tuple(f"matcher.{prefix}" for prefix in TOWER_WEIGHTS)
-"""Prefixes of the names of the towers' weights."""
+        return made
 
 
 def set_training_mode(matcher: Matcher, settings: TrainingConfig) -> None:
@@ -342,3 +317,61 @@ def set_training_mode(matcher: Matcher, settings: TrainingConfig) -> None:
             tower.stem_layers().eval()
     if settings.freeze_batch_norm:
         freeze_batch_norm(matcher)
+
+
+# The loss --------------------------------------------------------------------------------------------------
+
+
+class WeightedLosses(nn.Module):
+    """The losses of a training run whose weight is above 0, with their own parameters."""
+
+    def __init__(self, weights: Mapping[str, float], matcher: Matcher, objects: int) -> None:
+        """Create the losses with a weight above 0.
+
+        Args:
+            weights: Weight of each loss by name.
+            matcher: The model that they train.
+            objects: Number of training objects.
+
+        Raises:
+            ConfigError: A name is unknown.
+        """
+        super().__init__()
+        self.weights = {name: weight for name, weight in weights.items() if weight > 0}
+        dim = matcher.config.embedding_dim
+        self.terms = nn.ModuleList(LOSSES.load(name)(dim, objects) for name in self.weights)
+
+    def forward(self, batch: EncodedBatch) -> list[Tensor]:
+        """Return the weighted losses (scalars) of a batch."""
+        return [weight * term(batch) for weight, term in zip(self.weights.values(), self.terms, strict=True)]
+
+    def clamp(self) -> None:
+        """Clamp the losses' parameters to their ranges."""
+        for term in self.terms:
+            if isinstance(term, Loss):
+                term.clamp()
+
+
+def batch_loss(
+    matcher: Matcher,
+    losses: WeightedLosses,
+    batch: PairBatch,
+    touch_features: Tensor,
+    photo_features: Tensor,
+) -> Tensor:
+    """Return the loss (scalar) of a batch, from features of its distinct touches and photos."""
+    arrays = batch.touch_index, batch.photo_index, batch.labels, batch.touch_objects, batch.photo_objects
+    touch_index, photo_index, labels, *objects = (torch.from_numpy(array).to(touch_features.device) for array in arrays)
+    touch, photo = matcher.touch_encoding(touch_features), matcher.photo_encoding(photo_features)
+    logits = matcher.head(touch.partial[touch_index], photo.partial[photo_index])
+    loss = match_loss(logits, labels)
+    for term in losses(EncodedBatch(matcher, touch, photo, *objects)):
+        loss = loss + term
+    return loss
+
+
+def shuffle_fingers(touch_features: Tensor, fingers: int) -> Tensor:
+    """Return features (B, fingers * F) with the fingers of each touch permuted, drawn by PyTorch's CPU generator."""
+    each = touch_features.view(len(touch_features), fingers, -1)
+    order = torch.rand(len(each), fingers).argsort(dim=1).to(each.device)
+    return torch.take_along_dim(each, order[..., None], dim=1).flatten(1)

@@ -9,9 +9,9 @@ from importlib.util import find_spec
 import pytest
 
 from retrieval.commands.main import main
-from retrieval.errors import BadInput, CheckpointError
+from retrieval.errors import BadInput
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.training.state import state_path
+from retrieval.training.loop import state_path
 from retrieval.training.train import train
 from tests import ray_processes
 from tests.conftest import TINY
@@ -70,13 +70,9 @@ def test_an_error_of_a_rank_is_raised_as_a_clear_error(recording, tmp_path):
         train_on_ray(recording, tmp_path / "m.safetensors", config, workers=1)
 
 
-def test_an_unfinished_training_is_not_overwritten_and_workers_are_one_or_more(recording, tmp_path):
-    out = tmp_path / "m.safetensors"
+def test_workers_are_one_or_more(recording, tmp_path):
     with pytest.raises(BadInput, match="workers must be 1 or more; got 0"):
-        train_on_ray(recording, out, TINY, workers=0)
-    state_path(out).touch()
-    with pytest.raises(CheckpointError, match="continue it with --resume"):
-        train_on_ray(recording, out, TINY)
+        train_on_ray(recording, tmp_path / "m.safetensors", TINY, workers=0)
 
 
 @pytest.mark.parametrize("options", [["--cluster", "--task", "grasp-success"], ["--workers", "2"]])

@@ -260,9 +260,9 @@ def test_a_stopped_run_resumes(run, tmp_path, monkeypatch, made):
 def test_ctrl_c_during_training_prints_how_to_resume(run, tmp_path, monkeypatch):
     loss = Trainer.loss
 
-    def interrupted(self, loaded):
+    def interrupted(self, step, loaded):
         signal.raise_signal(signal.SIGINT)
-        return loss(self, loaded)
+        return loss(self, step, loaded)
 
     monkeypatch.setattr(Trainer, "loss", interrupted)
     with pytest.raises(JobInterrupted, match="run the same command to continue"):

@@ -14,7 +14,7 @@ from retrieval.methods.retrieve_rerank import RetrieveRerank
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.training.features import Features, encode_recording
 from retrieval.training.initial_weights import build_matcher
-from retrieval.training.state import state_path, unfinished_path
+from retrieval.training.loop import state_path
 from retrieval.training.train import Trainer, train
 from tests.conftest import TINY
 
@@ -57,7 +57,7 @@ def encodings(method, part):
 
 
 def no_training(monkeypatch):
-    monkeypatch.setattr(Trainer, "run", lambda *_: pytest.fail("trained"))
+    monkeypatch.setattr(Trainer, "run", lambda *_, **__: pytest.fail("trained"))
 
 
 @torch.inference_mode()
@@ -109,16 +109,16 @@ def stopped(parts, folder, monkeypatch, config=FROZEN):
     """Interrupt a fit in its fourth step, after the state of the third is on disk."""
     loss = Trainer.loss
 
-    def failing(self, loaded):
-        if self.step == 3:
+    def failing(self, step, loaded):
+        if step == 3:
             raise JobInterrupted("power cut")
-        return loss(self, loaded)
+        return loss(self, step, loaded)
 
     with monkeypatch.context() as during:
         during.setattr(Trainer, "loss", failing)
         with pytest.raises(JobInterrupted):
             fit(LateFusion, parts, folder, config)
-    assert state_path(unfinished_path(folder / "late_fusion-0.safetensors")).is_file()
+    assert state_path(folder / "late_fusion-0.safetensors").is_file()
     assert not (folder / "late_fusion-0.safetensors").exists()
 
 
@@ -127,7 +127,7 @@ def test_an_interrupted_fit_continues_and_ends_bit_for_bit_the_same(fitted, part
     fit(LateFusion, parts, tmp_path)
     path = tmp_path / "late_fusion-0.safetensors"
     assert path.read_bytes() == (fitted.settings.folder / path.name).read_bytes()
-    assert not state_path(unfinished_path(path)).exists()
+    assert not state_path(path).exists()
 
 
 @pytest.mark.parametrize("method", [LateFusion, RetrieveRerank])

@@ -12,10 +12,9 @@ from retrieval.errors import BadInput
 from retrieval.model.fusion import Matcher
 from retrieval.model.losses.match import match_loss
 from retrieval.training.batches import TrainedFeatures
-from retrieval.training.step import WeightedLosses, batch_loss
-from retrieval.training.train import set_training_mode
+from retrieval.training.train import WeightedLosses, batch_loss, set_training_mode
 from tests.conftest import TINY
-from tests.retrieval.training.test_train import load, same_weights, trainer_for, with_training
+from tests.retrieval.training.test_train import load, same_weights, stop_after, trainer_for, with_training
 
 # The paper's loss and numbers, on small pictures.
 PAPER = dataclasses.replace(
@@ -54,7 +53,7 @@ def difference(one, other):
 def shared_images(matcher, loaded):
     """Compute gradients like a training step: each distinct image passes through its tower once."""
     touch, photo = matcher.touch_features(loaded.touches), matcher.photo_features(loaded.photos)
-    batch_loss(matcher, WeightedLosses(PAPER.training.weights, matcher, 9), loaded.batch, touch, photo)[0].backward()
+    batch_loss(matcher, WeightedLosses(PAPER.training.weights, matcher, 9), loaded.batch, touch, photo).backward()
 
 
 def pair_by_pair(matcher, loaded):
@@ -90,10 +89,15 @@ def test_any_number_of_workers_gives_the_same_checkpoint(augment, recording, tmp
 
 
 def test_a_training_resumes_with_another_number_of_workers(recording, tmp_path):
-    first, other = (trainer_for(recording, tmp_path / "m.safetensors", with_training(TINY, workers=n)) for n in (0, 2))
-    first._validate_and_save()
-    other.resume()
-    assert same_weights(first.matcher.state_dict(), other.matcher.state_dict())
+    whole, first, other = (
+        trainer_for(recording, tmp_path / f"{name}.safetensors", with_training(TINY, workers=workers))
+        for name, workers in (("whole", 0), ("m", 0), ("m", 2))
+    )
+    whole.run(quiet=True)
+    with pytest.raises(RuntimeError, match="power cut"):
+        stop_after(first, 3)
+    other.run(quiet=True)
+    assert same_weights(whole.matcher.state_dict(), other.matcher.state_dict())
 
 
 def test_an_error_in_a_worker_is_the_plain_error(recording):

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.training.state import state_path
+from retrieval.training.loop import state_path
 from tests import ray_processes
 from tests.retrieval.training.test_train import TINY_TOML
 from tests.waiting import run_process, wait_until
@@ -67,7 +67,7 @@ def test_two_ranks_give_the_results_of_one_process(recording, settings, tmp_path
 
 @pytest.mark.slow
 @pytest.mark.parametrize("victim", [0, -1])
-def test_a_killed_rank_ends_the_job_and_resume_continues_it(victim, recording, settings, tmp_path):
+def test_a_killed_rank_ends_the_job_and_the_same_command_continues_it(victim, recording, settings, tmp_path):
     out, config = tmp_path / "m.safetensors", settings(iterations=100_000, validate_every=5)
     with run_process(command(recording, out, config), env=ENVIRONMENT) as process:
         wait_until(lambda: state_path(out).exists() or process.poll() is not None, limit_s=240)
@@ -78,9 +78,9 @@ def test_a_killed_rank_ends_the_job_and_resume_continues_it(victim, recording, s
     assert process.returncode != 0
     assert not set(ranks) & set(ray_processes.parents())
     state = state_path(out).stat().st_mtime_ns
-    with run_process([*command(recording, out, config), "--resume"], env=ENVIRONMENT) as process:
+    with run_process(command(recording, out, config), env=ENVIRONMENT) as process:
         wait_until(lambda: state_path(out).stat().st_mtime_ns != state or process.poll() is not None, limit_s=240)
         assert process.poll() is None, process.stderr.read()
         process.send_signal(signal.SIGINT)
         _, output = process.communicate(timeout=240)
-    assert "--resume continues from here" in output
+    assert "run the same command to continue" in output

@@ -26,9 +26,8 @@ from retrieval.model.losses.match import match_loss
 from retrieval.training import distributed
 from retrieval.training.batches import FrozenFeatures, TrainedFeatures
 from retrieval.training.initial_weights import build_matcher
-from retrieval.training.state import state_path
-from retrieval.training.step import WeightedLosses, batch_loss, shuffle_fingers
-from retrieval.training.train import Trainer, set_training_mode, train
+from retrieval.training.loop import state_path
+from retrieval.training.train import Trainer, WeightedLosses, batch_loss, set_training_mode, shuffle_fingers, train
 from tests.conftest import TINY
 from tests.waiting import run_process, wait_until
 
@@ -62,7 +61,7 @@ def test_each_distinct_image_passes_through_its_tower_once(recording, tmp_path, 
         tower.register_forward_hook(
             lambda _, images, __, name=name: counts.update({name: counts[name] + len(images[0])})
         )
-    trainer.loss(load(trainer.features, batch))
+    trainer.loss(0, load(trainer.features, batch))
     assert counts == {"touch": 2 * 4, "photo": len(set(batch.photos))}
 
 
@@ -76,7 +75,7 @@ def test_the_loss_of_a_batch_is_the_mean_over_its_single_pairs(recording):
     source = TrainedFeatures(config, CPU)
     loaded = load(source, sampler.batch(0, 3))
     losses = WeightedLosses(config.training.weights, matcher, 9)
-    loss, logits = batch_loss(matcher, losses, loaded.batch, *source.train_features(matcher, loaded))
+    loss = batch_loss(matcher, losses, loaded.batch, *source.train_features(matcher, loaded))
     batch = loaded.batch
     one_by_one = torch.cat(
         [
@@ -84,7 +83,6 @@ def test_the_loss_of_a_batch_is_the_mean_over_its_single_pairs(recording):
             for touch, photo in zip(batch.touch_index, batch.photo_index, strict=True)
         ]
     )
-    torch.testing.assert_close(logits, one_by_one, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(loss, match_loss(one_by_one, torch.from_numpy(batch.labels)), rtol=1e-5, atol=1e-6)
 
 
@@ -97,8 +95,9 @@ def test_each_loss_is_added_with_its_weight(recording):
     loaded = load(source, PairSampler(load_grasps(recording), seed=0).batch(0, 3))
     features = [part.detach() for part in source.train_features(matcher, loaded)]
     matcher.eval()
-    loss, logits = batch_loss(matcher, WeightedLosses(config.training.weights, matcher, 9), loaded.batch, *features)
+    loss = batch_loss(matcher, WeightedLosses(config.training.weights, matcher, 9), loaded.batch, *features)
     touch, photo = matcher.touch_encoding(features[0]), matcher.photo_encoding(features[1])
+    logits = matcher.head(touch.partial[loaded.batch.touch_index], photo.partial[loaded.batch.photo_index])
     objects = torch.from_numpy(loaded.batch.touch_objects), torch.from_numpy(loaded.batch.photo_objects)
     expected = match_loss(logits, torch.from_numpy(loaded.batch.labels))
     expected = expected + 0.3 * contrastive_loss(touch.embedding, photo.embedding, *objects, matcher.log_scale)
@@ -140,7 +139,6 @@ def test_a_loss_with_parameters_resumes_bit_for_bit(recording, tmp_path):
     with pytest.raises(RuntimeError, match="power cut"):
         stop_after(broken, 3)
     resumed = trainer_for(recording, parts, OWN)
-    resumed.resume()
     resumed.run(quiet=True)
     assert same_weights(whole.losses.state_dict(), resumed.losses.state_dict())
     assert same_weights(whole.matcher.state_dict(), resumed.matcher.state_dict())
@@ -170,11 +168,8 @@ def test_a_resumed_training_gives_the_bits_of_an_uninterrupted_one(recording, tm
     with pytest.raises(RuntimeError, match="power cut"):
         stop_after(broken, 3)
     resumed = trainer_for(recording, parts)
-    resumed.resume()
-    assert resumed.step == 3
     resumed.run(quiet=True)
     assert same_weights(whole.matcher.state_dict(), resumed.matcher.state_dict())
-    assert whole.best == resumed.best
     assert (tmp_path / "a.safetensors").read_bytes() == parts.read_bytes()
     assert not state_path(parts).exists()
 
@@ -187,14 +182,7 @@ WITHOUT_ENCODER = dataclasses.replace(WITH_ENCODER, matcher=TINY.matcher)
 
 def test_a_candidate_encoder_is_distilled_after_the_last_step_and_queries_are_stored(recording, tmp_path):
     trainer = trainer_for(recording, tmp_path / "m.safetensors", WITH_ENCODER)
-    with pytest.raises(RuntimeError, match="power cut"):
-        stop_after(trainer, 4)
-    underway = load_checkpoint(trainer.out)
-    assert underway.config == WITHOUT_ENCODER
-    assert underway.queries is None
-    trainer = trainer_for(recording, trainer.out, WITH_ENCODER)
-    trainer.run(quiet=True)
-    made = load_checkpoint(trainer.out)
+    made = trainer.run(quiet=True)
     assert made.config == WITH_ENCODER
     assert made.matcher.candidate_encoder is not None
     assert made.queries.shape == (len(trainer.validation.grasps), WITH_ENCODER.matcher.partial_width)
@@ -242,8 +230,7 @@ def test_a_power_cut_after_the_last_step_changes_no_bit(where, recording, tmp_pa
         where == "before the state is deleted"
     )
     resumed = trainer_for(recording, broken.out, WITH_ENCODER)
-    resumed.resume()
-    assert resumed.step == WITH_ENCODER.training.iterations
+    resumed.loss = lambda *_: pytest.fail("made a step")
     resumed.run(quiet=True)
     assert (tmp_path / "a.safetensors").read_bytes() == broken.out.read_bytes()
     assert not state_path(broken.out).exists()
@@ -257,7 +244,7 @@ def test_ctrl_c_after_the_last_step_leaves_a_usable_checkpoint_that_resuming_com
     train(recording, whole, WITH_ENCODER, quiet=True)
     module, name = step.split(".")
     function = getattr(import_module(f"retrieval.training.{module}"), name)
-    message = r"before the last parts were fitted; .* can rank photos but is not complete. Run the same .* --resume"
+    message = r"can already rank photos; run the same command"
     with monkeypatch.context() as interrupting:
         interrupting.setattr(f"retrieval.training.{step}", interrupted_before(function))
         with pytest.raises(JobInterrupted, match=message):
@@ -265,7 +252,7 @@ def test_ctrl_c_after_the_last_step_leaves_a_usable_checkpoint_that_resuming_com
     left = load_checkpoint(broken)
     assert (left.config, left.posterior) == (WITHOUT_ENCODER, None)
     assert state_path(broken).exists()
-    made = train(recording, broken, WITH_ENCODER, resume=True, quiet=True)
+    made = train(recording, broken, WITH_ENCODER, quiet=True)
     assert made.config == WITH_ENCODER
     assert made.posterior is not None
     assert whole.read_bytes() == broken.read_bytes()
@@ -286,31 +273,21 @@ def stop_after(trainer, steps):
     """Run and fail like a power cut in the step after `steps`, when the state of that step is on disk."""
     loss = trainer.loss
 
-    def failing(loaded):
-        if trainer.step == steps:
+    def failing(step, loaded):
+        if step == steps:
             raise RuntimeError("power cut")
-        return loss(loaded)
+        return loss(step, loaded)
 
     trainer.loss = failing
     trainer.run(quiet=True)
 
 
-def test_an_unfinished_training_is_neither_overwritten_nor_resumed_by_another(recording, tmp_path):
+def test_an_unfinished_training_is_neither_overwritten_nor_continued_by_another(recording, tmp_path):
     out = tmp_path / "m.safetensors"
     with pytest.raises(RuntimeError, match="power cut"):
         stop_after(trainer_for(recording, out), 3)
-    with pytest.raises(CheckpointError, match="--resume"):
-        train(recording, out, TINY, quiet=True)
-    with pytest.raises(CheckpointError, match="another config"):
-        train(recording, out, with_training(TINY, learning_rate=1e-4), resume=True, quiet=True)
-    out.unlink()
-    with pytest.raises(CheckpointError, match="no checkpoint"):
-        train(recording, out, TINY, resume=True, quiet=True)
-
-
-def test_resuming_without_a_state_is_an_error(recording, tmp_path):
-    with pytest.raises(CheckpointError, match="there is no"):
-        train(recording, tmp_path / "m.safetensors", TINY, resume=True, quiet=True)
+    with pytest.raises(CheckpointError, match=r"another config; .* delete the file"):
+        train(recording, out, with_training(TINY, learning_rate=1e-4), quiet=True)
 
 
 def test_ctrl_c_leaves_a_usable_checkpoint_and_a_state_to_resume(recording, tmp_path):
@@ -319,17 +296,16 @@ def test_ctrl_c_leaves_a_usable_checkpoint_and_a_state_to_resume(recording, tmp_
     )
     loss = trainer.loss
 
-    def interrupted(loaded):
-        if trainer.step == 1:
+    def interrupted(step, loaded):
+        if step == 1:
             os.kill(os.getpid(), signal.SIGINT)
-        return loss(loaded)
+        return loss(step, loaded)
 
     trainer.loss = interrupted
-    with pytest.raises(JobInterrupted, match="stopped at step 2 of 1000"):
+    with pytest.raises(JobInterrupted, match=r"step 2 of 1000.*run the same command to continue"):
         trainer.run(quiet=True)
     assert load_checkpoint(tmp_path / "m.safetensors").provenance["step"] == 2
     assert state_path(tmp_path / "m.safetensors").exists()
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_frozen_towers_encode_each_image_once_and_do_not_change(recording, tmp_path):
@@ -397,9 +373,8 @@ from retrieval.training.batches import TrainedFeatures
 from retrieval.data.dataset import load_grasps
 from retrieval.data.pairs import PairSampler
 from retrieval.model.losses.contrastive import contrastive_loss
-from retrieval.training.step import WeightedLosses, batch_loss
 from retrieval.training.initial_weights import build_matcher
-from retrieval.training.train import set_training_mode
+from retrieval.training.train import WeightedLosses, batch_loss, set_training_mode
 from tests.conftest import TINY
 from tests.retrieval.training.test_train import load, with_training
 
@@ -428,7 +403,7 @@ def loss(loaded):
     touch, photo = source.train_features(matcher, loaded)
     if sys.argv[3] == "contrast":
         return contrastive(touch, photo, batch.touch_objects, batch.photo_objects)
-    return batch_loss(matcher, losses, batch, touch, photo)[0]
+    return batch_loss(matcher, losses, batch, touch, photo)
 
 
 source = TrainedFeatures(config, torch.device("cpu"))
@@ -539,7 +514,7 @@ def test_two_ranks_train_from_the_command_line_and_stop_together(recording, tmp_
         wait_until(lambda: state_path(out).exists() or process.poll() is not None, limit_s=240)
         process.send_signal(signal.SIGINT)
         _, output = process.communicate(timeout=240)
-    assert "--resume continues from here" in output
+    assert "run the same command to continue" in output
     stopped = read_tensors(state_path(out))[1]["step"]
     assert stopped > 0
     # In a new, short training, no rank finds files before the other has written them.
@@ -586,7 +561,7 @@ def test_a_killed_training_resumes_from_its_last_state(recording, tmp_path):
     with run_process(command) as process:
         wait_until(lambda: state_path(out).exists() or process.poll() is not None, limit_s=240)
     assert state_path(out).exists()
-    done = subprocess.run([*command, "--resume"], capture_output=True, text=True, timeout=240, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stderr
     assert load_checkpoint(out).provenance["step"] > 0
 

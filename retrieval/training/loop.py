@@ -1,0 +1,261 @@
+"""The training loop of everything that is trained by gradient descent, and its state file.
+
+A step depends only on its number, the seed and the state. So a run that is stopped and continued on the same machine
+gives the same bits as an uninterrupted run.
+"""
+
+import hashlib
+import inspect
+import json
+import math
+import sys
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor, nn
+from torch.autograd.graph import increment_version
+
+from retrieval.console.interruption import interruption
+from retrieval.console.progress import Bar
+from retrieval.errors import CheckpointError, JobInterrupted, NumericalError
+from retrieval.model.checkpoint import load_weights, read_tensors, sibling_file, write_tensors
+from retrieval.model.config import SCHEDULES
+from retrieval.training import distributed
+
+Batch = TypeVar("Batch")
+RATE = "rate"
+"""Key of a parameter group: the ratio of its learning rate to that of the plan; 1 without this key."""
+_MODULE, _OPTIMIZER, _BEST = "module.", "optimizer.", "best."
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Length and learning rate of a training run.
+
+    Attributes:
+        steps: Number of optimiser steps.
+        learning_rate: Learning rate of the first step.
+        schedule: Name of the learning rate's schedule (`retrieval.model.config.SCHEDULES`).
+        validate_every: Number of steps between two validations, and between two states; the last step has both.
+    """
+
+    steps: int
+    learning_rate: float
+    schedule: str = "cosine"
+    validate_every: int = 1
+
+
+@dataclass(frozen=True)
+class BestStep:
+    """The step whose weights a training run returns.
+
+    Attributes:
+        step: Number of completed steps.
+        metrics: Result of its validation; the first value is the score, higher is better. Empty without validation:
+            then the last step is the best one.
+    """
+
+    step: int = 0
+    metrics: dict[str, float] = field(default_factory=dict)
+
+
+class TrainingInterrupted(JobInterrupted):
+    """Ctrl-C stopped a run, whose state is stored; `best` is the best step so far, with its weights in the module."""
+
+    def __init__(self, message: str, best: BestStep) -> None:
+        super().__init__(message)
+        self.best = best
+
+
+@dataclass(frozen=True)
+class StateFile:
+    """The file of an unfinished run: all weights, those of the best step, the optimiser, and the step.
+
+    Attributes:
+        path: The file (`state_path`).
+        identity: All that determines the run, in JSON types; a run with another identity cannot be continued.
+        is_replaceable: Whether a state that cannot be continued is replaced.
+    """
+
+    path: Path
+    identity: Mapping[str, Any]
+    is_replaceable: bool = False
+
+
+def state_path(out: Path) -> Path:
+    """Return the file of an unfinished training run of the checkpoint `out`."""
+    return sibling_file(out, ".state.safetensors")
+
+
+def train_loop(
+    module: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    plan: Plan,
+    batches: Callable[[range], Iterable[Batch]],
+    loss: Callable[[int, Batch], Tensor],
+    *,
+    title: str,
+    quiet: bool = False,
+    validate: Callable[[], dict[str, float]] | None = None,
+    state: StateFile | None = None,
+    step_context: Callable[[], AbstractContextManager[Any]] = nullcontext,
+) -> BestStep:
+    """Minimise the loss of batches, one batch a step, and leave the weights of the best step in `module`.
+
+    With a state file the run continues from it, and the first Ctrl-C ends the run after the current step. All ranks
+    (`retrieval.training.distributed`) must then call this function together.
+
+    Args:
+        module: All that is trained.
+        optimizer: The optimiser of its parameters.
+        plan: Length and learning rate of the run.
+        batches: Returns the batches of steps.
+        loss: Returns the loss (scalar) of a step, given its number from 0 and its batch.
+        title: What the progress bar shows.
+        quiet: No progress on stderr.
+        validate: Returns the metrics of `BestStep`, and leaves the module in training mode.
+        state: Where an unfinished run is stored; None for a short run.
+        step_context: Context of each step.
+
+    Raises:
+        NumericalError: The loss is not finite; no parameter has changed in this step.
+        CheckpointError: The state file is damaged or belongs to another run.
+        TrainingInterrupted: After Ctrl-C.
+    """
+    done, best, best_weights = 0, BestStep(), dict[str, Tensor]()
+    if state and state.path.exists():
+        try:
+            done, best, best_weights = _load(state, module, optimizer)
+        except CheckpointError:
+            if not state.is_replaceable:
+                raise
+    is_stopped = False
+    with (
+        interruption() if state else nullcontext(threading.Event()) as stop,
+        Bar(title, plan.steps, "steps", done=done, quiet=quiet) as bar,
+    ):
+        for batch in batches(range(done, plan.steps)):
+            for group in optimizer.param_groups:
+                group["lr"] = plan.learning_rate * group.get(RATE, 1.0) * SCHEDULES[plan.schedule](done, plan.steps)
+            with step_context():
+                optimizer.zero_grad(set_to_none=True)
+                current = loss(done, batch)
+                value = current.item()
+                if not math.isfinite(value):
+                    raise NumericalError(
+                        f"the loss must stay finite; {title}, step {done}, gave {value}; lower learning_rate, or "
+                        "report this if there is no such setting"
+                    )
+                current.backward()  # type: ignore[no-untyped-call]
+                optimizer.step()
+            # Fused optimisers do not increment the versions of the weights. Without this line, values that were cached
+            # from old weights would seem up to date.
+            increment_version(list(module.parameters()))
+            done += 1
+            bar.advance(note=f"loss {value:.3f}{_best_note(best)}")
+            # All ranks must stop after the same step, or the remaining ranks would wait forever.
+            is_stopped = state is not None and distributed.any_rank(stop.is_set(), current.device)
+            if is_stopped or done % plan.validate_every == 0 or done == plan.steps:
+                metrics = validate() if validate else {}
+                if not metrics:
+                    best = BestStep(done)
+                elif not best.metrics or _score(metrics) > _score(best.metrics):
+                    best = BestStep(done, metrics)
+                    best_weights = {name: tensor.clone() for name, tensor in module.state_dict().items()}
+                if state:
+                    if not distributed.rank():
+                        _save(state, module, optimizer, done, best, best_weights)
+                    distributed.any_rank(False, current.device)  # all ranks wait here until the file is written
+            if is_stopped:
+                break
+    if best_weights:
+        module.load_state_dict(best_weights)
+    if state and is_stopped:
+        raise TrainingInterrupted(
+            f"Stopped at step {done} of {plan.steps}. The state is stored in {state.path}; run the same command to "
+            "continue.",
+            best,
+        )
+    return best
+
+
+def _score(metrics: Mapping[str, float]) -> float:
+    return next(iter(metrics.values()))
+
+
+def _best_note(best: BestStep) -> str:
+    return "".join(f"  best {name.replace('_', ' ')} {value:.3f}" for name, value in [*best.metrics.items()][:1])
+
+
+def freeze_batch_norm(module: nn.Module) -> None:
+    """Put every batch normalisation of a module into evaluation mode: it uses its statistics and keeps them."""
+    for part in module.modules():
+        if isinstance(part, nn.BatchNorm2d):
+            part.eval()
+
+
+# The state -------------------------------------------------------------------------------------------------
+
+
+def _save(
+    state: StateFile,
+    module: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    done: int,
+    best: BestStep,
+    best_weights: Mapping[str, Tensor],
+) -> None:
+    tensors = {f"{_MODULE}{name}": tensor for name, tensor in module.state_dict().items()}
+    tensors |= {f"{_BEST}{name}": tensor for name, tensor in best_weights.items()}
+    for name, parameter in module.named_parameters():
+        for quantity, tensor in optimizer.state.get(parameter, {}).items():
+            tensors[f"{_OPTIMIZER}{name}.{quantity}"] = tensor
+    header = {"step": done, "best_step": best.step, "metrics": best.metrics, "identity": state.identity}
+    write_tensors(state.path, tensors, header)
+
+
+def _load(
+    state: StateFile, module: nn.Module, optimizer: torch.optim.Optimizer
+) -> tuple[int, BestStep, dict[str, Tensor]]:
+    """Load a state into `module` and `optimizer`; return the completed steps, the best one, and its weights."""
+    tensors, header = read_tensors(state.path)
+    stored = header["identity"]
+    for name, value in json.loads(json.dumps(state.identity)).items():
+        if stored.get(name) != value:
+            raise CheckpointError(
+                f"{state.path} belongs to an unfinished training run with another {name.replace('_', ' ')}; repeat the "
+                "command of that run to continue it, or delete the file to start a new one"
+            )
+
+    def part(prefix: str) -> dict[str, Tensor]:
+        return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
+
+    load_weights(module, part(_MODULE))
+    for name, parameter in module.named_parameters():
+        if quantities := part(f"{_OPTIMIZER}{name}."):  # PyTorch keeps the step count on the CPU
+            optimizer.state[parameter] = {
+                quantity: tensor if quantity == "step" else tensor.to(parameter.device)
+                for quantity, tensor in quantities.items()
+            }
+    return header["step"], BestStep(header["best_step"], header["metrics"]), part(_BEST)
+
+
+def code_digest(*classes: type) -> dict[str, str]:
+    """Return {"code": SHA-256} of the source of classes outside this project, or {} without any.
+
+    So an edited loss or method is fitted again. The source is that of the module, or of the class for a notebook.
+    """
+    sources = []
+    for each in classes:
+        if not each.__module__.startswith("retrieval."):
+            module = sys.modules[each.__module__]
+            try:
+                sources.append(inspect.getsource(module if getattr(module, "__file__", None) else each))
+            except (OSError, TypeError):  # typed into an interpreter, without source
+                sources.append(each.__qualname__)
+    return {"code": hashlib.sha256("\n".join(sources).encode()).hexdigest()} if sources else {}

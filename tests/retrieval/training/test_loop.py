@@ -1,0 +1,136 @@
+"""The training loop: learning rates, validation, the best step, the state file."""
+
+import math
+import os
+import signal
+from itertools import pairwise
+
+import pytest
+import torch
+
+from retrieval.errors import CheckpointError, JobInterrupted, NumericalError
+from retrieval.model.config import SCHEDULES
+from retrieval.training.loop import RATE, Plan, StateFile, train_loop
+
+
+def descend(plan, loss=None, module=None, **options):
+    """Train one weight from 0 on a slope of 1; return the weight after each step, and the result of the loop."""
+    module = module or torch.nn.ParameterList([torch.nn.Parameter(torch.zeros(1))])
+    optimizer, weights = torch.optim.Adam(module.parameters()), []
+    optimizer.register_step_post_hook(lambda *_: weights.append(module[0].item()))
+    best = train_loop(
+        module,
+        optimizer,
+        plan,
+        lambda steps: steps,
+        loss or (lambda step, _: module[0].sum()),
+        title="fit",
+        quiet=True,
+        **options,
+    )
+    return weights, best
+
+
+@pytest.mark.parametrize(
+    ("schedule", "factors"),
+    [
+        ("constant", [1, 1, 1, 1]),
+        ("cosine", [1, (1 + math.sqrt(0.5)) / 2, 0.5, (1 - math.sqrt(0.5)) / 2]),
+        ("halving", [1, 0.5, 0.25, 0.125]),
+    ],
+)
+def test_each_step_has_the_learning_rate_of_its_schedule_and_group(schedule, factors):
+    weight, other = (torch.nn.Parameter(torch.zeros(1)) for _ in range(2))
+    optimizer, weights = torch.optim.SGD([{"params": [weight]}, {"params": [other], RATE: 0.5}]), [0.0]
+    optimizer.register_step_post_hook(lambda *_: weights.append(weight.item()))
+    module = torch.nn.ParameterList([weight, other])
+    loss = lambda step, _: weight.sum() + other.sum()  # noqa: E731
+    best = train_loop(module, optimizer, Plan(4, 0.1, schedule), lambda steps: steps, loss, title="fit", quiet=True)
+    changes = [before - after for before, after in pairwise(weights)]
+    assert changes == pytest.approx([0.1 * factor for factor in factors], rel=1e-5)
+    assert other.item() == pytest.approx(weight.item() / 2)
+    assert (best.step, best.metrics) == (4, {})
+
+
+def test_every_schedule_starts_at_the_full_rate():
+    assert {name: factor(0, 7) for name, factor in SCHEDULES.items()} == dict.fromkeys(SCHEDULES, 1.0)
+
+
+def test_a_loss_that_is_not_finite_stops_before_the_step_and_names_the_remedy():
+    module = torch.nn.ParameterList([torch.nn.Parameter(torch.zeros(1))])
+    with pytest.raises(NumericalError, match=r"step 0, gave inf; lower learning_rate"):
+        descend(Plan(2, 0.1), lambda *_: module[0].sum() + math.inf, module)
+    assert module[0].item() == 0
+
+
+def test_the_weights_of_the_best_step_are_restored_not_the_last():
+    """Validation follows every second step and the last one; among equal scores the first step is the best."""
+    module = torch.nn.ParameterList([torch.nn.Parameter(torch.zeros(1))])
+    scores, validated = iter([0.6, 0.9, 0.9, 0.3]), []
+
+    def validate():
+        validated.append(module[0].item())
+        return {"score": next(scores), "other": 1.0 - len(validated)}
+
+    weights, best = descend(Plan(7, 0.1, validate_every=2), module=module, validate=validate)
+    assert validated == [weights[1], weights[3], weights[5], weights[6]]
+    assert (best.step, best.metrics) == (4, {"score": 0.9, "other": -1.0})
+    assert module[0].item() == validated[1] != validated[3]
+
+
+def power_cut(at):
+    """Return a loss that fails in step `at`."""
+
+    def loss(step, _):
+        if step == at:
+            raise RuntimeError("power cut")
+        return module[0].square().sum() - module[0].sum()
+
+    module = torch.nn.ParameterList([torch.nn.Parameter(torch.zeros(1))])
+    return loss, module
+
+
+def run(path, at=None, validations=None, **identity):
+    loss, module = power_cut(at)
+    scores = iter([0.6, 0.9, 0.1][3 - validations if validations else 0 :])
+    validate = lambda: {"score": next(scores)}  # noqa: E731
+    weights, best = descend(
+        Plan(6, 0.1, validate_every=2), loss, module, validate=validate, state=StateFile(path, identity)
+    )
+    return weights, best, module[0].item()
+
+
+def test_a_run_continues_from_its_state_with_the_bits_of_an_uninterrupted_run(tmp_path):
+    """The best step may lie before the cut: its weights are in the state."""
+    weights, best, last = run(tmp_path / "whole.safetensors")
+    path = tmp_path / "cut.safetensors"
+    with pytest.raises(RuntimeError, match="power cut"):
+        run(path, at=5)
+    assert run(path, validations=1) == (weights[4:], best, last)
+    assert best.step == 4
+    assert run(path) == ([], best, last)  # a finished run makes no step
+
+
+def test_ctrl_c_ends_after_the_current_step_which_is_validated_and_stored(tmp_path):
+    state, (_, module) = StateFile(tmp_path / "s.safetensors", {}), power_cut(None)
+
+    def loss(step, _):
+        if step == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+        return module[0].sum()
+
+    with pytest.raises(JobInterrupted, match=r"step 3 of 9.*run the same command") as stopped:
+        descend(Plan(9, 0.1, validate_every=5), loss, module, validate=lambda: {"score": 0.5}, state=state)
+    assert stopped.value.best.step == 3
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert len(descend(Plan(9, 0.1, validate_every=5), module=module, state=state)[0]) == 6
+
+
+def test_the_state_of_another_run_is_an_error_or_replaced(tmp_path):
+    path = tmp_path / "s.safetensors"
+    with pytest.raises(RuntimeError, match="power cut"):
+        run(path, at=5, config={"seed": 0})
+    with pytest.raises(CheckpointError, match=r"another config; .* delete the file"):
+        run(path, config={"seed": 1})
+    replaceable = StateFile(path, {"config": {"seed": 1}}, is_replaceable=True)
+    assert len(descend(Plan(6, 0.1), state=replaceable)[0]) == 6
