@@ -52,7 +52,7 @@ from indexes.store.rows import Row
 from retrieval.commands.main import main as retrieve
 from retrieval.data.dataset import load_grasps
 from retrieval.frontier.kinds import STRUCTURES
-from retrieval.metrics.k_way import binomial_interval
+from retrieval.metrics.intervals import binomial_interval
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.fusion import scorer_of
 from retrieval.model.fusion_scorer import FusionScorer

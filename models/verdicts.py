@@ -32,7 +32,7 @@ from retrieval.console.progress import Bar
 from retrieval.data.dataset import load_grasps
 from retrieval.data.images import read_rgb
 from retrieval.data.resize import RgbImage
-from retrieval.metrics.k_way import binomial_interval
+from retrieval.metrics.intervals import binomial_interval
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import for_inference, photo_features, touch_batch
 from retrieval.model.fusion import scorer_of

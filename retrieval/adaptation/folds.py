@@ -12,8 +12,8 @@ from retrieval.data.dataset import Grasp, linked_objects
 from retrieval.errors import BadInput
 from retrieval.methods.cca_towers import CcaProjections, CcaSelection, CcaSettings, select_settings
 from retrieval.methods.selection import held_out_folds
-from retrieval.metrics.k_way import k_way_accuracies
 from retrieval.metrics.measure import Measure, pooled
+from retrieval.metrics.ranking import k_way_accuracies
 from retrieval.training.features import Features
 
 GALLERY = 9

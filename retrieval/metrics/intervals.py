@@ -13,6 +13,13 @@ object means, and for proportions drawn as Beta(2.8, 1.2) and counted in 20 quer
     proportion  56   76   89   91   92   94   95   95   94 %
 
 So results set `few_objects` for fewer than 5, and every table marks these intervals.
+
+Values over several random splits into training and test objects: splits that share objects are not independent, so the
+spread of their values alone gives intervals that are far too narrow. The variance of their mean is estimated as
+`(1 / J + test / train) * s^2` (the corrected resampled t-test; Nadeau and Bengio 2003, Machine Learning 52, eq. 15),
+with J splits, s^2 the variance of their values, and test and train the numbers of objects of a split. It covers other
+test objects AND other training objects from the same collection. It does not cover another sensor, nor classes that the
+collection lacks.
 """
 
 from collections.abc import Sequence
@@ -20,7 +27,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm, t
+from scipy.special import betaincinv, ndtr, stdtr, stdtrit
 
 from retrieval.errors import BadInput
 from retrieval.metrics.measure import Measure
@@ -95,7 +102,7 @@ def bootstrap_interval(
     if count < 2:
         return np.full(means.shape[1], -np.inf), np.full(means.shape[1], np.inf)
     drawn = np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=draws)
-    tail = norm.cdf(-np.sqrt(count / (count - 1)) * t.ppf((1 + LEVEL) / 2, count - 1))
+    tail = ndtr(-np.sqrt(count / (count - 1)) * stdtrit(count - 1, (1 + LEVEL) / 2))
     low, high = np.quantile(drawn @ means / count, (tail, 1 - tail), axis=0)
     same = (means == means[:1]).all(0)  # a sum of equal numbers is rounded; the interval of equal means must not be
     return np.where(same, means[0], low), np.where(same, means[0], high)
@@ -153,3 +160,117 @@ def _flipped_sums(differences: NDArray[np.float64]) -> NDArray[np.float64]:
     for difference in differences[1:]:
         sums = np.concatenate([sums + difference, sums - difference])
     return sums
+
+
+# Splits ----------------------------------------------------------------------------------------------------
+
+
+def summarise_splits(splits: Sequence[Measure], ratio: float) -> dict[str, Any]:
+    """Return the "summary" of results.json over splits.
+
+    Args:
+        splits: One measure per split.
+        ratio: Test objects per training object of a split.
+
+    Returns:
+        The keys of `summarise`, with "by_split" [[m], ...], "min" and "max" [m] in place of "by_seed".
+
+    Raises:
+        BadInput: There are fewer than two splits.
+    """
+    means = _means(splits)
+    value, margin = means.mean(0), _margin(means, ratio)
+    return {
+        "value": value.tolist(),
+        "low": np.clip(value - margin, 0, 1).tolist(),
+        "high": np.clip(value + margin, 0, 1).tolist(),
+        "min": means.min(0).tolist(),
+        "max": means.max(0).tolist(),
+        "chance": np.mean([one.chance for one in splits], axis=0).tolist(),
+        "queries": sum(len(one.owner) for one in splits),
+        "objects": len(np.unique(np.concatenate([one.owner for one in splits]))),
+        "few_objects": len(splits) < FEW_OBJECTS,
+        "gallery": splits[0].gallery,
+        "by_split": means.tolist(),
+    }
+
+
+def compare_splits(a: Sequence[Measure], b: Sequence[Measure], ratio: float, *, column: int = 0) -> dict[str, Any]:
+    """Compare two methods on the same splits, paired by split.
+
+    Args:
+        a: Measures of the first method, one per split.
+        b: Measures of the second.
+        ratio: Test objects per training object of a split.
+        column: Column of the values; of a top-n curve, 0 is the top-1 accuracy.
+
+    Returns:
+        {"difference": a - b, "low", "high", "min", "max", "few_objects", "p"}; p is that of the corrected t-test,
+        two-sided.
+
+    Raises:
+        BadInput: There are fewer than two splits.
+    """
+    differences = (_means(a) - _means(b))[:, [column]]
+    value, margin = float(differences.mean()), float(_margin(differences, ratio)[0])
+    scale = margin / stdtrit(len(differences) - 1, (1 + LEVEL) / 2)
+    p = float(2 * stdtr(len(differences) - 1, -abs(value) / scale)) if scale else float(value == 0)
+    return {
+        "difference": value,
+        "low": max(value - margin, -1.0),
+        "high": min(value + margin, 1.0),
+        "min": float(differences.min()),
+        "max": float(differences.max()),
+        "few_objects": len(differences) < FEW_OBJECTS,
+        "p": p,
+    }
+
+
+def _means(splits: Sequence[Measure]) -> NDArray[np.float64]:
+    """Return the values (J, m) of the splits, with objects of equal weight."""
+    if len(splits) < 2:
+        raise BadInput(f"a spread over splits needs at least two splits; got {len(splits)}")
+    return np.array([one.by_object()[1].mean(0) for one in splits])
+
+
+def _margin(means: NDArray[np.float64], ratio: float) -> NDArray[np.float64]:
+    count = len(means)
+    spread = np.sqrt((1 / count + ratio) * means.var(0, ddof=1))
+    return np.asarray(stdtrit(count - 1, (1 + LEVEL) / 2) * spread)
+
+
+# Proportions -----------------------------------------------------------------------------------------------
+
+
+def grouped_interval(correct: Sequence[Sequence[bool]]) -> tuple[float, float]:
+    """Return the 95 % interval of the fraction of correct answers, given group by group (such as by object).
+
+    Answers of one group are correlated, so this is the exact binomial interval for the equivalent number of independent
+    answers (Korn and Graubard 1998): their number divided by the design effect (at least 1), the ratio of the variance
+    between groups to that of independent answers. If all answers are correct, or all wrong, groups show no difference,
+    and every answer is treated as independent. A few groups do not show how much groups differ: over 1,500 samples with
+    20 answers a group and proportions drawn as Beta(2.8, 1.2), coverage was 79 % with 2 groups, 86, 89, 92, 92, 92 and
+    93 % with 3 to 8, and 94 % with 9 and 10. Raises BadInput without answers.
+    """
+    total, successes = sum(map(len, correct)), sum(map(sum, correct))
+    if not 0 < successes < total or len(correct) < 2:
+        return binomial_interval(successes, total)
+    fraction = successes / total
+    squares = sum((sum(part) - fraction * len(part)) ** 2 for part in correct) * len(correct) / (len(correct) - 1)
+    effective = total / max(1.0, squares / (total * fraction * (1 - fraction)))
+    return clopper_pearson(fraction * effective, effective, 0.95)
+
+
+def binomial_interval(successes: int, trials: int, level: float = 0.95) -> tuple[float, float]:
+    """Return the exact interval of a proportion (Clopper and Pearson 1934): conservative for independent trials."""
+    if not 0 <= successes <= trials or trials < 1:
+        raise BadInput(f"successes must lie within 0..trials, and trials be at least 1; got {successes} of {trials}")
+    return clopper_pearson(successes, trials, level)
+
+
+def clopper_pearson(successes: float, trials: float, level: float) -> tuple[float, float]:
+    """Return the interval of `binomial_interval` for numbers that need not be whole."""
+    tail = (1 - level) / 2
+    low = betaincinv(successes, trials - successes + 1, tail) if successes else 0.0
+    high = betaincinv(successes + 1, trials - successes, 1 - tail) if successes < trials else 1.0
+    return float(low), float(high)

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import brentq
+from scipy.special import expit
 
 from retrieval.errors import BadInput, NumericalError
 from retrieval.metrics.measure import weight_below
@@ -37,7 +39,7 @@ class Calibration:
 
     def probability(self, logit: ArrayLike) -> NDArray[np.float64]:
         """Return the probability of a match at even odds, for people; never rank by it."""
-        return _expit(self.log_odds(logit))
+        return np.asarray(expit(self.log_odds(logit)))
 
 
 def fit_calibration(logits: ArrayLike, labels: ArrayLike) -> Calibration:
@@ -66,8 +68,6 @@ def _likeliest(z: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, f
     any scale and offset of the logits. A quasi-Newton search for slope and intercept together stops too
     early if, for example, the logits are 1000 +- 1.
     """
-    from scipy.optimize import brentq  # slow to import; queries do not need it
-
     positives, negatives = y.sum(), (1 - y).sum()
     targets = np.where(y == 1, (positives + 1) / (positives + 2), 1 / (negatives + 2))
     # Both classes have the same weight, whatever their counts: the odds are even by definition.
@@ -76,7 +76,7 @@ def _likeliest(z: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, f
     z = z - centre
 
     def slack(slope: float, intercept: float) -> NDArray[np.float64]:
-        return np.asarray(weights * (_expit(slope * z + intercept) - targets))
+        return np.asarray(weights * (expit(slope * z + intercept) - targets))
 
     def best_intercept(slope: float) -> float:
         # At an intercept of -reach every probability is almost 0, and at +reach almost 1. Every target is between these
@@ -156,9 +156,3 @@ def _checked(logits: ArrayLike, labels: ArrayLike) -> tuple[NDArray[np.float64],
     if not (true and false and true + false == len(y)):
         raise BadInput(f"pairs of both classes are needed, labelled 0 and 1; of {len(y)}, {true} are 1 and {false} 0")
     return z, y
-
-
-def _expit(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return 1 / (1 + exp(-x)) without overflow; importing scipy.special for it would cost a query 0.2 s."""
-    small = np.exp(-np.abs(x))
-    return np.asarray(np.where(x >= 0, 1, small) / (1 + small))

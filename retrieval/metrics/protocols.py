@@ -6,12 +6,14 @@ the description of the gallery states how many there are. In pair and K-way test
 however many photos they have; in rankings of the whole gallery each photo counts.
 """
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.errors import BadInput
 from retrieval.metrics import ranking
-from retrieval.metrics.k_way import k_way_accuracies
 from retrieval.metrics.measure import Measure, object_means, object_weights, weight_below
 from retrieval.metrics.table import ScoreTable, object_scores
 
@@ -70,13 +72,13 @@ def k_way(table: ScoreTable, k: int, *, photos: int = 1, draws: int = 16, seed: 
 
     Every candidate is represented by `photos` photos (`object_scores`) and scored by their mean. Photos are drawn
     `draws` times for every row. The expectation over the random choice of the other objects is computed in closed form
-    (`k_way_accuracies`). Chance is 1/k, 2/k, ..., 1. Raises BadInput for fewer than k objects.
+    (`ranking.k_way_accuracies`). Chance is 1/k, 2/k, ..., 1. Raises BadInput for fewer than k objects.
     """
     queries = table.with_targets
     scores = object_scores(queries, photos, draws, seed)
     true = np.take_along_axis(scores, np.searchsorted(queries.objects, queries.touch_owner)[None, :, None], 2)
     higher, equal = (scores > true).sum(2).ravel(), (scores == true).sum(2).ravel() - 1
-    curves = k_way_accuracies(higher, equal, len(queries.objects) - 1, k).reshape(draws, -1, k).mean(0)
+    curves = ranking.k_way_accuracies(higher, equal, len(queries.objects) - 1, k).reshape(draws, -1, k).mean(0)
     shown = "a photo" if photos == 1 else f"{photos} photos (fewer if it has no more)"
     words = f"{k} of these objects, each with {shown}: {table.gallery}"
     return Measure(curves, queries.touch_owner, np.arange(1, k + 1) / k, words)
@@ -87,17 +89,12 @@ def recall(table: ScoreTable, k: int) -> Measure:
 
     For photos as queries and touches as gallery, use `table.transposed()`.
     """
-    queries = table.with_targets
-    return _measure(
-        table, ranking.recall_at(k, queries.first), ranking.chance_of_recall(k, queries.relevant, ~queries.own)
-    )
+    return _rank_measure(table, lambda queries: ranking.recall_at(k, queries.first))
 
 
 def reciprocal_rank(table: ScoreTable) -> Measure:
     """1 / rank of the first photo of the object in the whole gallery, without own photos."""
-    queries = table.with_targets
-    chance = ranking.chance_of_reciprocal_rank(queries.relevant, ~queries.own)
-    return _measure(table, ranking.reciprocal_rank(queries.first), chance)
+    return _rank_measure(table, lambda queries: ranking.reciprocal_rank(queries.first))
 
 
 def average_precision(table: ScoreTable) -> Measure:
@@ -106,9 +103,15 @@ def average_precision(table: ScoreTable) -> Measure:
     With `table.with_own()` this is the cross-sensory retrieval of the ObjectFolder benchmark, whose gallery contains
     every instance of the other modality, including that of the query's own grasp.
     """
+    return _rank_measure(
+        table, lambda queries: ranking.average_precision(queries.scores, queries.relevant, ~queries.own)
+    )
+
+
+def _rank_measure(table: ScoreTable, value: Callable[[ScoreTable], NDArray[np.float64]]) -> Measure:
+    """Return the value of each query; that of a constant scorer is chance, because ties count by expectation."""
     queries = table.with_targets
-    values = ranking.average_precision(queries.scores, queries.relevant, ~queries.own)
-    return _measure(table, values, ranking.chance_of_average_precision(queries.relevant, ~queries.own))
+    return _measure(table, value(queries), value(replace(queries, scores=np.zeros_like(queries.scores))))
 
 
 def _measure(table: ScoreTable, values: NDArray[np.float64], chance: NDArray[np.float64] | float) -> Measure:

@@ -1,4 +1,4 @@
-"""Measures of a ranking by their expected value under ties, and their values by chance, in closed form.
+"""Measures of a ranking, and top-n accuracy of K-way tests, by their expected value under ties, in closed form.
 
 Each row is a query; the items of its gallery are ranked by score, and some are relevant. Recall at k is "any relevant
 item among the first k". All orders of equal scores are equally likely, so a constant scorer has exactly the value of
@@ -6,16 +6,17 @@ chance.
 
 Without ties the values equal those of trec_eval: R@k is its success_k, the others are recip_rank and map. trec_eval
 orders equal scores by the names of the items, compares scores in single precision, and gives a query without a relevant
-item the value 0. Here such a query is refused, and the protocols leave it out. R@k is not trec_eval's recall_k, which
+item the value 0; here such a query is left out. R@k is not trec_eval's recall_k, which
 is the fraction of the relevant items among the first k.
 """
 
+from math import comb
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.errors import BadInput, NumericalError
+from retrieval.errors import BadInput
 
 Scores = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -39,36 +40,14 @@ def first_relevant(scores: Scores, relevant: Mask, in_gallery: Mask) -> FirstRel
     """Return the position of the best relevant item of each query.
 
     Args:
-        scores: (Q, N).
-        relevant: (Q, N).
+        scores: (Q, N), finite.
+        relevant: (Q, N); every query has a relevant item in its gallery.
         in_gallery: (Q, N) whether the item is in the query's gallery.
-
-    Raises:
-        BadInput: A query has no relevant item in its gallery.
-        NumericalError: A score is not finite.
     """
-    good = _checked(relevant, in_gallery)
-    _require_finite(scores)
+    good = relevant & in_gallery
     best = np.where(good, scores, -np.inf).max(1, keepdims=True)
     equal = in_gallery & (scores == best)
     return FirstRelevant((in_gallery & (scores > best)).sum(1), equal.sum(1), (equal & good).sum(1))
-
-
-def _require_finite(scores: Scores) -> None:
-    """Raise NumericalError for a NaN or infinite score: a NaN compares false with everything and would go unnoticed."""
-    bad = np.flatnonzero(~np.isfinite(scores).all(axis=1))
-    if len(bad):
-        raise NumericalError(f"every score must be finite for ranking; row {bad[0]} contains a NaN or infinite one")
-
-
-def _checked(relevant: Mask, in_gallery: Mask) -> Mask:
-    good = relevant & in_gallery
-    empty = np.flatnonzero(~good.any(1))
-    if len(empty):
-        raise BadInput(
-            f"every query needs a relevant item in its gallery; row {empty[0]} has none: leave it out, and report it"
-        )
-    return good
 
 
 def recall_at(k: int, first: FirstRelevant) -> NDArray[np.float64]:
@@ -111,18 +90,12 @@ def average_precision(scores: Scores, relevant: Mask, in_gallery: Mask) -> NDArr
     Average precision at a cutoff is a different measure; do not compare the two.
 
     Args:
-        scores: (Q, N).
-        relevant: (Q, N).
+        scores: (Q, N), finite.
+        relevant: (Q, N); every query has a relevant item in its gallery.
         in_gallery: (Q, N) whether the item is in the query's gallery.
-
-    Raises:
-        BadInput: A query has no relevant item in its gallery.
-        NumericalError: A score is not finite.
     """
-    good = _checked(relevant, in_gallery)
-    _require_finite(scores)
     harmonic = np.append(0.0, np.cumsum(1 / np.arange(1.0, scores.shape[1] + 1)))
-    rows = zip(scores, good, in_gallery, strict=True)
+    rows = zip(scores, relevant & in_gallery, in_gallery, strict=True)
     return np.array([_precision_of_row(row[visible], row[mine], harmonic) for row, mine, visible in rows])
 
 
@@ -142,28 +115,39 @@ def _precision_of_row(every: Scores, relevant: Scores, harmonic: NDArray[np.floa
     return float((r / n * sums).sum() / len(relevant))
 
 
-def chance_of_recall(k: int, relevant: Mask, in_gallery: Mask) -> NDArray[np.float64]:
-    """Return `recall_at` (Q,) of a constant scorer."""
-    return recall_at(k, _all_tied(relevant, in_gallery))
+def k_way_accuracies(higher: NDArray[np.int64], equal: NDArray[np.int64], others: int, k: int) -> NDArray[np.float64]:
+    """Return the probability that the true photo ranks within the top 1..k, among k - 1 random others.
 
+    The value is exact over all draws without replacement, so it does not depend on a seed. Of n others, b score higher
+    and e equal. A draw contains i of the b and j of the e with hypergeometric probability, and among j + 1 equal scores
+    every rank is equally likely. A constant scorer gives 1/k, 2/k, ..., 1.
 
-def chance_of_reciprocal_rank(relevant: Mask, in_gallery: Mask) -> NDArray[np.float64]:
-    """Return `reciprocal_rank` (Q,) of a constant scorer."""
-    return reciprocal_rank(_all_tied(relevant, in_gallery))
+    Args:
+        higher: (Q,) number of others that score higher than the true photo of each query.
+        equal: (Q,) number of others with an equal score.
+        others: Number of others, at least k - 1.
+        k: Candidates of the test.
 
+    Returns:
+        (Q, k) values that end at 1.
 
-def chance_of_average_precision(relevant: Mask, in_gallery: Mask) -> NDArray[np.float64]:
-    """Return the average precision (Q,) of a constant scorer.
-
-    With R of N relevant it is p + (1 - p) H_N / N, p = (R - 1) / (N - 1).
+    Raises:
+        BadInput: There are fewer than k - 1 others.
     """
-    _, count, right = _all_tied(relevant, in_gallery)
-    harmonic = np.cumsum(1 / np.arange(1.0, in_gallery.shape[1] + 1))[count - 1]
-    p = (right - 1) / np.maximum(count - 1, 1)
-    return np.asarray(np.where(count == right, 1.0, p + (1 - p) * harmonic / count))
+    if k < 1 or others < k - 1:
+        raise BadInput(f"a {k}-way test needs k >= 1 and {k - 1} other candidates; got {others}")
+    cases, place = np.unique(np.stack([higher, equal], axis=1), axis=0, return_inverse=True)
+    curves = [_curve(int(above), int(tied), others, k) for above, tied in cases]
+    return np.array(curves)[place]
 
 
-def _all_tied(relevant: Mask, in_gallery: Mask) -> FirstRelevant:
-    return FirstRelevant(
-        np.zeros(len(in_gallery), dtype=np.int64), in_gallery.sum(1), _checked(relevant, in_gallery).sum(1)
-    )
+def _curve(higher: int, equal: int, others: int, k: int) -> NDArray[np.float64]:
+    """Return the top-n accuracies (k,) of one query."""
+    curve = np.zeros(k)
+    for above in range(min(higher, k - 1) + 1):
+        for tied in range(min(equal, k - 1 - above) + 1):
+            ways = comb(higher, above) * comb(equal, tied)
+            ways *= comb(others - higher - equal, k - 1 - above - tied)
+            within = np.clip((np.arange(1, k + 1) - above) / (tied + 1), 0, 1)
+            curve += ways / comb(others, k - 1) * within
+    return curve

@@ -14,7 +14,7 @@ import numpy as np
 
 from retrieval.data.dataset import Grasp, finger_count, load_grasps
 from retrieval.errors import BadInput
-from retrieval.metrics.k_way import binomial_interval
+from retrieval.metrics.intervals import binomial_interval
 from retrieval.search.embeddings import embed_photos
 from retrieval.serve.generations import ServedGeneration
 

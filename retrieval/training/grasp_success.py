@@ -40,7 +40,7 @@ from retrieval.data.dataset import (
 from retrieval.data.licences import LICENCES
 from retrieval.data.loading import worker_pool
 from retrieval.errors import DatasetError
-from retrieval.metrics.k_way import grouped_interval
+from retrieval.metrics.intervals import grouped_interval
 from retrieval.model.checkpoint import require_writable, write_tensors
 from retrieval.model.encode import batches, one_thread, touch_batch
 from retrieval.model.losses.match import match_loss

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from retrieval.evaluation.real.protocol import Protocol
-from retrieval.metrics.intervals import compare, summarise
+from retrieval.metrics.intervals import compare, compare_splits, summarise, summarise_splits
 from retrieval.metrics.measure import Measure
-from retrieval.metrics.resampled_splits import compare_splits, summarise_splits
 
 RULE = (
     "A result counts as touch only if it is evidence that the relief in the gel identifies the object: its main "

@@ -21,7 +21,7 @@ import torch
 from indexes.kinds.vector_index import Floats, RowNumbers, VectorIndex
 from retrieval.console.progress import Bar
 from retrieval.errors import BadInput
-from retrieval.metrics.k_way import binomial_interval
+from retrieval.metrics.intervals import binomial_interval
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.fusion import score_partials
 from retrieval.model.fusion_scorer import Partials

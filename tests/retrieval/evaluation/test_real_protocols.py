@@ -13,8 +13,8 @@ from retrieval.evaluation.real.conditions import clock_features, missing_no_cont
 from retrieval.evaluation.real.protocol import RecordingFacts
 from retrieval.evaluation.real.touch_to_touch import TouchToTouch
 from retrieval.evaluation.real.verdict import verdict
+from retrieval.metrics.intervals import compare_splits, summarise_splits
 from retrieval.metrics.measure import Measure, pooled
-from retrieval.metrics.resampled_splits import compare_splits, summarise_splits
 
 
 def facts(sequence_of, about=None, splits=None):

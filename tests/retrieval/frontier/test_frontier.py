@@ -17,7 +17,7 @@ from retrieval.frontier.formats import FORMATS, encoders, load_touch
 from retrieval.frontier.measure import measure_frontier
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, format_duration, miss_rate_point
 from retrieval.frontier.sample import Sample, Scale
-from retrieval.metrics.k_way import binomial_interval
+from retrieval.metrics.intervals import binomial_interval
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import encode_touches
 from retrieval.search.build.candidates import measure_candidates

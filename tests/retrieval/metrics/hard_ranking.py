@@ -9,10 +9,15 @@ from scipy import special
 from torch import nn
 
 from retrieval.methods.selection import ranking_auc
-from retrieval.metrics.intervals import bootstrap_interval, sign_flip_p
-from retrieval.metrics.k_way import binomial_interval, k_way_accuracies
+from retrieval.metrics.intervals import binomial_interval, bootstrap_interval, sign_flip_p
 from retrieval.metrics.pairs import pair_auc
-from retrieval.metrics.ranking import average_precision, first_relevant, recall_at, reciprocal_rank
+from retrieval.metrics.ranking import (
+    average_precision,
+    first_relevant,
+    k_way_accuracies,
+    recall_at,
+    reciprocal_rank,
+)
 from retrieval.metrics.table import ScoreTable
 from retrieval.model.fusion import FusionHead, score_partials
 from tests.hard_case import HardCase, error_of

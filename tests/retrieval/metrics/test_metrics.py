@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from retrieval.errors import BadInput
-from retrieval.metrics.k_way import binomial_interval, grouped_interval, k_way_accuracies
+from retrieval.metrics.intervals import binomial_interval, grouped_interval
+from retrieval.metrics.ranking import k_way_accuracies
 
 
 def curve(true_score, others, k):
