@@ -51,7 +51,7 @@ from indexes.store.manifest import FileChecksum
 from indexes.store.rows import Row
 from retrieval.commands.main import main as retrieve
 from retrieval.data.dataset import load_grasps
-from retrieval.frontier.kinds import STRUCTURES
+from retrieval.frontier.candidates import STRUCTURES
 from retrieval.metrics.intervals import binomial_interval
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.fusion import scorer_of

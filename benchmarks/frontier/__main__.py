@@ -1,10 +1,12 @@
 """`python -m benchmarks.frontier --out FOLDER [--only NAME ...] [--recording R] [--model M] [--quick]`."""
 
 import argparse
+from functools import partial
 from pathlib import Path
 
 from benchmarks.frontier import APPROXIMATIONS, NEED_NO_MODEL
-from retrieval.commands.frontier import run_frontier
+from retrieval.commands.frontier import recording_of
+from retrieval.frontier.measure import measure_frontier
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -13,13 +15,13 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder for frontier.json, frontier.html and plots")
     parser.add_argument("--only", nargs="+", default=(), choices=APPROXIMATIONS, metavar="NAME")
     parser.add_argument("--recording", type=Path, help="grasps of unseen objects (default: a small one is collected)")
-    parser.add_argument("--model", help="a checkpoint (default: that of `retrieve frontier`)")
+    parser.add_argument("--model", help="a checkpoint (default: the shipped one)")
     parser.add_argument("--quick", action="store_true", help="smallest sizes, as a quick test")
     arguments = parser.parse_args(argv)
-    run_frontier(
+    measure_frontier(
         arguments.out,
-        model=arguments.model,
-        recording=arguments.recording,
+        arguments.model,
+        partial(recording_of, arguments.recording, arguments.out, arguments.quick),
         only=arguments.only,
         quick=arguments.quick,
         table=APPROXIMATIONS,

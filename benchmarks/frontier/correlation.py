@@ -152,7 +152,6 @@ def cca_components(sample: Sample) -> ApproximationResult:
         reference=f"the object in the hand, one of {len(parts[2])}",
         tolerance=round(min(point.error for point in points) + 2.0, 1),
         points=tuple(points),
-        resolution=100 / len(test),
     )
     text = (
         f"Fitted on {len(parts[0])} objects; ridge, power and the default number of components chosen on "

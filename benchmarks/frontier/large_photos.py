@@ -99,7 +99,7 @@ def _panels(
         for point, wrong in zip(points, first[:-1], strict=True)
     )
     tolerance = round(100 * float(first[-1].mean()), 2)
-    yield Panel("another photo ranked first", time, "% of touches", reference, tolerance, flips, 100 / len(logits[0]))
+    yield Panel("another photo ranked first", time, "% of touches", reference, tolerance, flips)
 
 
 def _logits(sample: Sample, views: Sequence[RgbImage]) -> Array:

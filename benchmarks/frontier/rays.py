@@ -206,7 +206,7 @@ def limit_panel(
         points.append(Tradeoff("", f"{limit:,} steps", lost, is_default=limit == MAX_STEPS))
     timed = time_points(points, works, repeats)
     time = f"{len(exact):,} rays of photos and fingers"
-    return Panel("maximum steps of a ray", time, "% of rays lost", "no limit", 0.01, timed, 100.0 / len(exact))
+    return Panel("maximum steps of a ray", time, "% of rays lost", "no limit", 0.01, timed)
 
 
 def _met(bodies: Sequence[RayMarcher], max_steps: int) -> NDArray[np.bool_]:

@@ -1,10 +1,9 @@
 """`retrieve frontier`: measure the error and the run time of each approximation, for one model and recording."""
 
 import os
-from collections.abc import Collection, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -12,9 +11,6 @@ from retrieval.commands.options import Json, Model, OptionValues
 from retrieval.console.interruption import resumable
 from retrieval.console.output import print_json, say
 from retrieval.frontier import APPROXIMATIONS
-
-if TYPE_CHECKING:
-    from retrieval.frontier import Approximations
 
 SEED = 40_000
 """Seed of the collected objects; the shipped checkpoint was trained on other seeds."""
@@ -37,49 +33,20 @@ def frontier(
     json: Json = False,
 ) -> None:
     """Plot the error of each approximation against its run time, on a page. Resumes a stopped run."""
-    document = run_frontier(out, model=model, recording=recording, only=only or ())
-    if json:
-        print_json(document)
-
-
-def run_frontier(
-    out: Path,
-    *,
-    model: str | None,
-    recording: Path | None,
-    only: Sequence[str] = (),
-    quick: bool = False,
-    table: "Approximations" = APPROXIMATIONS,
-    model_free: Collection[str] = (),
-) -> dict[str, Any]:
-    """Measure, and write frontier.json, frontier.html and figures/.
-
-    Args:
-        out: Folder of the results. A second run continues from them.
-        model: The value of `--model`.
-        recording: Grasps of objects that the model was not trained on. None to collect a few on the simulated rig, if
-            a row needs them.
-        only: Names of rows; empty for all.
-        quick: Measure the smallest sizes only.
-        table: Rows that can be measured, see `retrieval.measure_frontier`.
-        model_free: Names of rows that need no model, see `retrieval.measure_frontier`.
-
-    Returns:
-        The content of frontier.json.
-    """
     from retrieval.frontier.measure import measure_frontier
     from retrieval.search import defaults
 
     path, reason = defaults.find_model(model)
     say(f"model: {path} ({reason})")
-    grasps = partial(_recording, recording, out, quick)
     with resumable(out):
-        document = measure_frontier(out, path, grasps, only=only, quick=quick, table=table, model_free=model_free)
+        document = measure_frontier(out, path, partial(recording_of, recording, out), only=only or ())
     say(f"page: {out / 'frontier.html'}")
-    return document
+    if json:
+        print_json(document)
 
 
-def _recording(recording: Path | None, out: Path, quick: bool) -> Path:
+def recording_of(recording: Path | None, out: Path, quick: bool = False) -> Path:
+    """Return the folder of the recording, after a small one is collected under `out` if it is None."""
     if recording is not None:
         return recording
     from retrieval.console.progress import CountedBar

@@ -22,7 +22,7 @@ APPROXIMATIONS: "Approximations" = Registry(
     "approximations",
     {
         "candidates": "retrieval.frontier.candidates:candidates",
-        "index_kinds": "retrieval.frontier.kinds:index_kinds",
+        "index_kinds": "retrieval.frontier.candidates:index_kinds",
         "towers": "retrieval.frontier.formats:towers",
         "partials": "retrieval.frontier.formats:partials",
     },

@@ -19,7 +19,7 @@ from retrieval.frontier import APPROXIMATIONS
 from retrieval.frontier.clock import machine
 from retrieval.frontier.points import ApproximationResult
 from retrieval.frontier.report import write_frontier
-from retrieval.frontier.sample import QUICK, Sample, Scale
+from retrieval.frontier.sample import Sample, Scale
 from retrieval.search.defaults import shipped_model
 from retrieval.version import __version__
 
@@ -75,9 +75,7 @@ def measure_frontier(
     'Number format of stored partial activations'
     """
     works = {name: table.resolve(name) for name in only or table}
-    scale = Scale(photos, queries, repeats)
-    if quick:
-        scale = dataclasses.replace(QUICK, photos=min(QUICK.photos, photos), queries=min(QUICK.queries, queries))
+    scale = Scale(min(photos, 2000), min(queries, 12), 2, quick) if quick else Scale(photos, queries, repeats)
     grasps = recording if callable(recording) else lambda: folder_of(recording)
     sample = Sample(Path(model or shipped_model()), grasps, out, scale, quiet)
     rows = {}

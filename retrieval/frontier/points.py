@@ -68,7 +68,6 @@ class Panel:
         reference: The reference of the error.
         tolerance: Accepted error; the recommended point is the fastest within it.
         points: The points.
-        resolution: Smallest measurable error above 0, such as 100 / queries; None for the smallest of the points.
     """
 
     title: str
@@ -77,7 +76,6 @@ class Panel:
     reference: str
     tolerance: float
     points: tuple[Tradeoff, ...]
-    resolution: float | None = None
 
     @property
     def recommended(self) -> Tradeoff:

@@ -20,7 +20,7 @@ _LABEL: Any = {"textcoords": "offset points", "fontsize": 7.5, "color": "#3a434c
 _ABOVE, _BELOW, _NEAR_PX = (7, 5), (7, -10), 20
 """Label offsets above and below a point, in points; a label within `_NEAR_PX` of the previous one goes below."""
 _FLOOR = 0.5
-"""An error of 0 is drawn at this fraction of the smallest measurable error."""
+"""An error of 0 is drawn at this fraction of the smallest error above 0."""
 
 LEGEND = (
     "Lower left is better. The line is the Pareto front: for its points, no other point is better in both time and "
@@ -111,8 +111,7 @@ def _draw(axes: Axes, panel: Panel) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.margins(x=0.12, y=0.1)
-    measurable = [error for error in (panel.resolution, *(point.error for point in panel.points)) if error]
-    floor = _FLOOR * min(measurable, default=1.0)
+    floor = _FLOOR * min((point.error for point in panel.points if point.error), default=1.0)
     for number, name in enumerate(dict.fromkeys(point.series for point in panel.points)):
         _series(axes, [point for point in panel.points if point.series == name], number, floor)
     _front(axes, panel, floor)

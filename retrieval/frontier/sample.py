@@ -44,9 +44,6 @@ class Scale:
     quick: bool = False
 
 
-QUICK = Scale(photos=2000, queries=12, repeats=2, quick=True)
-
-
 @dataclass(frozen=True, eq=False)
 class Sample:
     """Grasps of unseen objects: photos of the first half of each object's grasps, touches of the second half.

@@ -28,7 +28,7 @@ TINY = Scale(photos=700, queries=6, repeats=1, quick=True)
 
 def panel(*points, tolerance=1.0):
     made = tuple(Tradeoff("", f"s{place}", error, seconds=seconds) for place, (seconds, error) in enumerate(points))
-    return Panel("errors", "one go", "%", "the truth", tolerance, made, 0.1)
+    return Panel("errors", "one go", "%", "the truth", tolerance, made)
 
 
 @pytest.fixture(scope="module")

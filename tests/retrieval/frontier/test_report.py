@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.frontier import APPROXIMATIONS as KERNELS
-from retrieval.commands.frontier import _recording as collected
+from retrieval.commands.frontier import recording_of as collected
 from retrieval.commands.main import main
 from retrieval.frontier import APPROXIMATIONS
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff
@@ -32,7 +32,7 @@ def points(errors):
 
 @pytest.mark.parametrize("errors", [(3.0, 1.0, 0.0), (0.0, 0.0), (5.0,)], ids=["falling", "no errors", "one point"])
 def test_a_page_has_the_plot_the_lines_and_every_point(errors, tmp_path):
-    made = Panel("missed", "one query", "%", "every photo reranked", 1.5, points(errors), 0.5)
+    made = Panel("missed", "one query", "%", "every photo reranked", 1.5, points(errors))
     _, page, plot = write_frontier(tmp_path, document(made))
     text = page.read_text()
     assert plot.read_bytes().startswith(b"\x89PNG")
@@ -57,7 +57,7 @@ def test_the_performance_page_has_the_number_of_approximations():
 def test_labels_of_near_points_are_above_and_below():
     near = (Tradeoff("a", "one", 1.0, seconds=1.0), Tradeoff("a", "other", 0.98, seconds=1.01))
     far = Tradeoff("a", "third", 0.01, seconds=9.0)
-    (axes,) = figure([Panel("missed", "one query", "%", "all", 0.5, (*near, far), 0.01)]).axes
+    (axes,) = figure([Panel("missed", "one query", "%", "all", 0.5, (*near, far))]).axes
     heights = {text.get_text(): text.xyann[1] for text in axes.texts}
     assert heights["one"] > 0 > heights["other"]
     assert heights["third"] > 0
