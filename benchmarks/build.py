@@ -18,7 +18,7 @@ import torch
 from benchmarks.common import ResultLine, Times, as_text, duration, in_turns, matcher_of
 from retrieval.data.images import read_bytes
 from retrieval.data.resize import RgbImage
-from retrieval.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
 from retrieval.model.config import Config
 from retrieval.model.encode import batches, encode_photos, one_thread
 from retrieval.model.export import choose_photo_encoder
@@ -40,7 +40,7 @@ def measure(
         folder = Path(name)
         provenance = {"source": "random weights", "step": 0, "data_digest": "0" * 64, "metrics": {}}
         model, matcher = folder / "random.safetensors", matcher_of(config)
-        save_checkpoint(model, matcher, config, split=None, provenance=provenance)
+        store_checkpoint(Checkpoint(model, "", config, provenance, matcher=matcher), model)
         checkpoint = load_checkpoint(model)
         images, build = _ready(folder, checkpoint, number, photo_px)
 

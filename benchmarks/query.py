@@ -14,7 +14,7 @@ from PIL import Image
 from benchmarks.common import REPETITIONS, ResultLine, as_text, duration, in_turns, matcher_of
 from indexes.store.folder import IndexStore
 from indexes.store.rows import Row
-from retrieval.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
 from retrieval.model.checkpoint_info import fingerprint, read_scorer
 from retrieval.model.config import Config
 from retrieval.model.encode import TorchEncoder, touch_batch
@@ -118,7 +118,7 @@ def stored_checkpoint(folder: Path, matcher: Matcher, config: Config) -> Checkpo
     """Write the matcher to a file and load it."""
     about = {"source": "random weights", "step": 0, "data_digest": "0" * 64, "metrics": {}}
     path = folder / "model.safetensors"
-    save_checkpoint(path, matcher, config, split=None, provenance=about)
+    store_checkpoint(Checkpoint(path, "", config, about, matcher=matcher), path)
     return load_checkpoint(path)
 
 

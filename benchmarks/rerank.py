@@ -16,7 +16,7 @@ from benchmarks.common import REPETITIONS, ResultLine, as_text, config_of, durat
 from retrieval.model.checkpoint_info import read_checkpoint_info
 from retrieval.model.config import Config
 from retrieval.model.encode import encode_photos, encode_touches, to_batch, touch_batch
-from retrieval.model.fusion import FusionHead, scorer_of
+from retrieval.model.fusion import FusionHead
 from retrieval.model.fusion_scorer import StoredPartials, to_stored
 from retrieval.search.defaults import shipped_model
 
@@ -36,7 +36,7 @@ def measure(
     matcher, pre = matcher_of(config), config.preprocessing
     touch = random_images(config.matcher.fingers, pre.touch_px, seed=1)
     photos = random_images(sample, pre.photo_px, seed=2)
-    partial, scorer = encode_touches(matcher, [touch]).partial.numpy(), scorer_of(matcher.head)
+    partial, scorer = encode_touches(matcher, [touch]).partial.numpy(), matcher.head.scorer
     partials = encode_photos(matcher, photos).partial.numpy().astype(np.float16)
     one_touch, stacked = touch_batch([touch]), to_batch(photos)
 
@@ -95,7 +95,7 @@ def measure_cells(config: Config, candidates: int = 1000, repetitions: int = REP
     photos = generator.normal(size=(candidates, sizes.partial_width)).astype(np.float32)
     cells = photos[:, width:].reshape(candidates, -1, sizes.cell_dim)
     cells /= np.linalg.norm(cells, axis=2, keepdims=True)
-    scorer = scorer_of(FusionHead(1, 1, sizes.hidden, 0.0, sizes.embedding_dim, sizes.cell_dim))
+    scorer = FusionHead(1, 1, sizes.hidden, 0.0, sizes.embedding_dim, sizes.cell_dim).scorer
     arrays = {"with": to_stored(photos, width), "without": to_stored(photos[:, :width], width)}
     stored = {name: StoredPartials(each) for name, each in arrays.items()}
     with threadpool_limits(1, "blas"):

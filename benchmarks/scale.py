@@ -54,7 +54,6 @@ from retrieval.data.dataset import load_grasps
 from retrieval.frontier.candidates import STRUCTURES
 from retrieval.metrics.intervals import binomial_interval
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
-from retrieval.model.fusion import scorer_of
 from retrieval.model.fusion_scorer import FusionScorer
 from retrieval.search.defaults import shipped_model
 from retrieval.training.features import encode_recording
@@ -153,7 +152,7 @@ def blended_photos(model: Path, recording: Path, features: Path | None, by: str 
     rng, queries = np.random.default_rng(0), checkpoint.queries.astype(np.float32)
     middle = len(queries) // 2
     held_out = rng.permutation(np.concatenate([queries[middle:], touches]))
-    scorer = scorer_of(checkpoint.matcher.head)
+    scorer = checkpoint.matcher.head.scorer
     return BlendedPhotos(checkpoint, scorer, np.unique(photos, axis=0), queries[:middle], held_out, by)
 
 

@@ -35,7 +35,6 @@ from retrieval.data.resize import RgbImage
 from retrieval.metrics.intervals import binomial_interval
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import for_inference, photo_features, touch_batch
-from retrieval.model.fusion import scorer_of
 from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
 from retrieval.search.defaults import shipped_model
 from retrieval.training.calibration.posterior import IdentificationTrials
@@ -129,7 +128,7 @@ def score_photos(made: Checkpoint, folder: Path) -> ScoredTouches:
         photos = torch.cat([torch.from_numpy(features.photo), photo_features(made.matcher, images)])
         touches = made.matcher.touch_encoding(torch.from_numpy(features.touch).flatten(1)).partial.numpy()
         partials = made.matcher.photo_encoding(photos).partial.numpy()
-    scorer = scorer_of(made.matcher.head)
+    scorer = made.matcher.head.scorer
     touch_owner = features.owner
     owner = np.concatenate([touch_owner, touch_owner.max() + 1 + np.arange(len(files))])
     own = np.zeros((len(touch_owner), len(owner)), dtype=bool)

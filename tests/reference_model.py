@@ -4,7 +4,7 @@ import dataclasses
 
 import torch
 
-from retrieval.model.checkpoint import load_checkpoint, save_checkpoint
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
 from retrieval.model.posterior import Posterior
@@ -24,13 +24,6 @@ def write_reference_model(path, references=REFERENCE_CALIBRATION, posterior=POST
     config = Config(matcher, TINY.training, TINY.preprocessing)
     torch.manual_seed(0)
     provenance = {"source": "a test", "step": 1, "data_digest": "0" * 64, "metrics": {}}
-    save_checkpoint(
-        path,
-        Matcher(matcher).eval(),
-        config,
-        split=None,
-        provenance=provenance,
-        posterior=posterior,
-        references=references,
-    )
+    contents = {"matcher": Matcher(matcher).eval(), "posterior": posterior, "references": references}
+    store_checkpoint(Checkpoint(path, "", config, provenance, **contents), path)
     return load_checkpoint(path)

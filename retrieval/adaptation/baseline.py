@@ -12,7 +12,7 @@ from retrieval.adaptation.folds import FoldAccuracy, score_accuracy
 from retrieval.data.dataset import Grasp
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import one_thread
-from retrieval.model.fusion import ImageEncoding, Matcher, score_partials
+from retrieval.model.fusion import ImageEncoding, Matcher
 from retrieval.model.references import unit_embeddings
 from retrieval.training.calibration.touches import CalibrationTouches, ScoredTouches
 from retrieval.training.features import Features, encode_recording
@@ -59,7 +59,7 @@ class UnadaptedBaseline:
         matcher, partials = self.start.matcher, photos.partial.numpy()
         if pooled:
             partials = partials[:, : matcher.config.pooled_width]
-        return np.stack([score_partials(matcher.head, touch[None], partials) for touch in touches.partial])
+        return np.stack([matcher.head.scorer.logits(touch[None], partials) for touch in touches.partial.numpy()])
 
     @one_thread()
     def calibration_touches(

@@ -19,7 +19,7 @@ from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, data_digest, load_grasps
 from retrieval.errors import DatasetError
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
-from retrieval.model.fusion import ImageEncoding, score_partials
+from retrieval.model.fusion import ImageEncoding
 from retrieval.training.distil import blend
 from retrieval.training.features import Features, encode_recording
 
@@ -197,7 +197,7 @@ class Sample:
             photos: (N, partial_width) of the photos.
             rows: Rows of `photos` to score; None for all.
         """
-        return score_partials(self.checkpoint.matcher.head, torch.from_numpy(touch_partial)[None], photos, rows)
+        return self.checkpoint.matcher.head.scorer.logits(touch_partial[None], photos, rows)
 
     def stored(self, key: str, make: Callable[[], Any]) -> Any:
         """Return the JSON value `make()`, or the one that an earlier run stored under this key."""

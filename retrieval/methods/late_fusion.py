@@ -14,7 +14,7 @@ from retrieval.errors import BadInput
 from retrieval.methods.method import Array, Method, MethodSettings
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
-from retrieval.model.fusion import Matcher, score_partials
+from retrieval.model.fusion import Matcher
 from retrieval.training.features import Features
 from retrieval.training.initial_weights import build_matcher
 from retrieval.training.train import Trainer
@@ -55,8 +55,8 @@ class LateFusion(Method):
         return np.asarray(self._matcher.photo_encoding(torch.from_numpy(photo)).partial.numpy())
 
     def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
-        touches = torch.from_numpy(touch_encodings)
-        return np.array([score_partials(self._matcher.head, touch[None], photo_encodings) for touch in touches])
+        scorer = self._matcher.head.scorer
+        return np.array([scorer.logits(touch[None], photo_encodings) for touch in touch_encodings])
 
 
 def trained_checkpoint(settings: MethodSettings, train: Features, validation: Features) -> Checkpoint:

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 from retrieval.methods.late_fusion import LateFusion, trained_checkpoint
 from retrieval.methods.method import Array, MethodSettings
 from retrieval.model.checkpoint import Checkpoint
-from retrieval.model.fusion import score_partials
 from retrieval.training.distil import feature_partials, with_candidate_encoder
 from retrieval.training.features import Features
 
@@ -56,12 +55,10 @@ class RetrieveRerank(LateFusion):
 
     def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
         touch_partials, partials, nearness = self._parts(touch_encodings, photo_encodings)
-        scores = []
-        for touch_partial, near in zip(torch.from_numpy(touch_partials), nearness, strict=True):
+        scores, scorer = [], self._matcher.head.scorer
+        for touch_partial, near in zip(touch_partials, nearness, strict=True):
             rows = nearest_photos(near[None], self._count(len(partials)))
-            scores.append(
-                merge_scores(near[None], rows, score_partials(self._matcher.head, touch_partial[None], partials, rows))
-            )
+            scores.append(merge_scores(near[None], rows, scorer.logits(touch_partial[None], partials, rows)))
         return np.array(scores)
 
     def _score_sets(self, touch_encodings: Array, photo_encodings: Array, sets: NDArray[np.int64]) -> Array:

@@ -6,7 +6,7 @@ Nothing is unpickled. A file is written under a temporary name, flushed to disk,
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 from typing import Any
@@ -19,12 +19,12 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from _touch_retrieval.files import write_atomically
-from retrieval.data.dataset import Split
 from retrieval.data.licences import stored_licences
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.checkpoint_info import (
     FORMAT,
     HEADER,
+    PARTS,
     CheckpointInfo,
     checkpoint_info,
     read_header,
@@ -33,9 +33,7 @@ from retrieval.model.checkpoint_info import (
 )
 from retrieval.model.config import Config
 from retrieval.model.fusion import GelHead, Matcher
-from retrieval.model.posterior import Posterior
-from retrieval.model.references import ReferenceCalibration
-from retrieval.model.verification import CARD_FAR, VerificationCalibration
+from retrieval.model.verification import CARD_FAR
 from retrieval.version import __version__
 
 _QUERIES = "queries.touch_partials"
@@ -47,33 +45,17 @@ class Checkpoint(CheckpointInfo):
     """A matcher in evaluation mode, with the contents of its file.
 
     Attributes:
-        path: The file.
-        digest: SHA-256 of the file, in hexadecimal.
-        config: Settings of towers, head and preprocessing.
-        provenance: Step, seed, data digest, licences of the data and metrics of the training.
-        gel_check: Thresholds that separate touches, no-contact gels and other images; None without a gel head.
-        verification: Error rates of `Searcher.verify`; None if there were too few validation objects.
         matcher: The towers, the fusion head and the projections.
-        split: Training, validation and test objects; None if the training run had no split.
-        posterior: Calibration of the logits; None for an uncalibrated model.
-        queries: (Q, partial) partial activations of touches of validation objects, with which an index measures its
-            own search.
-        references: Calibration of reference touches; None if there were too few data.
-        pooled_posterior: As `posterior`, of the logits without late interaction; None for a model without cells.
-        pooled_references: As `references`, of the same logits.
+        queries: (Q, partial) float16 partial activations of touches of validation objects, with which an index measures
+            its own search.
 
     >>> checkpoint = retrieval.load_checkpoint("model.safetensors")
     >>> checkpoint.config.preprocessing.background, len(checkpoint.digest)
     ('none', 64)
     """
 
-    matcher: Matcher
-    split: Split | None
-    posterior: Posterior | None = None
+    matcher: Matcher = field(kw_only=True)
     queries: NDArray[np.float16] | None = None
-    references: ReferenceCalibration | None = None
-    pooled_posterior: Posterior | None = None
-    pooled_references: ReferenceCalibration | None = None
 
     def without_cells(self) -> "Checkpoint":
         """Return the model without late interaction, with the calibration of its logits, for an index without cells.
@@ -96,33 +78,6 @@ class Checkpoint(CheckpointInfo):
         )
 
 
-def save_checkpoint(
-    path: Path,
-    matcher: Matcher,
-    config: Config,
-    *,
-    split: Split | None,
-    provenance: Mapping[str, Any],
-    **calibrations: Any,
-) -> None:
-    """Write `path` and its model card, as `store_checkpoint`.
-
-    Args:
-        path: A name that ends in .safetensors.
-        matcher: The model to store.
-        config: Its settings.
-        split: Its training, validation and test objects.
-        provenance: Source, step, seed, data digest, licences of the data and metrics of the training.
-        **calibrations: Further fields of `Checkpoint`, such as `posterior`; None for those left out.
-
-    Raises:
-        CheckpointError: The file cannot be written.
-    """
-    calibrations = {"gel_check": None, "verification": None, **calibrations}
-    made = Checkpoint(path, "", config, dict(provenance), matcher=matcher, split=split, **calibrations)
-    store_checkpoint(made, path)
-
-
 def store_checkpoint(checkpoint: Checkpoint, path: Path) -> None:
     """Write a checkpoint and its model card (the same name with .md) atomically.
 
@@ -134,18 +89,16 @@ def store_checkpoint(checkpoint: Checkpoint, path: Path) -> None:
         CheckpointError: The file cannot be written.
     """
     require_writable(path)
-    parts = ["split", "posterior", "gel_check", "verification", "references"]
-    if checkpoint.config.matcher.cell_dim:
-        parts += ["pooled_posterior", "pooled_references"]
-    header: dict[str, Any] = {"config": checkpoint.config.to_dict(), "provenance": dict(checkpoint.provenance)}
-    for name in parts:
-        part = getattr(checkpoint, name)
-        header[name] = part.to_dict() if part else None
+    header: dict[str, Any] = {"config": checkpoint.config.to_dict(), "provenance": checkpoint.provenance}
+    for name in PARTS:
+        if checkpoint.config.matcher.cell_dim or not name.startswith("pooled"):
+            part = getattr(checkpoint, name)
+            header[name] = None if part is None else asdict(part)
     state = checkpoint.matcher.state_dict()
     if checkpoint.queries is not None:
         state[_QUERIES] = torch.from_numpy(checkpoint.queries)
     write_tensors(path, state, header)
-    write_atomically(sibling_file(path, ".md"), _model_card(path.name, header).encode())
+    write_atomically(sibling_file(path, ".md"), _model_card(path.name, checkpoint).encode())
 
 
 def require_writable(path: Path) -> None:
@@ -187,21 +140,12 @@ def load_checkpoint(path: str | Path, *, info: CheckpointInfo | None = None) -> 
     path = Path(path)
     state, header = read_tensors(path, check=info is None)
     info = info or checkpoint_info(path, header)
+    queries = state.pop(_QUERIES, None)
+    width = info.config.matcher.touch_partial_width
     try:
-        split = None if header["split"] is None else Split.from_dict(header["split"])
-        posterior, pooled_posterior = (
-            None if header.get(name) is None else Posterior.from_dict(header[name])
-            for name in ("posterior", "pooled_posterior")
-        )
-        references, pooled_references = (
-            None if header.get(name) is None else ReferenceCalibration.from_dict(header[name])
-            for name in ("references", "pooled_references")
-        )
-        queries = state.pop(_QUERIES, None)
-        partial = info.config.matcher.touch_partial_width
-        if queries is not None and (queries.dtype != torch.float16 or queries.shape[1:] != (partial,)):
+        if queries is not None and (queries.dtype != torch.float16 or queries.shape[1:] != (width,)):
             raise CheckpointError(
-                f"{_QUERIES} must be float16 (touches, {partial}); got {queries.dtype} {tuple(queries.shape)}"
+                f"{_QUERIES} must be float16 (touches, {width}); got {queries.dtype} {tuple(queries.shape)}"
             )
         try:
             with torch.device("meta"):  # shapes only: a header may describe more weights than fit into memory
@@ -212,20 +156,15 @@ def load_checkpoint(path: str | Path, *, info: CheckpointInfo | None = None) -> 
         matcher.load_state_dict(state)
     except BadInput as error:
         raise unusable(path, error) from error
+    contents = {name: getattr(info, name) for name in PARTS}
     return Checkpoint(
         path,
         info.digest,
         info.config,
         info.provenance,
-        info.gel_check,
-        info.verification,
-        matcher.eval(),
-        split,
-        posterior,
-        None if queries is None else np.asarray(queries.numpy()),
-        references,
-        pooled_posterior,
-        pooled_references,
+        matcher=matcher.eval(),
+        queries=None if queries is None else np.asarray(queries.numpy()),
+        **contents,
     )
 
 
@@ -300,44 +239,39 @@ def tensors_digest(state: Mapping[str, Tensor], description: str) -> str:
     return digest.hexdigest()
 
 
-def _model_card(name: str, header: Mapping[str, Any]) -> str:
-    matcher, provenance = header["config"]["matcher"], header["provenance"]
-    posterior, gel_check, split = header["posterior"], header["gel_check"], header["split"]
+def _model_card(name: str, checkpoint: Checkpoint) -> str:
+    config, provenance, split = checkpoint.config, checkpoint.provenance, checkpoint.split
     lines = [
         f"# {name}",
         "",
-        f"Matches touches of {matcher['fingers']} gel image(s) with photos. Tower `{matcher['tower']}`, "
-        f"output `{matcher['tower_output']}`.",
+        f"Matches touches of {config.matcher.fingers} gel image(s) with photos. Tower `{config.matcher.tower}`, "
+        f"output `{config.matcher.tower_output}`.",
         "",
         f"* Trained on: {provenance['source']} (data digest `{provenance['data_digest'][:16]}`)",
-        f"* Best step: {provenance['step']} of {header['config']['training']['iterations']}, "
-        f"seed {header['config']['training']['seed']}",
+        f"* Best step: {provenance['step']} of {config.training.iterations}, seed {config.training.seed}",
     ]
     lines += [f"* Licence of the data of {each.source}: {each}" for each in stored_licences(provenance)]
     if split:
-        lines.append(
-            "* Objects: " + ", ".join(f"{len(split[part])} {part}" for part in ("train", "validation", "test"))
-        )
+        lines.append(f"* Objects: {len(split.train)} train, {len(split.validation)} validation, {len(split.test)} test")
     for key, value in provenance["metrics"].items():
         lines.append(f"* {key.replace('_', ' ')}: {value:.4g}" if isinstance(value, float) else f"* {key}: {value}")
-    if posterior:
+    if posterior := checkpoint.posterior:
         lines.append(
-            f"* Probabilities: fitted on {posterior['tests']} sets of validation touches; "
-            f"slope {posterior['slope']:.3f}, offset {posterior['offset']:.3f}, "
-            f"dependence of grasps {posterior['dependence']:.3f}"
+            f"* Probabilities: fitted on {posterior.tests} sets of validation touches; slope {posterior.slope:.3f}, "
+            f"offset {posterior.offset:.3f}, dependence of grasps {posterior.dependence:.3f}"
         )
-    if references := header["references"]:
+    if references := checkpoint.references:
         lines.append(
-            f"* Reference touches: fitted on {references['touches']} touches of {references['objects']} objects that "
-            "were left out"
+            f"* Reference touches: fitted on {references.touches} touches of {references.objects} objects that were "
+            "left out"
         )
-    if header["verification"]:
-        bounds = VerificationCalibration.from_dict(header["verification"]).bounds(CARD_FAR)
+    if checkpoint.verification:
+        rate = checkpoint.verification.bounds(CARD_FAR).false_rejects
         lines.append(
-            f"* Verification at a false-accept rate of {CARD_FAR:g}: false-reject rate "
-            f"{bounds.false_rejects.value:.3f} [{bounds.false_rejects.low:.3f}, {bounds.false_rejects.high:.3f}]"
+            f"* Verification at a false-accept rate of {CARD_FAR:g}: false-reject rate {rate.value:.3f} "
+            f"[{rate.low:.3f}, {rate.high:.3f}]"
         )
-    if gel_check:
-        rates = [f"{name.replace('_', ' ')} {value:.3f}" for name, value in gel_check["rates"].items()]
+    if check := checkpoint.gel_check:
+        rates = [f"{name.replace('_', ' ')} {value:.3f}" for name, value in check.rates.items()]
         lines.append(f"* Check of gel images, on validation objects: {', '.join(rates)}")
     return "\n".join(lines) + "\n"

@@ -7,11 +7,15 @@ from typing import Any
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
+from _touch_retrieval.documents import typed
 from _touch_retrieval.files import file_digest, open_regular, parse_json
+from retrieval.data.dataset import Split
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.config import Config
 from retrieval.model.fusion_scorer import FusionScorer
 from retrieval.model.gel_check import GelCheck
+from retrieval.model.posterior import Posterior
+from retrieval.model.references import ReferenceCalibration
 from retrieval.model.verification import VerificationCalibration
 
 FORMAT = 2
@@ -26,19 +30,41 @@ class CheckpointInfo:
 
     Attributes:
         path: The file.
-        digest: SHA-256 of the file, in hexadecimal.
+        digest: SHA-256 of the file, in hexadecimal; empty for a model that is not written yet.
         config: Settings of towers, head and preprocessing.
-        provenance: Step, seed, data digest, metrics and so on.
-        gel_check: Thresholds on the readings of the gel head; None without one.
+        provenance: Source, step, seed, data digest, licences of the data and metrics of the training.
+        split: Training, validation and test objects; None if the training run had no split.
+        posterior: Calibration of the match logits; None for an uncalibrated model.
+        gel_check: Thresholds that separate touches, no-contact gels and other images; None without a gel head.
         verification: Error rates of `Searcher.verify`; None if there were too few validation objects.
+        references: Calibration of reference touches; None if there were too few data.
+        pooled_posterior: As `posterior`, of the logits without late interaction; None for a model without cells.
+        pooled_references: As `references`, of the same logits.
     """
 
     path: Path
     digest: str
     config: Config
     provenance: dict[str, Any]
-    gel_check: GelCheck | None
-    verification: VerificationCalibration | None
+    split: Split | None = None
+    posterior: Posterior | None = None
+    gel_check: GelCheck | None = None
+    verification: VerificationCalibration | None = None
+    references: ReferenceCalibration | None = None
+    pooled_posterior: Posterior | None = None
+    pooled_references: ReferenceCalibration | None = None
+
+
+PARTS: dict[str, type[Any]] = {
+    "split": Split,
+    "posterior": Posterior,
+    "gel_check": GelCheck,
+    "verification": VerificationCalibration,
+    "references": ReferenceCalibration,
+    "pooled_posterior": Posterior,
+    "pooled_references": ReferenceCalibration,
+}
+"""Types of the optional entries of a header."""
 
 
 def fingerprint(checkpoint: CheckpointInfo) -> dict[str, str]:
@@ -73,12 +99,14 @@ def checkpoint_info(path: Path, header: dict[str, Any]) -> CheckpointInfo:
         )
     try:
         config = Config.from_dict(header["config"])
-        check = None if header.get("gel_check") is None else GelCheck.from_dict(header["gel_check"])
-        rates = header.get("verification")
-        verification = None if rates is None else VerificationCalibration.from_dict(rates)
+        parts = {
+            name: typed(header[name], kind, name, complete=True, error=BadInput)
+            for name, kind in PARTS.items()
+            if header.get(name) is not None
+        }
     except BadInput as error:
         raise unusable(path, error) from error
-    return CheckpointInfo(path, file_digest(path), config, header["provenance"], check, verification)
+    return CheckpointInfo(path, file_digest(path), config, header["provenance"], **parts)
 
 
 def read_scorer(info: CheckpointInfo) -> FusionScorer:

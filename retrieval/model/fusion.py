@@ -12,16 +12,14 @@ import dataclasses
 import math
 from typing import NamedTuple
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
 from retrieval.errors import BadInput
 from retrieval.model.candidate_encoder import CandidateEncoder
 from retrieval.model.config import MatcherConfig
-from retrieval.model.fusion_scorer import FusionScorer, Partials
+from retrieval.model.fusion_scorer import FusionScorer
 from retrieval.model.late_interaction import CellEncoder, cell_scores, paired_cell_scores
 from retrieval.model.losses.contrastive import LOG_SCALE_INIT, LOG_SCALE_MAX
 from retrieval.model.towers import build_tower
@@ -135,6 +133,15 @@ class FusionHead(nn.Module):
         x = self.dropout(functional.relu(touch_partial[..., :hidden] + photo_partial[..., :hidden]))
         x = functional.relu(self.second(x))
         return self.out(x).squeeze(-1)  # type: ignore[no-any-return]
+
+    @property
+    def scorer(self) -> FusionScorer:
+        """The layers after the partial activations, without dropout, in numpy; weights on the CPU are shared."""
+        second, bias, out, out_bias = (
+            part.detach().cpu().numpy()
+            for part in (self.second.weight, self.second.bias, self.out.weight[0], self.out.bias)
+        )
+        return FusionScorer(second, bias, out, out_bias, cosine_dim=self.cosine_end - len(out), cell_dim=self.cell_dim)
 
     def _have_cells(self, partial: Tensor) -> bool:
         return partial.shape[-1] > self.cosine_end
@@ -359,36 +366,3 @@ def _projection(features: int, config: MatcherConfig) -> nn.Module:
 
 def _unit(x: Tensor) -> Tensor:
     return functional.normalize(x.float(), dim=-1, eps=1e-6)
-
-
-def scorer_of(head: FusionHead) -> FusionScorer:
-    """Return the scorer of a head: its layers after the partial activations, without dropout.
-
-    It shares the head's weights if these are on the CPU.
-    """
-    second, bias, out, out_bias = (
-        part.detach().cpu().numpy()
-        for part in (head.second.weight, head.second.bias, head.out.weight[0], head.out.bias)
-    )
-    cosine_dim = head.cosine_end - len(out)
-    return FusionScorer(second, bias, out, out_bias, cosine_dim=cosine_dim, cell_dim=head.cell_dim)
-
-
-def score_partials(
-    head: FusionHead,
-    touch_partials: Tensor,
-    photo_partials: Partials,
-    rows: NDArray[np.int64] | None = None,
-) -> NDArray[np.float32]:
-    """Return `FusionScorer.logits` for a head in PyTorch.
-
-    Args:
-        head: The fusion head.
-        touch_partials: (G, a) partial activations of the grasps.
-        photo_partials: (N, b) partial activations of the photos.
-        rows: Photos to score; None for all.
-
-    Returns:
-        Summed match logits (len(rows),).
-    """
-    return scorer_of(head).logits(touch_partials.detach().cpu().numpy(), photo_partials, rows)

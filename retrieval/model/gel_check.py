@@ -5,18 +5,15 @@ contact, gel without contact, or a picture that is not a gel image. With a no-co
 from that frame, which needs no model.
 """
 
-import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from _touch_retrieval.documents import typed
 from retrieval.data.resize import RgbImage, resize
-from retrieval.errors import BadInput
 
 CONTACT, NO_CONTACT, NOT_A_GEL = "contact", "no contact", "not a gel image"
 BLOCKS = 16
@@ -63,15 +60,6 @@ class GelCheck:
             (CONTACT if contact else NO_CONTACT) if gel else NOT_A_GEL
             for gel, contact in zip(is_gel, has_contact, strict=True)
         ]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return a plain dictionary, as stored in checkpoints."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: Any) -> "GelCheck":
-        """Inverse of `to_dict`. Raises BadInput for anything else."""
-        return typed(data, cls, "gel_check", complete=True, error=BadInput)
 
 
 def contact_level(touch: RgbImage, no_contact: RgbImage) -> float:

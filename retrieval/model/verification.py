@@ -15,16 +15,15 @@ expected object is any other object, or the object whose photos are most similar
 Terms follow ISO/IEC 19795-1: false-accept rate (FAR), false-reject rate (FRR), genuine, impostor.
 """
 
-import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from _touch_retrieval.documents import check_fields, typed
+from _touch_retrieval.documents import check_fields
 from retrieval.errors import BadInput
 
 MAX_GRASPS = 4
@@ -152,15 +151,6 @@ class VerificationCalibration:
             error_rate(min(1.0, rejects + early), self.objects),
             tuple(1 - _fraction_below(accept, quantiles) for quantiles in self.genuine),
         )
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return a plain dictionary, as stored in checkpoints."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: Any) -> "VerificationCalibration":
-        """Inverse of `to_dict`. Raises BadInput for anything else."""
-        return typed(data, cls, "verification", complete=True, error=BadInput)
 
 
 def supports_calibration(group_sizes: tuple[int, ...]) -> bool:

@@ -11,7 +11,6 @@ import torch
 from benchmarks import scale
 from benchmarks.common import matcher_of
 from retrieval.model.checkpoint import Checkpoint
-from retrieval.model.fusion import scorer_of
 from tests.conftest import TINY
 
 
@@ -23,7 +22,7 @@ def crowd():
     object.__setattr__(checkpoint, "matcher", matcher)
     rng = np.random.default_rng(0)
     photos, touches = (rng.normal(size=(n, config.matcher.partial_width)).astype(np.float32) for n in (50, 19))
-    return scale.BlendedPhotos(checkpoint, scorer_of(matcher.head), photos, touches[:12], touches[12:])
+    return scale.BlendedPhotos(checkpoint, matcher.head.scorer, photos, touches[:12], touches[12:])
 
 
 def test_every_kind_returns_its_figures(crowd, tmp_path):

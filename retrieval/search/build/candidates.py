@@ -8,7 +8,6 @@ The cost of exhaustive search grows with the catalogue, so larger catalogues use
 until a tenth of the photos has changed.
 """
 
-import copy
 import time
 from collections.abc import Mapping
 from itertools import takewhile
@@ -23,8 +22,7 @@ from retrieval.console.progress import Bar
 from retrieval.errors import BadInput
 from retrieval.metrics.intervals import binomial_interval
 from retrieval.model.checkpoint import Checkpoint
-from retrieval.model.fusion import score_partials
-from retrieval.model.fusion_scorer import Partials
+from retrieval.model.fusion_scorer import FusionScorer, Partials
 
 TARGET = 0.99
 """Agreement@k that the chosen number of candidates reaches."""
@@ -57,13 +55,12 @@ def measure_candidates(
         return {"k": photos, "top1_agreement": 1.0, "queries": 0, "photos": photos}
     if not can_measure(checkpoint):
         return None
-    # Scored and timed on the CPU as in searches, even if the towers run on a GPU.
-    head, (touches, queries) = copy.deepcopy(checkpoint.matcher.head).cpu(), _queries(checkpoint, photos)
+    scorer, (touches, queries) = checkpoint.matcher.head.scorer, _queries(checkpoint, photos)
     top1, taken = [], []
     with Bar("measure", len(queries), "touches", quiet=quiet) as bar:
         for touch in touches:
             start = time.perf_counter()
-            top1.append(int(score_partials(head, touch[None], partials).argmax()))
+            top1.append(int(scorer.logits(touch[None], partials).argmax()))
             taken.append(time.perf_counter() - start)
             bar.advance()
     exhaustive_ms = ms = 1e3 * median(taken)
@@ -72,7 +69,7 @@ def measure_candidates(
         if hits / len(queries) >= TARGET:
             break
     if k < photos:
-        ms = _search_ms(head, touches[:TIMED_QUERIES], queries, index, partials, k)
+        ms = _search_ms(scorer, touches[:TIMED_QUERIES], queries, index, partials, k)
     return {
         "k": k,
         "top1_agreement": hits / len(queries),
@@ -85,14 +82,14 @@ def measure_candidates(
 
 
 def _search_ms(
-    head: Any, touches: torch.Tensor, queries: Floats, index: VectorIndex, partials: Partials, k: int
+    scorer: FusionScorer, touches: Floats, queries: Floats, index: VectorIndex, partials: Partials, k: int
 ) -> float:
     """Return the median milliseconds of candidate search and reranking, one touch at a time."""
     taken = []
     for number in range(len(touches)):
         start = time.perf_counter()
         rows: RowNumbers = np.sort(index.candidates(queries[number : number + 1], k)[0])
-        score_partials(head, touches[number : number + 1], partials, rows)
+        scorer.logits(touches[number : number + 1], partials, rows)
         taken.append(time.perf_counter() - start)
     return 1e3 * median(taken)
 
@@ -127,7 +124,7 @@ def can_measure(checkpoint: Checkpoint) -> bool:
 
 
 @torch.inference_mode()
-def query_codes(checkpoint: Checkpoint, count: int | None = None) -> tuple[torch.Tensor, Floats]:
+def query_codes(checkpoint: Checkpoint, count: int | None = None) -> tuple[Floats, Floats]:
     """Return partial activations and embeddings of the touches that a checkpoint stores to measure with.
 
     Args:
@@ -146,12 +143,12 @@ def query_codes(checkpoint: Checkpoint, count: int | None = None) -> tuple[torch
             f"{checkpoint.path} must have touches to measure with and a candidate encoder; train it again with "
             "`retrieve train` (a preset with candidate_width above 0)"
         )
-    partials = torch.from_numpy(checkpoint.queries[:count].astype(np.float32))
-    pooled = partials[:, : checkpoint.config.matcher.pooled_width]
+    partials = checkpoint.queries[:count].astype(np.float32)
+    pooled = torch.from_numpy(partials[:, : checkpoint.config.matcher.pooled_width])
     return partials, candidate_encoder.touch(pooled.to(next(candidate_encoder.parameters()).device)).cpu().numpy()
 
 
-def _queries(checkpoint: Checkpoint, photos: int) -> tuple[torch.Tensor, Floats]:
+def _queries(checkpoint: Checkpoint, photos: int) -> tuple[Floats, Floats]:
     """Return `query_codes` of some touches: as many as can score every photo within `MEASUREMENT_FLOPS`.
 
     At least `MIN_QUERIES` are used. One score is a product with a square matrix: 2 hidden^2 operations.

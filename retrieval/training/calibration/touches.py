@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from retrieval.data.dataset import Grasp
-from retrieval.model.fusion import Matcher, scorer_of
+from retrieval.model.fusion import Matcher
 from retrieval.model.references import unit_embeddings
 
 Numbers = NDArray[np.int64]
@@ -79,7 +79,7 @@ def calibration_touches(
     photo_partials, photo_embeddings = encoded.partial.cpu().numpy(), encoded.embedding.cpu().numpy()
     if pooled:
         photo_partials = photo_partials[:, : matcher.config.pooled_width]
-    scorer = scorer_of(matcher.head)
+    scorer = matcher.head.scorer
     logits = np.stack([scorer.logits(partial[None], photo_partials) for partial in touch_partials])
     embeddings = unit_embeddings(touch_partials, matcher.config.cosine_columns)
     return CalibrationTouches(ScoredTouches(logits, touch_owner, photo_owner, own), embeddings, photo_embeddings)

@@ -19,7 +19,7 @@ from retrieval.metrics.ranking import (
     reciprocal_rank,
 )
 from retrieval.metrics.table import ScoreTable
-from retrieval.model.fusion import FusionHead, score_partials
+from retrieval.model.fusion import FusionHead
 from tests.hard_case import HardCase, error_of
 
 _TOP, _MEASURES, _PARTIALS, _INTERVALS = "top k", "rank measures", "partials", "intervals"
@@ -57,7 +57,7 @@ def _nan_partial() -> HardCase:
     partials = np.array([[1.0], [np.nan], [2.0]], np.float16)
     logits = np.maximum(partials[:, 0], 0)
     naive = np.argsort(logits)[::-1]
-    ours, holds = error_of(lambda: score_partials(_adding_head(1), torch.zeros(1, 1), partials), "photo row 1")
+    ours, holds = error_of(lambda: _adding_head(1).scorer.logits(torch.zeros(1, 1).numpy(), partials), "photo row 1")
     text = f"photos {', '.join(map(str, naive))}: the NaN is best"
     case = "one of three partial activations is NaN"
     return HardCase(_TOP, case, "refused, the row named", text, ours, holds, naive[0] == 2)
@@ -76,7 +76,7 @@ def _sum_of_partials() -> HardCase:
     """40000 + 40000 is infinite in float16; stored in float16 and added in float32 it is 80000."""
     partials, touch = np.array([[4e4]], np.float16), torch.tensor([[4e4]])
     naive = float((partials + touch.numpy().astype(np.float16))[0, 0])
-    ours = float(score_partials(_adding_head(1), touch, partials)[0])
+    ours = float(_adding_head(1).scorer.logits(touch.numpy(), partials)[0])
     case = "two partial activations of 40000"
     return HardCase(_PARTIALS, case, "logit 80000", f"{naive:g}", f"{ours:g}", ours == 8e4, naive == 8e4)
 
@@ -85,7 +85,7 @@ def _subnormal_partials() -> HardCase:
     """1e-6 to 8e-6 are below float16's normal numbers: added to a touch of 1 in float16, all photos tie."""
     partials, touch = (np.arange(1, 9)[:, None] * 2.0**-20).astype(np.float16), torch.ones(1, 1)
     naive = (partials + np.float16(1))[:, 0]
-    ours = score_partials(_adding_head(1), touch, partials)
+    ours = _adding_head(1).scorer.logits(touch.numpy(), partials)
     naive_text, text = (f"{len(np.unique(scores))} distinct" for scores in (naive, ours))
     holds, tied = ours.tolist() == [1 + row * 2.0**-20 for row in range(1, 9)], len(np.unique(naive)) < 8
     expected = "8 distinct logits, 1e-6 apart"

@@ -20,9 +20,9 @@ from _touch_retrieval.files import file_digest
 from retrieval.data.dataset import Split
 from retrieval.errors import CheckpointError
 from retrieval.model.checkpoint import (
+    Checkpoint,
     load_checkpoint,
     read_tensors,
-    save_checkpoint,
     store_checkpoint,
     write_tensors,
 )
@@ -51,7 +51,7 @@ def save(path, **changes):
     if changes.get("gel_check"):
         matcher.gel_head = GelHead(matcher.touch_tower.feature_count)
     contents = {"split": SPLIT, "posterior": POSTERIOR, "provenance": PROVENANCE} | changes
-    save_checkpoint(path, matcher, TINY, **contents)
+    store_checkpoint(Checkpoint(path, "", TINY, matcher=matcher, **contents), path)
     return matcher
 
 
@@ -244,7 +244,7 @@ def test_a_weight_that_is_not_finite_is_refused(saved, value):
         ({"config": {"matcher": {"colour": 1}}}, "matcher has no setting 'colour'; known settings:"),
         ({"config": {"matcher": {"tower": "vgg"}}}, "tower must be one of"),
         ({"config": [1]}, "it must be a table"),
-        ({"split": {"train": ["a"]}}, "split must have seed, train, validation, test; validation is missing"),
+        ({"split": {"train": ["a"]}}, "split must have seed, train, validation, test; seed is missing"),
         ({"split": []}, "split must be a table"),
         (
             {"posterior": {"slope": 1.0}},
@@ -261,7 +261,7 @@ def test_a_weight_that_is_not_finite_is_refused(saved, value):
         ),
         ({"gel_check": {"rates": {}}}, "gel_check must have foreign_above, contact_above, level_above"),
         (
-            {"gel_check": GEL_CHECK.to_dict() | {"level_above": "1"}},
+            {"gel_check": dataclasses.asdict(GEL_CHECK) | {"level_above": "1"}},
             "gel_check.level_above must be a number or nothing, got '1'",
         ),
     ],

@@ -1,5 +1,6 @@
 """The touch encoder as ONNX: the same numbers, no PyTorch in a query, and no stale file in use."""
 
+import dataclasses
 import json
 import shutil
 import subprocess
@@ -16,7 +17,7 @@ from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import BadInput, CheckpointError, NumericalError, RetrievalError
 from retrieval.model import export as exporting
 from retrieval.model import onnx_encoder
-from retrieval.model.checkpoint import load_checkpoint, save_checkpoint
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
 from retrieval.model.config import Config, MatcherConfig
 from retrieval.model.encode import TorchEncoder, encode_touches, torch_photo_encoder, touch_features
 from retrieval.model.export import choose_photo_encoder, export
@@ -61,7 +62,7 @@ def export_random_matcher(path, config, seed=0, *, gel_head=False):
         if isinstance(module, torch.nn.BatchNorm2d | torch.nn.BatchNorm1d):
             module.running_mean.uniform_(-0.1, 0.1)
             module.running_var.uniform_(0.5, 1.5)
-    save_checkpoint(path, matcher, config, split=None, provenance=PROVENANCE)
+    store_checkpoint(Checkpoint(path, "", config, PROVENANCE, matcher=matcher), path)
     checkpoint = load_checkpoint(path)
     path.with_suffix(".onnx").write_bytes(exporting.touch_encoder_to_onnx(checkpoint))
     return checkpoint.matcher, OnnxEncoder(path.with_suffix(".onnx"), checkpoint.digest)
@@ -134,7 +135,7 @@ def test_with_an_export_a_query_runs_with_torch_blocked(model_copy, index, touch
 def test_a_stale_export_is_not_used_and_a_warning_is_logged(model_copy, index, touch, catalogue, tmp_path, caplog):
     export(load_checkpoint(model_copy))
     checkpoint = load_checkpoint(model_copy)
-    save_checkpoint(model_copy, checkpoint.matcher, checkpoint.config, split=None, provenance=PROVENANCE)
+    store_checkpoint(dataclasses.replace(checkpoint, provenance=PROVENANCE), model_copy)
     build_index(catalogue, load_checkpoint(model_copy), tmp_path / "index", quiet=True)
     assert Searcher.open(index).query([touch]).index["encoder"] == "torch"
     assert "m.onnx is the export of another checkpoint" in caplog.text

@@ -10,7 +10,7 @@ from torch.nn import functional
 from retrieval.errors import NumericalError
 from retrieval.model import fusion_scorer
 from retrieval.model.config import MatcherConfig
-from retrieval.model.fusion import FusionHead, Matcher, Standardise, score_partials
+from retrieval.model.fusion import FusionHead, Matcher, Standardise
 from retrieval.model.towers import TOWERS
 
 
@@ -52,7 +52,7 @@ def test_the_cosine_of_the_embeddings_adds_to_the_logit_and_is_part_of_the_parti
         expected = without + matcher.cosine_scale * cosine
         assert touch.partial.shape == photo.partial.shape == (3, config.partial_width) == (3, 64 + 16)
         torch.testing.assert_close(matcher(touches, photos), expected, rtol=1e-5, atol=1e-5)
-        two = score_partials(matcher.head, touch.partial[:2], photo.partial.numpy())
+        two = matcher.head.scorer.logits(touch.partial[:2].numpy(), photo.partial.numpy())
         by_pair = matcher.head(touch.partial[:2, None], photo.partial[None]).sum(0)
         torch.testing.assert_close(torch.from_numpy(two), by_pair, rtol=1e-5, atol=1e-5)
         matcher.cosine_scale.fill_(-1.0)  # the scale never rewards a low cosine
@@ -110,7 +110,7 @@ def test_scores_of_many_photos_are_the_logits_of_single_pairs_for_any_block_size
         expected = [
             sum(float(head(touch[None], torch.from_numpy(photo[None]))) for touch in touches) for photo in photos
         ]
-    np.testing.assert_allclose(score_partials(head, touches, photos), expected, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(head.scorer.logits(touches.numpy(), photos), expected, rtol=1e-5, atol=1e-5)
 
 
 def test_a_logit_that_is_not_finite_is_an_error_although_sorting_would_rank_it_first():
@@ -119,7 +119,7 @@ def test_a_logit_that_is_not_finite_is_an_error_although_sorting_would_rank_it_f
     photos = np.zeros((3, 32), dtype=np.float32)
     photos[1] = np.inf
     with pytest.raises(NumericalError, match="photo row 1"):
-        score_partials(small_head(), torch.randn(1, 32), photos)
+        small_head().scorer.logits(torch.randn(1, 32).numpy(), photos)
 
 
 def test_views_of_a_photo_reach_the_tower_one_by_one_with_channels_last():

@@ -8,7 +8,7 @@ import torch
 
 from retrieval.errors import ConfigError
 from retrieval.model.config import MatcherConfig
-from retrieval.model.fusion import Matcher, scorer_of
+from retrieval.model.fusion import Matcher
 from retrieval.model.late_interaction import CellEncoder, cell_scores, paired_cell_scores
 from retrieval.model.losses.listwise import listwise_loss
 from retrieval.model.losses.loss import EncodedBatch
@@ -90,7 +90,7 @@ def test_logits_of_every_pair_equal_those_of_single_pairs_and_those_in_numpy(mat
     assert photo.shape[1] == CELLS.partial_width
     for row in range(3):
         torch.testing.assert_close(table[row], matcher.head(touch[row][None], photo), rtol=1e-5, atol=1e-5)
-        numpy = scorer_of(matcher.head).logits(touch[row][None].numpy(), photo.numpy())
+        numpy = matcher.head.scorer.logits(touch[row][None].numpy(), photo.numpy())
         np.testing.assert_allclose(numpy, table[row], rtol=1e-5, atol=1e-5)
 
 

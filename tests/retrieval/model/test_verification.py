@@ -7,6 +7,7 @@ import re
 import numpy as np
 import pytest
 
+from _touch_retrieval.documents import typed
 from retrieval.errors import BadInput
 from retrieval.model.posterior import Posterior
 from retrieval.model.verification import (
@@ -155,11 +156,11 @@ def test_objects_of_two_groups_are_not_compared_with_each_other():
 
 
 def test_the_document_of_a_calibration_gives_the_same_calibration(fitted):
-    document = json.loads(json.dumps(fitted.to_dict()))
-    assert VerificationCalibration.from_dict(document) == fitted
+    document = json.loads(json.dumps(dataclasses.asdict(fitted)))
+    assert typed(document, VerificationCalibration, "verification", complete=True) == fitted
     assert len(document["impostors"]) == len(LEVELS)
     assert len(document["similar"]) == len(QUANTILES)
     with pytest.raises(BadInput, match="verification must have"):
-        VerificationCalibration.from_dict({**document, "impostors": [1.0]})
+        VerificationCalibration(**document | {"impostors": [1.0]})
     with pytest.raises(BadInput, match=r"verification.*objects"):
-        VerificationCalibration.from_dict({**document, "group_sizes": [3]})
+        VerificationCalibration(**document | {"group_sizes": [3]})

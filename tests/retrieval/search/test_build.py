@@ -19,7 +19,7 @@ from retrieval.commands.main import main
 from retrieval.data import preprocessing
 from retrieval.data.catalogue import list_catalogue, read_photo
 from retrieval.errors import DatasetError, NumericalError
-from retrieval.model.checkpoint import load_checkpoint, save_checkpoint
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
 from retrieval.model.encode import encode_photos
 from retrieval.search.build import codes
 from retrieval.search.build.build_index import build_index
@@ -79,7 +79,7 @@ def changed_model(checkpoint, path, by=0.5):
     """A checkpoint with other weights."""
     with torch.no_grad():
         checkpoint.matcher.head.out.bias += by
-    save_checkpoint(path, checkpoint.matcher, checkpoint.config, split=None, provenance=PROVENANCE)
+    store_checkpoint(Checkpoint(path, "", checkpoint.config, PROVENANCE, matcher=checkpoint.matcher), path)
     return load_checkpoint(path)
 
 

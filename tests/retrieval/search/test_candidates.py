@@ -11,6 +11,7 @@ import indexes
 from indexes.store.folder import IndexStore
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
 from retrieval.model.fusion import Matcher
+from retrieval.model.fusion_scorer import FusionScorer
 from retrieval.search.build import build_index as building
 from retrieval.search.build import candidates as measuring
 from retrieval.search.build.build_index import build_index
@@ -97,7 +98,7 @@ def test_an_index_that_finds_nothing_reranks_every_photo(checkpoint, gallery):
 
 
 def test_few_photos_are_all_scored_and_a_model_without_touches_measures_nothing(checkpoint, gallery, monkeypatch):
-    monkeypatch.setattr(measuring, "score_partials", None)
+    monkeypatch.setattr(FusionScorer, "logits", None)
     few = measure_candidates(checkpoint, indexes.build(gallery[0][:4]), gallery[1][:4])
     assert (few["k"], few["queries"]) == (4, 0)
     assert candidates_sentence(few, 4) == "The fusion head scores all 4 photos."

@@ -12,7 +12,7 @@ from indexes.store.folder import IndexStore
 from indexes.store.sharded import read_sharded_manifest
 from retrieval.commands.main import main
 from retrieval.errors import BadInput
-from retrieval.model.checkpoint import load_checkpoint, read_tensors, save_checkpoint, store_checkpoint
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint, read_tensors, store_checkpoint
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
 from retrieval.model.posterior import Posterior
@@ -44,7 +44,7 @@ def checkpoint(tmp_path):
         "pooled_posterior": POOLED_POSTERIOR,
         "pooled_references": POOLED_REFERENCES,
     }
-    save_checkpoint(path, Matcher(CELLS).eval(), config, split=None, provenance=provenance, **calibration)
+    store_checkpoint(Checkpoint(path, "", config, provenance, matcher=Matcher(CELLS).eval(), **calibration), path)
     return load_checkpoint(path)
 
 
@@ -227,6 +227,6 @@ def test_a_model_with_a_candidate_encoder_embeds_its_stored_touches(
     config = Config(sizes, TINY.training, TINY.preprocessing)
     queries = np.ones((3, sizes.touch_partial_width), dtype=np.float16)
     path, provenance = tmp_path / "encoder.safetensors", checkpoint.provenance
-    save_checkpoint(path, Matcher(sizes).eval(), config, split=None, provenance=provenance, queries=queries)
+    store_checkpoint(Checkpoint(path, "", config, provenance, matcher=Matcher(sizes).eval(), queries=queries), path)
     report = build_index(catalogue, load_checkpoint(path), tmp_path / "index", cells=cells, quiet=True)
     assert report.candidates["queries"] == 3

@@ -14,7 +14,7 @@ import torch
 from indexes.errors import MismatchedIndex
 from indexes.kinds.vector_index import VectorIndex
 from retrieval.errors import BadInput, CheckpointError, ImageError
-from retrieval.model.checkpoint import load_checkpoint, save_checkpoint
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
 from retrieval.model.encode import to_batch, touch_batch
 from retrieval.model.posterior import Posterior
 from retrieval.search.build.build_index import build_index
@@ -65,9 +65,8 @@ def variant(model, path, **changes):
         config = dataclasses.replace(config, **{part: dataclasses.replace(getattr(config, part), **{name: value})})
     provenance = {"source": "a test", "step": 1, "data_digest": "0" * 64, "metrics": {}}
     posterior, check = checkpoint.posterior, checkpoint.gel_check
-    save_checkpoint(
-        path, checkpoint.matcher, config, split=None, provenance=provenance, posterior=posterior, gel_check=check
-    )
+    contents = {"matcher": checkpoint.matcher, "posterior": posterior, "gel_check": check}
+    store_checkpoint(Checkpoint(path, "", config, provenance, **contents), path)
     return load_checkpoint(path)
 
 
