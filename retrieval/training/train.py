@@ -287,8 +287,6 @@ class Trainer:
             digest="",
             config=self.config_without_encoder,
             provenance={"step": best.step, **self.provenance, "metrics": best.metrics},
-            gel_check=None,
-            verification=None,
             matcher=self.matcher.eval(),
             split=self.split,
         )
