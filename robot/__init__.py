@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from robot.rig import load_rig as load_rig
     from robot.sim.gel.sensor import draw_sensor as draw_sensor
     from robot.sim.objects.draw import draw_object as draw_object
-    from robot.sim.pinch import Grip as Grip
+    from robot.sim.scene import Grip as Grip
     from robot.sim.scene import Scene as Scene
 
 _MODULES = {
@@ -44,7 +44,7 @@ _MODULES = {
     "Frame": "readings",
     "GraspPlan": "grasping.planner",
     "GraspPlanner": "grasping.planner",
-    "Grip": "sim.pinch",
+    "Grip": "sim.scene",
     "Gripper": "devices",
     "Pose": "readings",
     "RecordedGrasp": "recording.grasp",

@@ -15,7 +15,7 @@ from robot.sim.contact.layer import SINGLE_PRECISION_TOLERANCE, Contact, Layer, 
 from robot.sim.contact.scaled_problem import ElasticSurface, ScaledProblem
 from robot.sim.gel.optics import LedOptics
 from robot.sim.gel.surface import Field, Surface
-from robot.sim.pinch import Hand
+from robot.sim.scene import Hand
 
 LAYER = Layer(HALF_SPACE.modulus_mpa, 0.48, 2.0)
 CAMERA_NOISE = 0.8

@@ -18,8 +18,7 @@ from robot.sim.camera import NOISE, PinholeCamera
 from robot.sim.objects.body import GEL_STEP_MM, ClippedRays, SdfBody, Vectors, clip_to_box
 from robot.sim.objects.draw import draw_object
 from robot.sim.objects.packets import MAX_STEPS, first_hits, hits
-from robot.sim.pinch import Grip
-from robot.sim.scene import Scene
+from robot.sim.scene import Grip, Scene
 
 _FAMILIES = ("knurl", "bumps", "weave")
 _OBJECTS, _PX = 8, 256

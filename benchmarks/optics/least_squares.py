@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.optics.real_presses import PIXEL_MM, BallTable, Presses, ball_table, changed_centre
-from robot.sim.gel.fitted_optics import feature_count, normal_features, place_terms
+from robot.sim.gel.fitted_optics import normal_features, place_terms
 
 Matrix = NDArray[np.float64]
 
@@ -121,7 +121,7 @@ def solve(grams: Sequence[Gram], ridge: float) -> Matrix:
 
 def columns_of(wide: OpticsSetting, narrow: OpticsSetting) -> NDArray[np.intp]:
     """Return the columns of a wide model that form a narrower one (lower degree, fewer places, same or no reaches)."""
-    lit, lit_wide = feature_count(narrow.degree, 0), feature_count(wide.degree, 0)
+    lit, lit_wide = (model.degree * (model.degree + 3) // 2 for model in (narrow, wide))
     chosen = [*range(lit), *range(lit_wide, lit_wide + 3 * len(narrow.reaches_mm))]
     return np.array([one * wide.places + place for one in chosen for place in range(narrow.places)], dtype=np.intp)
 

@@ -26,7 +26,6 @@ from benchmarks.optics.least_squares import Matrix
 from benchmarks.optics.model_choice import Fit, fit, held_out_error, picture_error, select, to_optics
 from benchmarks.optics.real_presses import BALLS_MM, Presses, find_presses, read_presses
 from robot.errors import BadRobotInput, RobotError
-from robot.sim.gel.fitted_optics import optics_to_json
 
 FIT_COUNT = {"gelsight": 36, "gelsight_mini": 18}
 SPLITS = 5
@@ -112,6 +111,7 @@ def document(presses: Presses, scores: dict[str, Scores]) -> dict[str, Any]:
     setting = select(presses, everything, align=True, ship=True)
     fitted = fit(presses, everything, setting, align=True)
     figures = {name: one.summary() for name, one in scores.items()}
+    model = json.dumps(asdict(to_optics(presses, fitted)))
     return {
         "sensor": presses.name,
         "source": SOURCE,
@@ -121,7 +121,7 @@ def document(presses: Presses, scores: dict[str, Scores]) -> dict[str, Any]:
             name: {key: {part: round(number, 4) for part, number in value.items()} for key, value in one.items()}
             for name, one in figures.items()
         },
-        "model": optics_to_json(to_optics(presses, fitted)),
+        "model": json.loads(model, parse_float=lambda text: float(f"{float(text):.6g}")),
     }
 
 

@@ -16,7 +16,7 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from robot.grasping.settings import GraspSettings
 from robot.sim.objects.mesh import MeshBody
-from robot.sim.pinch import PAD_MM
+from robot.sim.scene import PAD_MM
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -16,7 +16,6 @@ import numpy.typing as npt
 from robot.sim.light import GAMMA, Floats, GBuffer, Lamps, develop, radiance
 from robot.sim.objects.body import Body
 from robot.sim.objects.draw import SimObject
-from robot.sim.objects.materials import ObjectMaterial
 
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
@@ -144,9 +143,9 @@ class Lighting:
         table_seed: seed of the table's texture.
     """
 
-    direction: tuple[float, float, float]
-    lamp: tuple[float, float, float]
-    sky: tuple[float, float, float]
+    direction: tuple[float, ...]
+    lamp: tuple[float, ...]
+    sky: tuple[float, ...]
     exposure: float
     table_seed: int
 
@@ -161,11 +160,9 @@ class Lighting:
         lamp = rng.uniform(0.75, 1.0) * np.array([1 + warmth, 1.0, 1 - warmth])
         sky = rng.uniform(0.18, 0.32) * np.array([1 - warmth, 1.0, 1 + warmth])
         direction = math.cos(height) * math.cos(turn), math.cos(height) * math.sin(turn), math.sin(height)
-        return cls(direction, _triple(lamp), _triple(sky), rng.uniform(0.85, 1.15), int(rng.integers(2**31)))
-
-
-def _triple(values: Array) -> tuple[float, float, float]:
-    return float(values[0]), float(values[1]), float(values[2])
+        return cls(
+            direction, tuple(lamp.tolist()), tuple(sky.tolist()), rng.uniform(0.85, 1.15), int(rng.integers(2**31))
+        )
 
 
 @dataclass(frozen=True)
@@ -248,16 +245,12 @@ def shading_inputs(view: CameraView, lighting: Lighting) -> tuple[GBuffer, Lamps
     colour = _table(lighting.table_seed, view.camera)
     colour[view.pixels] = view.obj.appearance.albedo(view.object_points)
     surfaces = GBuffer(view.camera.rays, normals, view.is_object, lamp_visibility, occlusion.ravel(), colour)
-    return surfaces, _lamps(lighting, view.obj.material)
-
-
-def _lamps(lighting: Lighting, material: ObjectMaterial) -> Lamps:
-    """Return the lamps; the rougher the material, the wider and weaker its highlight."""
-    sharpness = 4.0 + 120.0 * (1.0 - material.roughness) ** 2
+    # The rougher the material, the wider and weaker its highlight.
+    sharpness = 4.0 + 120.0 * (1.0 - view.obj.material.roughness) ** 2
     strength = (sharpness + 8.0) / 60.0
     lamp, sky = (lighting.exposure * np.array(colour) for colour in (lighting.lamp, lighting.sky))
-    gloss = strength * material.gloss, strength * _TABLE_GLOSS
-    return Lamps(np.array(lighting.direction), lamp, sky, gloss, sharpness)
+    gloss = strength * view.obj.material.gloss, strength * _TABLE_GLOSS
+    return surfaces, Lamps(light, lamp, sky, gloss, sharpness)
 
 
 def _lamp_visibility(view: CameraView, own: Array, light: Array) -> Floats:
@@ -333,23 +326,13 @@ def depth(view: CameraView, noise_seed: int) -> npt.NDArray[np.float32]:
     px = view.camera.px
     rng = np.random.default_rng([73, noise_seed])
     exact = (view.distance_mm * view.camera.depth_per_distance).reshape(px, px)
-    noisy = _add_flying_pixels(exact, rng) + 1.5 * rng.standard_normal(exact.shape) * (exact / 700.0) ** 2
-    noisy[_hole_mask(view, exact, rng)] = np.nan
-    return (np.round(noisy) / 1000.0).astype(np.float32)
-
-
-def _add_flying_pixels(exact: Array, rng: np.random.Generator) -> Array:
-    """Mix the near and the far surface in some pixels next to an edge."""
-    window = np.ones((3, 3), np.uint8)
-    near, far = cv2.erode(exact, window), cv2.dilate(exact, window)
+    # Next to an edge, some pixels mix the near and the far surface.
+    near, far = cv2.erode(exact, np.ones((3, 3), np.uint8)), cv2.dilate(exact, np.ones((3, 3), np.uint8))
     mixed = near + rng.random(exact.shape) * (far - near)
-    return np.where((far - near > 12.0) & (rng.random(exact.shape) < 0.35), mixed, exact)
-
-
-def _hole_mask(view: CameraView, exact: Array, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
-    """Return where the sensor has no reading: steep surfaces, some glossy pixels, and single pixels anywhere."""
-    px = view.camera.px
+    noisy = np.where((far - near > 12.0) & (rng.random(exact.shape) < 0.35), mixed, exact)
+    noisy = noisy + 1.5 * rng.standard_normal(exact.shape) * (exact / 700.0) ** 2
+    # No reading: steep surfaces, some glossy pixels, and single pixels anywhere.
     steep = np.hypot(cv2.Sobel(exact, cv2.CV_64F, 1, 0, scale=0.125), cv2.Sobel(exact, cv2.CV_64F, 0, 1, scale=0.125))
     gloss = np.where(view.is_object, view.obj.material.gloss, 0.0).reshape(px, px)
-    chance = 0.003 + 0.5 * (steep > 6.0) + 0.06 * gloss
-    return np.asarray(rng.random(exact.shape) < chance)
+    noisy[rng.random(exact.shape) < 0.003 + 0.5 * (steep > 6.0) + 0.06 * gloss] = np.nan
+    return (np.round(noisy) / 1000.0).astype(np.float32)

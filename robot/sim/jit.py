@@ -18,15 +18,11 @@ except ImportError as error:
 
 
 def jit(function: Callable[..., Any], **settings: Any) -> Callable[..., Any]:
-    """Compile a function with numba at its first call with arguments of a type.
+    """Compile a function with numba at its first call with arguments of a type; `settings`: more of `numba.njit`.
 
     The compiled code is cached next to the source, or in the user's cache if that folder is read-only. It is compiled
     again when the function's own file changes, so every function that it calls must be in the same file. Divisions by 0
     follow numpy. It uses no threads, so processes that use it may fork, and it releases the GIL.
-
-    Args:
-        function: the function to compile.
-        **settings: further options of `numba.njit`.
     """
     settings = {"error_model": "numpy", "nogil": True, **settings}
     try:

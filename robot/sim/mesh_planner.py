@@ -14,9 +14,8 @@ from robot.sim.antipodal import AntipodalGrasps, Array
 from robot.sim.camera import Placement
 from robot.sim.meshes import grasps_of
 from robot.sim.objects.mesh import MeshBody
-from robot.sim.pinch import GRAVITY_M_S2
 from robot.sim.rig import SimRig
-from robot.sim.scene import Scene
+from robot.sim.scene import GRAVITY_M_S2, SAFETY, Scene
 
 
 class MeshPlanner(GraspPlanner):
@@ -76,7 +75,7 @@ def _check_graspable(scene: Scene, grasps: AntipodalGrasps, settings: GraspSetti
                 f"{stroke_mm:.0f} mm less {settings.clearance_mm:g} mm of clearance on either side"
             )
         raise UngraspableError("no approach from above or from a side is clear of the object and the table")
-    weight, friction = scene.hand.safety * scene.obj.mass_kg * GRAVITY_M_S2, scene.obj.material.friction
+    weight, friction = SAFETY * scene.obj.mass_kg * GRAVITY_M_S2, scene.obj.material.friction
     if 2 * friction * settings.force_n[1] < weight:
         raise UngraspableError(
             f"too heavy to lift: {scene.obj.mass_kg:.2f} kg of {scene.obj.material.name} need "

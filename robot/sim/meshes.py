@@ -82,7 +82,7 @@ def _resting_object(path: Path, seed: int, settings: GraspSettings) -> SimObject
     """
     mesh = read_mesh(path)
     rated: list[tuple[int, float, SimObject]] = []
-    for up in stable_up_directions(mesh.vertices, mesh.centre_of_mass):
+    for up in stable_up_directions(mesh.vertices, mesh.solid.center_mass):
         obj = mesh_object(path, mesh, seed, up=up)
         found = grasps_of(obj.body, settings)
         rated.append((len(found), -found.min_width_mm, obj))

@@ -2,7 +2,7 @@
 
 import math
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -16,7 +16,7 @@ from robot.devices import Arm, Camera, Gripper, TactileSensor, VirtualDevice
 from robot.errors import DeviceError, RobotConfigError
 from robot.gel_settings import parse_gel_settings
 from robot.grasping.planner import load_planner
-from robot.grasping.settings import GraspSettings, parse_attempt_settings
+from robot.grasping.settings import parse_attempt_settings
 from robot.readings import RGBD, Frame, GripperState, Intrinsics, Pose, Region
 from robot.recording.folder import UNITS
 from robot.rig import Rig
@@ -25,8 +25,7 @@ from robot.sim.camera import PinholeCamera, Placement
 from robot.sim.gel.sensor import draw_sensor
 from robot.sim.objects.draw import STROKE_MM, SimObject, draw_object
 from robot.sim.objects.shapes import SHAPES
-from robot.sim.pinch import PAD_MM, SIDES, Grip, Hand
-from robot.sim.scene import Scene
+from robot.sim.scene import PAD_MM, SIDES, Grip, Hand, Scene
 
 if TYPE_CHECKING:
     from robot.sim.meshes import MeshFolder
@@ -157,7 +156,11 @@ class SimRig(Rig):
         options = SimSettings(**settings)
         self._seed, self._families = seed, tuple(sorted(options.families))
         attempt = parse_attempt_settings(options.attempt, options.grasp)
-        self.meshes = _mesh_folder(options.meshes, seed, attempt.grasp) if options.meshes else None
+        self.meshes: MeshFolder | None = None
+        if options.meshes:
+            from robot.sim import meshes  # slow to import
+
+            self.meshes = meshes.MeshFolder(options.meshes, seed, attempt.grasp)
         self._hand = Hand(
             grid=options.contact_grid, tolerance=options.contact_tolerance, turns_about_grip=self.meshes is not None
         )
@@ -168,7 +171,10 @@ class SimRig(Rig):
             for pair in drawn
         ]
         self._camera = PinholeCamera(focal_px=options.focal_px)
-        clock, self.error_mm = SimClock(), _calibration_error(seed, options.localisation_mm)
+        rng = np.random.default_rng([102, seed])
+        turn, size = rng.uniform(0.0, 2.0 * math.pi), rng.uniform(*options.localisation_mm)
+        self.error_mm = np.array([size * math.cos(turn), size * math.sin(turn), 0.0])
+        clock = SimClock()
         self.sim_state = SimState(clock)
         super().__init__(
             SimArm(self.sim_state),
@@ -264,19 +270,6 @@ class SimRig(Rig):
 def _procedural(seed: int, index: int, families: tuple[str, ...]) -> SimObject:
     """Draw an object, cached: it keeps its baked relief between attempts."""
     return draw_object(seed, index, family=families[index % len(families)] if families else None)
-
-
-def _mesh_folder(folder: str, seed: int, settings: GraspSettings) -> "MeshFolder":
-    from robot.sim.meshes import MeshFolder  # slow to import
-
-    return MeshFolder(folder, seed, settings)
-
-
-def _calibration_error(seed: int, localisation_mm: Sequence[float]) -> Array:
-    """Return the error (3,) of the camera's calibration in mm."""
-    rng = np.random.default_rng([102, seed])
-    turn, size = rng.uniform(0.0, 2.0 * math.pi), rng.uniform(localisation_mm[0], localisation_mm[1])
-    return np.array([size * math.cos(turn), size * math.sin(turn), 0.0])
 
 
 # Devices ----------------------------------------------------------------------------------------------------

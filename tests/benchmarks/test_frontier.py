@@ -52,7 +52,7 @@ def test_the_command_plots_a_kernel_s_row_without_a_recording(model, tmp_path, c
 
 def test_the_rig_solves_contacts_at_the_default():
     from benchmarks.frontier.contact import contact_panels
-    from robot.sim.pinch import Hand
+    from robot.sim.scene import Hand
 
     panels = contact_panels(1, rows=(60, 120), tolerances=(1e-1, 1e-2), reference_rows=120)
     hand = Hand()

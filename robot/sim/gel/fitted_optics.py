@@ -12,7 +12,7 @@ presses), so every quantity is clipped to the limits of the fit.
 """
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
 from typing import Any
@@ -125,11 +125,6 @@ def _slope(heights: Array, axis: int, step_mm: float) -> Array:
     return np.asarray(np.gradient(heights, np.float32(step_mm), axis=axis), np.float32)
 
 
-def feature_count(degree: int, reaches: int) -> int:
-    """Return the number of features of a model of this degree in the normal and this number of reaches."""
-    return degree * (degree + 3) // 2 + 3 * reaches
-
-
 def normal_features(nx: Any, ny: Any, degree: int) -> list[Any]:
     """Return nx^i ny^j for i + j = 1, 2, ... degree."""
     powers_x, powers_y = [np.ones_like(nx)], [np.ones_like(ny)]
@@ -190,17 +185,3 @@ def load_fitted(name: str) -> FittedOptics:
 def optics_from_json(content: dict[str, Any]) -> FittedOptics:
     """Build the optics from the content of a fitted file."""
     return typed(content["model"], FittedOptics, "model")
-
-
-def optics_to_json(optics: FittedOptics) -> dict[str, Any]:
-    """Convert to a document that `optics_from_json` reads, with six digits of each number."""
-    document: dict[str, Any] = _round_numbers(asdict(optics))
-    return document
-
-
-def _round_numbers(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _round_numbers(each) for name, each in value.items()}
-    if isinstance(value, tuple):
-        return [_round_numbers(each) for each in value]
-    return float(f"{value:.6g}") if isinstance(value, float) else value

@@ -33,24 +33,13 @@ class Flaws:
     texture: float = 0.012
 
 
-@dataclass(frozen=True)
-class FlawMaps:
-    """Effect of flaws on a picture.
-
-    Attributes:
-        darkening: (rows, cols) factor of the picture.
-        slope_x: (rows, cols) addition to the gel's slope to the right.
-        slope_y: (rows, cols) addition to the gel's slope downwards.
-    """
-
-    darkening: Array
-    slope_x: Array
-    slope_y: Array
-
-
 @lru_cache(maxsize=8)
-def flaw_maps(flaws: Flaws, field: Field) -> FlawMaps:
-    """Return the maps of these flaws; their places do not depend on the size of the image."""
+def flaw_maps(flaws: Flaws, field: Field) -> tuple[Array, Array, Array]:
+    """Return the effect of flaws on a picture, (rows, cols) each; their places do not depend on the image's size.
+
+    Returns:
+        A factor of the picture, and additions to the gel's slope to the right and downwards.
+    """
     rng = np.random.default_rng([flaws.seed, 0x6E1])
     darkening = _specks(rng, flaws.specks, field) * _hairs(rng, flaws.hairs, field)
     heights = _grains(rng, flaws.grains, field)
@@ -61,7 +50,7 @@ def flaw_maps(flaws: Flaws, field: Field) -> FlawMaps:
     rough = rng.standard_normal((2, field.rows, field.cols), dtype=np.float32)
     # Skin is rough at many scales; a camera still resolves grains of two pixels.
     rough = np.stack([cv2.GaussianBlur(one, (0, 0), 1.4) * np.float32(5.0 * flaws.texture) for one in rough])
-    return FlawMaps(darkening, (right + rough[0]).astype(np.float32), (down + rough[1]).astype(np.float32))
+    return darkening, (right + rough[0]).astype(np.float32), (down + rough[1]).astype(np.float32)
 
 
 def _places(rng: np.random.Generator, count: int) -> NDArray[np.float64]:

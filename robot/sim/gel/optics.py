@@ -19,10 +19,8 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from robot.sim.gel.pixels import shade_by_bars
 from robot.sim.gel.surface import Array, Field, Surface, resized
-
-Triple = tuple[float, float, float]
+from robot.sim.jit import jit
 
 
 class Optics(ABC):
@@ -118,8 +116,8 @@ class LedOptics(Optics):
     """
 
     bars: tuple[LedBar, ...] = MINI_BARS
-    backdrops: tuple[GaussianBackdrop, GaussianBackdrop, GaussianBackdrop] = MINI_BACKDROPS
-    mix: tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]] = MINI_MIX
+    backdrops: tuple[GaussianBackdrop, ...] = MINI_BACKDROPS
+    mix: tuple[tuple[float, ...], ...] = MINI_MIX
     ambient: float = 0.38
     shadow: float = 0.25
     gamma: float = 1.0
@@ -138,7 +136,7 @@ class LedOptics(Optics):
                 shade -= np.float32(self.shadow) * cast
         axes, mix, ambient = (x.ravel(), y.ravel()), np.array(self.mix, np.float32), np.float32(self.ambient)
         out, backdrop = np.empty((field.rows, field.cols, 3), np.float32), self.backdrop(field)
-        shade_by_bars(np.stack(slopes), leds, strengths, axes, shades, mix, ambient, backdrop, out)
+        _shade_by_bars(np.stack(slopes), leds, strengths, axes, shades, mix, ambient, backdrop, out)
         return out if self.gamma == 1 else backdrop * (out / backdrop) ** np.float32(self.gamma)
 
 
@@ -151,7 +149,7 @@ def _backdrop(backdrops: tuple[GaussianBackdrop, ...], field: Field) -> Array:
 
 @lru_cache(maxsize=16)
 def _leds(bars: tuple[LedBar, ...], field: Field) -> tuple[Array, Array]:
-    """Return places (bars, points, 3) and strengths (bars, points, rows, cols) of the LEDs, for `shade_by_bars`.
+    """Return places (bars, points, 3) and strengths (bars, points, rows, cols) of the LEDs, for `_shade_by_bars`.
 
     Bars with fewer points than the longest are padded with LEDs of strength 0.
     """
@@ -181,6 +179,47 @@ def led_strengths(bar: LedBar, field: Field) -> Array:
         flat += strengths[-1] * led[2]
     flat = np.maximum(flat, np.finfo(np.float64).tiny)
     return np.stack([strength / flat for strength in strengths]).astype(np.float32)
+
+
+@jit
+def _shade_by_bars(slopes, leds, strengths, axes, shades, mix, ambient, backdrop, out):  # type: ignore[no-untyped-def]
+    """Write the picture (rows, cols, 3) of LedOptics into `out`; all arrays are float32.
+
+    Args:
+        slopes: (2, rows, cols) slopes of the surface.
+        leds: (bars, points, 3) places of the LEDs, mm.
+        strengths: (bars, points, rows, cols); an LED contributes its strength times (normal . vector to it), or 0.
+        axes: x (cols,) and y (rows,) of the pixels in mm.
+        shades: (bars, rows, cols) fraction of a bar's light that reaches a pixel.
+        mix: (3, bars) contribution of each bar to each channel.
+        ambient: fraction of the light from all directions.
+        backdrop: (rows, cols, 3) picture of the flat gel.
+        out: (rows, cols, 3) result.
+    """
+    bars, points = leds.shape[0], leds.shape[1]
+    rows, cols = slopes.shape[1], slopes.shape[2]
+    x, y = axes
+    light, steep, one = np.empty((bars, cols), np.float32), np.empty(cols, np.float32), np.float32(1)
+    for row in range(rows):
+        for i in range(cols):
+            s, t = slopes[0, row, i], slopes[1, row, i]
+            steep[i] = one / np.sqrt(one + s * s + t * t)
+        for bar in range(bars):
+            for i in range(cols):
+                light[bar, i] = 0
+            for point in range(points):
+                led_x, led_y, led_z = leds[bar, point, 0], leds[bar, point, 1] - y[row], leds[bar, point, 2]
+                for i in range(cols):
+                    towards = led_z - slopes[0, row, i] * (led_x - x[i]) - slopes[1, row, i] * led_y
+                    light[bar, i] += strengths[bar, point, row, i] * (towards if towards > 0 else np.float32(0))
+            for i in range(cols):
+                light[bar, i] *= steep[i] * shades[bar, row, i]
+        for channel in range(3):
+            for i in range(cols):
+                mixed = np.float32(0)
+                for bar in range(bars):
+                    mixed += mix[channel, bar] * light[bar, i]
+                out[row, i, channel] = backdrop[row, i, channel] * (ambient + (one - ambient) * mixed)
 
 
 # Shadows ---------------------------------------------------------------------------------------------------

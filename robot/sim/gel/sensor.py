@@ -23,9 +23,9 @@ from robot.gel_settings import GelSettings
 from robot.sim.contact.layer import Layer
 from robot.sim.gel.fitted_optics import load_fitted
 from robot.sim.gel.marks import Flaws, Markers, flaw_maps, marker_darkening
-from robot.sim.gel.optics import MINI_BACKDROPS, MINI_BARS, GaussianBackdrop, LedBar, LedOptics, Optics, Triple
-from robot.sim.gel.pixels import add_camera_noise
+from robot.sim.gel.optics import MINI_BACKDROPS, MINI_BARS, GaussianBackdrop, LedBar, LedOptics, Optics
 from robot.sim.gel.surface import Array, Field, Surface
+from robot.sim.jit import jit
 
 Picture = NDArray[np.uint8]
 
@@ -42,7 +42,7 @@ class Noise:
     shot: float = 0.006
 
 
-_PLAIN_LED, _PLAIN_NOISE, _UNKNOWN_GEL = LedOptics(), Noise(), GelSettings()
+_PLAIN_LED, _PLAIN_FIELD, _PLAIN_NOISE, _UNKNOWN_GEL = LedOptics(), Field(), Noise(), GelSettings()
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,7 @@ class GelSensor:
     Attributes:
         layer: the elastic gel.
         optics: model that turns the surface into colours.
-        rows: rows of the image.
-        cols: columns of the image.
-        pixel_mm: side of a pixel on the gel.
+        field: the part of the gel in the camera's view.
         tint: factor of each channel.
         exposure: factor of all channels.
         blur_px: standard deviation of the camera's point spread.
@@ -67,10 +65,8 @@ class GelSensor:
 
     layer: Layer
     optics: Optics = _PLAIN_LED
-    rows: int = 240
-    cols: int = 320
-    pixel_mm: float = 0.0634
-    tint: Triple = (1.0, 1.0, 1.0)
+    field: Field = _PLAIN_FIELD
+    tint: tuple[float, ...] = (1.0, 1.0, 1.0)
     exposure: float = 1.0
     blur_px: float = 0.7
     noise: Noise = _PLAIN_NOISE
@@ -83,11 +79,6 @@ class GelSensor:
     def gel(self) -> GelSettings:
         """Thickness and elasticity of the gel."""
         return GelSettings(self.layer.thickness_mm, self.layer.modulus_mpa, self.layer.poisson)
-
-    @property
-    def field(self) -> Field:
-        """The part of the gel in the camera's view."""
-        return Field(self.rows, self.cols, self.pixel_mm)
 
     def background(self, seed: int) -> Picture:
         """Return the no-contact frame, (rows, cols, 3) uint8 RGB; equal to render() of zero displacement."""
@@ -114,8 +105,8 @@ class GelSensor:
         slope_x, slope_y = surface.slopes
         darkening: Array | None = None
         if self.flaws is not None:
-            maps = flaw_maps(self.flaws, self.field)
-            slope_x, slope_y, darkening = slope_x + maps.slope_x, slope_y + maps.slope_y, maps.darkening
+            darkening, right, down = flaw_maps(self.flaws, self.field)
+            slope_x, slope_y = slope_x + right, slope_y + down
         image = self.optics.colours(surface, (slope_x, slope_y))
         if self.markers is not None:
             dots = marker_darkening(self.markers, surface)
@@ -138,12 +129,10 @@ class GelSensor:
         return picture
 
     def _add_noise(self, clean: Array, seed: int) -> Picture:
-        if self.noise.read == 0 and self.noise.shot == 0:
-            return np.clip(np.rint(clean), 0, 255).astype(np.uint8)
         rows, values = clean.shape[0], clean.shape[1] * 3  # a row's colours one after the other
-        tile, place = _draw_noise(self.rows, self.cols, seed)
+        tile, place = _draw_noise(self.field.rows, self.field.cols, seed)
         out, flat = np.empty((rows, values), np.uint8), np.ascontiguousarray(clean).reshape(rows, values)
-        add_camera_noise(flat, tile, place, np.float32(self.noise.read), np.float32(self.noise.shot), out)
+        _add_camera_noise(flat, tile, place, np.float32(self.noise.read), np.float32(self.noise.shot), out)
         return out.reshape(clean.shape)
 
 
@@ -164,7 +153,7 @@ def _tile(rows: int, cols: int, is_mirrored: bool) -> Array:
 
 
 def _draw_noise(rows: int, cols: int, seed: int) -> tuple[Array, tuple[int, int, int, int]]:
-    """Return a large tile of standard normal noise and the place of a window in it, as `add_camera_noise` takes them.
+    """Return a large tile of standard normal noise and the place of a window in it, as `_add_camera_noise` takes them.
 
     Fresh random values would cost more than the optics. 64 x 64 places, mirrored and of either sign, do not repeat
     visibly for a person or a tower.
@@ -175,6 +164,31 @@ def _draw_noise(rows: int, cols: int, seed: int) -> tuple[Array, tuple[int, int,
     first_row, step = (down, 1) if keeps_rows else (down + rows - 1, -1)
     first_col = right if keeps_cols else _TILE_MARGIN - right
     return _tile(rows, cols, not keeps_cols), (first_row, step, 3 * first_col, 1 if is_positive else -1)
+
+
+@jit
+def _add_camera_noise(clean, tile, place, read, shot, out):  # type: ignore[no-untyped-def]
+    """Write rounded grey levels with noise of variance read^2 + shot * level into `out`.
+
+    Args:
+        clean: (rows, n) grey levels; n is the number of columns times 3.
+        tile: (tile rows, tile n) noise of variance 1.
+        place: first row, step from row to row (1 or -1), and first value of a row in the tile; then the noise's sign.
+        read: standard deviation of the read noise.
+        shot: variance of the shot noise per grey level.
+        out: (rows, n) uint8 result.
+    """
+    square = read * read
+    first_row, step, first, sign = place
+    for row in range(out.shape[0]):
+        levels, greys = clean[row], out[row]  # slices of one row are faster than two indices
+        noise = tile[first_row + step * row, first : first + len(greys)]
+        for i in range(len(greys)):
+            level = levels[i]
+            spread = np.float32(sign) * np.sqrt((level if level > 0 else np.float32(0)) * shot + square)
+            grey = np.rint(level + spread * noise[i])
+            grey = grey if grey > 0 else np.float32(0)
+            greys[i] = np.int32(grey if grey < 255 else np.float32(255))
 
 
 # Drawing sensors -------------------------------------------------------------------------------------------
@@ -210,29 +224,20 @@ def draw_sensor(seed: int, finger: str, *, optics: str = "led", gel: GelSettings
     )
     sensor = GelSensor(
         replace(layer, **gel.known()),
-        tint=_triple(1 + 0.02 * rng.standard_normal(3)),
+        tint=tuple((1 + 0.02 * rng.standard_normal(3)).tolist()),
         exposure=float(rng.uniform(0.9, 1.12)),
         blur_px=float(rng.uniform(0.5, 0.9)),
         noise=Noise(float(rng.uniform(0.6, 1.1)), float(rng.uniform(0.003, 0.012))),
-        flaws=_draw_flaws(rng),
+        flaws=Flaws(
+            seed=int(rng.integers(1 << 31)),
+            specks=int(rng.poisson(12)),
+            hairs=int(rng.poisson(2.5)),
+            grains=int(rng.poisson(20)),
+            texture=float(rng.uniform(0.003, 0.01)),
+        ),
     )
     sensor = replace(sensor, optics=OPTICS[optics](rng))
     return _draw_camera(sensor, rng) if optics == "varied" else sensor
-
-
-def _triple(values: Any) -> Triple:
-    red, green, blue = (float(value) for value in values)
-    return red, green, blue
-
-
-def _draw_flaws(rng: np.random.Generator) -> Flaws:
-    return Flaws(
-        seed=int(rng.integers(1 << 31)),
-        specks=int(rng.poisson(12)),
-        hairs=int(rng.poisson(2.5)),
-        grains=int(rng.poisson(20)),
-        texture=float(rng.uniform(0.003, 0.01)),
-    )
 
 
 def _draw_led(rng: np.random.Generator) -> LedOptics:
@@ -244,7 +249,7 @@ def _draw_led(rng: np.random.Generator) -> LedOptics:
     )
     return LedOptics(
         bars,
-        backdrops,  # type: ignore[arg-type]
+        backdrops,
         ambient=float(rng.uniform(0.33, 0.43)),
         shadow=float(rng.uniform(0.15, 0.35)),
     )
@@ -283,8 +288,8 @@ def _draw_varied(rng: np.random.Generator) -> LedOptics:
         rows, backdrops = rows[[0, 0, 0]], backdrops[:1] * 3
     return LedOptics(
         bars,
-        backdrops,  # type: ignore[arg-type]
-        tuple(tuple(float(value) for value in row / row.sum()) for row in rows),  # type: ignore[arg-type]
+        backdrops,
+        tuple(tuple(float(value) for value in row / row.sum()) for row in rows),
         ambient=float(rng.uniform(0.15, 0.6)),
         shadow=float(rng.uniform(0, 0.4)),
         gamma=float(np.exp(rng.uniform(-0.5, 0.5))),
@@ -308,8 +313,8 @@ def _draw_camera(sensor: GelSensor, rng: np.random.Generator) -> GelSensor:
     has_markers, is_reduced, is_compressed = (bool(value) for value in rng.uniform(size=3) < (0.25, 0.5, 0.5))
     return replace(
         sensor,
-        pixel_mm=float(rng.uniform(0.045, 0.08)),
-        tint=_triple(np.exp(0.08 * rng.standard_normal(3))),
+        field=Field(pixel_mm=float(rng.uniform(0.045, 0.08))),
+        tint=tuple(np.exp(0.08 * rng.standard_normal(3)).tolist()),
         exposure=float(np.exp(rng.uniform(-0.3, 0.3))),
         blur_px=float(rng.uniform(0.4, 2.0)),
         noise=Noise(float(rng.uniform(0.3, 3.0)), float(rng.uniform(0.002, 0.03))),

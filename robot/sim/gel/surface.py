@@ -70,7 +70,15 @@ class Surface:
 
     def __init__(self, displacement_mm: NDArray[Any], field: Field) -> None:
         self.field = field
-        self.displacement_mm = _validate_displacement(displacement_mm)
+        array = np.asarray(displacement_mm)
+        if array.ndim != 2 or array.size == 0 or array.dtype.kind not in "fiu":
+            raise SceneError(
+                f"displacement_mm must be a (rows, cols) map of numbers, got {array.dtype} of shape {array.shape}; "
+                "give Contact.displacement_mm"
+            )
+        if not np.isfinite(array).all():
+            raise SceneError("displacement_mm must be finite; see Contact.flags")
+        self.displacement_mm: Array = np.clip(array, -_MAX_DEPTH_MM, _MAX_DEPTH_MM).astype(np.float32)
 
     @cached_property
     def slopes(self) -> tuple[Array, Array]:
@@ -100,15 +108,3 @@ def resized(image: Array, shape: tuple[int, int]) -> Array:
     finer = image.shape[0] > shape[0] or image.shape[1] > shape[1]
     out: Array = cv2.resize(image, shape[::-1], interpolation=cv2.INTER_AREA if finer else cv2.INTER_CUBIC)
     return out
-
-
-def _validate_displacement(displacement_mm: NDArray[Any]) -> Array:
-    array = np.asarray(displacement_mm)
-    if array.ndim != 2 or array.size == 0 or array.dtype.kind not in "fiu":
-        raise SceneError(
-            f"displacement_mm must be a (rows, cols) map of numbers, got {array.dtype} of shape {array.shape}; "
-            "give Contact.displacement_mm"
-        )
-    if not np.isfinite(array).all():
-        raise SceneError("displacement_mm must be finite; see Contact.flags")
-    return np.asarray(np.clip(array, -_MAX_DEPTH_MM, _MAX_DEPTH_MM), np.float32)

@@ -87,22 +87,10 @@ class Mesh:
         return np.asarray(np.linalg.norm(self._crosses, axis=1) / 2)
 
     @cached_property
-    def volume_mm3(self) -> float:
-        """Signed volume, by the divergence theorem: positive if the faces point outwards."""
-        return float(np.einsum("ij,ij->", *self._tetrahedra) / 6)
-
-    @property
-    def centre_of_mass(self) -> Vectors:
-        """Centre of mass (3,) of the homogeneous solid."""
-        weight = np.einsum("ij,ij->i", *self._tetrahedra) / (6 * self.volume_mm3)
-        middle = self.vertices.mean(axis=0)
-        return np.asarray(middle + weight @ (self.corners - middle).sum(axis=1) / 4)
-
-    @property
-    def _tetrahedra(self) -> tuple[Vectors, Vectors]:
-        """For each face and the vertices' middle: an edge and the cross product of the two others, (F, 3) each."""
-        a, b, c = (self.corners - self.vertices.mean(axis=0)).transpose(1, 0, 2)
-        return a, np.cross(b, c)
+    def solid(self) -> Any:
+        """The same as a `trimesh.Trimesh`, whose volume is positive if the faces point outwards."""
+        trimesh, _ = _import_packages()
+        return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
     def rest_on_table(self, up: Vectors) -> "Mesh":
         """Return the mesh turned until the unit direction `up` is vertical, centred, with its lowest point at z = 0."""
@@ -141,8 +129,7 @@ class MeshBody(Body):
     @cached_property
     def _caster(self) -> Any:
         """Embree's tree over the faces; it casts on one thread."""
-        trimesh, intersector = _import_packages()
-        return intersector(trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, process=False))
+        return _import_packages()[1](self.mesh.solid)
 
     @cached_property
     def _samples(self) -> tuple[cKDTree, Vectors, Vectors]:
@@ -157,7 +144,7 @@ class MeshBody(Body):
 
     def volumes_mm3(self, shell_mm: float) -> tuple[float, float]:
         """Return the exact volume; the shell's volume is area times thickness, at most the whole."""
-        return self.mesh.volume_mm3, min(self.mesh.volume_mm3, float(self.mesh.areas.sum()) * shell_mm)
+        return self.mesh.solid.volume, min(self.mesh.solid.volume, float(self.mesh.areas.sum()) * shell_mm)
 
     def _cast(self, rays: ClippedRays) -> Vectors:
         ahead = np.flatnonzero(rays.near_mm <= rays.far_mm)
@@ -351,11 +338,11 @@ def _place_on_table(mesh: Mesh, file: Path) -> Mesh:
     if thin < MIN_THICKNESS_MM:
         hint = f"at {scale:g} mm a unit; export it in mm or m, with z up"
         raise SceneError(f"{file} must be at least {MIN_THICKNESS_MM:g} mm thick, got {thin:.3g} mm {hint}")
-    if standing.volume_mm3 < 0:
+    if standing.solid.volume < 0:
         standing = Mesh(standing.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]))
-    if standing.volume_mm3 < 1.0:
+    if standing.solid.volume < 1.0:
         raise SceneError(
-            f"{file} must enclose a volume, got {standing.volume_mm3:g} mm3; export a solid, not a flat surface"
+            f"{file} must enclose a volume, got {standing.solid.volume:g} mm3; export a solid, not a flat surface"
         )
     return standing
 

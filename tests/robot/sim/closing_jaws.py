@@ -9,7 +9,7 @@ close. An explicit method must resolve that oscillation or it diverges. The impl
 without a step.
 
 The simulated rig does not use it. A recording has no image from the closing motion, and at its end each finger carries
-the commanded force, with which the rig presses at once (robot.sim.pinch). This module is the reference: a test closes
+the commanded force, with which the rig presses at once (robot.sim.scene). This module is the reference: a test closes
 jaws on the rig's own gels and compares the depths with the rig's.
 """
 

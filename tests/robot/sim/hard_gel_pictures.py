@@ -12,6 +12,7 @@ from benchmarks.optics.real_presses import BallTable, Presses
 from robot.sim.contact.kernels import Floats
 from robot.sim.contact.layer import Layer
 from robot.sim.gel.sensor import GelSensor, Noise
+from robot.sim.gel.surface import Field
 from tests.hard_case import HardCase, error_of
 
 _FIT, _GEL = "photometric fit", "gel picture"
@@ -133,8 +134,8 @@ def _prediction_above_white() -> HardCase:
 
 def _lamp_too_bright() -> HardCase:
     """Three times the exposure: values above 255 are white."""
-    sensor = GelSensor(Layer(0.3, 0.48, 2.0), exposure=3.0, noise=Noise(0.0, 0.0), rows=24, cols=32)
-    plain = GelSensor(Layer(0.3, 0.48, 2.0), noise=Noise(0.0, 0.0), rows=24, cols=32).background(0).astype(np.int64)
+    sensor = GelSensor(Layer(0.3, 0.48, 2.0), exposure=3.0, noise=Noise(0.0, 0.0), field=Field(24, 32))
+    plain = GelSensor(Layer(0.3, 0.48, 2.0), noise=Noise(0.0, 0.0), field=Field(24, 32)).background(0).astype(np.int64)
     bright = plain * 3 > 258
     naive, ours = int((plain * 3).astype(np.uint8)[bright].min()), int(sensor.background(0)[bright].min())
     return HardCase(
@@ -145,7 +146,7 @@ def _lamp_too_bright() -> HardCase:
 def _nan_displacement() -> HardCase:
     displacement = np.zeros((24, 32))
     displacement[12, 16] = np.nan
-    sensor = GelSensor(Layer(0.3, 0.48, 2.0), rows=24, cols=32)
+    sensor = GelSensor(Layer(0.3, 0.48, 2.0), field=Field(24, 32))
     naive = int((~np.isfinite(np.gradient(displacement, axis=1))).sum())
     ours, holds = error_of(partial(sensor.render, displacement, 0), "finite")
     words = f"{naive} slopes along x are NaN"

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ def dome(depth_mm=1.0):
 
 def fitted(degree=2, places=3, reaches=(1.0,), seed=0, **limits):
     rng = np.random.default_rng(seed)
-    count = fitted_optics.feature_count(degree, len(reaches)) * places
+    count = (degree * (degree + 3) // 2 + 3 * len(reaches)) * places
     free = {
         "steepest": 1.0,
         "left": -1,
@@ -81,6 +82,4 @@ def test_the_shipped_fits_name_their_source_and_licence_and_stay_small(name):
 
 def test_fitted_optics_survive_their_file():
     model = fitted()
-    again = fitted_optics.optics_from_json(json.loads(json.dumps({"model": fitted_optics.optics_to_json(model)})))
-    np.testing.assert_allclose(again.weights, model.weights, rtol=1e-5)
-    assert again.limits == model.limits
+    assert fitted_optics.optics_from_json(json.loads(json.dumps({"model": asdict(model)}))) == model

@@ -30,19 +30,19 @@ def ball(tmp_path):
 def test_a_cube_stands_on_the_table_in_every_format(tmp_path, write, name):
     item = load_mesh_object(write(tmp_path / name, 20 * CORNERS + [100, 5, -3], CUBE), 0, relief="smooth")
     np.testing.assert_allclose([item.body.lower, item.body.upper], [[-20, -20, 0], [20, 20, 40]], atol=1e-4)
-    assert item.body.mesh.volume_mm3 == pytest.approx(64000)
+    assert item.body.mesh.solid.volume == pytest.approx(64000)
     assert item.object_id == "mesh.cube-smooth-0000"
     assert len(item.body.mesh.vertices) == 8
 
 
 def test_small_numbers_are_metres(tmp_path):
     path = obj(tmp_path / "cube.obj", 0.02 * CORNERS, CUBE)
-    assert load_mesh_object(path, 0).body.mesh.volume_mm3 == pytest.approx(64000)
+    assert load_mesh_object(path, 0).body.mesh.solid.volume == pytest.approx(64000)
 
 
 def test_inward_faces_are_turned(tmp_path):
     path = obj(tmp_path / "cube.obj", 20 * CORNERS, CUBE[:, ::-1])
-    assert load_mesh_object(path, 0).body.mesh.volume_mm3 == pytest.approx(64000)
+    assert load_mesh_object(path, 0).body.mesh.solid.volume == pytest.approx(64000)
 
 
 def test_only_geometry_is_read(tmp_path, monkeypatch):
@@ -175,7 +175,7 @@ def test_corner_normals_are_smooth_on_a_ball_and_sharp_on_a_cube():
     np.testing.assert_allclose(round_mesh.corner_normals, vertices[faces], atol=0.03)
     cube = Mesh(CORNERS, CUBE)
     np.testing.assert_allclose(cube.corner_normals, np.repeat(cube.face_normals[:, None], 3, axis=1), atol=1e-12)
-    assert cube.volume_mm3 == pytest.approx(8)
+    assert cube.solid.volume == pytest.approx(8)
     assert cube.areas.sum() == pytest.approx(24)
 
 

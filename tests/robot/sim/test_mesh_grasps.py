@@ -55,9 +55,9 @@ def test_a_box_rests_on_its_six_sides_upright_first_then_the_most_stable():
 
 def test_the_centre_of_mass_is_that_of_the_solid_at_any_position():
     (vertices, faces), away = box(60, 90, 180), [500, -7, 90]
-    np.testing.assert_allclose(Mesh(vertices + np.array(away), faces).centre_of_mass, away, atol=1e-9)
+    np.testing.assert_allclose(Mesh(vertices + np.array(away), faces).solid.center_mass, away, atol=1e-9)
     cone = Mesh(*revolved([(30, 0), (0.001, 80)]))
-    np.testing.assert_allclose(cone.centre_of_mass, [0, 0, 20], atol=0.01)  # a quarter of its height
+    np.testing.assert_allclose(cone.solid.center_mass, [0, 0, 20], atol=0.01)  # a quarter of its height
 
 
 # Grasps -----------------------------------------------------------------------------------------------------

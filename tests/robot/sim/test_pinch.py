@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from collections import Counter
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from robot.sim.camera import Placement
 from robot.sim.gel.sensor import draw_sensor
 from robot.sim.objects.body import Body
 from robot.sim.objects.draw import draw_object
-from robot.sim.pinch import GRAVITY_M_S2, Grip, Hand, Pinch
+from robot.sim.scene import GRAVITY_M_S2, SAFETY, Grip, Hand, Scene
 
 SENSORS = {finger: draw_sensor(0, finger) for finger in "ab"}
 ANY = draw_object(0, 0)
@@ -56,15 +55,8 @@ def thing(body, *, friction=0.6, modulus_mpa=1e4, density_kg_m3=1000.0):
 
 
 def pinch(obj, *, yaw=0.0, force_n=12.0, sensors=None, placement=None, opening_mm=110.0, z_mm=50.0, y_mm=0.0):
-    return Pinch(
-        obj=obj,
-        placement=placement or Placement(),
-        grip=Grip(Pose(0.0, y_mm, z_mm, yaw), force_n, opening_mm),
-        sensors=SENSORS if sensors is None else sensors,
-        hand=Hand(),
-        seed=1,
-        passes=Counter(),
-    )
+    grip, sensors = Grip(Pose(0.0, y_mm, z_mm, yaw), force_n, opening_mm), SENSORS if sensors is None else sensors
+    return Scene(obj, placement or Placement(), sensors=sensors, grip=grip, seed=1).pinch
 
 
 def test_flat_sides_end_nearly_square_to_the_fingers():
@@ -86,7 +78,7 @@ def test_the_jaws_end_at_the_width_less_both_approaches():
 def test_a_bare_finger_does_not_give_way():
     made = pinch(thing(Slanted()), sensors={"a": SENSORS["a"]})
     assert made.final_opening_mm == pytest.approx(20 - made.contact("a").approach_mm, abs=0.3)
-    assert made.passes["contact"] == 1
+    assert made.scene.passes["contact"] == 1
     assert made.slip_reason is None
 
 
@@ -106,7 +98,7 @@ def test_a_stiffer_object_touches_less_of_the_gel():
 @pytest.mark.parametrize(("factor", "held"), [(1.05, True), (0.95, False)])
 def test_friction_must_carry_the_weight_and_a_half(factor, held):
     friction, mass_kg = 0.5, 0.1
-    force = factor * Hand().safety * mass_kg * GRAVITY_M_S2 / (2 * friction)
+    force = factor * SAFETY * mass_kg * GRAVITY_M_S2 / (2 * friction)
     made = pinch(thing(Slanted(half_y_mm=5.0), friction=friction), force_n=force)
     assert made.slip_reason == (None if held else "the object is too heavy for the friction")
 
@@ -128,7 +120,7 @@ def test_contacts_that_are_far_apart_along_the_fingers_slip():
 def test_an_object_next_to_the_fingers_is_missed():
     made = pinch(thing(Slanted(half_y_mm=5.0)), y_mm=30.0)
     assert made.miss_reason == "the object is not between the fingers"
-    assert made.passes["contact"] == 0
+    assert made.scene.passes["contact"] == 0
 
 
 def test_a_finger_lands_on_an_object_that_is_off_the_middle():
@@ -144,7 +136,9 @@ def test_an_object_grasped_far_from_its_middle_turns_about_the_grip():
     block, angle = thing(Slanted()), math.radians(10)
     moved = {}
     for about_grip in (True, False):
-        made = dataclasses.replace(pinch(block, y_mm=30.0, yaw=angle), hand=Hand(turns_about_grip=about_grip))
+        made = dataclasses.replace(
+            pinch(block, y_mm=30.0, yaw=angle).scene, hand=Hand(turns_about_grip=about_grip)
+        ).pinch
         assert made.final_placement.yaw_rad == pytest.approx(angle, abs=math.radians(0.6))
         moved[about_grip] = made.final_placement.to_object(np.array([[0.0, 30.0, 0.0]]))[0]
     np.testing.assert_allclose(moved[True], [0, 30, 0], atol=1e-9)
@@ -160,7 +154,7 @@ def test_from_the_side_the_gap_of_an_upright_cylinder_is_turned_by_a_quarter(til
     post = dataclasses.replace(draw_object(0, 0, family="cylinder", relief="smooth"))
     upright = pinch(post, yaw=0.3, z_mm=40.0).gap("a")
     grip = Grip(Pose(0.0, 0.0, 40.0, 0.3, tilt), 12.0)
-    tilted = dataclasses.replace(pinch(post, yaw=0.3), grip=grip).gap("a")
+    tilted = dataclasses.replace(pinch(post, yaw=0.3).scene, grip=grip).pinch.gap("a")
     assert np.ptp(upright, axis=0).max() < 1e-3 < np.ptp(upright, axis=1).max()
     assert np.ptp(tilted, axis=1).max() < 1e-3 < np.ptp(tilted, axis=0).max()
 

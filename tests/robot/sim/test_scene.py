@@ -11,8 +11,7 @@ from robot.readings import Pose
 from robot.sim.camera import Placement
 from robot.sim.gel.sensor import draw_sensor
 from robot.sim.objects.draw import draw_object
-from robot.sim.pinch import Grip
-from robot.sim.scene import Scene
+from robot.sim.scene import Grip, Scene
 
 SENSORS = {finger: draw_sensor(0, finger) for finger in "ab"}
 BOTTLE = draw_object(0, 0, family="cylinder", relief="ribs")
