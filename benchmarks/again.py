@@ -20,7 +20,7 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -28,7 +28,6 @@ import numpy as np
 import torch
 from PIL import Image
 
-from benchmarks.common import ResultLine
 from indexes.kinds.faiss_index import load_faiss
 from indexes.store.codes import CodeCache
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
@@ -42,8 +41,8 @@ PHOTOS, ROUNDS = 10_000, 3
 OLD_S = 3600
 
 
-def measure(photos: int = PHOTOS, rounds: int = ROUNDS) -> Iterator[ResultLine]:
-    """Yield one line: builds without new photos and with a new one, in turn."""
+def measure(photos: int = PHOTOS, rounds: int = ROUNDS) -> tuple[str, dict[str, float]]:
+    """Time builds without new photos and with a new one, in turn; return a sentence, and the median seconds by name."""
     checkpoint = load_checkpoint(shipped_model())
     with tempfile.TemporaryDirectory() as name:
         catalogue, index = Path(name) / "catalog", Path(name) / "index"
@@ -69,12 +68,11 @@ def measure(photos: int = PHOTOS, rounds: int = ROUNDS) -> Iterator[ResultLine]:
             ("looking", "`os.walk` and `os.stat` alone"),
         )
     )
-    text = (
+    return (
         f"{photos} photos, CPU time of one thread: {shown}; in addition, decoding and encoding the new photo "
         f"{median['first_encoding']:.3f} s ({median['encoding']:.3f} s after the first time), and start-up of any "
         f"command, with Python, imports and the model, {median['started']:.2f} s"
-    )
-    yield ResultLine("again", checkpoint.config.matcher.tower, text, {"photos": photos, **median}, dict(times))
+    ), median
 
 
 def build(catalogue: Path, index: Path, new: int) -> dict[str, float]:
@@ -158,7 +156,7 @@ def _cpu_s(work: Callable[[], object]) -> float:
 
 
 def main() -> None:
-    """Print the line."""
+    """Print the sentence."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.again", description=__doc__.split("\n\n")[0])
     parser.add_argument("--photos", type=float, default=PHOTOS)
     parser.add_argument("--rounds", type=int, default=ROUNDS)
@@ -168,8 +166,7 @@ def main() -> None:
         catalogue, index, new = arguments.build
         print(json.dumps(build(Path(catalogue), Path(index), int(new))))
         return
-    for line in measure(int(arguments.photos), arguments.rounds):
-        print(line)
+    print(measure(int(arguments.photos), arguments.rounds)[0])
 
 
 if __name__ == "__main__":

@@ -1,12 +1,11 @@
 """`python -m benchmarks.scale [--sizes 1e3 1e4 1e5] [--recording R --features F] [--json]`: time against N.
 
 Catalogues of N photos are drawn from the trained model's own distribution: partial activations of recorded photos, each
-a blend of two (w A + (1 - w) B, w uniform in 1/2..1), with their embeddings by the checkpoint's candidate encoder
-(`--by contrastive`: with the embeddings whose cosine is in the partial activations). The exhaustive top-1 of a touch is
-the photo with the greatest match logit. One half of the stored touches of the checkpoint (of its validation objects)
-chooses the settings and the number of candidates that contain the exhaustive top-1 for 99 % of them. `MARGIN` times
-this number is used, because a hundred touches hardly determine the last percent. The reported recall is that of other
-touches: the other half, and those of the recording.
+a blend of two (w A + (1 - w) B, w uniform in 1/2..1), with their embeddings by the checkpoint's candidate encoder. The
+exhaustive top-1 of a touch is the photo with the greatest match logit. One half of the stored touches of the checkpoint
+(of its validation objects) chooses the settings and the number of candidates that contain the exhaustive top-1 for 99 %
+of them. `MARGIN` times this number is used, because a hundred touches hardly determine the last percent. The reported
+recall is that of other touches: the other half, and those of the recording.
 
 The cost model, for h = hidden, d = embedding_dim, k candidates, L = 4 sqrt(N) lists and p visited lists:
 
@@ -40,7 +39,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.common import duration
 from indexes import load_kind
 from indexes.errors import ParameterError
 from indexes.kinds.faiss_index import FLAT, FaissIndex
@@ -106,8 +104,6 @@ class BlendedPhotos:
         photos: (n, h) partial activations of recorded photos, from which catalogues are blended.
         touches: (Q, h) partial activations of touches that choose the number of candidates.
         held_out: (J, h) partial activations of other touches.
-        by: the embeddings of candidate search, "candidate_encoder" or, if their cosine is in the partial activations,
-            "contrastive".
     """
 
     checkpoint: Checkpoint
@@ -115,14 +111,10 @@ class BlendedPhotos:
     photos: np.ndarray
     touches: np.ndarray
     held_out: np.ndarray
-    by: str = "candidate_encoder"
 
     @torch.inference_mode()
     def embeddings(self, partials: np.ndarray, modality: str) -> np.ndarray:
         """Return unit embeddings (n, d) of "touch" or "photo" partial activations."""
-        if self.by == "contrastive":
-            scaled = partials[:, self.checkpoint.config.matcher.hidden :]
-            return scaled / np.linalg.norm(scaled, axis=1, keepdims=True)
         return getattr(self.checkpoint.matcher.candidate_encoder, modality)(torch.from_numpy(partials)).numpy()
 
     def blocks(self, start: int, stop: int, seed: int) -> Iterator[Arrays]:
@@ -136,15 +128,11 @@ class BlendedPhotos:
             yield {"embeddings": self.embeddings(partials, "photo"), "partials": partials.astype(np.float16)}
 
 
-def blended_photos(model: Path, recording: Path, features: Path | None, by: str = "candidate_encoder") -> BlendedPhotos:
+def blended_photos(model: Path, recording: Path, features: Path | None) -> BlendedPhotos:
     """Return the blended photos of a recording; `features` caches the encoding."""
     checkpoint = load_checkpoint(model).without_cells()  # blended photos have no cells
     if checkpoint.queries is None or checkpoint.matcher.candidate_encoder is None:
         raise SystemExit(f"{model} has no stored touches or no candidate encoder; train it again")
-    if by == "contrastive" and not checkpoint.config.matcher.cosine:
-        raise SystemExit(
-            f"the partial activations of {model} contain no contrastive embedding; its configuration has cosine = false"
-        )
     found = encode_recording(load_grasps(recording), checkpoint.matcher, checkpoint.config, features)
     with torch.inference_mode():
         photos = checkpoint.matcher.photo_encoding(torch.from_numpy(found.photo)).partial.numpy()
@@ -153,7 +141,7 @@ def blended_photos(model: Path, recording: Path, features: Path | None, by: str 
     middle = len(queries) // 2
     held_out = rng.permutation(np.concatenate([queries[middle:], touches]))
     scorer = checkpoint.matcher.head.scorer
-    return BlendedPhotos(checkpoint, scorer, np.unique(photos, axis=0), queries[:middle], held_out, by)
+    return BlendedPhotos(checkpoint, scorer, np.unique(photos, axis=0), queries[:middle], held_out)
 
 
 def measure(crowd: BlendedPhotos, photos: int, kinds: Sequence[str], folder: Path, queries: int = QUERIES) -> Size:
@@ -318,6 +306,11 @@ def _median(work: Callable[[int], object], numbers: Sequence[int]) -> float:
     return float(np.median(seconds))
 
 
+def duration(seconds: float) -> str:
+    """Return seconds or milliseconds with three digits as text."""
+    return f"{seconds:.3g} s" if seconds >= 1 else f"{1e3 * seconds:.3g} ms"
+
+
 def lines(size: Size) -> Iterator[str]:
     """Yield the measurements at one size as text."""
     f = size.figures
@@ -372,19 +365,11 @@ def main() -> None:
     )
     parser.add_argument("--features", type=Path, help="file to store encoded features")
     parser.add_argument("--queries", type=int, default=QUERIES)
-    parser.add_argument(
-        "--by",
-        choices=("candidate_encoder", "contrastive"),
-        default="candidate_encoder",
-        help="embedding for candidate search",
-    )
     parser.add_argument("--json", action="store_true", help="one JSON document per line")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
-        crowd = blended_photos(
-            arguments.model, arguments.recording or collected(folder), arguments.features, arguments.by
-        )
+        crowd = blended_photos(arguments.model, arguments.recording or collected(folder), arguments.features)
         sizes = []
         for number in arguments.sizes:
             sizes.append(measure(crowd, int(number), arguments.kinds, folder / "index", arguments.queries))

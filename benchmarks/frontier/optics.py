@@ -10,7 +10,7 @@ from benchmarks.optics.photometric import DEGREES, by_degree
 from retrieval.frontier.clock import time_points
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff
 from retrieval.frontier.sample import Sample
-from robot.sim.gel.fitted_optics import FittedOptics, feature_count, fitted_document, load_fitted
+from robot.sim.gel.fitted_optics import FittedOptics, fitted_document, load_fitted
 from robot.sim.gel.surface import Field, Surface
 
 
@@ -51,5 +51,5 @@ def optics_panel(repeats: int, name: str = "gelsight") -> Panel:
 
 def _of_degree(optics: FittedOptics, degree: int) -> FittedOptics:
     """Return optics with the cost of this degree; the time does not depend on the values of the weights."""
-    count = feature_count(degree, len(optics.reaches_mm)) * optics.places
+    count = (degree * (degree + 3) // 2 + 3 * len(optics.reaches_mm)) * optics.places
     return replace(optics, degree=degree, weights=((0.0, 0.0, 0.0),) * count)

@@ -9,15 +9,16 @@ import pytest
 import torch
 
 from benchmarks import scale
-from benchmarks.common import matcher_of
 from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.fusion import Matcher
 from tests.conftest import TINY
 
 
 @pytest.fixture(scope="module")
 def crowd():
     config = dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, candidate_width=8))
-    matcher = matcher_of(config)
+    torch.manual_seed(0)
+    matcher = Matcher(config.matcher).eval()
     checkpoint = Checkpoint.__new__(Checkpoint)
     object.__setattr__(checkpoint, "matcher", matcher)
     rng = np.random.default_rng(0)
@@ -36,15 +37,6 @@ def test_every_kind_returns_its_figures(crowd, tmp_path):
     assert "2,000 photos: written in " in text
     assert "  flat: " in text
     json.dumps(vars(size), allow_nan=False)
-
-
-def test_contrastive_embeddings_are_the_last_part_of_the_partials_at_unit_length(crowd):
-    hidden = TINY.matcher.hidden
-    checkpoint = SimpleNamespace(config=TINY)
-    partials = np.zeros((2, hidden + 2), np.float32)
-    partials[:, :hidden], partials[:, hidden:] = 9, [[3, 4], [0, -2]]
-    found = dataclasses.replace(crowd, checkpoint=checkpoint, by="contrastive").embeddings(partials, "photo")
-    assert found.tolist() == pytest.approx(np.array([[0.6, 0.8], [0, -1]]))
 
 
 def test_held_out_touches_evaluate_the_number_of_candidates_that_others_chose(crowd, tmp_path, monkeypatch):

@@ -101,7 +101,7 @@ def test_the_rig_shows_the_gels_at_the_rest_position_of_closing_jaws():
         rig.gripper.grasp(12.0)
         pinch = rig.sim_state.scene.pinch
         gaps = [np.maximum(pinch.gap(finger), 0.0) for finger in "ab"]
-        layers = [pinch.sensors[finger].layer for finger in "ab"]
+        layers = [pinch.scene.sensors[finger].layer for finger in "ab"]
         pixel_mm = pinch._pixel_mm
     pressed = [
         press(gap, pixel_mm, layer, force_n=12.0, tolerance=1e-4) for gap, layer in zip(gaps, layers, strict=True)
