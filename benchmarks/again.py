@@ -30,12 +30,12 @@ from PIL import Image
 
 from indexes.kinds.faiss_index import load_faiss
 from indexes.store.codes import CodeCache
+from retrieval.indexing.build import build_index
+from retrieval.indexing.codes import code_layout, code_model
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import batches, encode_photos
 from retrieval.model.fusion_scorer import to_stored
-from retrieval.search.build.build_index import build_index
-from retrieval.search.build.codes import code_layout, code_model
-from retrieval.search.defaults import shipped_model
+from retrieval.model.shipped import shipped_model
 
 PHOTOS, ROUNDS = 10_000, 3
 OLD_S = 3600

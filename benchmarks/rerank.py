@@ -12,7 +12,7 @@ from retrieval.model.checkpoint_info import read_checkpoint_info
 from retrieval.model.config import MatcherConfig
 from retrieval.model.fusion import FusionHead
 from retrieval.model.fusion_scorer import StoredPartials, to_stored
-from retrieval.search.defaults import shipped_model
+from retrieval.model.shipped import shipped_model
 
 CANDIDATES, REPETITIONS, CALLS = 1000, 5, 20
 

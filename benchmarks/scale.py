@@ -53,7 +53,7 @@ from retrieval.frontier.candidates import STRUCTURES
 from retrieval.metrics.intervals import binomial_interval
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.fusion_scorer import FusionScorer
-from retrieval.search.defaults import shipped_model
+from retrieval.model.shipped import shipped_model
 from retrieval.training.features import encode_recording
 
 KINDS = {"flat": (), **STRUCTURES}

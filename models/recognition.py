@@ -34,7 +34,7 @@ from retrieval.metrics.table import ScoreTable, object_scores
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import batches, photo_features
 from retrieval.model.posterior import Posterior
-from retrieval.search.defaults import find_model
+from retrieval.search.opening import find_model
 from retrieval.training.distil import feature_partials
 from retrieval.training.features import encode_recording
 

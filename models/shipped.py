@@ -35,7 +35,7 @@ from retrieval.methods.method import MethodSettings
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint, write_tensors
 from retrieval.model.config import Config, load_config
 from retrieval.model.encode import default_device, one_thread
-from retrieval.search import defaults
+from retrieval.model.shipped import SHIPPED, shipped_model
 from retrieval.training import distil
 from retrieval.training.batches import FrozenFeatures, recorded_features
 from retrieval.training.calibration.calibrate import calibrate_checkpoint
@@ -91,7 +91,7 @@ def main(argv: list[str] | None = None) -> int:
     score.add_argument("--objects", type=int, default=120)
     score.add_argument("--grasps", type=int, default=8)
     score.add_argument("--model", type=Path, help="another checkpoint than the shipped one")
-    score.add_argument("--fingers", type=int, choices=tuple(defaults.SHIPPED), default=2, help="gel images of a touch")
+    score.add_argument("--fingers", type=int, choices=tuple(SHIPPED), default=2, help="gel images of a touch")
     for job in (make, calibrate_job, score):
         job.add_argument("folder", type=Path)
         job.add_argument("--jobs", type=int, default=2)
@@ -111,7 +111,7 @@ def make_shipped(arguments: argparse.Namespace) -> int:
     for number, steps in enumerate(LATER_STEPS, start=1):
         start = {"start": str(train_head(for_fingers(last, 2)).path)}
         last = train_round(folder, number, start | LATER_ROUND | {"iterations": steps, "validate_every": steps})
-    for fingers, name in defaults.SHIPPED.items():
+    for fingers, name in SHIPPED.items():
         trained = for_fingers(last, fingers)
         made = distilled(train_head(trained), *trained.features)
         if made.queries is not None:  # the file stays below 12 MB
@@ -276,8 +276,8 @@ def calibrate_shipped(arguments: argparse.Namespace) -> int:
     """Calibrate both shipped checkpoints again: posterior, gel check, reference touches, bounds of verifications."""
     if code := collect_calibration(arguments):
         return code
-    for fingers, name in defaults.SHIPPED.items():
-        shipped = load_checkpoint(defaults.shipped_model(fingers))
+    for fingers, name in SHIPPED.items():
+        shipped = load_checkpoint(shipped_model(fingers))
         store(calibrated(shipped, arguments.folder, fingers), arguments.folder / name)
     return 0
 
@@ -324,7 +324,7 @@ def score_shipped(arguments: argparse.Namespace) -> int:
         return code
     split = recording.with_name("split.json")
     split.write_text(json.dumps(draw_split(load_grasps(recording), FITTED, FITTED).to_dict(), indent=1) + "\n")
-    model = arguments.model or defaults.shipped_model(arguments.fingers)
+    model = arguments.model or shipped_model(arguments.fingers)
     methods = "late_fusion,retrieve_rerank,chance"
     out = arguments.folder / "report"
     if arguments.fingers == 1:

@@ -36,7 +36,7 @@ from retrieval.metrics.intervals import binomial_interval
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import for_inference, photo_features, touch_batch
 from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
-from retrieval.search.defaults import shipped_model
+from retrieval.model.shipped import shipped_model
 from retrieval.training.calibration.posterior import IdentificationTrials
 from retrieval.training.calibration.touches import ScoredTouches
 from retrieval.training.features import encode_recording

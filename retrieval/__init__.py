@@ -2,8 +2,8 @@
 
 Public names are imported on first use, so `import retrieval` is fast. Each layer imports only the layers before it:
 
-    errors, version, console, metrics -> data -> model -> training, search -> cluster -> methods -> evaluation -> report
-    -> adaptation, frontier, serve -> commands
+    errors, version, console, metrics -> data -> model -> training -> indexing -> search -> cluster -> methods
+    -> evaluation -> report -> adaptation, frontier, serve -> commands
 
 >>> import retrieval
 >>> with retrieval.open("index") as searcher:
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from retrieval.evaluation.real.benchmark import benchmark as benchmark
     from retrieval.evaluation.real.protocol import Protocol as Protocol
     from retrieval.frontier.measure import measure_frontier as measure_frontier
+    from retrieval.indexing.build import build_index as build_index
+    from retrieval.indexing.report import BuildReport as BuildReport
     from retrieval.methods.method import Method as Method
     from retrieval.methods.method import MethodSettings as MethodSettings
     from retrieval.model.checkpoint import Checkpoint as Checkpoint
@@ -37,17 +39,15 @@ if TYPE_CHECKING:
     from retrieval.model.encode import encode_photos as encode_photos
     from retrieval.model.encode import encode_touches as encode_touches
     from retrieval.model.losses.loss import Loss as Loss
+    from retrieval.model.shipped import shipped_model as shipped_model
     from retrieval.model.touch_reader import EncodedTouches as EncodedTouches
     from retrieval.model.towers.tower import Tower as Tower
     from retrieval.report.evaluation import write_report as write_report
-    from retrieval.search.build.build_index import build_index as build_index
-    from retrieval.search.build.build_report import BuildReport as BuildReport
-    from retrieval.search.defaults import shipped_model as shipped_model
+    from retrieval.search.answer import Match as Match
+    from retrieval.search.answer import QueryResult as QueryResult
     from retrieval.search.embeddings import embed_photos as embed_photos
-    from retrieval.search.query.answer import Match as Match
-    from retrieval.search.query.answer import QueryResult as QueryResult
-    from retrieval.search.query.searcher import Searcher as Searcher
-    from retrieval.search.query.verification import Verification as Verification
+    from retrieval.search.searcher import Searcher as Searcher
+    from retrieval.search.verification import Verification as Verification
     from retrieval.serve.client import Client as Client
     from retrieval.training.train import train as train
 
@@ -56,24 +56,24 @@ if TYPE_CHECKING:
 _MODULES = {
     "Adaptation": "adaptation.recipe:Adaptation",
     "BadInput": "errors:BadInput",
-    "BuildReport": "search.build.build_report:BuildReport",
+    "BuildReport": "indexing.report:BuildReport",
     "Checkpoint": "model.checkpoint:Checkpoint",
     "Client": "serve.client:Client",
     "Config": "model.config:Config",
     "EncodedTouches": "model.touch_reader:EncodedTouches",
     "Loss": "model.losses.loss:Loss",
-    "Match": "search.query.answer:Match",
+    "Match": "search.answer:Match",
     "Method": "methods.method:Method",
     "Protocol": "evaluation.real.protocol:Protocol",
-    "QueryResult": "search.query.answer:QueryResult",
+    "QueryResult": "search.answer:QueryResult",
     "RetrievalError": "errors:RetrievalError",
-    "Searcher": "search.query.searcher:Searcher",
+    "Searcher": "search.searcher:Searcher",
     "MethodSettings": "methods.method:MethodSettings",
     "Tower": "model.towers.tower:Tower",
-    "Verification": "search.query.verification:Verification",
+    "Verification": "search.verification:Verification",
     "adapt": "adaptation.recipe:adapt",
     "benchmark": "evaluation.real.benchmark:benchmark",
-    "build_index": "search.build.build_index:build_index",
+    "build_index": "indexing.build:build_index",
     "check_recording": "data.check.recording:check_recording",
     "embed_photos": "search.embeddings:embed_photos",
     "encode_photos": "model.encode:encode_photos",
@@ -84,8 +84,8 @@ _MODULES = {
     "load_grasps": "data.dataset:load_grasps",
     "make_split": "data.dataset:make_split",
     "measure_frontier": "frontier.measure:measure_frontier",
-    "open": "search.query.searcher:Searcher.open",
-    "shipped_model": "search.defaults:shipped_model",
+    "open": "search.searcher:Searcher.open",
+    "shipped_model": "model.shipped:shipped_model",
     "train": "training.train:train",
     "write_report": "report.evaluation:write_report",
 }

@@ -136,8 +136,8 @@ def checkpoint(model: Path) -> Any:
 @pytest.fixture(scope="session")
 def index(catalogue: Path, model: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The index of the catalogue: 24 photos of 8 objects. Do not change it."""
+    from retrieval.indexing.build import build_index
     from retrieval.model.checkpoint import load_checkpoint
-    from retrieval.search.build.build_index import build_index
 
     out = tmp_path_factory.mktemp("search") / "index"
     build_index(catalogue, load_checkpoint(model), out, quiet=True)
@@ -154,8 +154,8 @@ def grasps(tmp_path_factory: pytest.TempPathFactory) -> list[list[tuple[Path, ..
 @pytest.fixture(scope="session")
 def cluster(catalogue: Path, model: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The index of the catalogue in four shards. Do not change it."""
+    from retrieval.indexing.sharded import build_sharded
     from retrieval.model.checkpoint import load_checkpoint
-    from retrieval.search.sharding.build_sharded import build_sharded
 
     out = tmp_path_factory.mktemp("cluster") / "cluster"
     build_sharded(catalogue, load_checkpoint(model), out, 4, quiet=True)
@@ -165,7 +165,7 @@ def cluster(catalogue: Path, model: Path, tmp_path_factory: pytest.TempPathFacto
 @pytest.fixture(scope="module")
 def searcher(index: Path) -> Iterator[Any]:
     """The opened index."""
-    from retrieval.search.query.searcher import Searcher
+    from retrieval.search.searcher import Searcher
 
     with Searcher.open(index) as opened:
         yield opened

@@ -19,11 +19,11 @@ from retrieval.methods.cca_towers import TowerWidths
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config, load_config
 from retrieval.model.fusion import Matcher
+from retrieval.model.shipped import is_shipped
 from retrieval.model.towers import TOWER_SEPARATOR
 from retrieval.model.towers.concatenated import feature_counts_of, parts_of
 from retrieval.model.towers.tower import Tower
 from retrieval.model.towers.weights import GEL, initialise_tower
-from retrieval.search.defaults import is_shipped
 from retrieval.training.features import Features, encode_recording
 from retrieval.training.licences import checkpoint_licences
 

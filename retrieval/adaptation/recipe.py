@@ -13,7 +13,7 @@ from retrieval.adaptation.estimate import Estimate, estimate_accuracy
 from retrieval.adaptation.fitting import calibrate_baseline, calibrate_fit, fit_matcher
 from retrieval.data.dataset import AnyRecording, Split, finger_count, folder_of, load_grasps
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable, store_checkpoint
-from retrieval.search.defaults import shipped_model
+from retrieval.model.shipped import shipped_model
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,9 +19,9 @@ from indexes.errors import IndexesError, LockedIndex
 from retrieval.cluster.session import ray_session
 from retrieval.console.output import say
 from retrieval.errors import RetrievalError
+from retrieval.indexing.sharded import ShardBuild, ShardJob, ShardRunner, build_shard
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import default_device
-from retrieval.search.sharding.build_sharded import ShardBuild, ShardJob, ShardRunner, build_shard
 
 RELEASE_TIMEOUT_S = 60.0
 """Longest wait for a lost process to release its shard's lock."""

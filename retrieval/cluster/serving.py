@@ -29,9 +29,9 @@ from retrieval.console.output import say
 from retrieval.errors import BadInput, IncompleteSearch, RetrievalError
 from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_checkpoint_info
 from retrieval.model.posterior import Posterior
-from retrieval.search.query.objects import ListedPhoto
-from retrieval.search.query.opening import folder_shard, sharded_index_info
-from retrieval.search.query.shard import (
+from retrieval.search.objects import ListedPhoto
+from retrieval.search.opening import folder_shard, sharded_index_info
+from retrieval.search.shard import (
     IndexInfo,
     Page,
     ShardQuery,

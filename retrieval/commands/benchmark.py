@@ -21,7 +21,7 @@ from retrieval.console.interruption import resumable
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput
 from retrieval.evaluation.real import PROTOCOLS
-from retrieval.search.defaults import SHIPPED_NAMES, shipped_model
+from retrieval.model.shipped import SHIPPED_NAMES, shipped_model
 
 HELP = "Measure methods on public data sets of real touches, with controls."
 PRESET = "real"

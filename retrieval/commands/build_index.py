@@ -11,8 +11,8 @@ from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput, RetrievalError
 
 if TYPE_CHECKING:
+    from retrieval.indexing.report import BuildReport
     from retrieval.model.checkpoint import Checkpoint
-    from retrieval.search.build.build_report import BuildReport
 
 PREVIEW_PHOTOS = 16
 """Photos in a preview, at even distances in the catalogue."""
@@ -71,11 +71,11 @@ def build_index(
     """Make a folder of photos searchable."""
     from indexes.store.sharded import is_sharded, read_sharded_manifest
     from retrieval.data.catalogue import require_separate_folders
+    from retrieval.indexing import build, sharded
     from retrieval.model.checkpoint import load_checkpoint
     from retrieval.model.export import export_to_cache
-    from retrieval.search import defaults
-    from retrieval.search.build import build_index as build
-    from retrieval.search.sharding import build_sharded
+    from retrieval.model.shipped import is_shipped
+    from retrieval.search.opening import find_model
 
     require_separate_folders(catalogue, out)
     sheet = _preview_path(catalogue, out) if preview else None
@@ -83,7 +83,7 @@ def build_index(
         shards = read_sharded_manifest(out).of
     if shards is None and cluster:
         raise BadInput("--cluster needs shards; give --shards too")
-    path, reason = defaults.find_model(model, out)
+    path, reason = find_model(model, out)
     say(f"model: {path} ({reason})")
     checkpoint = load_checkpoint(path)
     options: dict[str, Any] = {"objects_from": objects_from, "kind": kind, "cells": cells}
@@ -96,8 +96,8 @@ def build_index(
         if shards is None:
             report = build.build_index(catalogue, checkpoint, out, **options)
         else:
-            report = build_sharded.build_sharded(catalogue, checkpoint, out, shards, run=run, **options)
-    if defaults.is_shipped(path) and (exported := export_to_cache(checkpoint)):
+            report = sharded.build_sharded(catalogue, checkpoint, out, shards, run=run, **options)
+    if is_shipped(path) and (exported := export_to_cache(checkpoint)):
         say(f"exported once, for queries without PyTorch: {exported}")
     for line in report.lines():
         say(line)

@@ -101,8 +101,8 @@ def example_object(queries: "Mapping[str, Sequence[Grasp]]") -> str:
 
 def _accuracy_summary(index: Path, queries: "dict[str, list[Grasp]]") -> str:
     """Return a sentence with top-1 and top-5 accuracy, their chance levels, and the precision of the match verdict."""
-    from retrieval.search.query.answer import MATCH
-    from retrieval.search.query.searcher import Searcher
+    from retrieval.search.answer import MATCH
+    from retrieval.search.searcher import Searcher
 
     with Searcher.open(index) as searcher:
         gallery = searcher.objects.count

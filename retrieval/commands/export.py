@@ -19,8 +19,8 @@ def export(
     """Export a checkpoint's touch encoder to ONNX. With it, `query` runs without PyTorch."""
     from retrieval.model.checkpoint import load_checkpoint
     from retrieval.model.export import export as write_export
-    from retrieval.search import defaults
+    from retrieval.search.opening import find_model
 
-    path, reason = defaults.find_model(model)
+    path, reason = find_model(model)
     say(f"model: {path} ({reason})")
     say(f"written: {write_export(load_checkpoint(path), out)}")

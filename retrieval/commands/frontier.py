@@ -34,9 +34,9 @@ def frontier(
 ) -> None:
     """Plot the error of each approximation against its run time, on a page. Resumes a stopped run."""
     from retrieval.frontier.measure import measure_frontier
-    from retrieval.search import defaults
+    from retrieval.search.opening import find_model
 
-    path, reason = defaults.find_model(model)
+    path, reason = find_model(model)
     say(f"model: {path} ({reason})")
     with resumable(out):
         document = measure_frontier(out, path, partial(recording_of, recording, out), only=only or ())

@@ -20,8 +20,8 @@ from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput, RetrievalError
 
 if TYPE_CHECKING:
-    from retrieval.search.query.answer import QueryResult
-    from retrieval.search.query.searcher import Searcher
+    from retrieval.search.answer import QueryResult
+    from retrieval.search.searcher import Searcher
     from robot.recording.grasp import RecordedGrasp
     from robot.rig import Rig
 
@@ -68,9 +68,9 @@ def identify(
     if far is not None and expect is None:
         raise BadInput("--far is the false-accept rate of --expect; give both, or neither")
     path = resolve_index(index)
-    from retrieval.search.query.answer import EXIT_CODES
-    from retrieval.search.query.searcher import Searcher
-    from retrieval.search.query.verification import VERIFY_EXIT_CODES
+    from retrieval.search.answer import EXIT_CODES
+    from retrieval.search.searcher import Searcher
+    from retrieval.search.verification import VERIFY_EXIT_CODES
     from robot.collection import CollectSettings, collect
     from robot.grasping.spread import SpreadPlanner
     from robot.rig import load_rig
@@ -156,7 +156,7 @@ class _Run:
     @property
     def sentence(self) -> str:
         """The answer as a sentence."""
-        from retrieval.search.query.answer import verdict_sentence
+        from retrieval.search.answer import verdict_sentence
 
         return str(self.answer.sentence) if self.expect else verdict_sentence(self.answer)
 

@@ -166,9 +166,9 @@ def refuse_options(reason: str, **options: object) -> None:
 
 def resolve_index(index: str | None) -> Path:
     """Return the folder of the index, and print it if the user named none."""
-    from retrieval.search import defaults
+    from retrieval.search.opening import find_index
 
-    path, reason = defaults.find_index(index)
+    path, reason = find_index(index)
     if index is None:
         say(f"index: {path} ({reason})")
     return path

@@ -35,8 +35,8 @@ def query(
 ) -> int:
     """Find the catalogue photo of the object in the hand."""
     path = resolve_index(index)
-    from retrieval.search.query.answer import EXIT_CODES, verdict_sentence
-    from retrieval.search.query.searcher import Searcher
+    from retrieval.search.answer import EXIT_CODES, verdict_sentence
+    from retrieval.search.searcher import Searcher
 
     if html:
         require_output(html, ".html")

@@ -22,7 +22,7 @@ from retrieval.console.output import say
 from retrieval.errors import BadInput, ConfigError
 
 if TYPE_CHECKING:
-    from retrieval.search.query.opening import OpenShards
+    from retrieval.search.opening import OpenShards
     from robot.recording.folder import RecordingWriter
 
 TOKEN_VARIABLE = "RETRIEVE_TOKEN"
@@ -87,7 +87,7 @@ def serve(
         from retrieval.serve.settings import ServiceSettings
     except ImportError as error:
         raise BadInput(f"{error.name} is missing; run: pip install 'touch-retrieval[serve]'") from error
-    from retrieval.search import defaults
+    from retrieval.search.opening import find_index
     from retrieval.serve.rig import load_live_rig, simulated_live_rig
 
     if no_history:
@@ -95,7 +95,7 @@ def serve(
     cluster_options = {"replicas": replicas, "shard_timeout": shard_timeout}
     if not cluster:
         refuse_options("needs --cluster", **cluster_options)
-    path, reason = defaults.find_index(index)
+    path, reason = find_index(index)
     if index is None:
         say(f"index: {path} ({reason})")
     local = path.resolve()
@@ -157,7 +157,7 @@ def _feedback_writer(folder: Path, index: str | Path, stack: ExitStack) -> "Reco
         RobotError: The recording cannot be written.
     """
     from retrieval.model.checkpoint_info import read_checkpoint_info
-    from retrieval.search.defaults import manifest_of, model_of
+    from retrieval.search.opening import manifest_of, model_of
     from robot.recording.folder import RecordingWriter
 
     if folder.exists() and not folder.is_dir():

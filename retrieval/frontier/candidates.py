@@ -19,7 +19,7 @@ from retrieval.console.progress import Bar
 from retrieval.frontier.clock import time_points
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, miss_rate_point
 from retrieval.frontier.sample import Array, Sample
-from retrieval.search.build.candidates import TARGET, candidate_steps
+from retrieval.indexing.candidates import TARGET, candidate_steps
 
 FEW = (10, 25, 50, 100, 250)
 """Numbers of candidates below the first one that `build-index` tries."""

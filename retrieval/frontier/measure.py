@@ -20,7 +20,7 @@ from retrieval.frontier.clock import machine
 from retrieval.frontier.points import ApproximationResult
 from retrieval.frontier.report import write_frontier
 from retrieval.frontier.sample import Sample, Scale
-from retrieval.search.defaults import shipped_model
+from retrieval.model.shipped import shipped_model
 from retrieval.version import __version__
 
 if TYPE_CHECKING:

@@ -23,8 +23,8 @@ P(o | present) is the probability of o given that the catalogue has the object. 
 from the logits, never as P(o) / (1 - P(none)): that quotient is 0 / 0 if P(none) rounds to 1.
 
 A query passes through four files. `fusion_scorer.py` sums the match logits z of a photo over the grasps.
-`search/query/objects.py` computes l(o) of each object; reference touches change it (`references.py`).
-`search/query/shard.py` chooses the photos to score and samples the others. `EvidenceMass.merged` below sums the shards.
+`search/objects.py` computes l(o) of each object; reference touches change it (`references.py`).
+`search/shard.py` chooses the photos to score and samples the others. `EvidenceMass.merged` below sums the shards.
 """
 
 import math

@@ -4,7 +4,7 @@ from pathlib import Path
 from string import ascii_lowercase
 
 from retrieval.report.pages import data_uri, jpeg, render, thumbnail
-from retrieval.search.query.answer import QueryResult
+from retrieval.search.answer import QueryResult
 
 _THUMBNAIL_PX = 320
 

@@ -6,7 +6,7 @@ from itertools import chain, repeat
 from typing import TYPE_CHECKING
 
 from retrieval.console.output import printable, show
-from retrieval.search.query.answer import NearestReference, QueryResult
+from retrieval.search.answer import NearestReference, QueryResult
 
 if TYPE_CHECKING:
     from retrieval.report.results import Results

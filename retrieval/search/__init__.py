@@ -1,1 +1,1 @@
-"""From photos to an index, and from gel images to ranked objects."""
+"""From gel images to ranked objects."""

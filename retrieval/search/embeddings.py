@@ -11,7 +11,7 @@ from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import encode_photos
 from retrieval.model.touch_reader import EncodedTouches
 from retrieval.model.touches import AnyImage, read_image
-from retrieval.search.defaults import find_model
+from retrieval.search.opening import find_model
 
 
 def embed_photos(photos: Sequence[AnyImage], *, model: str | Path | Checkpoint | None = None) -> EncodedTouches:

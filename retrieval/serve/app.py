@@ -10,7 +10,7 @@ from fastapi import FastAPI
 from starlette.staticfiles import StaticFiles
 from threadpoolctl import threadpool_limits
 
-from retrieval.search.query.opening import OpenShards
+from retrieval.search.opening import OpenShards
 from retrieval.serve import catalogue, errors, history, human_baseline, queries, security
 from retrieval.serve.service import LiveRig, Service
 from retrieval.serve.settings import ServiceSettings

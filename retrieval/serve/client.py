@@ -15,7 +15,7 @@ from retrieval.data.images import encode_image, read_bytes
 from retrieval.errors import BadInput, ImageError, RetrievalError
 from retrieval.model.gel_images import GelImage
 from retrieval.model.touches import AnyImage, AnyTouches, InputImage, parse_grasps
-from retrieval.search.query.answer import Match, QueryResult
+from retrieval.search.answer import Match, QueryResult
 
 try:
     import httpx

@@ -10,9 +10,8 @@ import logging
 from functools import cached_property
 
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
-from retrieval.search.defaults import manifest_of
-from retrieval.search.query.opening import OpenShards
-from retrieval.search.query.searcher import Searcher
+from retrieval.search.opening import OpenShards, manifest_of
+from retrieval.search.searcher import Searcher
 from retrieval.serve.errors import HttpProblem
 from retrieval.serve.settings import ServiceSettings
 

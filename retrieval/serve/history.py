@@ -10,7 +10,7 @@ from pydantic import Field
 
 from retrieval.data.images import read_bytes
 from retrieval.errors import BadInput, ImageError
-from retrieval.search.query.answer import MATCH, NONE_OF_THESE, UNCALIBRATED
+from retrieval.search.answer import MATCH, NONE_OF_THESE, UNCALIBRATED
 from retrieval.serve.catalogue import IMAGE_RESPONSES, image_response
 from retrieval.serve.errors import HttpProblem
 from retrieval.serve.generations import ServedGeneration

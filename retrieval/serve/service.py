@@ -8,7 +8,7 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
-from retrieval.search.query.opening import OpenShards
+from retrieval.search.opening import OpenShards
 from retrieval.serve.decoders import Decoders
 from retrieval.serve.generations import Generations
 from retrieval.serve.queue import Queue

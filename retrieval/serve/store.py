@@ -27,7 +27,7 @@ from retrieval.data.images import decode, encode_image
 from retrieval.data.text import replace_surrogates
 from retrieval.errors import BadInput, RetrievalError
 from retrieval.model.gel_check import CONTACT
-from retrieval.search.query.answer import QueryResult
+from retrieval.search.answer import QueryResult
 from retrieval.serve.uploads import RequestPictures
 
 log = logging.getLogger(__name__)

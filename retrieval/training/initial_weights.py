@@ -9,8 +9,8 @@ from retrieval.errors import CheckpointError
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
+from retrieval.model.shipped import shipped_model
 from retrieval.model.towers.weights import initialise_tower
-from retrieval.search.defaults import shipped_model
 
 TOWER_WEIGHTS = ("touch_tower.", "photo_tower.")
 """Prefixes of the names of the towers' weights in a matcher."""

@@ -6,9 +6,9 @@ from retrieval.data.dataset import recording_licence
 from retrieval.data.licences import DataLicence, stored_licences
 from retrieval.model.checkpoint_info import CheckpointInfo, read_checkpoint_info
 from retrieval.model.config import TrainingConfig
+from retrieval.model.shipped import is_shipped
 from retrieval.model.towers import TOWER_SEPARATOR
 from retrieval.model.towers.weights import GEL, SHIPPED
-from retrieval.search.defaults import is_shipped
 
 _SHIPPED = DataLicence("simulated objects of the shipped models", "MIT", "as touch-retrieval")
 

@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks import again, rerank
 from retrieval.model.checkpoint_info import read_checkpoint_info
-from retrieval.search.defaults import shipped_model
+from retrieval.model.shipped import shipped_model
 
 
 def test_reranking_with_cells_is_compared_with_reranking_without():

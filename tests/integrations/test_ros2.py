@@ -11,9 +11,9 @@ import pytest
 pytest.importorskip("rosbags")
 
 import retrieval
+from retrieval.indexing.build import build_index
 from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
 from retrieval.model.touch_reader import TouchReader
-from retrieval.search.build.build_index import build_index
 from robot.importers.rosbag import Bag
 from tests import synthetic
 from tests.integrations import fake_rclpy

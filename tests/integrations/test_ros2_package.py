@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip("rosbags")
 
 from retrieval.model import fusion_scorer, verification
-from retrieval.search.query import answer
+from retrieval.search import answer
 from retrieval.version import __version__
 from tests.documents import table_rows
 from tests.integrations.fake_rclpy import DEFINED, FILES, FOLDER, MESSAGES, node_module

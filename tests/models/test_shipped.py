@@ -14,8 +14,8 @@ from retrieval.data.images import to_float
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import touch_features
 from retrieval.model.gel_check import NOT_A_GEL
+from retrieval.model.shipped import SHIPPED, shipped_model
 from retrieval.model.towers import build_tower
-from retrieval.search import defaults
 from robot.rig import load_rig
 
 
@@ -75,9 +75,9 @@ def test_the_shipped_checkpoint_is_far_above_chance_on_unseen_objects(tmp_path, 
     assert measures["topn_k5"]["value"][0] > 0.4  # chance 0.2
 
 
-@pytest.mark.parametrize("fingers", defaults.SHIPPED)
+@pytest.mark.parametrize("fingers", SHIPPED)
 def test_the_shipped_checkpoints_calibrate_reference_touches_with_and_without_photos(fingers):
-    made = load_checkpoint(defaults.shipped_model(fingers))
+    made = load_checkpoint(shipped_model(fingers))
     references = made.references
     assert references.objects == len(made.split.validation) == 99
     apart, equal = references.touch_only.log_ratio([-0.2, 0.9], 1)
@@ -85,9 +85,9 @@ def test_the_shipped_checkpoints_calibrate_reference_touches_with_and_without_ph
     assert references.weight * references.with_photos.slope > 1
 
 
-@pytest.mark.parametrize("fingers", defaults.SHIPPED)
+@pytest.mark.parametrize("fingers", SHIPPED)
 def test_the_shipped_checkpoints_do_not_take_a_photo_for_a_gel_image(fingers):
-    made, photos = load_checkpoint(defaults.shipped_model(fingers)), []
+    made, photos = load_checkpoint(shipped_model(fingers)), []
     with load_rig("sim", seed=990) as rig:
         for name in rig.object_ids(20):
             rig.prepare(name, 0)

@@ -11,7 +11,7 @@ import pytest
 from retrieval.commands.main import main
 from retrieval.data.dataset import load_grasps, make_split
 from retrieval.model.checkpoint_info import read_header
-from retrieval.search.query.answer import EXIT_CODES
+from retrieval.search.answer import EXIT_CODES
 from retrieval.serve.store import HistoryStore
 from robot.recording.folder import RecordingWriter, read_recording
 from tests import real_data_sets

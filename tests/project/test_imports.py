@@ -19,7 +19,9 @@ LAYERS = (
     ("errors", "version", "console", "metrics"),
     ("data",),
     ("model",),
-    ("training", "search"),
+    ("training",),
+    ("indexing",),
+    ("search",),
     ("cluster",),
     ("methods",),
     ("evaluation",),
@@ -90,20 +92,6 @@ def test_modules_of_retrieval_import_only_earlier_layers():
             parts = name.split(".")
             if parts[0] == "retrieval" and len(parts) > 1 and parts[1] in layer_of:
                 assert layer_of[parts[1]] <= layer_of[own], f"{path} imports {name}"
-
-
-def test_the_folders_of_search_do_not_import_each_other():
-    """`query` and `build` are independent; only opening.py opens sharded indexes."""
-    search = ROOT / "retrieval" / "search"
-    for folder, others in (
-        ("build", ("query", "sharding")),
-        ("query", ("build", "sharding")),
-        ("sharding", ("query",)),
-    ):
-        for path in sorted((search / folder).glob("*.py")):
-            forbidden = tuple(f"retrieval.search.{other}" for other in others)
-            found = [name for name in imported(path) if name.startswith(forbidden)]
-            assert not found or path.name == "opening.py", f"{path} imports {found}"
 
 
 def test_contributing_and_the_package_document_the_layers():

@@ -12,8 +12,8 @@ import pytest
 import robot
 from benchmarks import reference
 from benchmarks.reference import PACKAGES, PAGE
+from retrieval.indexing.build import build_index
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search.build.build_index import build_index
 from tests import synthetic
 from tests.project.test_imports import HEAVY, run_blocked
 

@@ -12,12 +12,12 @@ import pytest
 import torch
 
 from indexes.store.sharded import read_sharded_manifest
+from retrieval.indexing import candidates
+from retrieval.indexing.build import build_index
+from retrieval.indexing.sharded import build_sharded
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search.build import candidates
-from retrieval.search.build.build_index import build_index
-from retrieval.search.sharding.build_sharded import build_sharded
 from tests import reference_model
-from tests.retrieval.search.test_candidates import checkpoint_of
+from tests.retrieval.indexing.test_candidates import checkpoint_of
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore"),  # Ray's own warnings

@@ -22,9 +22,9 @@ from indexes.store.folder import IndexStore
 from indexes.store.sharded import read_sharded_manifest
 from retrieval.data.catalogue import list_catalogue
 from retrieval.errors import IncompleteSearch
+from retrieval.indexing.sharded import build_sharded
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search.query.searcher import Searcher
-from retrieval.search.sharding.build_sharded import build_sharded
+from retrieval.search.searcher import Searcher
 from tests import ray_processes, serving, synthetic
 from tests.waiting import first_line, run_process
 
@@ -121,7 +121,7 @@ HOLDING = """
 import sys, time
 from retrieval.cluster.serving import Deployments, ReplicaSettings
 from retrieval.cluster.session import ray_session
-from retrieval.search.query.searcher import Searcher
+from retrieval.search.searcher import Searcher
 with ray_session() as ray:
     searcher = Searcher.open(sys.argv[1], shards=Deployments(ray, ReplicaSettings(cpus=0.1)).open)
     print("ready", flush=True)
@@ -219,7 +219,7 @@ import sys, time
 from concurrent.futures import ThreadPoolExecutor
 from retrieval.cluster.serving import Deployments, ReplicaSettings
 from retrieval.cluster.session import ray_session
-from retrieval.search.query.searcher import Searcher
+from retrieval.search.searcher import Searcher
 with ray_session(2) as ray:
     served = Deployments(ray, ReplicaSettings(cpus=0.1, wait_s=240.0))
     with Searcher.open(sys.argv[1], shards=served.open) as searcher, ThreadPoolExecutor(12) as threads:

@@ -15,7 +15,7 @@ from retrieval.commands.main import application, main
 from retrieval.commands.options import Command
 from retrieval.frontier import APPROXIMATIONS
 from retrieval.methods import METHODS
-from retrieval.search import defaults
+from retrieval.model.shipped import shipped_model
 from tests.meshes import box, sphere, stl
 
 
@@ -37,7 +37,7 @@ def test_the_two_commands_of_the_readme_work(workplace, capsys):
     assert main(["build-index", "catalog/"]) == 0
     output = capsys.readouterr()
     assert output.out == ""
-    assert f"model: {defaults.shipped_model()} (shipped; trained on the simulated rig" in output.err
+    assert f"model: {shipped_model()} (shipped; trained on the simulated rig" in output.err
     assert main(["query", "--gelsight", "a.png", "b.png"]) == 5
     output = capsys.readouterr()
     assert output.out == ""
@@ -168,7 +168,7 @@ def test_wrong_use_is_one_line_on_stderr_and_exit_code_2(case, workplace, model,
 
 
 def test_an_unexpected_error_has_a_traceback_only_with_debug(workplace, monkeypatch, capsys):
-    monkeypatch.setattr(defaults, "find_index", lambda path: 1 / 0)
+    monkeypatch.setattr("retrieval.search.opening.find_index", lambda path: 1 / 0)
     assert main(["query", "--gelsight", "a.png"]) == 1
     assert "unexpected ZeroDivisionError" in capsys.readouterr().err
     with pytest.raises(ZeroDivisionError):

@@ -8,10 +8,10 @@ import pytest
 
 from retrieval.commands.main import main
 from retrieval.data.dataset import load_grasps
+from retrieval.indexing.build import build_index
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search.build.build_index import build_index
-from retrieval.search.defaults import shipped_model
-from retrieval.search.query import answer, searcher
+from retrieval.model.shipped import shipped_model
+from retrieval.search import answer, searcher
 from robot.collection import CollectSettings, collect
 from robot.recording.folder import read_recording
 from robot.rig import load_rig

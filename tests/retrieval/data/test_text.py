@@ -8,8 +8,8 @@ import pytest
 from retrieval.data.catalogue import list_catalogue
 from retrieval.data.text import is_utf8, replace_surrogates
 from retrieval.errors import DatasetError
+from retrieval.indexing.build import build_index
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search.build.build_index import build_index
 from retrieval.serve.errors import HttpProblem
 from robot.errors import RecordingError
 from robot.recording.folder import RecordingWriter, read_recording

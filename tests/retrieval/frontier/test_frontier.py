@@ -17,10 +17,10 @@ from retrieval.frontier.formats import FORMATS, encoders, load_touch
 from retrieval.frontier.measure import measure_frontier
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, format_duration, miss_rate_point
 from retrieval.frontier.sample import Sample, Scale
+from retrieval.indexing.candidates import measure_candidates
 from retrieval.metrics.intervals import binomial_interval
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import encode_touches
-from retrieval.search.build.candidates import measure_candidates
 from tests import synthetic
 
 TINY = Scale(photos=700, queries=6, repeats=1, quick=True)
@@ -170,7 +170,7 @@ def test_measuring_towers_leaves_the_model_in_evaluation_mode(rows, sample):
 
 def test_an_index_stores_partials_in_the_default_format(catalogue, model, tmp_path):
     from indexes.store.folder import IndexStore
-    from retrieval.search.build.build_index import build_index
+    from retrieval.indexing.build import build_index
 
     build_index(catalogue, load_checkpoint(model), tmp_path / "index", quiet=True)
     stored = IndexStore(tmp_path / "index").open().arrays["partials"]

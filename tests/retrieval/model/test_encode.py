@@ -17,8 +17,8 @@ from retrieval.model.encode import (
     to_batch,
 )
 from retrieval.model.fusion import Matcher
+from retrieval.model.shipped import shipped_model
 from retrieval.model.towers import TOWERS
-from retrieval.search.defaults import shipped_model
 
 SIDE = 48
 

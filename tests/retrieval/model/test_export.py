@@ -15,6 +15,7 @@ from indexes.store.folder import IndexStore
 from retrieval.commands.main import main
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import BadInput, CheckpointError, NumericalError, RetrievalError
+from retrieval.indexing.build import build_index
 from retrieval.model import export as exporting
 from retrieval.model import onnx_encoder
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
@@ -23,10 +24,9 @@ from retrieval.model.encode import TorchEncoder, encode_touches, torch_photo_enc
 from retrieval.model.export import choose_photo_encoder, export
 from retrieval.model.fusion import GelHead, Matcher
 from retrieval.model.onnx_encoder import OnnxEncoder
+from retrieval.model.shipped import shipped_model
 from retrieval.model.towers import OUTPUTS, TOWERS
-from retrieval.search.build.build_index import build_index
-from retrieval.search.defaults import shipped_model
-from retrieval.search.query.searcher import Searcher
+from retrieval.search.searcher import Searcher
 from tests.project.test_imports import run_blocked
 from tests.project.test_project import PROJECT
 
@@ -199,9 +199,9 @@ def test_a_long_build_gives_the_same_index_with_either_encoder(catalogue, model,
     checkpoint = load_checkpoint(model)
     build_index(catalogue, checkpoint, tmp_path / "torch", quiet=True)
     calls = []
-    monkeypatch.setattr("retrieval.search.build.codes.MIN_PHOTOS_FOR_ONNX", 1)
+    monkeypatch.setattr("retrieval.indexing.codes.MIN_PHOTOS_FOR_ONNX", 1)
     monkeypatch.setattr(
-        "retrieval.search.build.codes.choose_photo_encoder",
+        "retrieval.indexing.codes.choose_photo_encoder",
         lambda made: calls.append(1) or choose_photo_encoder(made),
     )
     build_index(catalogue, checkpoint, tmp_path / "onnx", quiet=True)

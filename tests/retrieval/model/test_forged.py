@@ -14,7 +14,7 @@ from retrieval.commands.main import main
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.checkpoint import load_checkpoint, read_tensors, write_tensors
 from retrieval.model.checkpoint_info import read_checkpoint_info, read_scorer
-from retrieval.search.query.objects import listed_photo
+from retrieval.search.objects import listed_photo
 from retrieval.training.gate import load_gate
 from tests.retrieval.model.test_checkpoint import rewrite, save
 

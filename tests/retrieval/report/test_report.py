@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 import pytest
 
+from retrieval.indexing.build import build_index
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.posterior import Posterior
 from retrieval.report.query import query_html
 from retrieval.report.terminal import print_table
-from retrieval.search.build.build_index import build_index
-from retrieval.search.query.answer import Match, NearestReference, QueryResult, verdict_sentence
-from retrieval.search.query.searcher import Searcher
+from retrieval.search.answer import Match, NearestReference, QueryResult, verdict_sentence
+from retrieval.search.searcher import Searcher
 from tests.pages import HtmlPage
 
 SCRIPT = "<script>alert(1)</script>"

@@ -12,15 +12,15 @@ from indexes.store.folder import IndexStore
 from indexes.store.sharded import read_sharded_manifest
 from retrieval.commands.main import main
 from retrieval.errors import BadInput
+from retrieval.indexing import candidates
+from retrieval.indexing.build import build_index
+from retrieval.indexing.sharded import build_sharded
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, read_tensors, store_checkpoint
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
 from retrieval.model.posterior import Posterior
 from retrieval.model.references import ReferenceCalibration
-from retrieval.search.build import candidates
-from retrieval.search.build.build_index import build_index
-from retrieval.search.query.searcher import Searcher
-from retrieval.search.sharding.build_sharded import build_sharded
+from retrieval.search.searcher import Searcher
 from retrieval.training.calibration import calibrate
 from retrieval.training.calibration.posterior import fit_posterior
 from retrieval.training.calibration.touches import calibration_touches
@@ -86,7 +86,7 @@ def test_a_second_build_embeds_no_photo_again(index, catalogue, checkpoint):
 
 def test_an_index_that_lost_its_cells_is_refused(index, checkpoint):
     from indexes.errors import CorruptIndex
-    from retrieval.search.query.opening import folder_shard
+    from retrieval.search.opening import folder_shard
 
     generation = IndexStore(index).open()
     del generation.arrays["cells"]

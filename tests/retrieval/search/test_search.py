@@ -14,13 +14,13 @@ import torch
 from indexes.errors import MismatchedIndex
 from indexes.kinds.vector_index import VectorIndex
 from retrieval.errors import BadInput, CheckpointError, ImageError
+from retrieval.indexing.build import build_index
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
 from retrieval.model.encode import to_batch, touch_batch
 from retrieval.model.posterior import Posterior
-from retrieval.search.build.build_index import build_index
-from retrieval.search.query.objects import ScoredObjects
-from retrieval.search.query.searcher import Searcher
-from retrieval.search.query.shard import combined_embedding
+from retrieval.search.objects import ScoredObjects
+from retrieval.search.searcher import Searcher
+from retrieval.search.shard import combined_embedding
 from tests import synthetic
 
 FLOAT16_ROUNDING = 2**-11
@@ -260,7 +260,7 @@ def test_the_candidates_are_the_photos_nearest_to_all_grasps_together(
 ):
     """Plain loops: the best sums of inner products, the full network on these photos, and on the other photos of the
     best objects among them."""
-    monkeypatch.setattr("retrieval.search.query.shard.MIN_COMPLETED_OBJECTS", completed)
+    monkeypatch.setattr("retrieval.search.shard.MIN_COMPLETED_OBJECTS", completed)
     checkpoint, generation = searcher.checkpoint, searcher.generation
     load, products = checkpoint.config.preprocessing.load_touch, np.zeros(24)
     for grasp in grasps:

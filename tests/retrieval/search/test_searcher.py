@@ -17,11 +17,11 @@ from PIL import Image
 
 import retrieval
 from retrieval.errors import BadInput, ImageError
+from retrieval.indexing.build import build_index
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.export import touch_encoder_to_onnx
 from retrieval.model.fork_guard import fork_guard
-from retrieval.search.build.build_index import build_index
-from retrieval.search.query.searcher import Searcher
+from retrieval.search.searcher import Searcher
 from tests import synthetic
 
 

@@ -12,12 +12,12 @@ from indexes.errors import CorruptIndex, MismatchedIndex
 from indexes.store.folder import IndexStore
 from indexes.store.sharded import read_sharded_manifest, shard_number, write_sharded_manifest
 from retrieval.errors import BadInput, RetrievalError
+from retrieval.indexing.sharded import build_sharded
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.posterior import EvidenceMass, Posterior
-from retrieval.search.query.objects import ListedPhoto
-from retrieval.search.query.searcher import Searcher
-from retrieval.search.query.shard import RankedObject, ShardResult, merge_results
-from retrieval.search.sharding.build_sharded import build_sharded
+from retrieval.search.objects import ListedPhoto
+from retrieval.search.searcher import Searcher
+from retrieval.search.shard import RankedObject, ShardResult, merge_results
 
 NUMBERS = ("logit", "probability", "probability_if_present")
 STEEP = Posterior(slope=2.0, offset=-1.5, dependence=0.25, tests=1)
@@ -208,7 +208,7 @@ class Killed(Exception):
 def test_killed_between_shards_the_index_is_unchanged_and_the_next_build_embeds_the_rest(
     after, catalogue, model, tmp_path, embedded, monkeypatch
 ):
-    from retrieval.search.sharding import build_sharded as module
+    from retrieval.indexing import sharded as module
 
     finished, build = [], module.build_shard
 
@@ -233,7 +233,7 @@ def test_killed_between_shards_the_index_is_unchanged_and_the_next_build_embeds_
 
 def test_killed_before_every_switch_the_old_generations_answer(catalogue_copy, model, touch, monkeypatch):
     """A shard gets a new photo in each turn, so its folder has many generations."""
-    from retrieval.search.sharding import build_sharded as module
+    from retrieval.indexing import sharded as module
 
     catalog, cluster = catalogue_copy
     with Searcher.open(cluster) as searcher:

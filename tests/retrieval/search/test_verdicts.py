@@ -11,9 +11,9 @@ from PIL import Image
 from retrieval.commands.main import main
 from retrieval.data.dataset import load_grasps
 from retrieval.model.checkpoint_info import read_checkpoint_info
-from retrieval.search.defaults import SHIPPED, shipped_model
-from retrieval.search.query.answer import EXIT_CODES, verdict_sentence
-from retrieval.search.query.searcher import Searcher
+from retrieval.model.shipped import SHIPPED, shipped_model
+from retrieval.search.answer import EXIT_CODES, verdict_sentence
+from retrieval.search.searcher import Searcher
 from robot.collection import CollectSettings, collect
 from robot.rig import load_rig
 

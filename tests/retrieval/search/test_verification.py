@@ -8,9 +8,9 @@ import pytest
 import retrieval
 from retrieval.commands.main import main
 from retrieval.errors import BadInput
+from retrieval.indexing.build import build_index
 from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
 from retrieval.model.verification import MAX_GRASPS
-from retrieval.search.build.build_index import build_index
 from tests.verification import POSTERIOR, calibration
 
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 import retrieval
 from retrieval.errors import BadInput, ImageError, RetrievalError
-from retrieval.search.query.answer import Match
+from retrieval.search.answer import Match
 from tests.serving import listening
 
 TOKEN = "a token of some length"

@@ -12,8 +12,8 @@ import httpx
 import pytest
 from threadpoolctl import threadpool_info
 
+from retrieval.indexing.build import build_index
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search.build.build_index import build_index
 from retrieval.serve.service import LiveRig
 from retrieval.serve.settings import ServiceSettings
 from tests import synthetic

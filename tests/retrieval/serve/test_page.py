@@ -7,8 +7,8 @@ import shutil
 
 import pytest
 
+from retrieval.indexing.build import build_index
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search.build.build_index import build_index
 from retrieval.serve.service import GraspResult, LiveRig
 from tests import synthetic
 from tests.browser import address, ask, choose, page, serious

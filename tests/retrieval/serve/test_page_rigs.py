@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from retrieval.data.preprocessing import Preprocessing
+from retrieval.indexing.build import build_index
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search.build.build_index import build_index
 from retrieval.serve.rig import load_live_rig, simulated_live_rig
 from retrieval.training.train import train
 from robot.sim.rig import SimRig

@@ -4,9 +4,9 @@ import dataclasses
 
 import pytest
 
+from retrieval.indexing.build import build_index
 from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
-from retrieval.search.build.build_index import build_index
-from retrieval.search.query.searcher import Searcher
+from retrieval.search.searcher import Searcher
 from tests.browser import address, choose, page, serious
 from tests.verification import POSTERIOR, calibration
 

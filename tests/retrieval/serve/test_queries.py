@@ -6,9 +6,9 @@ import json
 
 import pytest
 
+from retrieval.indexing.build import build_index
 from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
-from retrieval.search.build.build_index import build_index
-from retrieval.search.query.searcher import Searcher
+from retrieval.search.searcher import Searcher
 from tests import synthetic
 from tests.serving import problem, service
 from tests.verification import POSTERIOR, calibration

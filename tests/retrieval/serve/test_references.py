@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from retrieval.data.dataset import load_grasps
-from retrieval.search.build.build_index import build_index
+from retrieval.indexing.build import build_index
 from tests.browser import address, ask, page, serious
 from tests.reference_model import NAMES, write_reference_model
 from tests.serving import problem, service, with_history

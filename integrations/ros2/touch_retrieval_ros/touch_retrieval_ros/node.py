@@ -21,7 +21,7 @@ from touch_retrieval_msgs.srv import Verify
 import retrieval
 from indexes.errors import IndexesError
 from retrieval.errors import RetrievalError
-from retrieval.search.query.answer import verdict_sentence
+from retrieval.search.answer import verdict_sentence
 from touch_retrieval_ros.recogniser import Recogniser
 
 PARAMETERS: dict[str, Any] = {

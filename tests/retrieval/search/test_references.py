@@ -10,14 +10,14 @@ import pytest
 from indexes.errors import CorruptIndex
 from indexes.store.folder import IndexStore
 from retrieval.errors import BadInput
+from retrieval.indexing.build import build_index
+from retrieval.indexing.sharded import build_sharded
 from retrieval.model.references import SHARPNESS, ReferenceCalibration, unit_embeddings
 from retrieval.report.query import query_html
 from retrieval.report.terminal import print_table
-from retrieval.search.build.build_index import build_index
-from retrieval.search.query.answer import QueryResult
-from retrieval.search.query.searcher import Searcher
-from retrieval.search.query.shard import FolderShard
-from retrieval.search.sharding.build_sharded import build_sharded
+from retrieval.search.answer import QueryResult
+from retrieval.search.searcher import Searcher
+from retrieval.search.shard import FolderShard
 from tests import synthetic
 from tests.documents import ROOT, text_of
 from tests.reference_model import NAMES, POSTERIOR, REFERENCE_CALIBRATION, write_reference_model

@@ -9,15 +9,15 @@ import torch
 
 import indexes
 from indexes.store.folder import IndexStore
+from retrieval.indexing import build as building
+from retrieval.indexing import candidates as measuring
+from retrieval.indexing.build import build_index
+from retrieval.indexing.candidates import candidates_sentence, kept_measurement, measure_candidates, query_codes
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
 from retrieval.model.fusion import Matcher
 from retrieval.model.fusion_scorer import FusionScorer
-from retrieval.search.build import build_index as building
-from retrieval.search.build import candidates as measuring
-from retrieval.search.build.build_index import build_index
-from retrieval.search.build.candidates import candidates_sentence, kept_measurement, measure_candidates, query_codes
 from tests.conftest import TINY
-from tests.retrieval.search.test_build import PROVENANCE, other_picture
+from tests.retrieval.indexing.test_build import PROVENANCE, other_picture
 
 PHOTOS, TOUCHES = 70, 40
 

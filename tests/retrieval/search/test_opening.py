@@ -1,4 +1,4 @@
-"""The default model and index of a command."""
+"""The default index and checkpoint of a command."""
 
 from pathlib import Path
 
@@ -10,7 +10,9 @@ from indexes.store.folder import IndexStore
 from indexes.store.rows import Row
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.checkpoint_info import read_checkpoint_info
-from retrieval.search import defaults
+from retrieval.model.shipped import shipped_model
+from retrieval.search import opening
+from retrieval.search.opening import find_index, find_model
 
 
 @pytest.fixture(autouse=True)
@@ -21,22 +23,22 @@ def _in_an_empty_folder(tmp_path, monkeypatch):
 def test_a_file_in_place_of_an_index_raises(tmp_path):
     (tmp_path / "model.safetensors").touch()
     with pytest.raises(BadInput, match=r"model\.safetensors is a file; an index is a folder"):
-        defaults.find_index(str(tmp_path / "model.safetensors"))
+        find_index(str(tmp_path / "model.safetensors"))
 
 
 def test_shipped_models_are_selected_by_their_number_of_fingers():
-    assert defaults.find_model("shipped")[0] == defaults.shipped_model()
-    assert defaults.find_model("shipped-one-finger")[0] == defaults.shipped_model(1)
+    assert find_model("shipped")[0] == shipped_model()
+    assert find_model("shipped-one-finger")[0] == shipped_model(1)
     for fingers in (1, 2):
-        assert read_checkpoint_info(defaults.shipped_model(fingers)).config.matcher.fingers == fingers
+        assert read_checkpoint_info(shipped_model(fingers)).config.matcher.fingers == fingers
     with pytest.raises(BadInput, match="take touches of 1 or 2 gel images; got 3"):
-        defaults.shipped_model(3)
+        shipped_model(3)
 
 
 def shipped_in(folder, monkeypatch):
     shipped = folder / "shipped.safetensors"
     shipped.write_bytes(b"shipped")
-    monkeypatch.setattr(defaults, "shipped_model", lambda: shipped)
+    monkeypatch.setattr(opening, "shipped_model", lambda: shipped)
     return shipped
 
 
@@ -50,12 +52,12 @@ def index_built_with(model, folder):
 
 
 def test_an_index_in_the_folder_determines_the_model(tmp_path, monkeypatch):
-    shipped_in(tmp_path, monkeypatch)
+    shipped = shipped_in(tmp_path, monkeypatch)
     own = tmp_path / "own.safetensors"
     own.write_bytes(b"own")
     index_built_with(own, tmp_path / "index")
-    assert defaults.find_model(None) == (own, "the one that index was built with")
-    assert defaults.find_model(None, Path("elsewhere"))[0] == defaults.shipped_model()  # no index determines the model
+    assert find_model(None) == (own, "the one that index was built with")
+    assert find_model(None, Path("elsewhere"))[0] == shipped  # no index determines the model
 
 
 def test_a_moved_model_of_an_index_is_found_by_its_content_or_raises(tmp_path, monkeypatch):
@@ -63,22 +65,22 @@ def test_a_moved_model_of_an_index_is_found_by_its_content_or_raises(tmp_path, m
     gone.write_bytes(b"shipped")
     index_built_with(gone, tmp_path / "index")
     gone.unlink()
-    assert defaults.find_model(None)[0] == shipped
+    assert find_model(None)[0] == shipped
     shipped.write_bytes(b"another")
     with pytest.raises(CheckpointError, match=r"no longer at .*gone\.safetensors; name it with --model"):
-        defaults.find_model(None)
+        find_model(None)
 
 
 def test_a_damaged_index_does_not_determine_the_model(tmp_path, monkeypatch):
     shipped = shipped_in(tmp_path, monkeypatch)
     index_built_with(shipped, tmp_path / "index")
     (tmp_path / "index" / "gen-000001" / "manifest.json").write_text("{")
-    assert defaults.find_model(None)[1].startswith("shipped")
+    assert find_model(None)[1].startswith("shipped")
 
 
 def test_the_index_in_this_folder_is_used(tmp_path):
     (tmp_path / "index").mkdir()
     with pytest.raises(BadInput, match=r"no index in this folder; run `retrieve build-index"):
-        defaults.find_index(None)
+        find_index(None)
     (tmp_path / "index" / "CURRENT").write_text("gen-000001")
-    assert defaults.find_index(None) == (Path("index"), "in this folder")
+    assert find_index(None) == (Path("index"), "in this folder")

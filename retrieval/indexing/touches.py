@@ -18,11 +18,11 @@ from retrieval.data.catalogue_touches import CatalogueTouch
 from retrieval.data.folder_walk import SkippedPhoto
 from retrieval.data.images import decode_rgb
 from retrieval.errors import BadInput, ImageError
+from retrieval.indexing.codes import code_model
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, batches, touch_features
 from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
 from retrieval.model.references import REFERENCE_PARTIALS, REFERENCE_ROWS
-from retrieval.search.build.codes import code_model
 
 Partials = NDArray[np.float16]
 BATCH = 32

@@ -21,7 +21,7 @@ from retrieval.model.references import REFERENCE_ROWS
 from retrieval.model.touch_reader import EncodedTouches, Stopwatch, TouchEncoder, TouchReader
 from retrieval.model.touches import AnyImage, AnyTouches, InputImage, parse_grasps
 from retrieval.model.verification import MAX_GRASPS, DecisionBounds
-from retrieval.search.query.answer import (
+from retrieval.search.answer import (
     Match,
     QueryResult,
     gel_classes,
@@ -29,11 +29,11 @@ from retrieval.search.query.answer import (
     require_counts,
     verdict_of,
 )
-from retrieval.search.query.objects import Objects
-from retrieval.search.query.opening import OpenShards, open_index, scorer_for, torch_encoder
-from retrieval.search.query.reference_touches import reference_summary
-from retrieval.search.query.shard import FolderShard, RankedObject, Shard, ShardQuery, ShardResult
-from retrieval.search.query.verification import Verification
+from retrieval.search.objects import Objects
+from retrieval.search.opening import OpenShards, open_index, scorer_for, torch_encoder
+from retrieval.search.references import reference_summary
+from retrieval.search.shard import FolderShard, RankedObject, Shard, ShardQuery, ShardResult
+from retrieval.search.verification import Verification
 
 
 class Searcher:

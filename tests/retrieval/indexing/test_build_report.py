@@ -8,7 +8,7 @@ import pytest
 from indexes.store.folder import IndexStore
 from retrieval.commands.main import main
 from retrieval.errors import BadInput
-from retrieval.search.build.build_index import build_index
+from retrieval.indexing.build import build_index
 
 
 @pytest.fixture

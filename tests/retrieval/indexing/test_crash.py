@@ -18,9 +18,9 @@ from dataclasses import dataclass
 import pytest
 
 from retrieval.data.catalogue import list_catalogue, read_photo
+from retrieval.indexing.build import build_index
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search.build.build_index import build_index
-from retrieval.search.query.searcher import Searcher
+from retrieval.search.searcher import Searcher
 from tests import synthetic
 
 KILLS = int(os.environ.get("KILLS", "5"))

@@ -19,12 +19,12 @@ from retrieval.commands.main import main
 from retrieval.data import preprocessing
 from retrieval.data.catalogue import list_catalogue, read_photo
 from retrieval.errors import DatasetError, NumericalError
+from retrieval.indexing import codes
+from retrieval.indexing.build import build_index
+from retrieval.indexing.codes import map_ahead
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
 from retrieval.model.encode import encode_photos
-from retrieval.search.build import codes
-from retrieval.search.build.build_index import build_index
-from retrieval.search.build.codes import map_ahead
-from retrieval.search.query.searcher import Searcher
+from retrieval.search.searcher import Searcher
 from tests import synthetic
 
 HOUR_NS = 3600 * 10**9
@@ -266,8 +266,8 @@ KILLED = """
 import os, signal, sys, torch
 from pathlib import Path
 from retrieval.model import photo_encoder
-from retrieval.search.build import codes
-from retrieval.search.build.build_index import build_index
+from retrieval.indexing import codes
+from retrieval.indexing.build import build_index
 from retrieval.model.checkpoint import load_checkpoint
 
 catalogue, model, index, fatal = sys.argv[1:]

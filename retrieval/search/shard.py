@@ -23,9 +23,9 @@ from retrieval.model.fusion_scorer import FusionScorer, StoredPartials
 from retrieval.model.posterior import EvidenceMass, Posterior
 from retrieval.model.references import REFERENCE_ROWS
 from retrieval.model.touch_reader import Stopwatch
-from retrieval.search.query.answer import NearestReference
-from retrieval.search.query.objects import ListedPhoto, Objects, ScoredObjects, listed_photo
-from retrieval.search.query.reference_touches import References, Similarities
+from retrieval.search.answer import NearestReference
+from retrieval.search.objects import ListedPhoto, Objects, ScoredObjects, listed_photo
+from retrieval.search.references import References, Similarities
 
 DEFAULT_CANDIDATES = 1000
 MIN_COMPLETED_OBJECTS = 20

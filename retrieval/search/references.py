@@ -24,8 +24,8 @@ from retrieval.model.references import (
     reference_similarity,
     unit_embeddings,
 )
-from retrieval.search.query.answer import NearestReference
-from retrieval.search.query.objects import ListedPhoto, Objects, ScoredObjects
+from retrieval.search.answer import NearestReference
+from retrieval.search.objects import ListedPhoto, Objects, ScoredObjects
 
 Similarities = NDArray[np.float64]
 

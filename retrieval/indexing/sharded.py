@@ -33,14 +33,14 @@ from retrieval.data.catalogue_touches import CatalogueTouch
 from retrieval.data.folder_walk import SkippedPhoto
 from retrieval.data.naming import Naming, naming_warnings
 from retrieval.errors import BadInput, NoReadablePhoto
+from retrieval.indexing.build import BuildOptions, build_listed, naming_by, stores_cells
+from retrieval.indexing.codes import no_photo
+from retrieval.indexing.report import BuildReport
+from retrieval.indexing.touches import require_reference_calibration
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.checkpoint_info import fingerprint
 from retrieval.model.fusion_scorer import CELLS
 from retrieval.model.references import REFERENCE_CALIBRATION, REFERENCE_ROWS
-from retrieval.search.build.build_index import BuildOptions, build_listed, naming_by, stores_cells
-from retrieval.search.build.build_report import BuildReport
-from retrieval.search.build.codes import no_photo
-from retrieval.search.build.embed_touches import require_reference_calibration
 from retrieval.version import __version__
 
 _KEEP_ALL = 10**6

@@ -19,20 +19,20 @@ from indexes.store.rows import TEXT, Row, encode_rows
 from retrieval.data.catalogue import Catalogue, list_catalogue
 from retrieval.data.naming import FOLDER, Naming, naming_warnings
 from retrieval.errors import BadInput
-from retrieval.model.checkpoint import Checkpoint
-from retrieval.model.checkpoint_info import fingerprint
-from retrieval.model.fusion_scorer import CELLS, PARTIALS, StoredPartials, largest_rounding
-from retrieval.model.references import REFERENCE_CALIBRATION, REFERENCE_ROWS
-from retrieval.search.build.build_report import BuildReport
-from retrieval.search.build.candidates import (
+from retrieval.indexing.candidates import (
     can_measure,
     candidates_sentence,
     kept_measurement,
     measure_candidates,
     query_codes,
 )
-from retrieval.search.build.codes import FileDigests, PhotoCodes, code_blocks, code_layout, code_model, find_codes
-from retrieval.search.build.embed_touches import ReferenceBuild, embed_references, touch_code_digest, touch_layout
+from retrieval.indexing.codes import FileDigests, PhotoCodes, code_blocks, code_layout, code_model, find_codes
+from retrieval.indexing.report import BuildReport
+from retrieval.indexing.touches import ReferenceBuild, embed_references, touch_code_digest, touch_layout
+from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.checkpoint_info import fingerprint
+from retrieval.model.fusion_scorer import CELLS, PARTIALS, StoredPartials, largest_rounding
+from retrieval.model.references import REFERENCE_CALIBRATION, REFERENCE_ROWS
 from retrieval.version import __version__
 
 PARTS = {"checkpoint": "model", "preprocessing": "preprocessing of photos"}

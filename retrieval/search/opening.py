@@ -1,20 +1,99 @@
-"""Open an index folder or a sharded index, with the checkpoint that built it."""
+"""Find an index, the checkpoint that built it, and the default of both; open an index folder or a sharded index."""
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from _touch_retrieval.files import file_digest
+from indexes.errors import IndexesError
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation, check_fingerprint
-from indexes.store.manifest import Manifest
+from indexes.store.manifest import Manifest, read_manifest
 from indexes.store.sharded import ShardedManifest, is_sharded, open_shard, read_sharded_manifest
+from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_checkpoint_info, read_scorer
 from retrieval.model.fusion_scorer import CELLS, FusionScorer, stored_layout
+from retrieval.model.shipped import SHIPPED_NAMES, shipped_model
 from retrieval.model.touch_reader import TouchEncoder
-from retrieval.search import defaults
-from retrieval.search.query.objects import check_usable
-from retrieval.search.query.shard import FolderShard, IndexInfo, Shard, Shards
+from retrieval.search.objects import check_usable
+from retrieval.search.shard import FolderShard, IndexInfo, Shard, Shards
+
+INDEX = Path("index")
+"""Default index folder of `build-index` and `query`."""
+
+
+def find_index(choice: str | None) -> tuple[Path, str]:
+    """Return the index folder to use, and the reason.
+
+    Args:
+        choice: A folder; None for ./index.
+
+    Raises:
+        BadInput: There is no index.
+    """
+    if choice is not None:
+        if Path(choice).is_file():
+            raise BadInput(f"{choice} is a file; an index is a folder, which `retrieve build-index` writes")
+        return Path(choice), "given"
+    if (INDEX / "CURRENT").is_file() or is_sharded(INDEX):
+        return INDEX, "in this folder"
+    raise BadInput(
+        "there is no index in this folder; run `retrieve build-index CATALOGUE` first, or name one with --index"
+    )
+
+
+def find_model(choice: str | None, index: str | Path = INDEX) -> tuple[Path, str]:
+    """Return the checkpoint to use, and the reason.
+
+    Args:
+        choice: A path or one of `SHIPPED_NAMES`; None for the checkpoint of `index`, else the shipped one.
+        index: Index folder or sharded index.
+
+    Raises:
+        CheckpointError: There is no checkpoint, or the one of `index` is missing.
+    """
+    if choice in SHIPPED_NAMES:
+        return shipped_model(SHIPPED_NAMES[choice]), "shipped; trained on the simulated rig"
+    if choice is not None:
+        return Path(choice), "given"
+    manifest = None
+    with suppress(IndexesError):  # an unusable index is ignored
+        manifest = manifest_of(index)
+    if manifest is not None:
+        return model_of(manifest), f"the one that {index} was built with"
+    if shipped_model().is_file():
+        return shipped_model(), "shipped; trained on the simulated rig: train your own for real sensors"
+    raise CheckpointError("there is no trained model; make one with `retrieve train`, or name it with --model")
+
+
+def manifest_of(index: str | Path) -> Manifest | ShardedManifest:
+    """Return the manifest of the current generation of an index folder or of a sharded index.
+
+    Raises:
+        IndexesError: The index is missing or damaged.
+    """
+    folder = Path(index)
+    return read_sharded_manifest(folder) if is_sharded(folder) else read_manifest(folder / IndexStore(folder).current())
+
+
+def model_of(manifest: Manifest | ShardedManifest) -> Path:
+    """Return the checkpoint that built an index: at its old path, else an equal shipped one.
+
+    Raises:
+        CheckpointError: Neither exists.
+    """
+    path = Path(str(manifest.about.get("checkpoint")))
+    if path.is_file():
+        return path
+    shipped = shipped_model()
+    if shipped.is_file() and file_digest(shipped) == manifest.fingerprint.get("checkpoint"):
+        return shipped
+    raise CheckpointError(
+        f"the model of this index is no longer at {path}; name it with --model, or build the index again with another"
+    )
+
 
 OpenShards = Callable[[str | Path, ShardedManifest, CheckpointInfo], Shard]
 """Opens the shards of a sharded index, in this process or elsewhere."""
@@ -60,7 +139,7 @@ def read_checkpoint_of(manifest: Manifest | ShardedManifest, model: str | Path |
     Raises:
         CheckpointError: The checkpoint is missing or damaged.
     """
-    stored = read_checkpoint_info(Path(model) if model else defaults.model_of(manifest))
+    stored = read_checkpoint_info(Path(model) if model else model_of(manifest))
     if stored.digest != manifest.fingerprint.get("checkpoint"):
         from retrieval.model.checkpoint import load_checkpoint
 

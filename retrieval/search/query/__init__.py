@@ -1,1 +1,0 @@
-"""From gel images to ranked objects."""

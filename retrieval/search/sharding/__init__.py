@@ -1,1 +1,0 @@
-"""Indexes in several shards, in a folder or in an object store."""
