@@ -36,9 +36,7 @@ from retrieval.data.resize import resize
 from retrieval.errors import JobInterrupted
 from retrieval.model.checkpoint import write_tensors
 from retrieval.model.encode import autocast, default_device
-from retrieval.model.towers import build_tower
-from retrieval.model.towers.tower import Tower
-from retrieval.model.towers.weights import initialise_tower
+from retrieval.model.towers.tower import Tower, build_tower
 from retrieval.training.augmentation import sample_grid
 from retrieval.training.loop import RATE, Plan, StateFile, freeze_batch_norm, state_path, train_loop
 from robot.sim.gel.sensor import draw_sensor
@@ -244,7 +242,7 @@ class GelTowerTraining(Dataset[Batch]):
         self.labelled, self.device = labelled, default_device()
         self.published, tower = (build_tower("mobilenet_v2", "stages").to(self.device).eval() for _ in range(2))
         for each in (self.published, tower):
-            initialise_tower(each, init)
+            each.initialise(init)
         torch.manual_seed(0)
         self.tower, self.projection = tower, nn.Linear(tower.feature_count, EMBEDDING)
         self.head = LabelHead(tower.feature_count, [picture.labels for picture in labelled])

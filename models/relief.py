@@ -22,8 +22,7 @@ from retrieval.data.preprocessing import Preprocessing
 from retrieval.model.checkpoint import write_tensors
 from retrieval.model.config import Config
 from retrieval.model.encode import autocast, default_device, to_batch
-from retrieval.model.towers import build_tower
-from retrieval.model.towers.weights import initialise_tower
+from retrieval.model.towers.tower import build_tower
 from retrieval.training.augmentation import augment, sample_grid
 from retrieval.training.loop import RATE, Plan, StateFile, freeze_batch_norm, state_path, train_loop
 
@@ -88,7 +87,7 @@ class ReliefTraining(Dataset[tuple[list[int], Tensor]]):
         self.validation = [picture for picture in pictures if picture.object_id in names]
         torch.manual_seed(seed)
         self.tower = build_tower(matcher.tower, matcher.tower_output)
-        initialise_tower(self.tower, config.training.init)
+        self.tower.initialise(config.training.init)
         self.head = LabelHead(self.tower.feature_count, [picture.labels for picture in self.pictures])
         self.modules = nn.ModuleDict({"tower": self.tower, "head": self.head}).to(self.device)
         groups: list[dict[str, Any]] = [

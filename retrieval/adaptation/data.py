@@ -21,9 +21,8 @@ from retrieval.model.config import Config, load_config
 from retrieval.model.fusion import Matcher
 from retrieval.model.shipped import is_shipped
 from retrieval.model.towers import TOWER_SEPARATOR
-from retrieval.model.towers.concatenated import feature_counts_of, parts_of
 from retrieval.model.towers.tower import Tower
-from retrieval.model.towers.weights import GEL, initialise_tower
+from retrieval.model.towers.weights import GEL
 from retrieval.training.features import Features, encode_recording
 from retrieval.training.licences import checkpoint_licences
 
@@ -61,7 +60,8 @@ class AdaptationData:
     @property
     def blocks(self) -> TowerWidths:
         """Feature widths of the combined towers, for a touch and for a photo."""
-        touch, photo = feature_counts_of(self.matcher.touch_tower), feature_counts_of(self.matcher.photo_tower)
+        towers = self.matcher.touch_tower, self.matcher.photo_tower
+        touch, photo = ([part.feature_count for part in tower.backbones] for tower in towers)
         return TowerWidths(touch * self.config.matcher.fingers, photo * self.matcher.views, len(touch))
 
 
@@ -120,18 +120,18 @@ def load_towers(matcher: Matcher, start: Checkpoint, init: str) -> None:
     """Load the weights of the towers of `config_for`; `init` are those of the published tower, or "none"."""
     own, published = start.matcher, [] if init == NO_TOWER else [init]
     gel = [GEL] if published and _has_gel_tower(start) else []
-    _load_parts(matcher.touch_tower, parts_of(own.touch_tower), [*gel, *published])
+    _load_parts(matcher.touch_tower, own.touch_tower.backbones, [*gel, *published])
     only_published = published and is_shipped(start.path)
-    _load_parts(matcher.photo_tower, [] if only_published else parts_of(own.photo_tower), published)
+    _load_parts(matcher.photo_tower, [] if only_published else own.photo_tower.backbones, published)
 
 
 def _load_parts(tower: Tower, start: Sequence[Tower], inits: Sequence[str]) -> None:
     """Load the weights of the start model into the first parts of a tower, and those of `inits` into the others."""
-    parts = parts_of(tower)
+    parts = tower.backbones
     for part, source in zip(parts, start, strict=False):
         part.load_state_dict(source.state_dict())
     for part, init in zip(parts[len(start) :], inits, strict=True):
-        initialise_tower(part, init)
+        part.initialise(init)
 
 
 def _has_gel_tower(start: Checkpoint) -> bool:

@@ -32,7 +32,6 @@ from retrieval.methods.selection import Validator, held_out_folds, validation_ro
 from retrieval.methods.standardise import Standardiser
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
-from retrieval.model.towers.concatenated import feature_counts_of
 from retrieval.training.calibration.posterior import fit_posterior
 from retrieval.training.calibration.touches import CalibrationTouches, ScoredTouches
 
@@ -288,9 +287,9 @@ def tower_widths(config: Config, features: "Features") -> TowerWidths:
 
     with torch.device("meta"):
         matcher = Matcher(config.matcher)
-    towers = feature_counts_of(matcher.touch_tower)
+    towers = [part.feature_count for part in matcher.touch_tower.backbones]
     touch_view = towers * features.touch.shape[1]
-    photo_view = feature_counts_of(matcher.photo_tower) * len(config.preprocessing.views)
+    photo_view = [part.feature_count for part in matcher.photo_tower.backbones] * len(config.preprocessing.views)
     expected, got = (sum(touch_view), sum(photo_view)), (_rows(features).shape[1], features.photo.shape[1])
     if expected != got:
         raise BadInput(

@@ -11,7 +11,8 @@ from torch.nn import functional
 from retrieval.methods.method import Array, Method
 from retrieval.methods.selection import Validator
 from retrieval.methods.standardise import Standardiser
-from retrieval.model.losses.contrastive import LOG_SCALE_INIT, LOG_SCALE_MAX, contrastive_loss
+from retrieval.model.fusion import LOG_SCALE_INIT, LOG_SCALE_MAX
+from retrieval.model.losses.listwise import contrastive_loss
 from retrieval.training.loop import BestStep, Plan, train_loop
 
 if TYPE_CHECKING:

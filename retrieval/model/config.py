@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from msgspec import Meta
 
@@ -18,10 +18,6 @@ from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import ConfigError
 from retrieval.model.losses import LOGIT_LOSSES, LOSSES
 from retrieval.model.towers import TOWER_SEPARATOR, tower_name
-
-if TYPE_CHECKING:
-    from retrieval.model.losses.loss import Loss
-    from retrieval.model.towers.tower import Tower
 
 FractionBelowOne = Annotated[float, Meta(ge=0, lt=1)]
 
@@ -276,8 +272,8 @@ class Config:
     def using(
         self,
         *,
-        tower: "str | type[Tower] | None" = None,
-        losses: "Mapping[str, float] | Mapping[str | type[Loss], float] | None" = None,
+        tower: str | type | None = None,
+        losses: Mapping[str, float] | Mapping[str | type, float] | None = None,
     ) -> "Config":
         """Return the configuration with another tower, or with other losses in addition to the match loss.
 

@@ -21,9 +21,10 @@ from retrieval.model.candidate_encoder import CandidateEncoder
 from retrieval.model.config import MatcherConfig
 from retrieval.model.fusion_scorer import FusionScorer
 from retrieval.model.late_interaction import CellEncoder, cell_scores, paired_cell_scores
-from retrieval.model.losses.contrastive import LOG_SCALE_INIT, LOG_SCALE_MAX
-from retrieval.model.towers import build_tower
+from retrieval.model.towers.tower import build_tower
 
+LOG_SCALE_INIT, LOG_SCALE_MAX = math.log(1 / 0.07), math.log(100.0)
+"""Initial and largest log of the factor of cosines in the contrastive loss."""
 COSINE_SCALE_INIT = 4.0
 """Initial amount that a cosine of 1 adds to the logit."""
 

@@ -10,7 +10,6 @@ from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
 from retrieval.model.shipped import shipped_model
-from retrieval.model.towers.weights import initialise_tower
 
 TOWER_WEIGHTS = ("touch_tower.", "photo_tower.")
 """Prefixes of the names of the towers' weights in a matcher."""
@@ -27,7 +26,7 @@ def build_matcher(config: Config) -> Matcher:
             (matcher.photo_tower, settings.init_photo, "photo_tower"),
         ):
             shipped = partial(_shipped_tower, config.matcher.fingers, side)
-            initialise_tower(tower, settings.tower_init(init), shipped)
+            tower.initialise(settings.tower_init(init), shipped)
     for tower in (matcher.touch_tower, matcher.photo_tower):
         tower.requires_grad_(not settings.freeze_towers)
         if settings.freeze_stem:

@@ -33,8 +33,7 @@ from retrieval.model.config import Config, TrainingConfig, named_config
 from retrieval.model.encode import default_device
 from retrieval.model.fusion import Matcher
 from retrieval.model.losses import LOSSES
-from retrieval.model.losses.loss import EncodedBatch, Loss
-from retrieval.model.losses.match import match_loss
+from retrieval.model.losses.loss import EncodedBatch, Loss, match_loss
 from retrieval.model.towers.tower import Tower
 from retrieval.training import distributed
 from retrieval.training.batches import FeatureSource, FrozenFeatures, LoadedBatch, TrainedFeatures

@@ -7,9 +7,8 @@ import torch
 from models import gel_tower
 from models.random_surfaces import GRID, RandomSurface, presses
 from retrieval.model.checkpoint import read_tensors
-from retrieval.model.towers import build_tower
+from retrieval.model.towers.tower import build_tower
 from retrieval.model.towers.weights import gel_tower as packaged_gel_tower
-from retrieval.model.towers.weights import initialise_tower
 from robot.sim.gel.sensor import draw_sensor
 
 
@@ -48,7 +47,7 @@ def test_a_training_writes_a_tower_that_loads(tmp_path, monkeypatch):
     line = f"{tmp_path} --init {packaged_gel_tower()} --sensors 2 --labelled 12 --jobs 1 --steps 2"
     assert gel_tower.main(line.split()) == 0
     tower = build_tower("mobilenet_v2", "stages")
-    initialise_tower(tower, str(tmp_path / "gel-tower.safetensors"))
+    tower.initialise(str(tmp_path / "gel-tower.safetensors"))
     before = read_tensors(packaged_gel_tower())[0]["features.10.conv.0.0.weight"]
     assert not torch.equal(tower.state_dict()["features.10.conv.0.0.weight"], before.float())
     assert "2 sensors" in (tmp_path / "gel-tower.md").read_text()

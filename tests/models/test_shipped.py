@@ -15,7 +15,7 @@ from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import touch_features
 from retrieval.model.gel_check import NOT_A_GEL
 from retrieval.model.shipped import SHIPPED, shipped_model
-from retrieval.model.towers import build_tower
+from retrieval.model.towers.tower import build_tower
 from robot.rig import load_rig
 
 

@@ -20,7 +20,7 @@ from benchmarks.reference import COMMANDS
 from benchmarks.reference import commands as commands_page
 from retrieval import load_config
 from retrieval.commands.main import main
-from retrieval.model.towers import build_tower
+from retrieval.model.towers.tower import build_tower
 from retrieval.search.answer import EXIT_CODES
 from retrieval.search.verification import VERIFY_EXIT_CODES
 from robot.rig import load_rig

@@ -1,10 +1,19 @@
-"""Listwise loss: each touch picks the photos of its object out of all photos of a batch, each photo its touches."""
+"""Listwise losses: each touch picks the photos of its object out of all photos of a batch, each photo its touches."""
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from retrieval.model.losses.loss import EncodedBatch, Loss
+
+
+class ContrastiveLoss(Loss):
+    """`contrastive_loss` of the embeddings of a batch. Its learned scale belongs to the matcher and its checkpoints."""
+
+    def forward(self, batch: EncodedBatch) -> Tensor:
+        """Return the loss (scalar) of a batch."""
+        objects = batch.touch_objects, batch.photo_objects
+        return contrastive_loss(batch.touch.embedding, batch.photo.embedding, *objects, batch.matcher.log_scale)
 
 
 class ListwiseLoss(Loss):
@@ -14,6 +23,42 @@ class ListwiseLoss(Loss):
         """Return the loss (scalar) of a batch."""
         logits = batch.matcher.head.all_logits(batch.touch.partial, batch.photo.partial)
         return listwise_loss(logits, batch.touch_objects, batch.photo_objects)
+
+
+class PooledListwiseLoss(Loss):
+    """`listwise_loss` of the match logits without late interaction.
+
+    Candidates are found by the pooled logit, and an index without cells ranks by it. Without this loss the cells learn
+    to explain everything, and the pooled logit becomes useless.
+    """
+
+    def forward(self, batch: EncodedBatch) -> Tensor:
+        """Return the loss (scalar) of a batch."""
+        pooled = batch.matcher.config.pooled_width
+        logits = batch.matcher.head.all_logits(batch.touch.partial[:, :pooled], batch.photo.partial[:, :pooled])
+        return listwise_loss(logits, batch.touch_objects, batch.photo_objects)
+
+
+def contrastive_loss(
+    touch: Tensor, photo: Tensor, touch_objects: Tensor, photo_objects: Tensor, log_scale: Tensor
+) -> Tensor:
+    """Return the symmetric cross-entropy between unit embeddings of touches and of photos (InfoNCE).
+
+    Each touch must pick each photo of its own object out of that photo and the photos of OTHER objects: photos of the
+    same object are never negatives of each other (InfoNCE with several positives: Khosla et al., NeurIPS 2020, eq. 2,
+    with the other positives removed from the denominator). The loss is averaged over a touch's photos, then over the
+    touches that have a photo of their own object and one of another. The other direction does the same for each photo
+    among the touches, and the result is the mean of the two. A direction without such rows contributes zero.
+
+    Args:
+        touch: (T, d) unit embeddings.
+        photo: (N, d) unit embeddings.
+        touch_objects: (T,) integer labels.
+        photo_objects: (N,) integer labels.
+        log_scale: Scores are exp(log_scale) times the cosines.
+    """
+    scores = log_scale.float().exp() * touch.float() @ photo.float().T
+    return listwise_loss(scores, touch_objects, photo_objects)
 
 
 def listwise_loss(scores: Tensor, touch_objects: Tensor, photo_objects: Tensor) -> Tensor:

@@ -1,11 +1,11 @@
-"""Contract of a training loss: its input and its output."""
+"""Contract of a training loss, and the paper's loss of pairs."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from torch import Tensor, nn
+from torch.nn import functional
 
-if TYPE_CHECKING:
-    from retrieval.model.fusion import ImageEncoding, Matcher
+from retrieval.model.fusion import ImageEncoding, Matcher
 
 
 class EncodedBatch(NamedTuple):
@@ -19,9 +19,9 @@ class EncodedBatch(NamedTuple):
         photo_objects: (N,) objects of the photos.
     """
 
-    matcher: "Matcher"
-    touch: "ImageEncoding"
-    photo: "ImageEncoding"
+    matcher: Matcher
+    touch: ImageEncoding
+    photo: ImageEncoding
     touch_objects: Tensor
     photo_objects: Tensor
 
@@ -60,3 +60,12 @@ class Loss(nn.Module):
 
     def clamp(self) -> None:
         """Clamp parameters to their range, after each step."""
+
+
+def match_loss(logits: Tensor, labels: Tensor) -> Tensor:
+    """Return the mean binary cross-entropy of match logits (P,) against labels (P,) of 0 and 1.
+
+    This is the paper's loss, which every training run includes. It is computed from logits: `log(sigmoid(z))` is -inf
+    below z = -104 in float32, and its gradient NaN.
+    """
+    return functional.binary_cross_entropy_with_logits(logits.float(), labels.float())

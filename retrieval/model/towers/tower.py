@@ -1,15 +1,19 @@
 """Base class of every tower; a backbone only implements `_encode`."""
 
-from collections.abc import Iterable
+import logging
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from retrieval.errors import BadInput, CheckpointError, ConfigError, NumericalError
-from retrieval.model.towers.weights import State, download
+from retrieval.model.towers import OUTPUTS, TOWER_SEPARATOR, TOWERS
+from retrieval.model.towers.weights import GEL, SHIPPED, State, download, gel_tower, read_state
 
+log = logging.getLogger(__name__)
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
@@ -124,16 +128,115 @@ class Tower(nn.Module):
         """Encode normalised images (B, 3, H, W) to (B, feature_count)."""
         raise NotImplementedError
 
-    def published_weights(self) -> State:
-        """Return the weights that are published for this architecture. Raises CheckpointError if there are none."""
-        if self.url is None:
-            raise CheckpointError(f"no weights are published for {type(self).__name__}; give a file, or `random`")
-        return download(self.url)
+    @property
+    def backbones(self) -> Sequence["Tower"]:
+        """The concatenated towers; of any other tower, itself."""
+        return [self]
+
+    def initialise(self, init: str, shipped: Callable[[], State] | None = None) -> None:
+        """Load the initial weights.
+
+        Args:
+            init: "random" leaves the tower as built. "imagenet" loads the published weights, "shipped" those of
+                `shipped`, "gel" the file `gel_tower`. Anything else is the path of a .pth, .pt or .safetensors state
+                dict with the tower's key names, which for our own towers are torchvision's. Concatenated towers take
+                one value for all, or one each, joined by `TOWER_SEPARATOR`.
+            shipped: Returns the state dict for "shipped".
+
+        Raises:
+            CheckpointError: A file is missing, damaged or of another architecture.
+        """
+        if init == "random":
+            return
+        if init == SHIPPED and shipped is not None:
+            self.load(shipped(), "the shipped checkpoint")
+        elif init == GEL:
+            self.load(read_state(gel_tower()), "the gel tower of the package")
+        elif init == "imagenet":
+            if self.url is None:
+                raise CheckpointError(f"no weights are published for {type(self).__name__}; give a file, or `random`")
+            self.load(download(self.url), f"the published {type(self).__name__}")
+        else:
+            self.load(read_state(Path(init)), init)
+
+    def load(self, state: State, source: str) -> None:
+        """Load a state dict. Every layer must fit; either side may lack an optional one.
+
+        Args:
+            state: The weights by name, perhaps in an older layout (`rename_state`).
+            source: Their name in messages.
+
+        Raises:
+            CheckpointError: The weights are of another architecture, or not finite.
+        """
+        state, own, kind = self.rename_state(state), self.state_dict(), type(self).__name__
+        optional, classes = self.optional_prefixes, self.optional_prefixes[:1]
+        unknown = [key for key in state if key not in own and not key.startswith(optional)]
+        missing = [key for key in own if key not in state and not key.startswith(classes)]
+        if unknown or missing:
+            problem = f"lacks {missing[0]}" if missing else f"has an unknown {unknown[0]}"
+            raise CheckpointError(f"{source} does not fit {kind}: it {problem}; name the tower it is for")
+        for key in (key for key in own if key in state):
+            if state[key].shape != own[key].shape:
+                got, expected = tuple(state[key].shape), tuple(own[key].shape)
+                raise CheckpointError(f"{source} does not fit {kind}: {key} is {got}, must be {expected}")
+            if not bool(torch.isfinite(state[key]).all()):
+                raise CheckpointError(f"{source} contains a NaN or infinite weight in {key}; give another file")
+        if any(key.startswith(classes) and key not in state for key in own):
+            log.warning("%s has no 1000-way layer: this layer is initialised randomly", source)
+        self.load_state_dict({key: state.get(key, value) for key, value in own.items()})
 
     @staticmethod
     def rename_state(state: State) -> State:
         """Map the keys of a known older layout to the current one; by default the identity."""
         return state
+
+
+class ConcatenatedTowers(Tower):
+    """Several backbones on one image, with concatenated features: differently pretrained ones complement each other."""
+
+    def __init__(self, parts: Sequence[Tower]) -> None:
+        super().__init__()
+        self.parts = nn.ModuleList(parts)
+        self.feature_count = sum(part.feature_count for part in parts)
+
+    @property
+    def backbones(self) -> Sequence[Tower]:
+        """The concatenated towers."""
+        return list(self.parts)  # type: ignore[arg-type]
+
+    def initialise(self, init: str, shipped: Callable[[], State] | None = None) -> None:
+        """Load the initial weights of each part, as in `Tower.initialise`."""
+        inits, count = init.split(TOWER_SEPARATOR), len(self.backbones)
+        if len(inits) not in (1, count):
+            raise CheckpointError(
+                f"{count} concatenated towers need initial weights each, joined by {TOWER_SEPARATOR!r}; got {init!r}"
+            )
+        for part, part_init in zip(self.backbones, inits * (count // len(inits)), strict=True):
+            part.initialise(part_init, shipped)
+
+    def _encode(self, images: Tensor) -> Tensor:
+        return torch.cat([part._encode(images) for part in self.backbones], dim=1)
+
+
+def build_tower(name: str, output: str = "pooled") -> Tower:
+    """Build the tower `name`, or several concatenated ones, with random weights.
+
+    Args:
+        name: A row of `TOWERS`, or "module:Class" of an imported module.
+        output: "pooled" gives the globally averaged features of the last stage; "classes" keeps the 1000-way linear
+            layer of ImageNet checkpoints, whose outputs the paper concatenates; "stages" gives mean, deviation and
+            maximum over the maps of several stages, from edges to parts.
+
+    Raises:
+        ConfigError: The name or output is unknown.
+    """
+    if TOWER_SEPARATOR in name:
+        return ConcatenatedTowers([build_tower(part, output) for part in name.split(TOWER_SEPARATOR)])
+    if output not in OUTPUTS:
+        raise ConfigError(f"tower output must be one of {', '.join(OUTPUTS)}; got {output!r}")
+    tower: Tower = TOWERS.load(name)(output)
+    return tower
 
 
 def _grid_means(maps: Tensor, cells: int) -> Tensor:

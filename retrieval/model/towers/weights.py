@@ -1,20 +1,14 @@
-"""Initial weights of a tower: random, from a file, or published ones."""
+"""State dicts of towers, from files or published ones."""
 
 import logging
-from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING
 from urllib.error import URLError
 
 import torch
 from torch import Tensor
 
 from retrieval.errors import CheckpointError
-from retrieval.model.towers import TOWER_SEPARATOR
-
-if TYPE_CHECKING:
-    from retrieval.model.towers.tower import Tower
 
 State = dict[str, Tensor]
 SHIPPED = "shipped"
@@ -24,43 +18,6 @@ GEL = "gel"
 log = logging.getLogger(__name__)
 
 
-def initialise_tower(tower: "Tower", init: str, shipped: Callable[[], State] | None = None) -> None:
-    """Give `tower` its initial weights.
-
-    Args:
-        tower: A tower, or concatenated ones.
-        init: "random" leaves it as built. "imagenet" loads the published weights (`Tower.published_weights`), "shipped"
-            those of `shipped`, "gel" the file `gel_tower`. Anything else is the path of a .pth, .pt or .safetensors
-            state dict with the tower's key names, which for our own towers are torchvision's. Concatenated towers take
-            one value for all, or one each, joined by `TOWER_SEPARATOR`.
-        shipped: Returns the state dict for "shipped".
-
-    Raises:
-        CheckpointError: A file is missing, damaged or of another architecture.
-    """
-    from retrieval.model.towers.concatenated import ConcatenatedTowers  # a tower, which imports this module
-
-    if init == "random":
-        return
-    if isinstance(tower, ConcatenatedTowers):
-        inits, count = init.split(TOWER_SEPARATOR), len(tower.parts)
-        if len(inits) not in (1, count):
-            raise CheckpointError(
-                f"{count} concatenated towers need initial weights each, joined by {TOWER_SEPARATOR!r}; got {init!r}"
-            )
-        for part, part_init in zip(tower.parts, inits * (count // len(inits)), strict=True):
-            initialise_tower(part, part_init, shipped)  # type: ignore[arg-type]
-        return
-    if init == SHIPPED and shipped is not None:
-        load_tower_state(tower, shipped(), "the shipped checkpoint")
-        return
-    if init == GEL:
-        load_tower_state(tower, read_state(gel_tower()), "the gel tower of the package")
-        return
-    state = tower.published_weights() if init == "imagenet" else read_state(Path(init))
-    load_tower_state(tower, state, f"the published {type(tower).__name__}" if init == "imagenet" else init)
-
-
 def gel_tower() -> Path:
     """Return the file of the package's touch tower for real gels: MobileNetV2 with the output "stages".
 
@@ -68,27 +25,6 @@ def gel_tower() -> Path:
     (`python -m models.gel_tower`).
     """
     return Path(str(resources.files("retrieval") / "shipped" / "gel-tower.safetensors"))
-
-
-def load_tower_state(tower: "Tower", state: State, source: str) -> None:
-    """Load `state` into `tower`. Every layer must fit; either side may lack an optional one."""
-    state = tower.rename_state(state)
-    own = tower.state_dict()
-    optional, classes = tower.optional_prefixes, tower.optional_prefixes[:1]
-    unknown = [key for key in state if key not in own and not key.startswith(optional)]
-    missing = [key for key in own if key not in state and not key.startswith(classes)]
-    if unknown or missing:
-        problem = f"lacks {missing[0]}" if missing else f"has an unknown {unknown[0]}"
-        raise CheckpointError(f"{source} does not fit {type(tower).__name__}: it {problem}; name the tower it is for")
-    shapes = [key for key in own if key in state and state[key].shape != own[key].shape]
-    if shapes:
-        got, expected = tuple(state[shapes[0]].shape), tuple(own[shapes[0]].shape)
-        raise CheckpointError(f"{source} does not fit {type(tower).__name__}: {shapes[0]} is {got}, must be {expected}")
-    if bad := [key for key in own if key in state and not bool(torch.isfinite(state[key]).all())]:
-        raise CheckpointError(f"{source} contains a NaN or infinite weight in {bad[0]}; give another file")
-    if any(key.startswith(classes) and key not in state for key in own):
-        log.warning("%s has no 1000-way layer: this layer is initialised randomly", source)
-    tower.load_state_dict({key: state.get(key, value) for key, value in own.items()})
 
 
 def read_state(path: Path) -> State:

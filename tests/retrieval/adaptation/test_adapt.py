@@ -22,8 +22,7 @@ from retrieval.methods.cca_towers import GRID, CcaSettings, TowerWidths, fit_pro
 from retrieval.methods.selection import Validator
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.fusion import Matcher
-from retrieval.model.towers import build_tower
-from retrieval.model.towers.weights import initialise_tower
+from retrieval.model.towers.tower import build_tower
 from retrieval.training.calibration.posterior import fit_posterior
 from retrieval.training.calibration.touches import CalibrationTouches, ScoredTouches
 from retrieval.training.calibration.verification import fit_verification, verification_sequences
@@ -181,8 +180,8 @@ def test_touches_are_encoded_by_the_shipped_the_gel_and_the_published_tower_and_
     matcher = Matcher(config_for(start, 1, str(published), seed=0).matcher)
     load_towers(matcher, start, str(published))
     gel, added = build_tower("mobilenet_v2", "stages"), build_tower("mobilenet_v2", "stages")
-    initialise_tower(gel, "gel")
-    initialise_tower(added, str(published))
+    gel.initialise("gel")
+    added.initialise(str(published))
     images, pooled = torch.rand(2, 3, 64, 64), start.matcher.touch_tower.feature_count
     with torch.inference_mode():
         shipped = start.matcher.touch_tower.eval()(images)[:, :pooled]  # without cells
@@ -311,12 +310,12 @@ def published(tmp_path_factory):
 
 def test_initial_weights_are_for_all_towers_or_for_each(published):
     two = build_tower("mobilenet_v2+small", "pooled")
-    initialise_tower(two, f"{published}+random")
+    two.initialise(f"{published}+random")
     assert torch.equal(
         two.parts[0].features[0][0].weight, torch.load(published, weights_only=True)["features.0.0.weight"]
     )
     with pytest.raises(CheckpointError, match="2 concatenated towers need initial weights each"):
-        initialise_tower(two, "random+random+random")
+        two.initialise("random+random+random")
 
 
 @pytest.mark.usefixtures("unchecked")

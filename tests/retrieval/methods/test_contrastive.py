@@ -7,7 +7,8 @@ import torch
 from retrieval.methods.contrastive import ContrastiveEmbedding, ObjectSampler, Projections
 from retrieval.methods.method import MethodSettings
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
-from retrieval.model.losses.contrastive import LOG_SCALE_MAX, contrastive_loss
+from retrieval.model.fusion import LOG_SCALE_MAX
+from retrieval.model.losses.listwise import contrastive_loss
 from retrieval.training.features import Features
 
 CONFIG = Config(matcher=MatcherConfig(embedding_dim=4), training=TrainingConfig(iterations=80))

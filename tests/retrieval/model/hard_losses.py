@@ -7,9 +7,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from retrieval.methods.contrastive import Projections
-from retrieval.model.losses.contrastive import contrastive_loss
-from retrieval.model.losses.listwise import listwise_loss
-from retrieval.model.losses.match import match_loss
+from retrieval.model.losses.listwise import contrastive_loss, listwise_loss
+from retrieval.model.losses.loss import match_loss
 from retrieval.model.towers.tower import stage_statistics
 from retrieval.training.distil import distillation_loss
 from tests.hard_case import HardCase

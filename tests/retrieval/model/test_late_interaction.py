@@ -10,10 +10,9 @@ from retrieval.errors import ConfigError
 from retrieval.model.config import MatcherConfig
 from retrieval.model.fusion import Matcher
 from retrieval.model.late_interaction import CellEncoder, cell_scores, paired_cell_scores
-from retrieval.model.losses.listwise import listwise_loss
+from retrieval.model.losses.listwise import PooledListwiseLoss, listwise_loss
 from retrieval.model.losses.loss import EncodedBatch
-from retrieval.model.losses.pooled_listwise import PooledListwiseLoss
-from retrieval.model.towers import build_tower
+from retrieval.model.towers.tower import build_tower
 
 CELLS = MatcherConfig(
     "small",

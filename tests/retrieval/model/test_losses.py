@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from retrieval.model.losses.contrastive import LOG_SCALE_MAX, contrastive_loss
-from retrieval.model.losses.listwise import pick_loss
-from retrieval.model.losses.match import match_loss
+from retrieval.model.fusion import LOG_SCALE_MAX
+from retrieval.model.losses.listwise import contrastive_loss, pick_loss
+from retrieval.model.losses.loss import match_loss
 
 
 def unit(*shape, seed=0):

@@ -10,10 +10,10 @@ from torch import nn
 from torch.nn import functional
 
 from retrieval.errors import BadInput, CheckpointError, ConfigError, NumericalError
-from retrieval.model.towers import TOWERS, build_tower, tower_name
+from retrieval.model.towers import TOWERS, tower_name
 from retrieval.model.towers.mobilenet import InvertedResidual
-from retrieval.model.towers.tower import Tower, stage_statistics
-from retrieval.model.towers.weights import initialise_tower, load_tower_state, read_state
+from retrieval.model.towers.tower import Tower, build_tower, stage_statistics
+from retrieval.model.towers.weights import read_state
 from tests.data import touch_data
 
 # ResNet-18 and -50 cover both kinds of block.
@@ -125,11 +125,11 @@ def test_a_tower_refuses_input_that_is_not_an_image(images, error, words):
 def test_a_tower_loads_a_file_of_its_weights_and_refuses_unknown_ones(tmp_path):
     torch.save(Plain("pooled").state_dict(), tmp_path / "weights.pth")
     target = Plain("pooled")
-    initialise_tower(target, str(tmp_path / "weights.pth"))
+    target.initialise(str(tmp_path / "weights.pth"))
     with pytest.raises(CheckpointError, match=r"has an unknown layer\.other; name the tower"):
-        load_tower_state(target, {**target.state_dict(), "layer.other": torch.zeros(1)}, "w.pth")
+        target.load({**target.state_dict(), "layer.other": torch.zeros(1)}, "w.pth")
     with pytest.raises(CheckpointError, match="no weights are published for Plain; give a file"):
-        initialise_tower(target, "imagenet")
+        target.initialise("imagenet")
 
 
 class Plain(Tower):
@@ -155,9 +155,9 @@ def test_weights_of_another_architecture_are_refused_by_name():
     with pytest.raises(
         CheckpointError, match=r"layer1.0.conv1.weight is \(64, 64, 1, 1\), must be \(64, 64, 3, 3\)|unknown"
     ):
-        load_tower_state(build_tower("resnet18"), dict(build_tower("resnet50").state_dict()), "resnet50.pth")
+        build_tower("resnet18").load(dict(build_tower("resnet50").state_dict()), "resnet50.pth")
     with pytest.raises(CheckpointError, match="lacks"):
-        load_tower_state(build_tower("resnet18"), {}, "empty.pth")
+        build_tower("resnet18").load({}, "empty.pth")
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
@@ -167,7 +167,7 @@ def test_an_initial_weight_that_is_not_finite_is_refused_and_named(value):
     state["layer1.0.conv1.weight"] = torch.full_like(state["layer1.0.conv1.weight"], value)
     tower = build_tower("resnet18")
     with pytest.raises(CheckpointError, match=r"r\.pth contains a NaN or infinite weight in layer1\.0\.conv1\.weight"):
-        load_tower_state(tower, state, "r.pth")
+        tower.load(state, "r.pth")
     assert all(bool(torch.isfinite(weight).all()) for weight in tower.state_dict().values())
 
 
@@ -187,7 +187,7 @@ def test_without_network_the_error_names_the_file_to_fetch_and_its_place(tmp_pat
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     monkeypatch.setattr(torch.hub, "download_url_to_file", _no_network)
     with pytest.raises(CheckpointError, match=re.escape(str(tmp_path / "checkpoints" / "resnet18-f37072fd.pth"))):
-        initialise_tower(build_tower("resnet18"), "imagenet")
+        build_tower("resnet18").initialise("imagenet")
 
 
 def _no_network(*arguments, **settings):
@@ -197,7 +197,7 @@ def _no_network(*arguments, **settings):
 def test_real_imagenet_weights_load_in_their_older_key_layout():
     path = touch_data("weights/mobilenet_v2_imagenet_features.pt")
     tower = build_tower("mobilenet_v2")
-    initialise_tower(tower, str(path))
+    tower.initialise(str(path))
     state = read_state(path)
     assert torch.equal(tower.features[0][0].weight, state["features.0.0.weight"])
     assert torch.equal(tower.features[1].conv[1].weight, state["features.1.conv.3.weight"])

@@ -10,7 +10,7 @@ from retrieval.data.dataset import load_grasps
 from retrieval.data.pairs import PairSampler
 from retrieval.errors import BadInput
 from retrieval.model.fusion import Matcher
-from retrieval.model.losses.match import match_loss
+from retrieval.model.losses.loss import match_loss
 from retrieval.training.batches import TrainedFeatures
 from retrieval.training.train import WeightedLosses, batch_loss, set_training_mode
 from tests.conftest import TINY

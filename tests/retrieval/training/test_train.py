@@ -19,10 +19,8 @@ from retrieval.data.pairs import PairSampler
 from retrieval.errors import CheckpointError, ConfigError, DatasetError, JobInterrupted
 from retrieval.model.checkpoint import load_checkpoint, read_tensors
 from retrieval.model.fusion import Matcher
-from retrieval.model.losses.contrastive import contrastive_loss
-from retrieval.model.losses.listwise import listwise_loss
-from retrieval.model.losses.loss import Loss
-from retrieval.model.losses.match import match_loss
+from retrieval.model.losses.listwise import contrastive_loss, listwise_loss
+from retrieval.model.losses.loss import Loss, match_loss
 from retrieval.training import distributed
 from retrieval.training.batches import FrozenFeatures, TrainedFeatures
 from retrieval.training.initial_weights import build_matcher
@@ -372,7 +370,7 @@ from retrieval.training import distributed
 from retrieval.training.batches import TrainedFeatures
 from retrieval.data.dataset import load_grasps
 from retrieval.data.pairs import PairSampler
-from retrieval.model.losses.contrastive import contrastive_loss
+from retrieval.model.losses.listwise import contrastive_loss
 from retrieval.training.initial_weights import build_matcher
 from retrieval.training.train import WeightedLosses, batch_loss, set_training_mode
 from tests.conftest import TINY
