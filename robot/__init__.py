@@ -19,9 +19,7 @@ if TYPE_CHECKING:
     from robot.devices import Gripper as Gripper
     from robot.devices import TactileSensor as TactileSensor
     from robot.errors import RobotError as RobotError
-    from robot.grasping.planner import GraspPlan as GraspPlan
-    from robot.grasping.planner import GraspPlanner as GraspPlanner
-    from robot.grasping.spread import SpreadPlanner as SpreadPlanner
+    from robot.grasping.planner import SpreadPlanner as SpreadPlanner
     from robot.importers import load_importer as load_importer
     from robot.readings import Frame as Frame
     from robot.readings import Pose as Pose
@@ -30,6 +28,8 @@ if TYPE_CHECKING:
     from robot.recording.folder import SharedImage as SharedImage
     from robot.recording.folder import read_recording as read_recording
     from robot.recording.grasp import RecordedGrasp as RecordedGrasp
+    from robot.rig import GraspPlan as GraspPlan
+    from robot.rig import GraspPlanner as GraspPlanner
     from robot.rig import Rig as Rig
     from robot.rig import load_rig as load_rig
     from robot.sim.gel.sensor import draw_sensor as draw_sensor
@@ -42,8 +42,8 @@ _MODULES = {
     "Camera": "devices",
     "CollectSettings": "collection",
     "Frame": "readings",
-    "GraspPlan": "grasping.planner",
-    "GraspPlanner": "grasping.planner",
+    "GraspPlan": "rig",
+    "GraspPlanner": "rig",
     "Grip": "sim.scene",
     "Gripper": "devices",
     "Pose": "readings",
@@ -54,7 +54,7 @@ _MODULES = {
     "RobotError": "errors",
     "Scene": "sim.scene",
     "SharedImage": "recording.folder",
-    "SpreadPlanner": "grasping.spread",
+    "SpreadPlanner": "grasping.planner",
     "TactileSensor": "devices",
     "collect": "collection",
     "draw_object": "sim.objects.draw",

@@ -39,7 +39,7 @@
     [object]                                  # instead of depth: position and size of every object
     x_mm = 0
     ...
-    [planner]                                 # the grasp planner (robot.grasping.planner)
+    [planner]                                 # the grasp planner (robot.rig)
     name = "cylinder"                         # its other keys are the planner's settings
 
 The limits do not apply to homing, which has the gripper's own speed. A manual arm's limits apply only to the
@@ -60,10 +60,9 @@ from _touch_retrieval.registry import Registry
 from robot.devices import Camera, Device, TactileSensor
 from robot.errors import RobotConfigError, UnknownName
 from robot.gel_settings import parse_gel_settings
-from robot.grasping.planner import load_planner
 from robot.grasping.settings import AttemptSettings, GraspSettings, parse_attempt_settings
 from robot.readings import Region
-from robot.rig import Rig, ask_on_terminal
+from robot.rig import Rig, ask_on_terminal, load_planner
 from robot.settings import TypedSettings, build, build_named
 from robot.sight import hand_eye
 from robot.sight.cylinder import CylinderFit

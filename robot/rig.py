@@ -1,19 +1,32 @@
-"""The rig: arm, gripper, tactile sensors and camera, connected and closed together; and the registry of rigs."""
+"""The rig: arm, gripper, tactile sensors and camera, connected and closed together; and the planner of its grasps.
 
+A rig's file names the rig and the planner. A planner is a subclass of `GraspPlanner`, by its name or `module:Class`;
+the other keys of its table are the keyword arguments of its constructor:
+
+    rig = "sim"
+    fingers = ["a", "b"]   # the other keys are settings of that rig
+    [planner]
+    name = "cylinder"
+    search_margin_mm = 100
+"""
+
+import contextlib
 import sys
 import time
 import tomllib
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self
+
+import numpy as np
 
 from _touch_retrieval.registry import Registry
 from robot.devices import Arm, Camera, Clock, Device, Gripper, TactileSensor
 from robot.errors import RobotConfigError, UnknownName
-from robot.grasping.planner import CylinderPlanner, GraspPlanner
-from robot.grasping.settings import AttemptSettings
-from robot.readings import Pose
-from robot.settings import build
+from robot.grasping.settings import AttemptSettings, GraspSettings
+from robot.readings import RGBD, Pose
+from robot.settings import build, build_named
 from robot.sight.cylinder import CylinderFit
 from robot.storage import read_content
 
@@ -25,6 +38,94 @@ RIGS: "Registry[type[Rig]]" = Registry(
     base="robot.rig:Rig",
 )
 """Rigs by name, imported on first use."""
+
+PLANNERS: "Registry[type[GraspPlanner]]" = Registry(
+    "[planner]: name",
+    "planners",
+    {"cylinder": "robot.grasping.planner:CylinderPlanner", "mesh": "robot.sim.mesh_planner:MeshPlanner"},
+    error=UnknownName,
+    base="robot.rig:GraspPlanner",
+)
+"""Grasp planners by name, imported on first use."""
+
+
+@dataclass(frozen=True)
+class GraspPlan:
+    """One planned grasp.
+
+    Attributes:
+        pose: Pose in which the jaws close.
+        above: Pose after the lift.
+        opening_mm: Opening before the grasp.
+        force_n: Force on each finger.
+        approach: Poses on the way to `pose`; at the last one, the hand is clear of the object. If empty: `above`.
+        fit: Description of the object, for the attempt log.
+
+    >>> pose, above = robot.Pose(0.0, 0.0, 60.0, yaw_rad=1.0), robot.Pose(0.0, 0.0, 240.0, yaw_rad=1.0)
+    >>> robot.GraspPlan(pose, above, opening_mm=110.0, force_n=10.0).approach
+    ()
+    """
+
+    pose: Pose
+    above: Pose
+    opening_mm: float
+    force_n: float
+    approach: tuple[Pose, ...] = ()
+    fit: Mapping[str, Any] = field(default_factory=dict)
+
+
+class GraspPlanner(ABC):
+    """Plans one grasp from one picture.
+
+    Attributes:
+        needs_depth: Whether the picture must have depth; if not, depth is read only to be recorded.
+
+    >>> class OnTheMark(robot.GraspPlanner):
+    ...     needs_depth = False
+    ...
+    ...     def plan(self, rig, image, settings, rng):
+    ...         yaw_rad = rng.uniform(0.0, 3.14)
+    ...         pose, above = (robot.Pose(0.0, 0.0, z_mm, yaw_rad) for z_mm in (60.0, 240.0))
+    ...         return robot.GraspPlan(pose, above, opening_mm=rig.gripper.stroke_mm, force_n=10.0)
+    """
+
+    needs_depth: bool = True
+
+    def check(self, rig: "Rig") -> None:
+        """Raise RobotConfigError if this planner cannot plan for `rig`."""
+        if self.needs_depth and rig.object_fit is None and not rig.camera.has_depth:
+            raise RobotConfigError(
+                f"{rig.camera.name} has no depth: give the position and size of every object in [object]"
+            )
+
+    @abstractmethod
+    def plan(self, rig: "Rig", image: RGBD, settings: GraspSettings, rng: np.random.Generator) -> GraspPlan:
+        """Draw one grasp of the object in `image`, taken by the rig's camera.
+
+        Args:
+            rig: The rig, connected.
+            image: The picture; with depth if `needs_depth`.
+            settings: Settings of the random grasps.
+            rng: Source of all random choices.
+
+        Raises:
+            UngraspableError: No attempt at this object can succeed.
+            PlanError: This attempt is impossible.
+        """
+
+
+def load_planner(table: Mapping[str, Any], default: str = "cylinder") -> GraspPlanner:
+    """Return the planner that the table [planner] of a rig's file names.
+
+    Args:
+        table: `name`, and the planner's settings.
+        default: Planner to use if the table has no name.
+
+    Raises:
+        UnknownName: No planner has this name; the message lists the known ones.
+        RobotConfigError: A setting is unknown, missing, or of another type.
+    """
+    return build_named(PLANNERS, table, "name", where="[planner]", default=default)
 
 
 def ask_on_terminal(sentence: str) -> None:
@@ -79,9 +180,10 @@ class Rig:
         self.info = dict(info)
         self.clock, self.sleep, self.ask = clock, sleep, ask
         self.attempt, self.object_fit = attempt or AttemptSettings(), object_fit
-        self.planner = planner or CylinderPlanner()
+        self.planner = planner or load_planner({})
         self.planner.check(self)
         self._object_on_table: str | None = None
+        self._connected = contextlib.ExitStack()
 
     @property
     def devices(self) -> tuple[Device, ...]:
@@ -106,26 +208,17 @@ class Rig:
         """Ask a person to put this object on the table for attempt `number`.
 
         The request appears when the object changes. With `object_fit` it appears for every attempt, because the
-        attempt before may have moved the object from its given position.
-
-        Args:
-            object_id: The object.
-            number: Number of the attempt.
-
-        Raises:
-            RobotConfigError: There is no terminal for the request.
+        attempt before may have moved the object from its given position. Raise RobotConfigError without a terminal.
         """
-        if object_id != self._object_on_table or self.object_fit is not None:
-            position = (
-                "on the table"
-                if self.object_fit is None
-                else f"at x {self.object_fit.x_mm:g}, y {self.object_fit.y_mm:g} mm"
-            )
-            try:
-                self.ask(f"Put {object_id} {position}, remove all other objects, then press Enter.")
-            except EOFError as error:
-                raise RobotConfigError("a person must change the objects of this rig: run it in a terminal") from error
-            self._object_on_table = object_id
+        fit = self.object_fit
+        if object_id == self._object_on_table and fit is None:
+            return
+        position = "on the table" if fit is None else f"at x {fit.x_mm:g}, y {fit.y_mm:g} mm"
+        try:
+            self.ask(f"Put {object_id} {position}, remove all other objects, then press Enter.")
+        except EOFError as error:
+            raise RobotConfigError("a person must change the objects of this rig: run it in a terminal") from error
+        self._object_on_table = object_id
 
     def settings(self) -> dict[str, dict[str, Any]]:
         """Return the settings that each device reports, by device name; raise DeviceError if one fails."""
@@ -138,48 +231,30 @@ class Rig:
 
     def connect(self) -> None:
         """Connect all devices or none: if one fails, close the connected ones and raise its error."""
-        connected: list[Device] = []
-        try:
+        with contextlib.ExitStack() as connected:
             for device in self.devices:
-                device.connect()
-                connected.append(device)
-        except BaseException:
-            _close_all(connected)
-            raise
+                connected.enter_context(device)
+            self._connected = connected.pop_all()
 
     def close(self) -> None:
-        """Close every device, the last one first, then raise the first failure; a second call does nothing."""
-        if failure := _close_all(self.devices):
-            raise failure
+        """Close every device, the last one first, also after a failure, which is raised; a second call does nothing."""
+        self._connected.close()
 
     def __enter__(self) -> Self:
         self.connect()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
-        failure = _close_all(self.devices)
-        if failure and error is None:
-            raise failure
-        if failure and error is not None:
-            error.add_note(f"and while the rig was closed: {failure}")
-
-
-def _close_all(devices: tuple[Device, ...] | list[Device]) -> BaseException | None:
-    """Close all devices from the last to the first and return the first failure."""
-    failure: BaseException | None = None
-    for device in reversed(devices):
         try:
-            device.close()
-        except BaseException as error:  # a second Ctrl-C must not leave the rest open
-            failure = failure or error
-    return failure
+            self.close()
+        except BaseException as failure:
+            if error is None:
+                raise
+            error.add_note(f"and while the rig was closed: {failure}")
 
 
 def load_rig(spec: str, *, seed: int, **settings: Any) -> Rig:
     """Build the rig that `spec` names, but do not connect it; `spec` is a name of RIGS or a TOML file.
-
-        rig = "sim"
-        fingers = ["a", "b"]   # the other keys are settings of that rig
 
     The rig's `info` contains its name and settings, so that it can be built again.
 
@@ -198,21 +273,15 @@ def load_rig(spec: str, *, seed: int, **settings: Any) -> Rig:
     Traceback (most recent call last):
     robot.errors.UnknownName: a rig that is not a .toml file must be one of real, sim; got 'juggler'. ...
     """
-    name = spec
+    name, where = spec, ""
     if spec.endswith(".toml"):
-        name, settings = _read_toml(Path(spec), settings)
-    rig = build(RIGS.resolve(name), settings, where=spec if spec.endswith(".toml") else "", seed=seed)
+        try:
+            document = tomllib.loads(read_content(spec, RobotConfigError).decode())
+        except ValueError as error:
+            raise RobotConfigError(f"{spec} is not TOML: {error}") from error
+        name, where, settings = document.pop("rig", None), spec, {**document, **settings}
+        if not isinstance(name, str):
+            raise RobotConfigError(f'{spec} must name its rig, as in rig = "sim"; got {name!r}')
+    rig = build(RIGS.resolve(name), settings, where=where, seed=seed)
     rig.info |= {"rig": name, "rig_settings": settings}
     return rig
-
-
-def _read_toml(path: Path, over: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Return the name of the rig and its settings."""
-    try:
-        document = tomllib.loads(read_content(path, RobotConfigError).decode())
-    except ValueError as error:
-        raise RobotConfigError(f"{path} is not TOML: {error}") from error
-    name = document.pop("rig", None)
-    if not isinstance(name, str):
-        raise RobotConfigError(f'{path} must name its rig, as in rig = "sim"; got {name!r}')
-    return name, {**document, **over}

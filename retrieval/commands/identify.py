@@ -72,7 +72,7 @@ def identify(
     from retrieval.search.searcher import Searcher
     from retrieval.search.verification import VERIFY_EXIT_CODES
     from robot.collection import CollectSettings, collect
-    from robot.grasping.spread import SpreadPlanner
+    from robot.grasping.planner import SpreadPlanner
     from robot.rig import load_rig
 
     with Searcher.open(path, model=model) as searcher:

@@ -19,10 +19,9 @@ import numpy.typing as npt
 from _touch_retrieval.documents import Seed, typed
 from robot.devices import MAX_AGE_S, read_together
 from robot.errors import DeviceError, PlanError, RobotConfigError, UngraspableError
-from robot.grasping.planner import GraspPlan
 from robot.grasping.settings import AttemptSettings
 from robot.readings import RGBD, Pose
-from robot.rig import Rig
+from robot.rig import GraspPlan, Rig
 from robot.storage import file_content
 
 _OUTCOME_FROM = {"holding": "held", "no_part": "missed", "part_lost": "slipped"}

@@ -1,108 +1,17 @@
-"""Grasp planners: choose the grasp of the object in the camera's picture.
-
-A planner is a subclass of GraspPlanner. A rig's file names it, or gives `module:Class`; the other keys of the table
-are the keyword arguments of the planner:
-
-    [planner]
-    name = "cylinder"
-    search_margin_mm = 100
-
-In Python: `Rig(..., planner=MyPlanner())`.
-"""
+"""Grasp planners: a cylinder pinched from above, and one that spreads the grasps of an object over its height."""
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from _touch_retrieval.documents import NonNegative
-from _touch_retrieval.registry import Registry
-from robot.errors import PlanError, RobotConfigError, UnknownName
+from _touch_retrieval.documents import Count, NonNegative, typed
+from robot.errors import PlanError, RobotConfigError, UngraspableError
 from robot.grasping.settings import GraspSettings
 from robot.readings import RGBD, Pose, Region
-from robot.settings import build_named
+from robot.rig import GraspPlan, GraspPlanner, Rig
 from robot.sight.cylinder import CylinderFit, fit_cylinder
-
-if TYPE_CHECKING:
-    from robot.rig import Rig
-
-PLANNERS: "Registry[type[GraspPlanner]]" = Registry(
-    "[planner]: name",
-    "planners",
-    {"cylinder": "robot.grasping.planner:CylinderPlanner", "mesh": "robot.sim.mesh_planner:MeshPlanner"},
-    error=UnknownName,
-    base="robot.grasping.planner:GraspPlanner",
-)
-"""Grasp planners by name, imported on first use. The keys of a planner's table are the keyword arguments of its
-constructor."""
-
-
-@dataclass(frozen=True)
-class GraspPlan:
-    """One planned grasp.
-
-    Attributes:
-        pose: Pose in which the jaws close.
-        above: Pose after the lift.
-        opening_mm: Opening before the grasp.
-        force_n: Force on each finger.
-        approach: Poses on the way to `pose`; at the last one, the hand is clear of the object. If empty: `above`.
-        fit: Description of the object, for the attempt log.
-
-    >>> pose, above = robot.Pose(0.0, 0.0, 60.0, yaw_rad=1.0), robot.Pose(0.0, 0.0, 240.0, yaw_rad=1.0)
-    >>> robot.GraspPlan(pose, above, opening_mm=110.0, force_n=10.0).approach
-    ()
-    """
-
-    pose: Pose
-    above: Pose
-    opening_mm: float
-    force_n: float
-    approach: tuple[Pose, ...] = ()
-    fit: Mapping[str, Any] = field(default_factory=dict)
-
-
-class GraspPlanner(ABC):
-    """Plans one grasp from one picture.
-
-    Attributes:
-        needs_depth: Whether the picture must have depth; if not, depth is read only to be recorded.
-
-    >>> class OnTheMark(robot.GraspPlanner):
-    ...     needs_depth = False
-    ...
-    ...     def plan(self, rig, image, settings, rng):
-    ...         yaw_rad = rng.uniform(0.0, 3.14)
-    ...         pose, above = (robot.Pose(0.0, 0.0, z_mm, yaw_rad) for z_mm in (60.0, 240.0))
-    ...         return robot.GraspPlan(pose, above, opening_mm=rig.gripper.stroke_mm, force_n=10.0)
-    """
-
-    needs_depth: bool = True
-
-    def check(self, rig: "Rig") -> None:
-        """Raise RobotConfigError if this planner cannot plan for `rig`."""
-        if self.needs_depth and rig.object_fit is None and not rig.camera.has_depth:
-            raise RobotConfigError(
-                f"{rig.camera.name} has no depth: give the position and size of every object in [object]"
-            )
-
-    @abstractmethod
-    def plan(self, rig: "Rig", image: RGBD, settings: GraspSettings, rng: np.random.Generator) -> GraspPlan:
-        """Draw one grasp of the object in `image`, taken by the rig's camera.
-
-        Args:
-            rig: The rig, connected.
-            image: The picture; with depth if `needs_depth`.
-            settings: Settings of the random grasps.
-            rng: Source of all random choices.
-
-        Raises:
-            UngraspableError: No attempt at this object can succeed.
-            PlanError: This attempt is impossible.
-        """
 
 
 class CylinderPlanner(GraspPlanner):
@@ -117,29 +26,14 @@ class CylinderPlanner(GraspPlanner):
     def __init__(self, *, search_margin_mm: NonNegative = 150.0) -> None:
         self.search_margin_mm = search_margin_mm
 
-    def plan(self, rig: "Rig", image: RGBD, settings: GraspSettings, rng: np.random.Generator) -> GraspPlan:
+    def plan(self, rig: Rig, image: RGBD, settings: GraspSettings, rng: np.random.Generator) -> GraspPlan:
         """Fit the cylinder and draw one grasp of it; raise PlanError if this is impossible."""
-        workspace = rig.arm.workspace
-        lower, upper = workspace.lower, workspace.upper
-        margin = self.search_margin_mm
-        region = Region((lower[0] - margin, lower[1] - margin, -1.0), (upper[0] + margin, upper[1] + margin, upper[2]))
+        workspace, margin = rig.arm.workspace, self.search_margin_mm
+        (left, front, _), (right, back, top) = workspace.lower, workspace.upper
+        region = Region((left - margin, front - margin, -1.0), (right + margin, back + margin, top))
         fit = rig.object_fit or fit_cylinder(image, rig.camera.extrinsics, region)
         plan = plan_grasp(fit, settings, workspace, rig.gripper.stroke_mm, rng)
         return replace(plan, fit=fit.to_dict())
-
-
-def load_planner(table: Mapping[str, Any], default: str = "cylinder") -> GraspPlanner:
-    """Return the planner that the table [planner] of a rig's file names.
-
-    Args:
-        table: `name`, and the planner's settings.
-        default: Planner to use if the table has no name.
-
-    Raises:
-        UnknownName: No planner has this name; the message lists the known ones.
-        RobotConfigError: A setting is unknown, missing, or of another type.
-    """
-    return build_named(PLANNERS, table, "name", where="[planner]", default=default)
 
 
 def plan_grasp(
@@ -181,12 +75,7 @@ def plan_grasp(
             f"the object is wider than the stroke: at {math.degrees(yaw):.0f} degrees the jaws must open "
             f"{width:.0f} mm, but they open only {stroke_mm:.0f} mm"
         )
-    return GraspPlan(pose, _above(pose, fit, settings, workspace), stroke_mm, force)
-
-
-def _above(pose: Pose, fit: CylinderFit, settings: GraspSettings, workspace: Region) -> Pose:
-    """Return the start of the descent, inside the workspace and clear of the object; raise PlanError otherwise."""
-    above = Pose(pose.x_mm, pose.y_mm, min(pose.z_mm + settings.lift_mm, workspace.upper[2]), pose.yaw_rad)
+    above = replace(pose, z_mm=min(pose.z_mm + settings.lift_mm, workspace.upper[2]))
     if not (workspace.contains(pose) and workspace.contains(above)):
         raise PlanError(f"the grasp is out of the workspace {workspace.lower} to {workspace.upper}: {pose}")
     if above.z_mm < fit.height_mm + settings.floor_mm:
@@ -194,4 +83,52 @@ def _above(pose: Pose, fit: CylinderFit, settings: GraspSettings, workspace: Reg
             f"the object is too high: it is {fit.height_mm:.0f} mm high, and the fingertips rise to "
             f"{above.z_mm:.0f} mm, but they must rise to {settings.floor_mm:g} mm above it"
         )
-    return above
+    return GraspPlan(pose, above, stroke_mm, force)
+
+
+class SpreadPlanner(GraspPlanner):
+    """Draws several grasps from another planner; plans the one whose height differs most from those of earlier grasps.
+
+    No gain over random grasps was shown for recognition (docs/answers.md).
+
+    Args:
+        planner: Draws the grasps.
+        heights_mm: Heights of the earlier grasps of the object. The caller adds each new one.
+        draws: Grasps to choose from.
+
+    >>> heights_mm = []
+    >>> with robot.load_rig("sim", seed=0) as rig:
+    ...     rig.planner = robot.SpreadPlanner(rig.planner, heights_mm)
+    """
+
+    def __init__(self, planner: GraspPlanner, heights_mm: Sequence[float], *, draws: int = 8) -> None:
+        typed(draws, Count, "draws", error=RobotConfigError)
+        self.planner, self.heights_mm, self.draws = planner, heights_mm, draws
+        self.needs_depth = planner.needs_depth
+
+    def check(self, rig: Rig) -> None:
+        """Raise RobotConfigError if the other planner cannot plan for `rig`."""
+        self.planner.check(rig)
+
+    def plan(self, rig: Rig, image: RGBD, settings: GraspSettings, rng: np.random.Generator) -> GraspPlan:
+        """Plan the grasp that is farthest from the earlier ones; the first grasp is the first draw.
+
+        Raises:
+            UngraspableError: No attempt at this object can succeed.
+            PlanError: All drawn grasps are impossible; the message is that of the last one.
+        """
+        plans: list[GraspPlan] = []
+        for _ in range(self.draws if self.heights_mm else 1):
+            try:
+                plans.append(self.planner.plan(rig, image, settings, rng))
+            except UngraspableError:
+                raise
+            except PlanError as error:
+                failed = error
+        if not plans:
+            raise failed
+        return max(plans, key=self._distance_mm)
+
+    def _distance_mm(self, plan: GraspPlan) -> float:
+        """Return the difference to the nearest earlier height."""
+        return min((abs(plan.pose.z_mm - height) for height in self.heights_mm), default=0.0)

@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 
 from robot.errors import PlanError, RobotConfigError, UngraspableError
-from robot.grasping.planner import GraspPlan, GraspPlanner
 from robot.grasping.settings import GraspSettings
 from robot.readings import RGBD, Pose, Region
-from robot.rig import Rig
+from robot.rig import GraspPlan, GraspPlanner, Rig
 from robot.sim.antipodal import AntipodalGrasps, Array
 from robot.sim.camera import Placement
 from robot.sim.meshes import grasps_of

@@ -15,11 +15,10 @@ from _touch_retrieval.documents import Seed, typed
 from robot.devices import Arm, Camera, Gripper, TactileSensor, VirtualDevice
 from robot.errors import DeviceError, RobotConfigError
 from robot.gel_settings import parse_gel_settings
-from robot.grasping.planner import load_planner
 from robot.grasping.settings import parse_attempt_settings
 from robot.readings import RGBD, Frame, GripperState, Intrinsics, Pose, Region
 from robot.recording.folder import UNITS
-from robot.rig import Rig
+from robot.rig import Rig, load_planner
 from robot.settings import TypedSettings
 from robot.sim.camera import PinholeCamera, Placement
 from robot.sim.gel.sensor import draw_sensor
@@ -97,7 +96,7 @@ class SimSettings(TypedSettings):
         localisation_mm: range from which the error of the camera's calibration is drawn.
         grasp: the table [grasp], as for a real rig: random grasps (robot.grasping.settings.GraspSettings).
         attempt: the table [attempt]: speeds, waits, retries (robot.grasping.settings.AttemptSettings).
-        planner: the table [planner]: the grasp planner (robot.grasping.planner; "mesh" by default for meshes).
+        planner: the table [planner]: the grasp planner (robot.rig; "mesh" by default for meshes).
         gel: the tables [gel.a] and [gel.b]: materials of the gels (robot.gel_settings); unknown properties are drawn.
 
     Raises:

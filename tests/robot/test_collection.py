@@ -12,12 +12,12 @@ from robot.collection import CollectSettings, Progress, collect, grasp_id_of
 from robot.errors import DeviceError, RecordingError, RobotConfigError, StorageError, UngraspableError
 from robot.grasping.attempt import AttemptRunner, depth_in_mm
 from robot.grasping.gates import ContactAreaGate, recorded_touches
-from robot.grasping.planner import CylinderPlanner, GraspPlan
+from robot.grasping.planner import CylinderPlanner
 from robot.grasping.settings import AttemptSettings, GraspSettings
 from robot.readings import Pose
 from robot.recording.attempt_log import read_attempts
 from robot.recording.folder import RecordingWriter, read_recording
-from robot.rig import Rig
+from robot.rig import GraspPlan, Rig
 from robot.sight.cylinder import CylinderFit
 from robot.storage import file_content
 from tests.fake_rig import FakeArm, FakeRig

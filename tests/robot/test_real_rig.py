@@ -10,10 +10,10 @@ from robot.drivers.manual_arm import ManualArm
 from robot.drivers.usb_camera.driver import OpencvTactile, UvcCamera
 from robot.drivers.wsg50.driver import WSG50
 from robot.errors import RobotConfigError, UnknownName
-from robot.grasping.planner import CylinderPlanner, GraspPlan, GraspPlanner
+from robot.grasping.planner import CylinderPlanner
 from robot.readings import Pose
 from robot.real_rig import DRIVERS, load_driver
-from robot.rig import load_rig
+from robot.rig import GraspPlan, GraspPlanner, load_rig
 from robot.sight import hand_eye
 
 TABLES = {

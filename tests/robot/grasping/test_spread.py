@@ -5,7 +5,7 @@ import pytest
 
 import robot
 from robot.errors import PlanError, UngraspableError
-from robot.grasping.spread import SpreadPlanner
+from robot.grasping.planner import SpreadPlanner
 
 
 class Listed(robot.GraspPlanner):
