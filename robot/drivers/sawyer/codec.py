@@ -1,22 +1,55 @@
-"""Messages of a Sawyer as plain values of rosbridge messages, and the motion along a line. No socket, no clock.
+"""Messages of a Sawyer behind rosbridge, and the motion along a line. No socket, no clock.
 
-Topics, services and types are those of the Intera SDK (intera_core_msgs; names as in intera_sdk 5.3). A message with a
-missing or invalid value, or a number that is not finite, raises DeviceError.
+rosbridge (protocol 2.1) passes the messages of ROS as JSON. Its operations: advertise, publish, subscribe, call_service
+and service_response (its id echoed), status. Topics, services and types of the robot are those of the Intera SDK
+(intera_core_msgs; names as in intera_sdk 5.3). A message with a missing or invalid value raises DeviceError.
 """
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from robot.drivers.sawyer.link import ReceivedMessage
 from robot.errors import DeviceError
 from robot.readings import Pose
+
+Message = Mapping[str, Any]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class ReceivedMessage:
+    """A message of a topic, and its time of arrival on the link's clock."""
+
+    message: Message
+    time_s: float
+
+
+def encode(operation: Message) -> str:
+    """Return an operation of rosbridge as JSON; raise DeviceError for values that JSON cannot express, such as NaN."""
+    try:
+        return json.dumps(operation, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise DeviceError(f"rosbridge accepts only plain finite values: {error}") from error
+
+
+def decode(text: str | bytes) -> Message | None:
+    """Return the operation in one websocket message, or None if it is invalid."""
+    try:
+        found = msgspec.json.decode(text)
+    except (msgspec.DecodeError, UnicodeError):
+        return None
+    return found if isinstance(found, dict) and isinstance(found.get("op"), str) else None
+
+
+# The robot's messages -----------------------------------------------------------------------------------------
 
 Joints = npt.NDArray[np.float64]
 """(7,) rad, from the shoulder to the wrist."""
@@ -46,6 +79,158 @@ _SOURCE = {0: "nobody", 1: "the red button", 2: "an unknown source", 3: "a motor
 _MAX_LEAN_RAD = math.radians(10.0)
 STILL_RAD, STILL_S = 1e-3, 0.1
 """An arm is still if no joint moves by more than STILL_RAD within STILL_S."""
+
+
+_Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
+
+
+class _JointState(msgspec.Struct):
+    name: list[str]
+    position: list[_Number]
+
+
+class _Point(msgspec.Struct):
+    x: _Number
+    y: _Number
+    z: _Number
+
+
+class _Quaternion(_Point):
+    w: _Number
+
+
+class _TipPose(msgspec.Struct):
+    position: _Point
+    orientation: _Quaternion
+
+
+class _TipState(msgspec.Struct):
+    pose: dict[str, Any]
+
+
+class _TipStates(msgspec.Struct):
+    names: list[str]
+    states: list[_TipState]
+
+
+class CollisionState(msgspec.Struct):
+    """intera_core_msgs/CollisionDetectionState."""
+
+    collision_state: bool
+
+
+class Float(msgspec.Struct):
+    """std_msgs/Float64."""
+
+    data: _Number
+
+
+class _IKAnswer(msgspec.Struct):
+    result_type: Annotated[list[int], msgspec.Meta(min_length=1, max_length=1)]
+    joints: Annotated[list[_JointState], msgspec.Meta(min_length=1, max_length=1)]
+
+
+class RobotState(msgspec.Struct, frozen=True):
+    """intera_core_msgs/RobotAssemblyState: whether the arm may move, and the reason if not."""
+
+    enabled: bool
+    stopped: bool
+    error: bool
+    estop_button: int
+    estop_source: int
+
+    @property
+    def blocking_reason(self) -> str | None:
+        """Reason why the arm may not move, with the action for a person; None if it may move."""
+        if self.stopped:
+            source = _SOURCE.get(self.estop_source, "an unknown source")
+            button = _BUTTON.get(self.estop_button, "in an unknown state")
+            return (
+                f"the robot is stopped by {source}, its button is {button}: find the reason, clear the workspace, turn "
+                "the button to release it and enable the robot by hand; this program never resets an emergency stop"
+            )
+        if self.error:
+            return "the robot reports an error of one of its parts: read its screen, then reset and enable it by hand"
+        if not self.enabled:
+            return "the robot is not enabled: clear the workspace and enable it by hand, or set enable = true"
+        return None
+
+
+def parse(message: Message, kind: type[T]) -> T:
+    """Return a message as `kind`, a struct of this file; raise DeviceError if it does not fit."""
+    try:
+        return msgspec.convert(message, kind)
+    except msgspec.ValidationError as error:
+        raise DeviceError(f"the robot sent an invalid message: {error}, got {str(message)[:200]}") from error
+
+
+def joints_of(message: Message) -> Joints | None:
+    """Parse the arm's joints (7,) of a sensor_msgs/JointState; None for other joints, such as a gripper's."""
+    return _arm_joints(parse(message, _JointState))
+
+
+def _arm_joints(state: _JointState) -> Joints | None:
+    angles = dict(zip(state.name, state.position, strict=False))
+    return np.array([angles[name] for name in JOINTS]) if angles.keys() >= set(JOINTS) else None
+
+
+def is_still(arrivals: Sequence[ReceivedMessage], since_s: float, now_s: float) -> bool:
+    """Return whether the arm was still for the last STILL_S, by joint states that arrived after `since_s`."""
+    recent = [
+        joints
+        for arrival in arrivals
+        if arrival.time_s >= max(since_s, now_s - STILL_S) and (joints := joints_of(arrival.message)) is not None
+    ]
+    return now_s - since_s >= STILL_S and len(recent) >= 3 and float(np.ptp(recent, axis=0).max()) < STILL_RAD
+
+
+def tip_of(message: Message, tip: str) -> Message:
+    """Return the geometry_msgs/Pose of the named tip in an intera_core_msgs/EndpointStates."""
+    found = parse(message, _TipStates)
+    poses = dict(zip(found.names, found.states, strict=False))
+    if tip not in poses:
+        known = ", ".join(found.names)
+        raise DeviceError(f"the robot must report its tip {tip!r}, got {known}; set tip to one of these")
+    return poses[tip].pose
+
+
+def joint_command(positions: Joints) -> dict[str, Any]:
+    """Return an intera_core_msgs/JointCommand in position mode (rad)."""
+    return {
+        "mode": POSITION_MODE,
+        "names": list(JOINTS),
+        "position": positions.tolist(),
+        "velocity": [],
+        "acceleration": [],
+        "effort": [],
+    }
+
+
+def ik_request(tip_pose: Mapping[str, Any], tip: str, seed: Joints | None) -> dict[str, Any]:
+    """Return the arguments of intera_core_msgs/SolvePositionIK for one pose; without a seed the robot chooses one."""
+    seeds = [] if seed is None else [{"name": list(JOINTS), "position": seed.tolist(), "velocity": [], "effort": []}]
+    return {
+        "pose_stamp": [{"header": {"frame_id": "base"}, "pose": dict(tip_pose)}],
+        "seed_angles": seeds,
+        "seed_mode": SEED_AUTO if seed is None else SEED_USER,
+        "use_nullspace_goal": [],
+        "nullspace_goal": [],
+        "nullspace_gain": [],
+        "tip_names": [tip],
+    }
+
+
+def ik_answer(values: Message) -> Joints:
+    """Parse the joints in the answer to `ik_request`; raise DeviceError if there is no solution."""
+    answer = parse(values, _IKAnswer)
+    kind = answer.result_type[0]
+    found = _arm_joints(answer.joints[0]) if kind > 0 else None
+    if found is None:
+        raise DeviceError(f"IKService: {IK_FAILURES.get(kind, f'no solution, result type {kind}')}")
+    return found
+
+
+# Poses of the hand --------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -79,8 +264,9 @@ class Mount:
 
     def pose_of(self, tip: Mapping[str, Any]) -> Pose:
         """Return the pose of the fingertips for a tip's geometry_msgs/Pose; raise DeviceError if it is tilted."""
-        place = np.array([_number(tip, "position", axis) for axis in "xyz"]) * 1000
-        quaternion = [_number(tip, "orientation", axis) for axis in "xyzw"]
+        found = parse(tip, _TipPose)
+        place = np.array(msgspec.structs.astuple(found.position)) * 1000
+        quaternion = msgspec.structs.astuple(found.orientation)
         if abs(math.hypot(*quaternion) - 1.0) > 0.01:
             raise DeviceError(f"the robot's orientation must be a quaternion of length 1, got {quaternion}")
         turn = Rotation.from_quat(quaternion).as_matrix()
@@ -96,151 +282,10 @@ class Mount:
         return Pose(float(point[0]), float(point[1]), float(point[2]), yaw)
 
 
-@dataclass(frozen=True)
-class RobotState:
-    """Content of /robot/state: whether the arm may move, and the reason if not."""
-
-    enabled: bool
-    stopped: bool
-    error: bool
-    estop_button: int
-    estop_source: int
-
-    @property
-    def blocking_reason(self) -> str | None:
-        """Reason why the arm may not move, with the action for a person; None if it may move."""
-        if self.stopped:
-            source = _SOURCE.get(self.estop_source, "an unknown source")
-            button = _BUTTON.get(self.estop_button, "in an unknown state")
-            return (
-                f"the robot is stopped by {source}, its button is {button}: find the reason, clear the workspace, turn "
-                "the button to release it and enable the robot by hand; this program never resets an emergency stop"
-            )
-        if self.error:
-            return "the robot reports an error of one of its parts: read its screen, then reset and enable it by hand"
-        if not self.enabled:
-            return "the robot is not enabled: clear the workspace and enable it by hand, or set enable = true"
-        return None
-
-
-def robot_state(message: Mapping[str, Any]) -> RobotState:
-    """Parse intera_core_msgs/RobotAssemblyState."""
-    enabled, stopped, error = (_flag(message, name) for name in ("enabled", "stopped", "error"))
-    return RobotState(
-        enabled, stopped, error, int(_number(message, "estop_button")), int(_number(message, "estop_source"))
-    )
-
-
-def has_collided(message: Mapping[str, Any]) -> bool:
-    """Parse intera_core_msgs/CollisionDetectionState."""
-    return _flag(message, "collision_state")
-
-
-def joints_of(message: Mapping[str, Any]) -> Joints | None:
-    """Parse the arm's joints (7,) of a sensor_msgs/JointState; None for other joints, such as a gripper's."""
-    names, positions = message.get("name"), message.get("position")
-    if not isinstance(names, list) or not isinstance(positions, list) or len(names) != len(positions):
-        raise DeviceError(f"a joint state must have a position for each name, got {_short(message)}")
-    angles = {name: angle for name, angle in zip(names, positions, strict=True) if isinstance(name, str)}
-    if not set(angles) >= set(JOINTS):
-        return None
-    return np.array([_finite(angles[name], name) for name in JOINTS])
-
-
-def is_still(arrivals: Sequence[ReceivedMessage], since_s: float, now_s: float) -> bool:
-    """Return whether the arm was still for the last STILL_S, by joint states that arrived after `since_s`."""
-    recent = [
-        joints
-        for arrival in arrivals
-        if arrival.time_s >= max(since_s, now_s - STILL_S) and (joints := joints_of(arrival.message)) is not None
-    ]
-    return now_s - since_s >= STILL_S and len(recent) >= 3 and float(np.ptp(recent, axis=0).max()) < STILL_RAD
-
-
-def tip_of(message: Mapping[str, Any], tip: str) -> Mapping[str, Any]:
-    """Return the geometry_msgs/Pose of the named tip in an intera_core_msgs/EndpointStates."""
-    names, states = message.get("names"), message.get("states")
-    if not isinstance(names, list) or not isinstance(states, list) or tip not in names:
-        raise DeviceError(f"the robot must report its tip {tip!r}, got {_short(names)}; set tip to one of these")
-    place = names.index(tip)
-    state = states[place] if place < len(states) else None
-    pose = state.get("pose") if isinstance(state, dict) else None
-    if not isinstance(pose, dict):
-        raise DeviceError(f"a tip state must contain a pose, got {_short(message)}")
-    return pose
-
-
-def number_of(message: Mapping[str, Any]) -> float:
-    """Parse std_msgs/Float64."""
-    return _number(message, "data")
-
-
-def joint_command(positions: Joints) -> dict[str, Any]:
-    """Return an intera_core_msgs/JointCommand in position mode (rad)."""
-    return {
-        "mode": POSITION_MODE,
-        "names": list(JOINTS),
-        "position": positions.tolist(),
-        "velocity": [],
-        "acceleration": [],
-        "effort": [],
-    }
-
-
-def ik_request(tip_pose: Mapping[str, Any], tip: str, seed: Joints | None) -> dict[str, Any]:
-    """Return the arguments of intera_core_msgs/SolvePositionIK for one pose; without a seed the robot chooses one."""
-    seeds = [] if seed is None else [{"name": list(JOINTS), "position": seed.tolist(), "velocity": [], "effort": []}]
-    return {
-        "pose_stamp": [{"header": {"frame_id": "base"}, "pose": dict(tip_pose)}],
-        "seed_angles": seeds,
-        "seed_mode": SEED_AUTO if seed is None else SEED_USER,
-        "use_nullspace_goal": [],
-        "nullspace_goal": [],
-        "nullspace_gain": [],
-        "tip_names": [tip],
-    }
-
-
-def ik_answer(values: Mapping[str, Any]) -> Joints:
-    """Parse the joints in the answer to `ik_request`; raise DeviceError if there is no solution."""
-    kinds, solutions = values.get("result_type"), values.get("joints")
-    if not isinstance(kinds, list) or not isinstance(solutions, list) or len(kinds) != 1 or len(solutions) != 1:
-        raise DeviceError(f"IKService must return one solution for one pose, got {_short(values)}")
-    kind = int(_finite(kinds[0], "result_type"))
-    found = joints_of(solutions[0]) if kind > 0 and isinstance(solutions[0], dict) else None
-    if found is None:
-        raise DeviceError(f"IKService: {IK_FAILURES.get(kind, f'no solution, result type {kind}')}")
-    return found
-
-
-def _number(message: Mapping[str, Any], *path: str) -> float:
-    found: Any = message
-    for name in path:
-        found = found.get(name) if isinstance(found, dict) else None
-    return _finite(found, ".".join(path))
-
-
-def _finite(value: Any, name: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:  # also rejects NaN
-        raise DeviceError(f"the robot's {name} must be a finite number, got {_short(value)}")
-    return float(value)
-
-
-def _flag(message: Mapping[str, Any], name: str) -> bool:
-    if not isinstance(found := message.get(name), bool):
-        raise DeviceError(f"the robot's {name} must be true or false, got {_short(found)}")
-    return found
-
-
 def _about_z(point: npt.NDArray[np.float64], angle: float) -> npt.NDArray[np.float64]:
     x, y, z = point
     cosine, sine = math.cos(angle), math.sin(angle)
     return np.array([cosine * x - sine * y, sine * x + cosine * y, z])
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 200 else f"{text[:200]}..."
 
 
 # Motion of the hand along a straight line --------------------------------------------------------------------
