@@ -29,7 +29,7 @@ KERNELS = {
     "retrieval": (
         "tests.retrieval.model.hard_losses",
         "tests.retrieval.metrics.hard_probability",
-        "tests.retrieval.methods.hard_linear",
+        "tests.retrieval.training.hard_linear",
         "tests.retrieval.metrics.hard_ranking",
         "tests.retrieval.data.hard_images",
     ),

@@ -3,7 +3,7 @@
 Public names are imported on first use, so `import retrieval` is fast. Each layer imports only the layers before it:
 
     errors, version, console, metrics -> data -> model -> training -> indexing -> search -> cluster -> methods
-    -> evaluation -> report -> adaptation, frontier, serve -> commands
+    -> evaluation -> report -> frontier, serve -> commands
 
 >>> import retrieval
 >>> with retrieval.open("index") as searcher:
@@ -17,8 +17,6 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from retrieval.adaptation.recipe import Adaptation as Adaptation
-    from retrieval.adaptation.recipe import adapt as adapt
     from retrieval.data.check.recording import check_recording as check_recording
     from retrieval.data.dataset import load_grasps as load_grasps
     from retrieval.data.dataset import make_split as make_split
@@ -49,12 +47,14 @@ if TYPE_CHECKING:
     from retrieval.search.searcher import Searcher as Searcher
     from retrieval.search.verification import Verification as Verification
     from retrieval.serve.client import Client as Client
+    from retrieval.training.adapt import Adaptation as Adaptation
+    from retrieval.training.adapt import adapt as adapt
     from retrieval.training.train import train as train
 
     open = Searcher.open
 
 _MODULES = {
-    "Adaptation": "adaptation.recipe:Adaptation",
+    "Adaptation": "training.adapt:Adaptation",
     "BadInput": "errors:BadInput",
     "BuildReport": "indexing.report:BuildReport",
     "Checkpoint": "model.checkpoint:Checkpoint",
@@ -71,7 +71,7 @@ _MODULES = {
     "MethodSettings": "methods.method:MethodSettings",
     "Tower": "model.towers.tower:Tower",
     "Verification": "search.verification:Verification",
-    "adapt": "adaptation.recipe:adapt",
+    "adapt": "training.adapt:adapt",
     "benchmark": "evaluation.real.benchmark:benchmark",
     "build_index": "indexing.build:build_index",
     "check_recording": "data.check.recording:check_recording",

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from retrieval.frontier.clock import time_points
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, miss_rate_point
 from retrieval.frontier.sample import Sample
-from retrieval.methods.cca import Cca, canonical_correlations, cosine, decompose, unit_rows
+from retrieval.methods.cca import Cca
 from retrieval.methods.method import MethodSettings
+from retrieval.training.cca import canonical_correlations, cosine, decompose, unit_rows
 
 Matrix = NDArray[np.float64]
 Solver = Callable[["CcaProblem"], Matrix]

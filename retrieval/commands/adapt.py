@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from retrieval.commands.options import SEED, SPLIT, CheckpointOut, Recording, read_split
+from retrieval.commands.options import SPLIT, CheckpointOut, Recording, read_split
 from retrieval.console.output import say
 
 
@@ -24,17 +24,13 @@ def adapt(
         ),
     ] = "imagenet",
     split: Annotated[Path | None, typer.Option(help=f"{SPLIT}; test objects are not used")] = None,
-    cache: Annotated[
-        Path | None, typer.Option(help="folder that stores image features, to resume a stopped run")
-    ] = None,
-    seed: Annotated[int, typer.Option(parser=SEED, help="seed of the folds")] = 0,
 ) -> None:
     """Fit a model to a new sensor and your own objects. Takes minutes on two cores."""
-    from retrieval.adaptation.recipe import adapt as fit
     from retrieval.data.check.recording import check_gel_layout
+    from retrieval.training.adapt import adapt as fit
 
     for finding in check_gel_layout(recording):
         say(f"{finding.severity}: {finding.message}")
-    result = fit(recording, out, model, init=init, split=read_split(split), cache=cache, seed=seed)
+    result = fit(recording, out, model, init=init, split=read_split(split))
     for line in result.lines():
         say(line)

@@ -147,6 +147,13 @@ def recording_licence(folder: Path) -> DataLicence:
     return DataLicence(str(info["source"]), str(info.get("licence") or NOT_STATED), str(info.get("terms") or ""))
 
 
+def object_kinds(folder: Path) -> dict[str, str]:
+    """Return the class of each object whose class a recording names in its recording.json."""
+    objects = read_info(folder).get("objects")
+    entries = objects.items() if isinstance(objects, dict) else ()
+    return {name: str(about["class"]) for name, about in entries if isinstance(about, dict) and "class" in about}
+
+
 def finger_count(grasps: Sequence[Grasp]) -> int:
     """Return the number of gel images of each touch. Raises DatasetError if it differs between grasps."""
     first = grasps[0]

@@ -1,241 +1,17 @@
-"""CCA of concatenated towers, for few objects: the method that `retrieve adapt` fits.
+"""CCA of concatenated towers (`retrieval.training.cca_towers`), as `retrieve adapt` fits it."""
 
-The features of each tower are reduced to their widest directions, with equal weight for every tower. Canonical
-correlations with a ridge follow (`retrieval.methods.cca`). On a few dozen objects no method with more freedom was
-better (docs/measurements/adaptation.md). The maps of each modality compose to one affine map, so the result is stored
-as the projections of an ordinary matcher.
-
-Settings are chosen from `GRID` on held-out training objects (`select_settings`), never on test objects.
-"""
-
-from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from itertools import groupby, product
-from typing import TYPE_CHECKING, NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from retrieval.errors import BadInput
-from retrieval.methods.cca import (
-    MAX_DIRECTIONS,
-    CcaView,
-    canonical_correlations,
-    cosine,
-    decompose_standardised,
-    unit_rows,
-)
 from retrieval.methods.method import Array, Method
-from retrieval.methods.reduced_features import AffineMap, ReducedFeatures
-from retrieval.methods.selection import Validator, held_out_folds, validation_rows
-from retrieval.methods.standardise import Standardiser
-from retrieval.model.config import Config
-from retrieval.model.fusion import Matcher
 from retrieval.training.calibration.posterior import fit_posterior
-from retrieval.training.calibration.touches import CalibrationTouches, ScoredTouches
+from retrieval.training.cca import cosine, unit_rows
+from retrieval.training.cca_towers import fit_projections, select_settings, touch_rows, tower_widths
+from retrieval.training.selection import held_out_folds
 
 if TYPE_CHECKING:
     from retrieval.training.features import Features
-
-Matrix = NDArray[np.float64]
-Rows = NDArray[np.float32]
-Numbers = NDArray[np.int64]
-COMPONENTS = 64
-MAX_CHOICE_TOUCHES = 240
-"""Touches of a fold with which settings are chosen."""
-MAX_CALIBRATION_TOUCHES = 60
-"""Touches per object with which the calibrations are fitted."""
-
-
-class TowerWidths(NamedTuple):
-    """Feature widths of concatenated towers.
-
-    Attributes:
-        touch: Of each touch tower for the first finger, then for the next one.
-        photo: Of each photo tower for the first view, then for the next one.
-        touch_towers: Number of touch towers.
-    """
-
-    touch: Sequence[int]
-    photo: Sequence[int]
-    touch_towers: int = 1
-
-
-class CcaSettings(NamedTuple):
-    """Settings of one fit.
-
-    Attributes:
-        ridge: Ridge of touches, as a fraction of the mean variance.
-        photo_ridge: The same for photos.
-        directions: Directions of each tower's features.
-        power: Power of the correlation that weights a canonical variate.
-        last_tower: Use only the last of the touch towers.
-    """
-
-    ridge: float = 0.3
-    photo_ridge: float = 1.0
-    directions: int = 256
-    power: int = 1
-    last_tower: bool = False
-
-
-GRID = tuple(CcaSettings(*one) for one in product((0.1, 0.3, 1.0), (0.3, 1.0, 3.0), (64, 128, 256), (1, 2)))
-
-
-class CcaProjections(NamedTuple):
-    """Maps from touches and photos to encodings; the cosine is high if both show the same object."""
-
-    touch: AffineMap
-    photo: AffineMap
-
-    def cosines(self, touch: NDArray[np.floating], photo: NDArray[np.floating]) -> Rows:
-        """Return cosines (T, N) of features (T, F) and (N, F')."""
-        return unit_rows(self.touch(touch)) @ unit_rows(self.photo(photo)).T
-
-
-def fit_projections(
-    touch: Rows, photo: Rows, owner: Numbers, blocks: TowerWidths, settings: Sequence[CcaSettings] = GRID
-) -> Iterator[tuple[CcaSettings, CcaProjections]]:
-    """Yield the projections of each of the settings.
-
-    Args:
-        touch: (n, F) touch features of grasps.
-        photo: (n, F') photo features.
-        owner: (n,) objects, from 0.
-        blocks: Feature widths of the concatenated towers, of touches and of photos.
-        settings: The settings to fit.
-    """
-    limit = max(one.directions for one in settings)
-    touch_view = ReducedFeatures.of(touch, blocks.touch, limit, towers=blocks.touch_towers)
-    photo_view = ReducedFeatures.of(photo, blocks.photo, limit)
-    for one, projections in _fit(touch_view, photo_view, np.arange(len(owner)), owner, settings):
-        yield one, _of_features(touch_view, photo_view, one, projections)
-
-
-def _of_features(
-    touch: ReducedFeatures, photo: ReducedFeatures, settings: CcaSettings, projections: CcaProjections
-) -> CcaProjections:
-    """Return the projections of features, given those of reduced items."""
-    touch_map = touch.map(settings.directions, last_tower=settings.last_tower)
-    return CcaProjections(
-        touch_map.compose(projections.touch), photo.map(settings.directions).compose(projections.photo)
-    )
-
-
-def _fit(
-    touch: ReducedFeatures, photo: ReducedFeatures, rows: Numbers, owner: Numbers, settings: Sequence[CcaSettings]
-) -> Iterator[tuple[CcaSettings, CcaProjections]]:
-    """Yield the projections of reduced items, fitted on the given rows."""
-    for (directions, last_tower), some in groupby(sorted(settings, key=_reduction), _reduction):
-        items = [touch.items(directions, last_tower=last_tower)[rows], photo.items(directions)[rows]]
-        means = [part.mean(0) for part in items]
-        touch_view, photo_view = (_centred_view(part - mean) for part, mean in zip(items, means, strict=True))
-        for (ridge, photo_ridge), alike in groupby(sorted(some), lambda one: one[:2]):
-            found = canonical_correlations(touch_view, photo_view, owner[rows], ridge, photo_ridge)
-            for one in alike:
-                weights = found.correlations[:COMPONENTS] ** one.power
-                variates = (each[:, :COMPONENTS] * weights for each in (found.touch_weights, found.photo_weights))
-                yield (
-                    one,
-                    CcaProjections(
-                        *(AffineMap(each, -mean @ each) for each, mean in zip(variates, means, strict=True))
-                    ),
-                )
-
-
-def _reduction(settings: CcaSettings) -> tuple[int, bool]:
-    return settings.directions, settings.last_tower
-
-
-def _centred_view(x: Matrix) -> CcaView:
-    """Decompose centred items without scaling them: their spread is meaningful."""
-    return decompose_standardised(
-        x, Standardiser(np.arange(x.shape[1]), np.zeros(x.shape[1]), np.ones(x.shape[1])), MAX_DIRECTIONS
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class CcaSelection:
-    """Settings that were chosen on held-out objects.
-
-    Attributes:
-        settings: The chosen settings.
-        auc: Their mean AUC over the folds.
-        projections: The maps, fitted to all objects.
-        held_out_touches: For each fold, the cosines of its touches with its photos by maps that were fitted without its
-            objects, and the encodings of both: the input of the calibrations.
-    """
-
-    settings: CcaSettings
-    auc: float
-    projections: CcaProjections
-    held_out_touches: list[CalibrationTouches]
-
-
-def select_settings(
-    features: "Features",
-    blocks: TowerWidths,
-    folds: Sequence[Sequence[str]],
-    settings: Sequence[CcaSettings] | None = None,
-) -> CcaSelection:
-    """Choose the settings that rank photos of held-out objects best; among ties, the largest.
-
-    Only the reduction to the widest directions also sees the held-out grasps, but no object ids.
-
-    Args:
-        features: Features of grasps.
-        blocks: Feature widths of the concatenated towers, of touches and of photos.
-        folds: Objects of `features` that are held out together; the fit uses the others.
-        settings: The settings to choose from. Default: `GRID`, and with several touch towers the same for the last one.
-    """
-    if settings is None:
-        settings = GRID if blocks.touch_towers == 1 else (*GRID, *(one._replace(last_tower=True) for one in GRID))
-    limit = max(one.directions for one in settings)
-    touch_view = ReducedFeatures.of(_rows(features), blocks.touch, limit, towers=blocks.touch_towers)
-    photo_view = ReducedFeatures.of(features.photo, blocks.photo, limit)
-    items = {
-        one: (touch_view.items(one[0], last_tower=one[1]), photo_view.items(one[0]))
-        for one in set(map(_reduction, settings))
-    }
-    found: dict[CcaSettings, list[tuple[float, CcaProjections]]] = {one: [] for one in settings}
-    rows_of = [np.flatnonzero(np.isin(features.object_ids, fold)) for fold in folds]
-    for rows in rows_of:
-        held_out = features.select(rows)
-        some = validation_rows(held_out, MAX_CHOICE_TOUCHES)
-        validator, places = Validator(held_out.select(some)), rows[some]
-        others = np.setdiff1d(np.arange(len(features)), rows)
-        for one, projections in _fit(touch_view, photo_view, others, features.owner, settings):
-            touch, photo = items[_reduction(one)]
-            found[one].append((validator.touch_auc(projections.cosines(touch[places], photo[places])), projections))
-    aucs = {one: float(np.mean([auc for auc, _ in each])) for one, each in found.items()}
-    best = max(aucs, key=lambda one: (aucs[one], one))
-    parts = [
-        held_out_touches(features.select(rows), projections, *(part[rows] for part in items[_reduction(best)]))
-        for rows, (_, projections) in zip(rows_of, found[best], strict=True)
-    ]
-    every = np.arange(len(features))
-    projections = dict(_fit(touch_view, photo_view, every, features.owner, [best]))[best]
-    return CcaSelection(best, aucs[best], _of_features(touch_view, photo_view, best, projections), parts)
-
-
-def held_out_touches(
-    features: "Features", projections: CcaProjections, touch: NDArray[np.floating], photo: NDArray[np.floating]
-) -> CalibrationTouches:
-    """Return touches of objects that the projections were fitted without, for the calibrations.
-
-    Args:
-        features: The grasps. Of each object at most `MAX_CALIBRATION_TOUCHES` are used, evenly spaced.
-        projections: The maps.
-        touch: (n, k) reduced touches.
-        photo: (n, k') reduced photos.
-    """
-    rows = validation_rows(features, MAX_CALIBRATION_TOUCHES * len(set(features.object_ids)))
-    owner, own = features.owner[rows], np.eye(len(rows), dtype=np.bool_)
-    scored = ScoredTouches(projections.cosines(touch[rows], photo[rows]), owner, owner, own)
-    return CalibrationTouches(
-        scored, unit_rows(projections.touch(touch[rows])), unit_rows(projections.photo(photo[rows]))
-    )
 
 
 class CcaTowers(Method):
@@ -255,7 +31,7 @@ class CcaTowers(Method):
         choice = select_settings(known, blocks, folds)
         self.best_params = {**choice.settings._asdict(), "validation_auc": choice.auc}
         if not self.settings.fit_on_validation:
-            fits = fit_projections(_rows(train), train.photo, train.owner, blocks, [choice.settings])
+            fits = fit_projections(touch_rows(train), train.photo, train.owner, blocks, [choice.settings])
             self._projections = dict(fits)[choice.settings]
             return
         self._projections = choice.projections
@@ -271,29 +47,3 @@ class CcaTowers(Method):
 
     def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
         return cosine(touch_encodings, photo_encodings)
-
-
-def _rows(features: "Features") -> Rows:
-    return features.touch.reshape(len(features), -1)
-
-
-def tower_widths(config: Config, features: "Features") -> TowerWidths:
-    """Return the feature widths of each tower of `config`, of a touch and of a photo.
-
-    Raises:
-        BadInput: The features are not from these towers.
-    """
-    import torch
-
-    with torch.device("meta"):
-        matcher = Matcher(config.matcher)
-    towers = [part.feature_count for part in matcher.touch_tower.backbones]
-    touch_view = towers * features.touch.shape[1]
-    photo_view = [part.feature_count for part in matcher.photo_tower.backbones] * len(config.preprocessing.views)
-    expected, got = (sum(touch_view), sum(photo_view)), (_rows(features).shape[1], features.photo.shape[1])
-    if expected != got:
-        raise BadInput(
-            f"features must be those of the towers {config.matcher.tower} ({config.matcher.tower_output}), "
-            f"{expected[0]} of a touch and {expected[1]} of a photo; got {got[0]} and {got[1]}; use these towers"
-        )
-    return TowerWidths(touch_view, photo_view, len(towers))

@@ -2,18 +2,19 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
 from retrieval.methods.method import Array, Method
-from retrieval.methods.selection import Validator
-from retrieval.methods.standardise import Standardiser
 from retrieval.model.fusion import LOG_SCALE_INIT, LOG_SCALE_MAX
 from retrieval.model.losses.listwise import contrastive_loss
+from retrieval.training.cca import Standardiser
 from retrieval.training.loop import BestStep, Plan, train_loop
+from retrieval.training.selection import ranking_auc, validation_rows
 
 if TYPE_CHECKING:
     from retrieval.training.features import Features
@@ -51,9 +52,9 @@ class ContrastiveEmbedding(Method):
 
     def _fit(self, train: "Features", validation: "Features") -> None:
         self._touch, self._photo = Standardiser.fit(train.touch), Standardiser.fit(train.photo)
-        validator = Validator.of(validation)
+        chosen = validation.select(validation_rows(validation))
         steps = min(self.settings.config.training.iterations, MAX_STEPS)
-        fits = [self._train(train, validator, steps, place) for place in range(len(REGULARISATIONS))]
+        fits = [self._train(train, chosen, steps, place) for place in range(len(REGULARISATIONS))]
         aucs = [best.metrics["validation_auc"] for _, best in fits]
         place = aucs.index(max(aucs))
         self._module, best = fits[place]
@@ -66,7 +67,7 @@ class ContrastiveEmbedding(Method):
             "scale": self._scale,
         }
 
-    def _train(self, train: "Features", validator: Validator, steps: int, place: int) -> tuple[Projections, BestStep]:
+    def _train(self, train: "Features", validation: "Features", steps: int, place: int) -> tuple[Projections, BestStep]:
         """Return projections trained with one regularisation, at their best step."""
         dropout, weight_decay = REGULARISATIONS[place]
         with seeded_generator(self.settings.seed) as generator:
@@ -87,14 +88,14 @@ class ContrastiveEmbedding(Method):
                 self._training_loss(module, train, generator),
                 title=f"fit contrastive, {place + 1} of {len(REGULARISATIONS)}",
                 quiet=self.settings.quiet,
-                validate=self._validation(module, validator),
+                validate=self._validation(module, validation),
             )
         return module.eval(), best
 
     def _training_loss(
         self, module: Projections, train: "Features", generator: torch.Generator
     ) -> Callable[[int, int], Tensor]:
-        touch, photo = self._touch.tensor(train.touch), self._photo.tensor(train.photo)
+        touch, photo = _tensor(self._touch, train.touch), _tensor(self._photo, train.photo)
         draws = ObjectSampler(torch.from_numpy(train.owner), generator)
 
         def loss(_: int, __: int) -> Tensor:
@@ -105,31 +106,35 @@ class ContrastiveEmbedding(Method):
 
         return loss
 
-    def _validation(self, module: Projections, validator: Validator) -> Callable[[], dict[str, float]]:
-        touch = self._touch.tensor(validator.features.touch)
-        photo = self._photo.tensor(validator.features.photo)
+    def _validation(self, module: Projections, validation: "Features") -> Callable[[], dict[str, float]]:
+        touch = _tensor(self._touch, validation.touch)
+        photo = _tensor(self._photo, validation.photo)
 
         @torch.inference_mode()
         def validate() -> dict[str, float]:
             module.eval()
             scores = (module(touch, module.touch) @ module(photo, module.photo).T).numpy()
             module.train()
-            return {"validation_auc": validator.touch_auc(scores)}
+            return {"validation_auc": ranking_auc(scores, validation.owner)}
 
         return validate
 
     @torch.inference_mode()
     def _encode_touch(self, touch: Array) -> Array:
-        embeddings: Array = self._module(self._touch.tensor(touch), self._module.touch).numpy()
+        embeddings: Array = self._module(_tensor(self._touch, touch), self._module.touch).numpy()
         return embeddings
 
     @torch.inference_mode()
     def _encode_photo(self, photo: Array) -> Array:
-        embeddings: Array = self._module(self._photo.tensor(photo), self._module.photo).numpy()
+        embeddings: Array = self._module(_tensor(self._photo, photo), self._module.photo).numpy()
         return embeddings
 
     def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
         return self._scale * (touch_encodings @ photo_encodings.T)
+
+
+def _tensor(standardise: Standardiser, features: NDArray[Any]) -> Tensor:
+    return torch.from_numpy(standardise(features)).float()
 
 
 # Draws -----------------------------------------------------------------------------------------------

@@ -16,10 +16,10 @@ from retrieval.errors import BadInput
 from robot.errors import SceneError
 from tests.documents import ROOT
 from tests.hard_case import HardCase, error_of
-from tests.retrieval.methods import hard_linear as linear
 from tests.retrieval.metrics import hard_probability as probability
 from tests.retrieval.metrics import hard_ranking as ranking
 from tests.retrieval.model import hard_losses as losses
+from tests.retrieval.training import hard_linear as linear
 from tests.robot.sight.hard_sight import naive_circle
 from tests.robot.sim.hard_gel_pictures import _columns, _grams, naive_ridge
 

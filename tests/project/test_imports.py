@@ -26,7 +26,7 @@ LAYERS = (
     ("methods",),
     ("evaluation",),
     ("report",),
-    ("adaptation", "frontier", "serve"),
+    ("frontier", "serve"),
     ("commands",),
     ("__main__",),
 )

@@ -9,19 +9,12 @@ import pytest
 from retrieval.errors import BadInput, ConfigError, NumericalError
 from retrieval.methods import CHANCE, METHODS, cca_towers
 from retrieval.methods.cca import Cca
-from retrieval.methods.cca_towers import (
-    GRID,
-    CcaSettings,
-    TowerWidths,
-    fit_projections,
-    select_settings,
-    tower_widths,
-)
 from retrieval.methods.method import Method, MethodSettings
-from retrieval.methods.selection import Validator, ranking_auc
-from retrieval.methods.standardise import Standardiser
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
+from retrieval.training.cca import Standardiser
+from retrieval.training.cca_towers import GRID, CcaSettings, TowerWidths, fit_projections, select_settings, tower_widths
 from retrieval.training.features import Features
+from retrieval.training.selection import ranking_auc
 
 LEARNS = [name for name in METHODS if name != CHANCE]
 FEATURES = 256  # of the small tower
@@ -97,14 +90,13 @@ def test_two_fits_with_one_seed_give_the_same_scores_bit_for_bit(name):
 
 @pytest.mark.parametrize("name", LEARNS)
 def test_photos_of_the_touched_object_score_higher(name):
-    assert Validator.of(TEST).touch_auc(fitted(name).score(*encodings(fitted(name)))) > 0.8
+    assert ranking_auc(fitted(name).score(*encodings(fitted(name))), TEST.owner) > 0.8
 
 
 def test_equal_scores_are_exactly_at_chance_and_random_scores_are_close_to_it():
-    assert Validator.of(TEST).touch_auc(np.zeros((len(TEST), len(TEST)), np.float32)) == 0.5
+    assert ranking_auc(np.zeros((len(TEST), len(TEST)), np.float32), TEST.owner) == 0.5
     values = [
-        Validator.of(TEST).touch_auc(fitted("chance", seed).score(*encodings(fitted("chance", seed))))
-        for seed in range(12)
+        ranking_auc(fitted("chance", seed).score(*encodings(fitted("chance", seed))), TEST.owner) for seed in range(12)
     ]
     assert np.mean(values) == pytest.approx(0.5, abs=4 * np.std(values) / np.sqrt(len(values)))
 
@@ -200,20 +192,16 @@ def test_the_error_about_an_unknown_method_lists_the_known_ones():
 
 
 def test_the_ranking_auc_equals_that_of_loops():
-    rng = np.random.default_rng(3)
-    touch_owner, photo_owner = np.array([0, 0, 1, 2]), np.array([0, 0, 1, 1, 2])
-    scores = rng.integers(0, 4, (4, 5)).astype(float)
-    excluded = np.zeros((4, 5), bool)
-    excluded[[0, 1, 2, 3], [0, 1, 2, 4]] = True
+    rng, owner = np.random.default_rng(3), np.array([0, 0, 1, 1, 2])  # object 2 has one photo only
+    scores = rng.integers(0, 4, (5, 5)).astype(float)
     by_object = {}
-    for i in range(4):
-        own = [j for j in range(5) if photo_owner[j] == touch_owner[i] and not excluded[i, j]]
-        own = own or [j for j in range(5) if photo_owner[j] == touch_owner[i]]  # object 2 has one photo only
-        others = [j for j in range(5) if photo_owner[j] != touch_owner[i]]
+    for i in range(5):
+        own = [j for j in range(5) if owner[j] == owner[i] and j != i] or [i]
+        others = [j for j in range(5) if owner[j] != owner[i]]
         wins = [(scores[i, a] > scores[i, b]) + (scores[i, a] == scores[i, b]) / 2 for a in own for b in others]
-        by_object.setdefault(touch_owner[i], []).append(np.mean(wins))
+        by_object.setdefault(owner[i], []).append(np.mean(wins))
     expected = np.mean([np.mean(values) for values in by_object.values()])
-    assert ranking_auc(scores, touch_owner, photo_owner, excluded) == pytest.approx(expected, abs=1e-12)
+    assert ranking_auc(scores, owner) == pytest.approx(expected, abs=1e-12)
 
 
 def test_features_are_standardised_by_the_training_grasps_and_constant_ones_dropped():

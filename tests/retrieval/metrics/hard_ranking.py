@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from scipy import special
 from torch import nn
 
-from retrieval.methods.selection import ranking_auc
 from retrieval.metrics.intervals import binomial_interval, bootstrap_interval, sign_flip_p
 from retrieval.metrics.pairs import pair_auc
 from retrieval.metrics.ranking import (
@@ -20,6 +19,7 @@ from retrieval.metrics.ranking import (
 )
 from retrieval.metrics.table import ScoreTable
 from retrieval.model.fusion import FusionHead
+from retrieval.training.selection import ranking_auc
 from tests.hard_case import HardCase, error_of
 
 _TOP, _MEASURES, _PARTIALS, _INTERVALS = "top k", "rank measures", "partials", "intervals"
@@ -115,8 +115,7 @@ def _constant_scorer_by_area() -> HardCase:
     """Area under the ROC of a constant scorer: 0.5."""
     labels = np.array([1, 0, 0, 0])
     naive = float((np.zeros(1)[:, None] > np.zeros(3)).mean())
-    owners = np.array([0]), np.arange(4)
-    ours = pair_auc(np.zeros(4), labels), ranking_auc(np.zeros((1, 4)), *owners, np.zeros((1, 4), bool))
+    ours = pair_auc(np.zeros(4), labels), ranking_auc(np.zeros((4, 4)), np.arange(4))
     text = ", ".join(f"{value:g}" for value in ours)
     return HardCase(
         _MEASURES,

@@ -7,12 +7,12 @@ import shutil
 import onnx
 import pytest
 
-from retrieval.adaptation.recipe import adapt
 from retrieval.data.dataset import recording_licence
 from retrieval.data.licences import DataLicence, stored_licences
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.export import touch_encoder_to_onnx
 from retrieval.model.shipped import shipped_model
+from retrieval.training.adapt import adapt
 from retrieval.training.licences import checkpoint_licences, training_licences
 from retrieval.training.train import train
 from tests.conftest import TINY

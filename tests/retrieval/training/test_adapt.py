@@ -8,24 +8,21 @@ import pytest
 import torch
 
 import retrieval
-from retrieval.adaptation import folds
-from retrieval.adaptation.data import config_for, load_towers
-from retrieval.adaptation.estimate import Estimate
-from retrieval.adaptation.folds import draw_folds, measure, score_accuracy
-from retrieval.adaptation.recipe import adapt
 from retrieval.commands.main import main
 from retrieval.commands.options import training_config
 from retrieval.data.dataset import Split, load_grasps
 from retrieval.errors import BadInput, CheckpointError
-from retrieval.methods import cca_towers
-from retrieval.methods.cca_towers import GRID, CcaSettings, TowerWidths, fit_projections, select_settings
-from retrieval.methods.selection import Validator
 from retrieval.model.checkpoint import load_checkpoint
+from retrieval.model.config import load_config
 from retrieval.model.fusion import Matcher
 from retrieval.model.towers.tower import build_tower
+from retrieval.training import adapt as adaptation
+from retrieval.training import cca_towers
+from retrieval.training.adapt import Estimate, accuracies, adapt, config_for, draw_folds, fit_folds, load_towers
 from retrieval.training.calibration.posterior import fit_posterior
 from retrieval.training.calibration.touches import CalibrationTouches, ScoredTouches
 from retrieval.training.calibration.verification import fit_verification, verification_sequences
+from retrieval.training.cca_towers import GRID, CcaSettings, TowerWidths, fit_projections, select_settings
 from retrieval.training.features import Features
 from retrieval.training.initial_weights import build_matcher
 from tests.verification import calibration
@@ -34,7 +31,7 @@ from tests.verification import calibration
 @pytest.fixture
 def unchecked(monkeypatch):
     """Skip the gel check, whose 700 foreign images take most of the time."""
-    monkeypatch.setattr("retrieval.adaptation.fitting.with_gel_check", lambda made, *_, **__: made)
+    monkeypatch.setattr("retrieval.training.adapt.with_gel_check", lambda made, *_, **__: made)
 
 
 def correlated_features(objects=30, grasps=6, seed=0):
@@ -102,16 +99,17 @@ def test_a_held_out_fold_affects_neither_settings_nor_fit(monkeypatch):
     touch, photo, owner = correlated_features(objects=24)
     names = tuple(f"object-{number:02}" for number in owner)
     features = Features(tuple(map(str, range(len(names)))), names, touch[:, None], photo)
-    data = SimpleNamespace(grasps=[], kind_of=None, blocks=TowerWidths([12], [10]))
+    data = SimpleNamespace(grasps=[], kind_of={}, widths=TowerWidths([12], [10]), config=load_config("adapt"))
     drawn = [names[start : start + 8 * 6 : 6] for start in range(0, len(names), 8 * 6)]
     calls = []
-    monkeypatch.setattr(folds, "select_settings", lambda *args: calls.append(args) or select_settings(*args))
+    monkeypatch.setattr(adaptation, "select_settings", lambda *args: calls.append(args) or select_settings(*args))
 
     def fit(inputs):
-        return list(folds.fit_folds(inputs, drawn, data, seed=0, label="touches", quiet=True))
+        return list(fit_folds(inputs, drawn, data, label="touches", quiet=True))
 
-    for fold, (fitted, _, inner) in zip(fit(features), calls, strict=False):
-        assert not set(fold.left_out.object_ids) & {*fitted.object_ids, *(name for part in inner for name in part)}
+    fit(features)
+    for fold, (fitted, _, inner) in zip(drawn, calls, strict=False):
+        assert not set(fold) & {*fitted.object_ids, *(name for part in inner for name in part)}
     first = fit(features)[0]
     noise, other = (fit(with_noise(features, drawn[0], seed))[0] for seed in range(2))
     for found in (noise, other):
@@ -127,20 +125,23 @@ def test_a_setting_that_is_best_only_on_the_held_out_fold_is_not_selected(monkey
     touch, photo, owner = correlated_features(objects=24)
     names = tuple(f"object-{number:02}" for number in owner)
     features = Features(tuple(map(str, range(len(names)))), names, touch[:, None], photo)
-    data = SimpleNamespace(grasps=[], kind_of=None, blocks=TowerWidths([12], [10]))
+    data = SimpleNamespace(grasps=[], kind_of={}, widths=TowerWidths([12], [10]), config=load_config("adapt"))
     drawn = [names[start : start + 8 * 6 : 6] for start in range(0, len(names), 8 * 6)]
     planted, plain = GRID[0], GRID[-1]
     current = []
     fit = cca_towers._fit
     monkeypatch.setattr(cca_towers, "_fit", lambda *args: (current.append(one[0]) or one for one in fit(*args)))
+    held_out = []
     monkeypatch.setattr(
-        Validator,
-        "touch_auc",
-        lambda self, _: float(
-            current[-1] == planted if set(self.features.object_ids) <= set(drawn[0]) else current[-1] == plain
-        ),
+        cca_towers,
+        "ranking_auc",
+        lambda *_: float(current[-1] == planted if held_out[-1] <= set(drawn[0]) else current[-1] == plain),
     )
-    found = list(folds.fit_folds(features, drawn, data, seed=0, label="touches", quiet=True))
+    rows = cca_towers.validation_rows
+    monkeypatch.setattr(
+        cca_towers, "validation_rows", lambda part, count: held_out.append(set(part.object_ids)) or rows(part, count)
+    )
+    found = list(fit_folds(features, drawn, data, label="touches", quiet=True))
     assert found[0].settings == plain
     # With the fold itself the planted setting is selected.
     assert select_settings(features, TowerWidths([12], [10]), drawn[:1]).settings == planted
@@ -152,20 +153,19 @@ def test_accuracy_of_hand_made_scores():
     )
     # The own photo of a touch of a is that of the other grasp: photo 4 for touch 1, photo 1 for touch 4.
     scores = np.array([[9, 2, 3, 4], [5, 5, 1, 5], [0, 1, 2, 3], [2, 2, 1, 9]], np.float32)
-    found = score_accuracy(scores, features)
-    assert found.objects == 3
-    assert found.top1.tolist() == [1.0, 0.5, found.top1[2], 0.5]
-    assert found.pair_accuracy.tolist()[:2] == [1.0, 0.75]
-    assert measure([found], "top1").chance.tolist() == [pytest.approx(1 / 3)]
-    by_object = [np.mean([1.0, 0.75]), 0.75, found.pair_accuracy[2]]
-    assert measure([found], "pair_accuracy").by_object()[1].mean() == pytest.approx(np.mean(by_object))
+    top1, pairs = accuracies([scores], [features]).values()
+    assert top1.gallery == "3 held-out objects, one photo of each"
+    (unclear,) = set(top1.values[top1.owner == 2].flatten())
+    assert (top1.owner.tolist(), top1.values.flatten().tolist()) == ([0, 0, 1, 2], [1.0, 0.5, 0.5, unclear])
+    assert pairs.values.flatten().tolist()[::2] == [1.0, 0.75]
+    assert (top1.chance.tolist(), pairs.chance.tolist()) == ([pytest.approx(1 / 3)], [0.5])
 
 
 def test_the_preset_builds_the_same_towers_as_adapt_with_the_shipped_model(published):
     preset = training_config("adapt", None, init=str(published))
     preset = dataclasses.replace(preset, matcher=dataclasses.replace(preset.matcher, fingers=1))
     start = load_checkpoint(retrieval.shipped_model(1))
-    expected = Matcher(config_for(start, 1, str(published), seed=0).matcher, 2)
+    expected = Matcher(config_for(start, 1, str(published)).matcher, 2)
     load_towers(expected, start, str(published))
     made = build_matcher(preset)
     for side in ("touch_tower", "photo_tower"):
@@ -177,7 +177,7 @@ def test_the_preset_builds_the_same_towers_as_adapt_with_the_shipped_model(publi
 
 def test_touches_are_encoded_by_the_shipped_the_gel_and_the_published_tower_and_photos_by_the_last(published):
     start = load_checkpoint(retrieval.shipped_model(1))
-    matcher = Matcher(config_for(start, 1, str(published), seed=0).matcher)
+    matcher = Matcher(config_for(start, 1, str(published)).matcher)
     load_towers(matcher, start, str(published))
     gel, added = build_tower("mobilenet_v2", "stages"), build_tower("mobilenet_v2", "stages")
     gel.initialise("gel")
@@ -239,7 +239,7 @@ def test_thresholds_of_verifications_come_from_objects_outside_the_fit():
 def test_the_calibrations_of_a_fit_are_fitted_on_held_out_touches(recording, model, tmp_path, monkeypatch):
     monkeypatch.setattr(Estimate, "is_baseline_better", False)
     given = []
-    monkeypatch.setattr("retrieval.adaptation.fitting.fit_verification", lambda parts, posterior: given.extend(parts))
+    monkeypatch.setattr("retrieval.training.adapt.fit_verification", lambda parts, posterior: given.extend(parts))
     made = adapt(recording, tmp_path / "own.safetensors", load_checkpoint(model), init="none", quiet=True)
     held_out = made.estimate.choice.held_out_touches
     assert len(given) == len(held_out) > 1
@@ -253,7 +253,7 @@ def test_a_better_baseline_is_stored_with_fitted_probabilities(recording, model,
     start = dataclasses.replace(load_checkpoint(model), verification=calibration(accept=1.0, reject=-1.0))
     estimate = adapt(recording, tmp_path / "own.safetensors", start, init="none", quiet=True).estimate
     assert estimate.is_baseline_better == (
-        estimate.baseline_pair_accuracy.by_object()[1].mean() >= estimate.pair_accuracy.by_object()[1].mean()
+        estimate.to_dict()["baseline_pair_accuracy"] >= estimate.to_dict()["held_out_pair_accuracy"]
     )
     monkeypatch.setattr(Estimate, "is_baseline_better", True)
     estimate = adapt(recording, tmp_path / "own.safetensors", start, init="none", quiet=True).estimate
@@ -266,10 +266,14 @@ def test_a_better_baseline_is_stored_with_fitted_probabilities(recording, model,
     # Those of the start model are for its posterior; 12 objects are too few for new ones
     assert made.verification is None
     assert set(made.provenance["adapted_to"]) == {"source", "data_digest"}
-    other = dataclasses.replace(estimate, folds=estimate.folds)
-    object.__setattr__(other.baseline.start.config.matcher, "fingers", 1)
     monkeypatch.undo()
-    assert not other.is_baseline_better  # another number of fingers
+    best = {
+        name: dataclasses.replace(each, values=np.ones_like(each.values)) for name, each in estimate.measures.items()
+    }
+    for fits_fingers in (True, False):  # a model for another number of fingers cannot be used
+        baseline = dataclasses.replace(estimate.baseline, fits_fingers=fits_fingers)
+        other = dataclasses.replace(estimate, baseline=baseline, measures=best)
+        assert other.is_baseline_better == fits_fingers
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -319,14 +323,9 @@ def test_initial_weights_are_for_all_towers_or_for_each(published):
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_the_command_prints_the_estimate_and_reuses_its_cache(recording, model, tmp_path, capsys):
-    out, cache = tmp_path / "own.safetensors", tmp_path / "cache"
-    line = ["adapt", str(recording), "--out", str(out), "--model", str(model), "--init", "none", "--cache", str(cache)]
-    assert main(line) == 0
+def test_the_command_prints_the_estimate(recording, model, tmp_path, capsys):
+    out = tmp_path / "own.safetensors"
+    assert main(["adapt", str(recording), "--out", str(out), "--model", str(model), "--init", "none"]) == 0
     output = capsys.readouterr().err
     for part in ("top-1 accuracy", "low-pass touch", "pair accuracy", "fitted to 12 objects, 36 touches"):
         assert part in output
-    stored = sorted(cache.iterdir())
-    assert stored
-    assert main(line) == 0
-    assert sorted(cache.iterdir()) == stored

@@ -6,8 +6,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.methods.cca import CanonicalCorrelations, canonical_correlations, cosine, decompose, unit_rows
-from retrieval.methods.standardise import Standardiser
+from retrieval.training.cca import (
+    CanonicalCorrelations,
+    Standardiser,
+    canonical_correlations,
+    cosine,
+    decompose,
+    unit_rows,
+)
 from tests.hard_case import HardCase, error_of
 
 Matrix = NDArray[np.float64]

@@ -5,8 +5,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from retrieval.methods.selection import appearance_order, held_out_folds
 from retrieval.training.features import Features
+from retrieval.training.selection import appearance_order, held_out_folds
 
 KINDS = [[f"{kind}{number}" for number in range(4)] for kind in "abcdefghi"]
 NAMES = sorted(name for kind in KINDS for name in kind)

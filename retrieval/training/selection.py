@@ -1,7 +1,6 @@
-"""Choice of a method's settings by ranking on held-out objects, never on the objects of the fit."""
+"""Choice of settings by ranking on held-out objects, never on the objects of the fit."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,22 +20,16 @@ def validation_rows(validation: Features, max_rows: int = MAX_VALIDATION_ROWS) -
     return np.concatenate([part[np.linspace(0, len(part) - 1, min(each, len(part))).astype(int)] for part in parts])
 
 
-def ranking_auc(
-    scores: NDArray[np.floating[Any]],
-    touch_owner: NDArray[np.int64],
-    photo_owner: NDArray[np.int64],
-    excluded: NDArray[np.bool_],
-) -> float:
-    """Return how often a photo of the touched object scores above one of another object; ties count half.
+def ranking_auc(scores: NDArray[np.floating[Any]], owner: NDArray[np.int64]) -> float:
+    """Return how often another photo of the touched object scores above one of another object; ties count half.
 
     The mean is taken over the pairs of a touch, over the touches of an object, and over objects. A constant scorer has
     exactly 0.5.
 
     Args:
-        scores: (T, N).
-        touch_owner: (T,) objects.
-        photo_owner: (N,) objects.
-        excluded: (T, N) photos of the row's own grasps, which are ignored unless the object has no other.
+        scores: (n, n) of the touch of every grasp with the photo of every grasp. The photo of a touch's own grasp is
+            ignored unless its object has no other.
+        owner: (n,) object of each grasp.
 
     Raises:
         NumericalError: A score is not finite. A NaN would count as the higher one.
@@ -45,29 +38,12 @@ def ranking_auc(
     if len(bad):
         raise NumericalError(f"every score must be finite; touch {bad[0]} has a NaN or infinite one")
     values = np.empty(len(scores))
-    for row, (score, owner) in enumerate(zip(scores, touch_owner, strict=True)):
-        same = photo_owner == owner
-        own = same & ~excluded[row]
+    for row, score in enumerate(scores):
+        same = owner == owner[row]
+        own = same & (np.arange(len(owner)) != row)
         others = score[~same]
         values[row] = weight_below(score[own if own.any() else same], others).mean() / len(others)
-    return float(np.mean([values[touch_owner == owner].mean() for owner in np.unique(touch_owner)]))
-
-
-@dataclass(frozen=True, eq=False)
-class Validator:
-    """Validation grasps with which settings are chosen, by the AUC of their scores."""
-
-    features: Features
-
-    @classmethod
-    def of(cls, validation: Features) -> "Validator":
-        """Return a validator with a sufficient subset of the validation grasps."""
-        return cls(validation.select(validation_rows(validation)))
-
-    def touch_auc(self, scores: NDArray[np.floating[Any]]) -> float:
-        """Return the AUC of scores (n, n) of every touch with every photo."""
-        owner = self.features.owner
-        return ranking_auc(scores, owner, owner, np.eye(len(owner), dtype=np.bool_))
+    return float(np.mean([values[owner == each].mean() for each in np.unique(owner)]))
 
 
 MIN_OBJECTS_FOR_FOUR_FOLDS = 12

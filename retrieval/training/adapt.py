@@ -1,0 +1,573 @@
+"""Adapt a model to a new sensor and to your objects.
+
+Touches are encoded by the frozen towers of the start model (pretrained on relief in simulation), by the gel tower of
+the package (`retrieval.model.towers.weights.gel_tower`) and by a published tower (pretrained on photos); photos by the
+tower of the start model and by the published one. The photo tower of a shipped model is left out, since it has seen
+simulated photos only. The fit to these features is linear (`retrieval.training.cca_towers`).
+
+Every reported number comes from objects that were left out of the fit. On a similar sensor the start model is better
+than a fit to a few objects: it is then kept, with new calibrations.
+"""
+
+import dataclasses
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from retrieval.console.output import say
+from retrieval.console.progress import Bar
+from retrieval.data.dataset import (
+    AnyRecording,
+    Grasp,
+    Split,
+    data_digest,
+    finger_count,
+    folder_of,
+    linked_objects,
+    load_grasps,
+    object_kinds,
+    recording_licence,
+    recording_source,
+)
+from retrieval.data.licences import LICENCES
+from retrieval.errors import BadInput
+from retrieval.metrics.intervals import compare, summarise
+from retrieval.metrics.measure import Measure, pooled
+from retrieval.metrics.pairs import fit_calibration
+from retrieval.metrics.ranking import k_way_accuracies
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable, store_checkpoint
+from retrieval.model.config import Config, load_config
+from retrieval.model.encode import default_device, one_thread
+from retrieval.model.fusion import Matcher
+from retrieval.model.references import unit_embeddings
+from retrieval.model.shipped import is_shipped, shipped_model
+from retrieval.model.towers import TOWER_SEPARATOR
+from retrieval.model.towers.tower import Tower
+from retrieval.model.towers.weights import GEL
+from retrieval.training.batches import FrozenFeatures
+from retrieval.training.calibration.calibrate import fit_calibrations, with_gel_check
+from retrieval.training.calibration.touches import CalibrationTouches, ScoredTouches
+from retrieval.training.calibration.verification import fit_verification
+from retrieval.training.cca_towers import (
+    GRID,
+    MAX_CALIBRATION_TOUCHES,
+    CcaProjections,
+    CcaSelection,
+    TowerWidths,
+    fit_projections,
+    select_settings,
+    touch_rows,
+    tower_widths,
+)
+from retrieval.training.features import Features, encode_recording, features_by_image
+from retrieval.training.licences import checkpoint_licences
+from retrieval.training.selection import held_out_folds
+
+PRESET = "adapt"
+PUBLISHED_TOWER = "mobilenet_v2"
+"""Published tower that is combined with the towers of the start model, and backbone of the gel tower."""
+NO_TOWER = "none"
+"""Value of `init` for no published tower."""
+GALLERY = 9
+"""Approximate number of objects of a fold, which are the candidates of its touches."""
+MIN_OBJECTS = 6
+"""Minimum number of objects of an estimate: two folds of three."""
+
+
+def adapt(
+    recording: AnyRecording,
+    out: Path,
+    start: str | Path | Checkpoint | None = None,
+    *,
+    init: str = "imagenet",
+    split: Split | None = None,
+    quiet: bool = False,
+) -> "Adaptation":
+    """Fit a model to a recording from another sensor with your objects, and write the checkpoint `out`.
+
+    If the pair accuracy of the start model on held-out objects is at least that of the fit, `out` is a copy of the
+    start model with newly fitted calibrations and gel check.
+
+    Args:
+        recording: A folder, or the object that `robot.read_recording` returns.
+        out: The checkpoint (.safetensors).
+        start: The start model. Default: the shipped model for one finger, or for two or more.
+        init: Weights of the published MobileNetV2 that is combined with the towers of the start model: "imagenet", a
+            file, or "none" to use the towers of the start model only.
+        split: A split whose test objects are not used at all.
+        quiet: No progress on stderr.
+
+    Raises:
+        DatasetError: The recording cannot be read.
+        BadInput: The recording has fewer than two objects.
+        CheckpointError: `start` cannot be read, or `out` cannot be written.
+
+    >>> from pathlib import Path
+    >>> made = retrieval.adapt("lab", Path("mine.safetensors"), "model.safetensors", init="none", quiet=True)
+    >>> made.lines()[-1]
+    'mine.safetensors: fitted to 12 objects, 24 touches'
+    """
+    require_writable(out)
+    recording = folder_of(recording)
+    grasps = load_grasps(recording)
+    if not isinstance(start, Checkpoint):
+        start = load_checkpoint(start or shipped_model(min(finger_count(grasps), 2)))
+    if split is not None:
+        grasps = [grasp for grasp in grasps if grasp.object_id not in split.test]
+    if len({grasp.object_id for grasp in grasps}) < 2:
+        raise BadInput("A fit needs a recording of at least 2 objects. Record more.")
+    data = AdaptationData.of(recording, grasps, start, init, quiet)
+    estimate = estimate_accuracy(data, start, quiet=quiet)
+    if estimate and estimate.is_baseline_better:
+        checkpoint = _calibrated_baseline(start, data, estimate, quiet)
+    else:
+        checkpoint = _calibrated_fit(_fitted(data, estimate, out), data, estimate, quiet)
+    store_checkpoint(checkpoint, out)
+    return Adaptation(load_checkpoint(out), data, estimate)
+
+
+@dataclass(frozen=True, eq=False)
+class Adaptation:
+    """Result of `adapt`: the checkpoint and its accuracy on held-out objects.
+
+    Attributes:
+        checkpoint: The written checkpoint.
+        data: The fitted grasps and their features.
+        estimate: The accuracy estimate; None for fewer than six objects; the checkpoint then has no probabilities.
+
+    >>> from pathlib import Path
+    >>> made = retrieval.adapt("lab", Path("own.safetensors"), "model.safetensors", init="none", quiet=True)
+    >>> made.checkpoint.path.name
+    'own.safetensors'
+    >>> 0 <= made.estimate.to_dict()["held_out_top1"] <= 1
+    True
+    """
+
+    checkpoint: Checkpoint
+    data: "AdaptationData"
+    estimate: "Estimate | None"
+
+    def lines(self) -> list[str]:
+        """Return the result as lines of text."""
+        lines = self.estimate.lines() if self.estimate else []
+        grasps = self.data.grasps
+        objects = len({grasp.object_id for grasp in grasps})
+        return [*lines, f"{self.checkpoint.path}: fitted to {objects} objects, {len(grasps)} touches"]
+
+
+# Features of the combined towers ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class AdaptationData:
+    """The recorded grasps, the combined towers, and the features.
+
+    Attributes:
+        grasps: The grasps.
+        config: Configuration of the fitted matcher.
+        matcher: Matcher with the combined towers.
+        features: Tower features of the grasps.
+        low_pass: The same with low-pass (8 x 6) touches.
+        widths: Feature widths of the combined towers.
+        kind_of: The class of each object, as far as the recording has it.
+        provenance: Source, licences and digest of the data.
+    """
+
+    grasps: list[Grasp]
+    config: Config
+    matcher: Matcher
+    features: Features
+    low_pass: Features
+    widths: TowerWidths
+    kind_of: dict[str, str]
+    provenance: dict[str, object]
+
+    @classmethod
+    def of(cls, recording: Path, grasps: list[Grasp], start: Checkpoint, init: str, quiet: bool) -> "AdaptationData":
+        """Encode grasps of a recording with the towers of `config_for`."""
+        config = config_for(start, finger_count(grasps), init)
+        matcher = Matcher(config.matcher, len(config.preprocessing.views)).eval()
+        load_towers(matcher, start, init)
+        encode = partial(encode_recording, grasps, matcher, config, None, quiet=quiet)
+        features = encode()
+        low_pass = encode(touch_variant="low_pass", photo_features_from=features)
+        licences = dict.fromkeys([*checkpoint_licences(start), recording_licence(recording)])
+        provenance: dict[str, object] = {
+            "source": recording_source(recording),
+            LICENCES: [dataclasses.asdict(licence) for licence in licences],
+            "data_digest": data_digest(grasps),
+        }
+        widths, kinds = tower_widths(config, features), object_kinds(recording)
+        return cls(grasps, config, matcher, features, low_pass, widths, kinds, provenance)
+
+
+def config_for(start: Checkpoint, fingers: int, init: str) -> Config:
+    """Return the preset with the towers of the fit; with `init` "none" those of the start model only."""
+    preset, source = load_config(PRESET), start.config.matcher
+    touch, photo = [source.tower], [source.photo_tower or source.tower]
+    if init != NO_TOWER:
+        touch += [PUBLISHED_TOWER] * (1 + _has_gel_tower(start))
+        photo = [PUBLISHED_TOWER] if is_shipped(start.path) else [*photo, PUBLISHED_TOWER]
+    matcher = dataclasses.replace(
+        preset.matcher,
+        tower=TOWER_SEPARATOR.join(touch),
+        photo_tower=TOWER_SEPARATOR.join(photo),
+        tower_output=source.tower_output,
+        fingers=fingers,
+    )
+    training = dataclasses.replace(preset.training, init="random", init_touch="", init_photo="")
+    return dataclasses.replace(preset, matcher=matcher, training=training)
+
+
+def load_towers(matcher: Matcher, start: Checkpoint, init: str) -> None:
+    """Load the weights of the towers of `config_for`; `init` are those of the published tower, or "none"."""
+    published = [] if init == NO_TOWER else [init]
+    gel = [GEL] if published and _has_gel_tower(start) else []
+    _load_parts(matcher.touch_tower, start.matcher.touch_tower.backbones, [*gel, *published])
+    only_published = published and is_shipped(start.path)
+    _load_parts(matcher.photo_tower, [] if only_published else start.matcher.photo_tower.backbones, published)
+
+
+def _load_parts(tower: Tower, start: Sequence[Tower], inits: Sequence[str]) -> None:
+    """Load the weights of the start model into the first parts of a tower, and those of `inits` into the others."""
+    parts = tower.backbones
+    for part, source in zip(parts, start, strict=False):
+        part.load_state_dict(source.state_dict())
+    for part, init in zip(parts[len(start) :], inits, strict=True):
+        part.initialise(init)
+
+
+def _has_gel_tower(start: Checkpoint) -> bool:
+    """Return whether the gel tower is used with the towers of this model: its features are statistics of stages."""
+    return start.config.matcher.tower_output == "stages"
+
+
+# Accuracy on held-out objects ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Accuracy on held-out objects, of the fit, of the low-pass control and of the unadapted start model.
+
+    Attributes:
+        choice: The fit to all objects; its settings were selected by holding out half of each kind.
+        folds: Objects that are left out together. The fit to the others selects its settings among them.
+        baseline: The unadapted start model.
+        measures: "top1" and "pair_accuracy" of each, such as "held_out_top1", "held_out_top1_low_pass" and
+            "baseline_top1".
+    """
+
+    choice: CcaSelection
+    folds: list[tuple[str, ...]]
+    baseline: "UnadaptedBaseline"
+    measures: dict[str, Measure]
+
+    @property
+    def is_baseline_better(self) -> bool:
+        """Whether the unadapted model has at least the pair accuracy of the fit.
+
+        A model for another number of fingers cannot be used and is never better.
+        """
+        means = self.to_dict()
+        return self.baseline.fits_fingers and means["baseline_pair_accuracy"] >= means["held_out_pair_accuracy"]
+
+    def lines(self) -> list[str]:
+        """Return the estimate as lines of text."""
+        lines = [f"each object held out once, one touch, {self.measures['held_out_top1'].gallery}:"]
+        for name in ("top1", "pair_accuracy"):
+            touched, control = self.measures[f"held_out_{name}"], self.measures[f"held_out_{name}_low_pass"]
+            gain = compare([touched], [control])
+            lines.append(
+                f"  {_LABELS[name]} {interval(touched)}; low-pass touch {interval(control)}; "
+                f"chance {touched.chance[0]:.3f}; "
+                f"difference {gain['difference']:+.3f} [{gain['low']:+.3f}, {gain['high']:+.3f}]"
+            )
+        baseline = [f"{label} {interval(self.measures[f'baseline_{name}'])}" for name, label in _LABELS.items()]
+        lines += [f"  {self.verdict}", f"unadapted model: {', '.join(baseline)}"]
+        if self.is_baseline_better:
+            lines.append(
+                "  The unadapted model is used: its pair accuracy is at least that of the fit. "
+                "Only its calibrations and its check of gel images are fitted."
+            )
+        return lines
+
+    @property
+    def verdict(self) -> str:
+        """A sentence on whether the fit is better than its low-pass control."""
+        gain = compare([self.measures["held_out_top1"]], [self.measures["held_out_top1_low_pass"]])
+        if gain["low"] > 0:
+            return "Better than the low-pass control: the fit uses more than light and coarse shape."
+        return (
+            "Not better than the low-pass control: there is no evidence that the fit uses touch. Record more objects."
+        )
+
+    def to_dict(self) -> dict[str, float]:
+        """Return the metrics that the checkpoint stores: means over objects."""
+        means = {name: float(measure.by_object()[1].mean()) for name, measure in self.measures.items()}
+        return means | {"held_out_top1_chance": float(self.measures["held_out_top1"].chance[0])}
+
+
+_LABELS = {"top1": "top-1 accuracy", "pair_accuracy": "pair accuracy"}
+
+
+def interval(measure: Measure) -> str:
+    """Format a measure with its interval."""
+    summary = summarise([measure])
+    return f"{summary['value'][0]:.3f} [{summary['low'][0]:.3f}, {summary['high'][0]:.3f}]"
+
+
+@one_thread()
+def estimate_accuracy(data: AdaptationData, start: Checkpoint, *, quiet: bool) -> Estimate | None:
+    """Return the accuracy on held-out objects; None if there are too few objects."""
+    try:
+        folds = draw_folds(data.grasps, data.config.training.seed)
+    except BadInput as error:
+        if not quiet:
+            say(f"no accuracy estimate: {error}")
+        return None
+    measures = {}
+    for suffix, features, label in (
+        ("", data.features, "touches"),
+        ("_low_pass", data.low_pass, "low-pass touches"),
+    ):
+        left_out = [features.of_objects(fold) for fold in folds]
+        fits = fit_folds(features, folds, data, label=label, quiet=quiet)
+        scores = [
+            fit.projections.cosines(touch_rows(part), part.photo) for fit, part in zip(fits, left_out, strict=True)
+        ]
+        for name, measure in accuracies(scores, left_out).items():
+            measures[f"held_out_{name}{suffix}"] = measure
+    choice = _choose_settings(data.features, data)
+    baseline = UnadaptedBaseline.of(start, data.grasps, quiet)
+    scored = [part.scored.logits for part in baseline.touches(folds)]
+    found = accuracies(scored, [baseline.features.of_objects(fold) for fold in folds])
+    measures |= {f"baseline_{name}": measure for name, measure in found.items()}
+    return Estimate(choice, folds, baseline, measures)
+
+
+def draw_folds(grasps: Sequence[Grasp], seed: int) -> list[tuple[str, ...]]:
+    """Draw folds of about `GALLERY` objects, each left out once; objects that share a sequence stay together.
+
+    Raises:
+        BadInput: There are fewer than `MIN_OBJECTS` objects.
+    """
+    groups = linked_objects(grasps)
+    total = sum(map(len, groups))
+    if total < MIN_OBJECTS:
+        raise BadInput(f"Leaving each object out once needs at least {MIN_OBJECTS} objects, got {total}.")
+    folds: list[list[str]] = [[] for _ in range(min(max(round(total / GALLERY), 2), total // 3))]
+    for place in np.random.default_rng([seed, 7]).permutation(len(groups)):
+        min(folds, key=len).extend(groups[place])
+    return [tuple(sorted(fold)) for fold in folds]
+
+
+def fit_folds(
+    features: Features, folds: Sequence[Sequence[str]], data: AdaptationData, *, label: str, quiet: bool
+) -> Iterator[CcaSelection]:
+    """Yield the fit to the objects outside each fold. The settings are selected on the same objects."""
+    everyone = {name for fold in folds for name in fold}
+    with Bar(f"estimate, {label}", len(folds), "folds", quiet=quiet) as bar:
+        for fold in folds:
+            yield _choose_settings(features.of_objects(everyone.difference(fold)), data)
+            bar.advance()
+
+
+def _choose_settings(features: Features, data: AdaptationData) -> CcaSelection:
+    """Return settings, selected by holding out half of each kind of objects, and projections fitted to all objects."""
+    parts = held_out_folds(features, data.kind_of, linked_objects(data.grasps), data.config.training.seed)
+    return select_settings(features, data.widths, parts)
+
+
+def accuracies(scores: Sequence[NDArray[np.float32]], folds: Sequence[Features]) -> dict[str, Measure]:
+    """Return the accuracy of each touch of each fold with one random photo of each object of the fold.
+
+    Args:
+        scores: For each fold, (n, n) of every touch with every photo.
+        folds: The grasps of each fold.
+
+    Returns:
+        "top1": whether the photo of the touched object ranks first; 1/m if m photos tie. "pair_accuracy": the fraction
+        of the other objects' photos with a lower score; ties count 1/2.
+    """
+    names = sorted({name for fold in folds for name in fold.object_ids})
+    parts: dict[str, list[Measure]] = {"top1": [], "pair_accuracy": []}
+    for table, fold in zip(scores, folds, strict=True):
+        rng, owner = np.random.default_rng([0, 8]), fold.owner
+        rows = [np.flatnonzero(owner == name) for name in range(owner.max() + 1)]
+        higher, equal = np.empty((2, len(fold)), np.int64)
+        for touch, name in enumerate(owner):
+            drawn = np.array([rng.choice(mine[mine != touch] if len(mine) > 1 else mine) for mine in rows])
+            own, others = table[touch, drawn[name]], np.delete(table[touch, drawn], name)
+            higher[touch], equal[touch] = (others > own).sum(), (others == own).sum()
+        rivals, number = len(rows) - 1, np.array([names.index(each) for each in fold.object_ids])
+        top1 = k_way_accuracies(higher, equal, rivals, len(rows))
+        pairs = (1 - (higher + equal / 2) / rivals)[:, None]
+        for name, values, chance in (("top1", top1[:, :1], 1 / len(rows)), ("pair_accuracy", pairs, 0.5)):
+            parts[name].append(Measure(values, number, np.array([chance]), ""))
+    sizes = sorted({len(set(fold.object_ids)) for fold in folds})
+    gallery = " or ".join(map(str, sizes)) + " held-out objects, one photo of each"
+    return {name: dataclasses.replace(pooled(each), gallery=gallery) for name, each in parts.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class UnadaptedBaseline:
+    """A start model without any fit, and the features of the recorded grasps with its own preprocessing.
+
+    Attributes:
+        start: The model.
+        features: Tower features of the recorded grasps.
+        fits_fingers: Whether the model has the number of fingers of the grasps. Else their touches are repeated.
+    """
+
+    start: Checkpoint
+    features: Features
+    fits_fingers: bool
+
+    @classmethod
+    def of(cls, start: Checkpoint, grasps: list[Grasp], quiet: bool) -> "UnadaptedBaseline":
+        """Encode the grasps."""
+        config = dataclasses.replace(start.config.matcher, fingers=len(grasps[0].touches))
+        encoder = Matcher(config, start.matcher.views).eval()
+        encoder.touch_tower, encoder.photo_tower = start.matcher.touch_tower, start.matcher.photo_tower
+        found = encode_recording(grasps, encoder, dataclasses.replace(start.config, matcher=config), None, quiet=quiet)
+        wanted = start.config.matcher.fingers
+        touch = np.ascontiguousarray(found.touch[:, np.arange(wanted) % config.fingers])
+        return cls(start, dataclasses.replace(found, touch=touch), wanted == config.fingers)
+
+    @one_thread()
+    @torch.inference_mode()
+    def touches(
+        self, folds: Sequence[Sequence[str]], max_touches: int | None = None, *, pooled: bool = False
+    ) -> list[CalibrationTouches]:
+        """Return the touches of each fold, at most `max_touches` of an object; `pooled`: without late interaction."""
+        matcher, parts = self.start.matcher, []
+        scorer, width = matcher.head.scorer, matcher.config.pooled_width if pooled else None
+        for features in map(self.features.of_objects, folds):
+            if max_touches is not None:
+                rows = [np.flatnonzero(features.owner == name)[:max_touches] for name in np.unique(features.owner)]
+                features = features.select(np.concatenate(rows))
+            touch_partials = matcher.touch_encoding(torch.from_numpy(features.touch).flatten(1)).partial.numpy()
+            photos = matcher.photo_encoding(torch.from_numpy(features.photo))
+            photo_partials = photos.partial.numpy()[:, :width]
+            logits = np.stack([scorer.logits(partial[None], photo_partials) for partial in touch_partials])
+            scored = ScoredTouches(logits, features.owner, features.owner, np.eye(len(features), dtype=np.bool_))
+            embeddings = unit_embeddings(touch_partials, matcher.config.cosine_columns)
+            parts.append(CalibrationTouches(scored, embeddings, photos.embedding.numpy()))
+        return parts
+
+
+# The checkpoint --------------------------------------------------------------------------------------------
+
+
+@one_thread()
+def _fitted(data: AdaptationData, estimate: Estimate | None, out: Path) -> Checkpoint:
+    """Return a checkpoint with projections fitted to all objects; without an estimate, those of the largest ridge."""
+    features = data.features
+    if estimate:
+        projections = estimate.choice.projections
+        scale, offset = _log_odds(part.scored for part in estimate.choice.held_out_touches)
+    else:
+        largest, touch = max(GRID), touch_rows(features)
+        projections = dict(fit_projections(touch, features.photo, features.owner, data.widths, [largest]))[largest]
+        scale, offset = 1.0, 0.0
+    install_projections(data.matcher, projections, scale, offset)
+    objects = tuple(sorted(set(features.object_ids)))
+    return Checkpoint(
+        path=out,
+        digest="",
+        config=data.config,
+        provenance={"step": 0, **data.provenance, "metrics": estimate.to_dict() if estimate else {}},
+        gel_check=None,
+        verification=None,
+        matcher=data.matcher,
+        split=Split(data.config.training.seed, train=objects, validation=(), test=()),
+    )
+
+
+def _log_odds(parts: Iterable[ScoredTouches]) -> tuple[float, float]:
+    """Return scale and offset from cosine to log-odds of a match, with equally many true and false pairs."""
+    cosines, labels = [], []
+    for part in parts:
+        same = part.touch_owner[:, None] == part.photo_owner
+        rng = np.random.default_rng(0)
+        pairs = [rng.permutation(np.flatnonzero(mask.ravel())) for mask in (same & ~part.own, ~same)]
+        count = min(len(pairs[0]), len(pairs[1]), 20_000)
+        cosines += [part.logits.ravel()[drawn[:count]] for drawn in pairs]
+        labels += [np.ones(count), np.zeros(count)]
+    found = fit_calibration(np.concatenate(cosines), np.concatenate(labels))
+    return found.slope, found.intercept
+
+
+@torch.no_grad()
+def install_projections(matcher: Matcher, projections: CcaProjections, scale: float, offset: float) -> None:
+    """Make the match logit `scale * cosine + offset` of the projected features; the layers of the head contribute 0."""
+    for layer, found in ((matcher.touch_projection, projections.touch), (matcher.photo_projection, projections.photo)):
+        assert isinstance(layer, nn.Linear)  # the configuration of `adapt` has no hidden layer
+        used = found.weight.shape[1]  # shorter encodings leave zeros, which do not change the cosine
+        layer.weight.zero_()
+        layer.bias.zero_()
+        layer.weight[:used] = torch.from_numpy(found.weight.T.astype(np.float32))
+        layer.bias[:used] = torch.from_numpy(found.bias.astype(np.float32))
+    for parameter in matcher.head.parameters():
+        parameter.zero_()
+    matcher.head.out.bias.fill_(offset)
+    assert matcher.cosine_scale is not None
+    matcher.cosine_scale.fill_(scale)
+
+
+def _calibrated_fit(checkpoint: Checkpoint, data: AdaptationData, estimate: Estimate | None, quiet: bool) -> Checkpoint:
+    """Add the gel check and the calibrations to a fitted checkpoint.
+
+    The calibrations are fitted on the touches of held-out objects (half of each kind at a time), because the
+    projections are overfitted to the fitted objects; without an estimate there are none.
+    """
+    checkpoint = _with_gel_check(checkpoint, data.grasps, data.features, quiet)
+    if estimate is None:
+        return checkpoint
+    assert checkpoint.matcher.cosine_scale is not None
+    scale, offset = checkpoint.matcher.cosine_scale.item(), checkpoint.matcher.head.out.bias.item()
+    left_out = [
+        dataclasses.replace(part, scored=dataclasses.replace(part.scored, logits=scale * part.scored.logits + offset))
+        for part in estimate.choice.held_out_touches
+    ]
+    posterior, references = fit_calibrations(left_out)
+    verification = fit_verification(left_out, posterior)
+    return dataclasses.replace(checkpoint, posterior=posterior, references=references, verification=verification)
+
+
+def _calibrated_baseline(start: Checkpoint, data: AdaptationData, estimate: Estimate, quiet: bool) -> Checkpoint:
+    """Return the start model with a gel check and calibrations fitted to the recorded objects."""
+    checkpoint = _with_gel_check(start, data.grasps, estimate.baseline.features, quiet)
+    about = {name: data.provenance[name] for name in ("source", "data_digest")}
+    provenance = start.provenance | {
+        "adapted_to": about,
+        LICENCES: data.provenance[LICENCES],
+        "metrics": estimate.to_dict(),
+    }
+    touches = partial(estimate.baseline.touches, max_touches=MAX_CALIBRATION_TOUCHES)
+    posterior, references = fit_calibrations(touches(estimate.folds))
+    # Nothing was fitted to the objects, so a verification compares all of them with each other.
+    verification = fit_verification(touches([data.features.object_ids]), posterior)
+    made = dataclasses.replace(
+        checkpoint, provenance=provenance, posterior=posterior, references=references, verification=verification
+    )
+    if start.config.matcher.cell_dim:
+        posterior, references = fit_calibrations(touches(estimate.folds, pooled=True))
+        made = dataclasses.replace(made, pooled_posterior=posterior, pooled_references=references)
+    return made
+
+
+def _with_gel_check(checkpoint: Checkpoint, grasps: list[Grasp], features: Features, quiet: bool) -> Checkpoint:
+    """Return the checkpoint with a gel check: fitted on half of the objects, with thresholds from the others."""
+    device = default_device()
+    names = sorted({grasp.object_id for grasp in grasps})
+    groups = [[grasp for grasp in grasps if grasp.object_id in names[side::2]] for side in (0, 1)]
+    checkpoint.matcher.to(device)
+    source = FrozenFeatures(checkpoint.config, device, features_by_image(grasps, features, device))
+    return with_gel_check(checkpoint, source, *groups, quiet=quiet)
