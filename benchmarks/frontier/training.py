@@ -10,11 +10,11 @@ from torch import Tensor, nn
 
 from retrieval.data.pairs import PairBatch, PairSampler
 from retrieval.frontier.clock import time_points
-from retrieval.frontier.formats import load_touch
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff
 from retrieval.frontier.sample import Sample
 from retrieval.model.encode import autocast, has_fast_bfloat16, to_batch, touch_batch
 from retrieval.model.fusion import Matcher
+from retrieval.training.batches import BatchImages
 from retrieval.training.train import WeightedLosses, batch_loss, set_training_mode
 
 TOLERANCE = 0.1
@@ -51,9 +51,10 @@ class _Step:
 
     def __init__(self, sample: Sample, touches: int, number: int) -> None:
         config = sample.checkpoint.config
+        images = BatchImages(config)
         self.settings = dataclasses.replace(config.training, freeze_towers=False)
         self.batch: PairBatch = PairSampler(sample.grasps, seed=sample.seed, share_photos=True).batch(number, touches)
-        self.touches = touch_batch([load_touch(config.preprocessing, grasp) for grasp in self.batch.grasps])
+        self.touches = touch_batch([images.touch(grasp) for grasp in self.batch.grasps])
         self.photos = to_batch([config.preprocessing.load_photo(path) for path in self.batch.photos])
 
     def __call__(self, matcher: Matcher, precision: str) -> Tensor:

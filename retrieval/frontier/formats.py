@@ -13,22 +13,21 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from retrieval.data.dataset import Grasp
-from retrieval.data.preprocessing import Preprocessing
 from retrieval.frontier.clock import time_points
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff
 from retrieval.frontier.sample import Array, Sample
 from retrieval.model.checkpoint import Checkpoint
-from retrieval.model.encode import batches, for_inference, has_fast_bfloat16, touch_batch
+from retrieval.model.encode import for_inference, has_fast_bfloat16, touch_batch
 from retrieval.model.export import touch_encoder_to_onnx
 from retrieval.model.fusion import Matcher
 from retrieval.model.onnx_encoder import OnnxEncoder
+from retrieval.training.batches import BatchImages
 
 LOGIT_TOLERANCE = 0.05
 """Largest negligible error of a match logit: the probability changes by about one percentage point at most."""
 MAX_TOUCHES = 20
 """Number of touches that each tower format encodes: emulated bfloat16 is slow on processors without it."""
-_BATCH = 16
+Encode = Callable[[list[Any]], Array]
 
 # Towers ----------------------------------------------------------------------------------------------------
 
@@ -36,17 +35,13 @@ _BATCH = 16
 def towers(sample: Sample) -> ApproximationResult:
     """Measure formats of the touch tower: errors of match logits against float64, and the time of one touch."""
     rows = sample.touch_rows[: min(MAX_TOUCHES, sample.scale.queries)]
-    settings = sample.checkpoint.config.preprocessing
-    images = [load_touch(settings, sample.grasps[row]) for row in rows]
-    photos = sample.real_photo_codes["partial"]
-
-    def logits(encode: Encode) -> Array:
-        return _logits(sample, np.concatenate([encode(part) for part in batches(images, _BATCH)]), photos)
-
-    exact = logits(partial(_touch_partials, copy.deepcopy(sample.checkpoint.matcher).double()))
+    loader, photos = BatchImages(sample.checkpoint.config), sample.real_photo_codes["partial"]
+    images = [loader.touch(sample.grasps[row]) for row in rows]
+    exact = _logits(sample, _touch_partials(copy.deepcopy(sample.checkpoint.matcher).double(), images), photos)
     points, works = list[Tradeoff](), list[Callable[[], object]]()
     for name, encode, is_default in encoders(sample.checkpoint):
-        points.append(Tradeoff(name, "", _largest_error(logits(encode), exact), is_default=is_default))
+        error = _largest_error(_logits(sample, encode(images), photos), exact)
+        points.append(Tradeoff(name, "", error, is_default=is_default))
         works.append(partial(encode, images[:1]))
     return ApproximationResult(
         "Number format of the towers",
@@ -69,16 +64,6 @@ def _panel(
 ) -> Panel:
     timed = time_points(points, works, sample.scale.repeats)
     return Panel("largest error of a match logit", time, "nats", reference, LOGIT_TOLERANCE, timed)
-
-
-def load_touch(settings: Preprocessing, grasp: Grasp) -> list[Array]:
-    """Return the preprocessed images of one touch, one per finger."""
-    without = settings.background == "none"
-    references = [None] * len(grasp.touches) if without else grasp.backgrounds
-    return [settings.load_touch(*pair) for pair in zip(grasp.touches, references, strict=True)]
-
-
-Encode = Callable[[list[Any]], Array]
 
 
 def encoders(checkpoint: Checkpoint) -> Iterator[tuple[str, Encode, bool]]:

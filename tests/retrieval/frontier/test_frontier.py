@@ -13,7 +13,7 @@ from retrieval.errors import ConfigError, DatasetError
 from retrieval.frontier import APPROXIMATIONS
 from retrieval.frontier.candidates import default_k, ranks
 from retrieval.frontier.clock import time_points
-from retrieval.frontier.formats import FORMATS, encoders, load_touch
+from retrieval.frontier.formats import FORMATS, encoders
 from retrieval.frontier.measure import measure_frontier
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, format_duration, miss_rate_point
 from retrieval.frontier.sample import Sample, Scale
@@ -21,6 +21,7 @@ from retrieval.indexing.candidates import measure_candidates
 from retrieval.metrics.intervals import binomial_interval
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import encode_touches
+from retrieval.training.batches import BatchImages
 from tests import synthetic
 
 TINY = Scale(photos=700, queries=6, repeats=1, quick=True)
@@ -157,8 +158,8 @@ def candidate_sample(sample):
 
 
 def test_touches_are_encoded_by_the_default_of_the_towers(sample):
-    settings, matcher = sample.checkpoint.config.preprocessing, sample.checkpoint.matcher
-    images = [load_touch(settings, sample.grasps[sample.touch_rows[0]])]
+    matcher = sample.checkpoint.matcher
+    images = [BatchImages(sample.checkpoint.config).touch(sample.grasps[sample.touch_rows[0]])]
     default = next(encode for _, encode, is_default in encoders(sample.checkpoint) if is_default)
     assert np.array_equal(default(images), encode_touches(matcher, images).partial.numpy())
 
