@@ -17,10 +17,10 @@ read_gel_image = decoders.read_gel_image
 def die_of_large():
     """Kill the process at a large picture, as the system would."""
 
-    def read(data, name, px, compares_contact, max_pixels):
+    def read(data, name, px, max_pixels):
         if max_pixels == MAX_PIXELS:
             os.kill(os.getpid(), signal.SIGKILL)
-        return read_gel_image(data, name, px, compares_contact, max_pixels)
+        return read_gel_image(data, name, px, max_pixels)
 
     decoders.read_gel_image = read
     decoders.serve_pictures()
@@ -29,11 +29,11 @@ def die_of_large():
 def hang_on_large():
     """Hang at a large picture; its name is a file for the process id."""
 
-    def read(data, name, px, compares_contact, max_pixels):
+    def read(data, name, px, max_pixels):
         if max_pixels == MAX_PIXELS:
             Path(name).write_text(str(os.getpid()))
             time.sleep(600)
-        return read_gel_image(data, name, px, compares_contact, max_pixels)
+        return read_gel_image(data, name, px, max_pixels)
 
     decoders.read_gel_image = read
     decoders.serve_pictures()

@@ -65,7 +65,8 @@ class GelCheck:
 def contact_level(touch: RgbImage, no_contact: RgbImage) -> float:
     """Return the largest difference of a gel image from its no-contact frame, in grey levels of 255.
 
-    Both images are (H, W, 3) in 0..1. They are compared in 16 x 16 blocks, whose means suppress pixel noise.
+    Both images are (H, W, 3) in 0..1, in any resolution. They are compared in 16 x 16 blocks, whose means suppress
+    pixel noise.
     """
     size = (BLOCKS, BLOCKS)
     return 255 * float(np.abs(resize(touch, size) - resize(no_contact, size)).max())

@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from retrieval.data.resize import RgbImage
+from retrieval.data.resize import RgbImage, resize
 from retrieval.errors import BadInput, IncompleteSearch, NumericalError
 from retrieval.model.config import Config
 from retrieval.model.fork_guard import fork_guard
 from retrieval.model.gel_check import contact_level
-from retrieval.model.gel_images import GelImage
-from retrieval.model.touches import AnyImage, InputImage, parse_grasps
+from retrieval.model.touches import AnyImage, GelImage, InputImage, parse_grasps, read_image
 
 BATCH = 32
 """Largest number of grasps whose images are in memory, and in the encoder, at once."""
@@ -107,8 +106,8 @@ class TouchReader:
         self.encoder, self.fingers, self._preprocessing = encoder, config.matcher.fingers, config.preprocessing
         self.takes_background = compares_contact or self._preprocessing.background != "none"
 
-    def no_contact_frames(self, background: Sequence[AnyImage] | None) -> Sequence[GelImage | None]:
-        """Return the no-contact frame of each finger, None for a model that uses none.
+    def no_contact_frames(self, background: Sequence[AnyImage] | None) -> Sequence[RgbImage | None]:
+        """Return the no-contact frame (px, px, 3) of each finger, None for a model that uses none.
 
         Raises BadInput if the frames are missing, or given to a model that would ignore them.
         """
@@ -125,10 +124,10 @@ class TouchReader:
         frames = parse_grasps(background, self.fingers, noun="background")
         if len(frames) != 1:
             raise BadInput(f"give one background, with a no-contact frame for each finger; got {len(frames)}")
-        return [self._gel_image(frame, True) for frame in frames[0]]
+        return [self._resized(frame) for frame in frames[0]]
 
     def encode(
-        self, grasps: Sequence[Sequence[InputImage]], no_contact_frames: Sequence[GelImage | None], clock: Stopwatch
+        self, grasps: Sequence[Sequence[InputImage]], no_contact_frames: Sequence[RgbImage | None], clock: Stopwatch
     ) -> TouchEncodings:
         """Encode grasps in batches.
 
@@ -154,27 +153,24 @@ class TouchReader:
         )
 
     def _preprocessed(
-        self, grasps: Sequence[Sequence[InputImage]], no_contact_frames: Sequence[GelImage | None]
+        self, grasps: Sequence[Sequence[InputImage]], no_contact_frames: Sequence[RgbImage | None]
     ) -> list[list[tuple[RgbImage, float]]]:
         """Return the preprocessed images of grasps, each with its difference from its no-contact frame (0 without one).
 
         The images are decoded in parallel. Of several bad ones, the first is reported. The threads end with the call,
         because a forked process would not have them.
         """
-        subtracts = self._preprocessing.background != "none"
         for source in (source for grasp in grasps for source in grasp):
             # A Pillow image reads its file on the first access to its pixels, which two threads must not do at once.
             if isinstance(source.image, Image.Image):
                 with suppress(Exception):  # `read` reports it
                     source.image.load()
 
-        def view(source: InputImage, reference: GelImage | None) -> tuple[RgbImage, float]:
+        def view(source: InputImage, reference: RgbImage | None) -> tuple[RgbImage, float]:
             with fork_guard.computing():
-                image = self._gel_image(source, reference is not None)
-                if reference is None:
-                    return self._preprocessing.touch(image.touch), 0.0
-                level = contact_level(_blocks(image), _blocks(reference))
-                return self._preprocessing.touch(image.touch, reference.touch if subtracts else None), level
+                image = self._resized(source)
+                level = 0.0 if reference is None else contact_level(image, reference)
+                return self._preprocessing.touch(image, reference), level
 
         with ThreadPoolExecutor(DECODERS, "decode") as threads:
             jobs = [
@@ -183,20 +179,14 @@ class TouchReader:
             ]
             return [[job.result() for job in grasp] for grasp in jobs]
 
-    def _gel_image(self, source: InputImage, compares_contact: bool) -> GelImage:
-        """Return an image at this model's sizes. Raises ImageError; IncompleteSearch if read for another model."""
+    def _resized(self, source: InputImage) -> RgbImage:
+        """Return an image (px, px, 3) in 0..1. Raises ImageError; IncompleteSearch if it was read for another model."""
         px = self._preprocessing.touch_px
         if not isinstance(source.image, GelImage):
-            return GelImage.of(source.read(), px, compares_contact)
+            return resize(read_image(source.image, source.name), (px, px))
         if source.image.touch.shape != (px, px, 3):
             raise IncompleteSearch("an index of another model was opened in the meantime; repeat the query")
-        return source.image
-
-
-def _blocks(image: GelImage) -> RgbImage:
-    if image.blocks is None:
-        raise BadInput("a gel image was read without the blocks for the comparison with a no-contact frame")
-    return image.blocks
+        return source.image.touch
 
 
 def _finite(values: Floats, name: str) -> Floats:

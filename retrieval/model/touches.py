@@ -20,7 +20,20 @@ from PIL import Image
 from retrieval.data.images import check_pixels, decode_rgb, pillow_rgb, read_rgb, to_float
 from retrieval.data.resize import RgbImage
 from retrieval.errors import BadInput, ImageError
-from retrieval.model.gel_images import GelImage
+
+
+@dataclass(frozen=True, eq=False)
+class GelImage:
+    """A gel image that another process read and resized.
+
+    Attributes:
+        touch: (px, px, 3) float32 RGB in 0..1 for a model whose `touch_px` is px.
+        file_bytes: Size of its file, for answers.
+    """
+
+    touch: RgbImage
+    file_bytes: int
+
 
 AnyImage: TypeAlias = str | os.PathLike[str] | bytes | bytearray | memoryview | Image.Image | NDArray[Any] | GelImage
 """A path (as text or `PathLike`), the bytes of a file, a Pillow image, an array (H, W, 3) uint8 in RGB order, or a gel
@@ -44,13 +57,9 @@ class InputImage:
     image: AnyImage
     name: str
 
-    def read(self) -> RgbImage:
-        """Return (H, W, 3) float32 RGB in 0..1, the same for all forms of a picture. Raises ImageError."""
-        return read_image(self.image, self.name)
-
 
 def read_image(image: AnyImage, name: str) -> RgbImage:
-    """Return an image of any form as (H, W, 3) float32 RGB in 0..1.
+    """Return an image of any form as (H, W, 3) float32 RGB in 0..1, the same for all forms of a picture.
 
     Args:
         image: The image. Arrays must be uint8: the range of other types would have to be guessed.

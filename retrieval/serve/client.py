@@ -13,8 +13,7 @@ from PIL import Image
 
 from retrieval.data.images import encode_image, read_bytes
 from retrieval.errors import BadInput, ImageError, RetrievalError
-from retrieval.model.gel_images import GelImage
-from retrieval.model.touches import AnyImage, AnyTouches, InputImage, parse_grasps
+from retrieval.model.touches import AnyImage, AnyTouches, GelImage, InputImage, parse_grasps, read_image
 from retrieval.search.answer import Match, QueryResult
 
 try:
@@ -187,6 +186,6 @@ def _file(source: InputImage) -> bytes:
     if isinstance(image, bytes | bytearray | memoryview):
         return bytes(image)
     if isinstance(image, Image.Image | np.ndarray):
-        return encode_image(np.rint(255 * source.read()).astype(np.uint8))
+        return encode_image(np.rint(255 * read_image(source.image, source.name)).astype(np.uint8))
     assert not isinstance(image, GelImage), "only the service reads gel images in advance"
     return read_bytes(os.fspath(image))

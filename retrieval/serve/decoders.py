@@ -20,14 +20,14 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from retrieval.data.images import MAX_PIXELS
+from retrieval.data.images import MAX_PIXELS, check_pixels, decode, picture_size
+from retrieval.data.resize import resize_unchecked
 from retrieval.errors import ImageError, RetrievalError
-from retrieval.model.gel_check import BLOCKS
-from retrieval.model.gel_images import GelImage, PictureSize, read_gel_image
+from retrieval.model.touches import GelImage
 from retrieval.serve.settings import MAX_BODY_PIXELS
 
 PROGRAM = "from retrieval.serve.decoders import serve_pictures; serve_pictures()"
@@ -41,6 +41,18 @@ DECODE_BYTES = 200_000_000
 """Maximum memory for one picture. PNG, JPEG, BMP and TIFF pictures of maximum size need less, some formats more."""
 _LENGTHS = struct.Struct(">II")
 READY: dict[str, Any] = {"ready": True}
+
+
+class PictureSize(NamedTuple):
+    """Size in pixels of a picture, read from its file without decoding it."""
+
+    width: int
+    height: int
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels of the picture."""
+        return self.width * self.height
 
 
 class Decoders:
@@ -64,7 +76,7 @@ class Decoders:
         idle, self._idle = self._idle, []
         await asyncio.gather(*self._ending, *(process.end() for process in idle))
 
-    async def read(self, named_files: Sequence[tuple[str, bytes]], px: int, compares_contact: bool) -> list[GelImage]:
+    async def read(self, named_files: Sequence[tuple[str, bytes]], px: int) -> list[GelImage]:
         """Decode pictures to the input size of the model.
 
         Large pictures are decoded only after the sizes of all pictures are known.
@@ -72,7 +84,6 @@ class Decoders:
         Args:
             named_files: Name (for messages) and file content of each picture.
             px: `touch_px` of the model.
-            compares_contact: Whether the contact check needs the block means of the pictures.
 
         Returns:
             The gel images, in the order of `named_files`.
@@ -84,7 +95,7 @@ class Decoders:
 
         async def read_small(name: str, data: bytes) -> GelImage | PictureSize:
             async with self._small:
-                return await self._run(name, data, px, compares_contact, SMALL_PIXELS)
+                return await self._run(name, data, px, SMALL_PIXELS)
 
         found = await asyncio.gather(*(read_small(*one) for one in named_files), return_exceptions=True)
         for (name, _), one in zip(named_files, found, strict=True):
@@ -107,23 +118,19 @@ class Decoders:
         for (name, data), one in zip(named_files, first, strict=True):
             if isinstance(one, PictureSize):
                 async with self._large:
-                    one = await self._run(name, data, px, compares_contact, MAX_PIXELS)
+                    one = await self._run(name, data, px, MAX_PIXELS)
             assert isinstance(one, GelImage), "the picture has at most MAX_PIXELS"
             images.append(one)
         return images
 
-    async def _run(
-        self, name: str, data: bytes, px: int, compares_contact: bool, max_pixels: int
-    ) -> GelImage | PictureSize:
+    async def _run(self, name: str, data: bytes, px: int, max_pixels: int) -> GelImage | PictureSize:
         """Decode a picture in a process; cancelling ends the process.
 
         Raises ImageError if the picture cannot be decoded, RetrievalError if no process can be started.
         """
         process = self._idle.pop() if self._idle else await _Process.start()
         try:
-            document, content = await process.request(
-                {"name": name, "px": px, "compares_contact": compares_contact, "max_pixels": max_pixels}, data
-            )
+            document, content = await process.request({"name": name, "px": px, "max_pixels": max_pixels}, data)
             self._idle.append(process)
             return image_of(document, content)
         except (EOFError, ConnectionError, MemoryError):
@@ -229,12 +236,22 @@ def image_of(document: dict[str, Any], content: bytes) -> GelImage | PictureSize
         case {"error": str(reason), "name": str(name)}:
             raise ImageError(name, reason)
         case {"px": int(px), "file_bytes": int(file_bytes)}:
-            numbers = np.frombuffer(content, np.float32)
-            touch, blocks = np.split(numbers, [px * px * 3])
-            shape = (BLOCKS, BLOCKS, 3)
-            return GelImage(file_bytes, touch.reshape(px, px, 3), blocks.reshape(shape) if len(blocks) else None)
+            return GelImage(np.frombuffer(content, np.float32).reshape(px, px, 3), file_bytes)
         case _:
             raise MemoryError
+
+
+def read_gel_image(data: bytes, name: str, px: int, max_pixels: int) -> GelImage | PictureSize:
+    """Decode and resize a picture, or return only its size if it has more than `max_pixels` pixels.
+
+    Raises:
+        ImageError: The file is not a readable picture.
+    """
+    size = PictureSize(*picture_size(data, name))
+    if size.pixels > max_pixels:
+        return size
+    check_pixels(size, name)
+    return GelImage(resize_unchecked(decode(data, name), (px, px)), len(data))
 
 
 def _answer(requests: BinaryIO, text: int, content: int) -> bytes:
@@ -253,9 +270,7 @@ def _answer(requests: BinaryIO, text: int, content: int) -> bytes:
         return frame({"memory": DECODE_BYTES})
     if isinstance(found, PictureSize):
         return frame({"size": found})
-    arrays = [found.touch] if found.blocks is None else [found.touch, found.blocks]
-    contents = [np.ascontiguousarray(image, np.float32).tobytes() for image in arrays]
-    return frame({"px": len(found.touch), "file_bytes": found.file_bytes}, *contents)
+    return frame({"px": len(found.touch), "file_bytes": found.file_bytes}, found.touch.tobytes())
 
 
 def _one_thread() -> None:

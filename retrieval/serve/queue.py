@@ -85,7 +85,7 @@ class Queue:
         """Decode the pictures, then wait for the model; cancelling stops both."""
         if pictures is not None:
             px = self._generations.current.searcher.checkpoint.config.preprocessing.touch_px
-            images = await self._decoders.read(pictures.named_files(), px, pictures.background is not None)
+            images = await self._decoders.read(pictures.named_files(), px)
             pictures.set_images(iter(images))
 
         def run() -> Result:

@@ -17,8 +17,8 @@ from starlette.datastructures import Headers
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from retrieval.model.gel_images import GelImage
 from retrieval.model.posterior import NONE_PRIOR
+from retrieval.model.touches import GelImage
 from retrieval.serve.errors import HttpProblem, validation_message
 from retrieval.serve.settings import MAX_BODY_BYTES, MAX_PICTURES, MAX_SMALL_BODY_BYTES
 

@@ -49,23 +49,21 @@ async def running_decoders():
         await decoders.close()
 
 
-def read(*named_files, compares_contact=False, timeout=120):
+def read(*named_files, timeout=120):
     async def run():
         async with asyncio.timeout(timeout):
             async with running_decoders() as pool:
-                return await pool.read(named_files, 32, compares_contact)
+                return await pool.read(named_files, 32)
 
     return asyncio.run(run())
 
 
 def test_images_are_decoded_in_order_as_in_this_process():
     grey = saved(np.full((20, 40), 7, np.uint8))
-    found = read(("a", LARGE), ("b", SMALL), ("c", grey), compares_contact=True)
+    found = read(("a", LARGE), ("b", SMALL), ("c", grey))
     for image, data in zip(found, (LARGE, SMALL, grey), strict=True):
         assert np.array_equal(image.touch, resize_unchecked(decode(data, "x"), (32, 32)))
-        assert np.array_equal(image.blocks, resize_unchecked(decode(data, "x"), (16, 16)))
         assert image.file_bytes == len(data)
-    assert read(("b", SMALL))[0].blocks is None
 
 
 def test_the_first_bad_picture_is_reported():
@@ -85,8 +83,8 @@ def test_a_crashed_process_is_reported_for_its_picture_and_replaced(monkeypatch)
         async with running_decoders() as pool:
             for _ in range(2):
                 with pytest.raises(ImageError, match="b: decoding needs more than 5 s of CPU time or 200 MB"):
-                    await pool.read([("a", SMALL), ("b", LARGE)], 32, False)
-            return await pool.read([("a", SMALL)], 32, False)
+                    await pool.read([("a", SMALL), ("b", LARGE)], 32)
+            return await pool.read([("a", SMALL)], 32)
 
     assert asyncio.run(run())[0].file_bytes == len(SMALL)
 
@@ -97,11 +95,11 @@ def test_a_large_picture_does_not_delay_small_ones_and_its_process_ends_on_cance
     async def run():
         names = [str(tmp_path / "first"), str(tmp_path / "second")]
         async with running_decoders() as pool:
-            hanging = [asyncio.ensure_future(pool.read([(name, LARGE)], 32, False)) for name in names]
+            hanging = [asyncio.ensure_future(pool.read([(name, LARGE)], 32)) for name in names]
             async with asyncio.timeout(60):
                 while not (found := list(tmp_path.iterdir())) or not found[0].read_text():
                     await asyncio.sleep(0.01)
-            assert len(await pool.read([("a", SMALL)] * 10, 32, False)) == 10
+            assert len(await pool.read([("a", SMALL)] * 10, 32)) == 10
             (file,) = tmp_path.iterdir()  # large ones are decoded one at a time
             process = int(file.read_text())
             assert is_running(process)
@@ -111,7 +109,7 @@ def test_a_large_picture_does_not_delay_small_ones_and_its_process_ends_on_cance
             assert all(one.cancelled() for one in hanging)
             await asyncio.gather(*pool._ending)
             assert not is_running(process)
-            assert len(await pool.read([("a", SMALL)] * 2, 32, False)) == 2
+            assert len(await pool.read([("a", SMALL)] * 2, 32)) == 2
 
     asyncio.run(run())
 
@@ -146,7 +144,7 @@ decoders.serve_pictures()
 )
 def test_a_process_ends_beyond_its_cpu_limit_and_refuses_pictures_beyond_its_memory_limit(seconds, size, output):
     line = [sys.executable, "-c", LIMITS, str(seconds), str(size)]
-    request = frame({"name": "x", "px": 32, "compares_contact": False, "max_pixels": MAX_PIXELS}, LARGE)
+    request = frame({"name": "x", "px": 32, "max_pixels": MAX_PIXELS}, LARGE)
     done = subprocess.run(line, input=request * (1 if output else 200), capture_output=True, check=False, timeout=300)
     if output is None:
         assert done.returncode == -signal.SIGXCPU
