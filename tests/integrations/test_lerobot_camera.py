@@ -74,7 +74,7 @@ def test_the_default_size_and_rate_are_those_of_the_driver(make, sensor, size):
     driver = DRIVERS["sensors"].resolve(sensor)
     with driver(finger="a", device=camera.config.device, **QUICK) as gel:
         assert gel.read(10).pixels.shape == (camera.height, camera.width, 3)
-    assert camera.fps == driver.PRESET.fps
+    assert camera.fps == driver.PRESET["fps"]
     with camera:
         assert camera.read().shape == (camera.height, camera.width, 3)
 

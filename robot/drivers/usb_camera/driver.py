@@ -6,7 +6,8 @@ images of equal presses.
 """
 
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 import cv2
@@ -15,18 +16,13 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from robot.devices import Camera, Clock, Device, TactileSensor
-from robot.drivers.usb_camera.stream import (
-    CaptureSettings,
-    CaptureStream,
-    FrameReader,
-    UsbCameraSettings,
-    stable_path,
-)
+from robot.drivers.usb_camera.stream import CaptureStream, FrameReader, UsbCameraSettings, stable_path
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import RGBD, Frame
 
 Picture = npt.NDArray[np.uint8]
-_MAX_PX = 20_000
+_Fraction = Annotated[float, Meta(ge=0, lt=1)]
+_Size = Annotated[int, Meta(ge=1, le=20_000)]
 
 
 class UsbDevice(Device):
@@ -79,53 +75,35 @@ class GelCameraSettings(UsbCameraSettings):
         output_px: Width and height of the result; left out: the size of the remaining picture.
     """
 
-    crop: tuple[float, ...] = ()
-    output_px: tuple[int, ...] = ()
+    crop: tuple[_Fraction, _Fraction, _Fraction, _Fraction] = (0.0, 0.0, 0.0, 0.0)
+    output_px: tuple[_Size, _Size] | None = None
 
     def __post_init__(self) -> None:
         """Raise RobotConfigError for a setting out of range."""
         super().__post_init__()
-        crop, size = self.crop, self.output_px
-        left, top, right, bottom = crop if len(crop) == 4 else (0.0,) * 4
-        is_valid = len(crop) in (0, 4) and all(0 <= each < 1 for each in crop)
-        if not is_valid or left + right >= 1 or top + bottom >= 1:
-            raise RobotConfigError(
-                f"crop must be fractions at left, top, right and bottom that leave a part of the picture, got {crop}"
-            )
-        if size and (len(size) != 2 or not all(1 <= each <= _MAX_PX for each in size)):
-            raise RobotConfigError(f"output_px must be width and height, 1 to {_MAX_PX} pixels, got {size}")
+        left, top, right, bottom = self.crop
+        if left + right >= 1 or top + bottom >= 1:
+            raise RobotConfigError(f"crop must leave a part of the picture, got {self.crop}")
 
 
 class OpencvTactile(UsbDevice, TactileSensor):
     """The gel behind a USB camera; the fields of GelCameraSettings are keyword arguments of the constructor.
 
     Attributes:
-        PRESET: Default width, height, fps, fourcc and led of a kind of sensor; its other fields have no effect.
-        CROP: Default crop: fractions of width and height to remove at left, top, right and bottom.
+        PRESET: Settings of a kind of sensor, where the rig's file has none.
         QUARTER_TURNS: Rotation of the picture, in quarter turns counterclockwise.
     """
 
     Settings = GelCameraSettings
-    PRESET: ClassVar[CaptureSettings] = CaptureSettings()
-    CROP: ClassVar[tuple[float, ...]] = ()
+    PRESET: ClassVar[Mapping[str, Any]] = {}
     QUARTER_TURNS: ClassVar[int] = 0
     _options: GelCameraSettings
 
     def __init__(self, *, finger: str, clock: Clock = time.monotonic, **settings: Any) -> None:
         """Check the settings without using the device; raise RobotConfigError if invalid."""
         super().__init__(f"gel {finger}", finger, clock=clock)
-        options, preset = GelCameraSettings(**settings), self.PRESET
-        size = options if options.width or options.height else preset
-        self._options = replace(
-            options,
-            width=size.width,
-            height=size.height,
-            fps=options.fps or preset.fps,
-            fourcc=options.fourcc or preset.fourcc,
-            led=options.led or preset.led,
-            crop=options.crop or self.CROP,
-        )
-        self._path = stable_path(options.device, options.allow_index)
+        self._options = GelCameraSettings(**{**self.PRESET, **settings})
+        self._path = stable_path(self._options.device, self._options.allow_index)
         self._picture_px: list[int] = []
 
     def read_after(self, time_s: float, timeout_s: float) -> Frame:
@@ -159,7 +137,7 @@ class OpencvTactile(UsbDevice, TactileSensor):
 class GelSight(OpencvTactile):
     """The paper's GelSight, with the picture size, rate and format of the authors' usb_cam settings."""
 
-    PRESET = CaptureSettings(width=1280, height=960, fps=30.0, fourcc="MJPG")
+    PRESET: ClassVar = {"width": 1280, "height": 960, "fps": 30.0, "fourcc": "MJPG"}
 
 
 class GelSightMini(OpencvTactile):
@@ -168,8 +146,7 @@ class GelSightMini(OpencvTactile):
     The camera's full 3280 x 2464 pixels at 25 frames/s would occupy one CPU core.
     """
 
-    PRESET = CaptureSettings(width=320, height=240, fps=25.0)
-    CROP = (0.15, 0.15, 0.15, 0.15)
+    PRESET: ClassVar = {"width": 320, "height": 240, "fps": 25.0, "crop": (0.15, 0.15, 0.15, 0.15)}
 
 
 class Digit(OpencvTactile):
@@ -178,18 +155,20 @@ class Digit(OpencvTactile):
     The vendor's software transposes and flips its picture, which is a quarter turn counterclockwise.
     """
 
-    PRESET = CaptureSettings(width=320, height=240, fps=60.0, led=(15, 15, 15))
+    PRESET: ClassVar = {"width": 320, "height": 240, "fps": 60.0, "led": (15, 15, 15)}
     QUARTER_TURNS = 1
 
 
-def crop_and_resize(picture: Picture, crop: tuple[float, ...], output_px: tuple[int, ...]) -> Picture:
+def crop_and_resize(
+    picture: Picture, crop: tuple[float, float, float, float], output_px: tuple[int, int] | None
+) -> Picture:
     """Crop a picture (H, W, 3) and resize it, by area means to shrink (without aliasing of the gel's markers)."""
     height, width = picture.shape[:2]
-    left, top, right, bottom = crop or (0.0,) * 4
+    left, top, right, bottom = crop
     x, y = min(round(left * width), width - 1), min(round(top * height), height - 1)
     part = picture[y : max(y + 1, height - round(bottom * height)), x : max(x + 1, width - round(right * width))]
     part = np.ascontiguousarray(part)
-    if not output_px:
+    if output_px is None:
         return part
     shrinks = output_px[0] <= part.shape[1] and output_px[1] <= part.shape[0]
     method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR

@@ -51,15 +51,17 @@ _DAMAGED_IN_A_ROW = 10
 _STAMP_S = (-0.05, 1.0)
 """Accepted ages of a picture's own time stamp in s; a stamp outside this range is on another clock."""
 
+_Level = Annotated[int, Meta(ge=0, le=15)]
 _NUMBERED = re.compile(r"/dev/video\d+")
-_ZERO_ALLOWED = ("exposure_ms", "white_balance_k", "gain")
 
 
 @dataclass(frozen=True, kw_only=True)
-class CaptureSettings(TypedSettings):
-    """Requested settings of a camera; a setting with 0, "", () or None is not changed.
+class UsbCameraSettings(TypedSettings):
+    """Settings of a USB camera; what is None is not changed.
 
     Attributes:
+        device: Path in /dev/v4l/by-id, or in by-path (the socket).
+        allow_index: Whether `device` may be a number or a path such as /dev/video0.
         width: Width in pixels.
         height: Height in pixels.
         fps: Frames/s.
@@ -70,74 +72,41 @@ class CaptureSettings(TypedSettings):
         white_balance_k: Colour temperature, if not automatic.
         gain: Gain in the camera's own unit.
         led: Red, green and blue of a DIGIT, each 0 to 15.
-    """
-
-    width: Annotated[int, Meta(ge=0, le=20_000)] = 0
-    height: Annotated[int, Meta(ge=0, le=20_000)] = 0
-    fps: Annotated[float, Meta(ge=0, le=1000)] = 0.0
-    fourcc: str = ""
-    auto_exposure: bool = False
-    exposure_ms: NonNegative | None = None
-    auto_white_balance: bool = False
-    white_balance_k: NonNegative | None = None
-    gain: NonNegative | None = None
-    led: tuple[Annotated[int, Meta(ge=0, le=15)], ...] = ()
-
-    def __post_init__(self) -> None:
-        """Raise RobotConfigError for a setting out of range."""
-        super().__post_init__()
-        size, text, led = (self.width, self.height), self.fourcc, self.led
-        is_size = size == (0, 0) or min(size) > 0
-        _require("width and height must be given together", size, is_size)
-        _require('fourcc must be four letters, such as "MJPG"', text, not text or bool(re.fullmatch(r"[ -~]{4}", text)))
-        for name, automatic in (("exposure_ms", self.auto_exposure), ("white_balance_k", self.auto_white_balance)):
-            value = getattr(self, name)
-            _require(f"{name} must be left out if it is automatic", value, not automatic or value is None)
-        _require("led must be three numbers, 0 to 15", led, len(led) in (0, 3))
-
-    def requested(self) -> dict[str, Any]:
-        """Return the settings to write, in order of writing."""
-        values = {name: getattr(self, name) for name in _PROPERTIES}
-        return {
-            name: value
-            for name, value in values.items()
-            if value is not None and (value or isinstance(value, bool) or name in _ZERO_ALLOWED)
-        }
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReaderSettings(TypedSettings):
-    """Settings of a frame reader.
-
-    Attributes:
         keep: Number of buffered frames.
         warmup_s: Time after opening in which frames are dropped (automatic exposure, first black frames).
         timeout_s: Longest wait for a frame.
         frozen_s: Duration of equal frames after which the stream is opened again; they are stale long before.
     """
 
+    device: str
+    allow_index: bool = False
+    width: Annotated[int, Meta(ge=1, le=20_000)] | None = None
+    height: Annotated[int, Meta(ge=1, le=20_000)] | None = None
+    fps: Annotated[float, Meta(gt=0, le=1000)] | None = None
+    fourcc: Annotated[str, Meta(pattern="^[ -~]{4}$")] | None = None
+    auto_exposure: bool = False
+    exposure_ms: NonNegative | None = None
+    auto_white_balance: bool = False
+    white_balance_k: NonNegative | None = None
+    gain: NonNegative | None = None
+    led: tuple[_Level, _Level, _Level] | None = None
     keep: Annotated[int, Meta(ge=1, le=1000)] = 4
     warmup_s: Annotated[float, Meta(ge=0, le=MAX_CAMERA_WAIT_S)] = 1.0
     timeout_s: Annotated[float, Meta(ge=1e-3, le=MAX_CAMERA_WAIT_S)] = 3.0
     frozen_s: Annotated[float, Meta(ge=1e-3, le=MAX_CAMERA_WAIT_S)] = 2.0
 
+    def __post_init__(self) -> None:
+        """Raise RobotConfigError for a setting out of range, or for two that exclude each other."""
+        super().__post_init__()
+        if (self.width is None) != (self.height is None):
+            raise RobotConfigError(f"a camera's width and height must be given together, got {self.width, self.height}")
+        for name, is_automatic in (("exposure_ms", self.auto_exposure), ("white_balance_k", self.auto_white_balance)):
+            if is_automatic and getattr(self, name) is not None:
+                raise RobotConfigError(f"a camera's {name} must be left out if it is automatic")
 
-@dataclass(frozen=True, kw_only=True)
-class UsbCameraSettings(CaptureSettings, ReaderSettings):
-    """Settings of a USB camera.
-
-    Attributes:
-        device: Path in /dev/v4l/by-id, or in by-path (the socket).
-        allow_index: Whether `device` may be a number or a path such as /dev/video0.
-    """
-
-    device: str
-    allow_index: bool = False
-
-
-def _require(requirement: str, got: object, is_met: bool) -> None:
-    if not is_met:
-        raise RobotConfigError(f"a camera's {requirement}, got {got}")
+    def requested(self) -> dict[str, Any]:
+        """Return the settings to write, in order of writing."""
+        return {name: value for name in _PROPERTIES if (value := getattr(self, name)) is not None}
 
 
 @dataclass(frozen=True)
@@ -187,7 +156,7 @@ class CaptureStream:
         refused: Settings that the camera refused, each with the requested and the actual value.
     """
 
-    def __init__(self, device: str, settings: CaptureSettings, clock: Clock) -> None:
+    def __init__(self, device: str, settings: UsbCameraSettings, clock: Clock) -> None:
         """Open and set up the camera at the path `device`; raise DeviceError if this fails."""
         self.device, self.clock = device, clock
         self.refused: dict[str, str] = {}
@@ -224,7 +193,7 @@ class CaptureStream:
         with contextlib.suppress(cv2.error):
             self._capture.release()
 
-    def _write(self, settings: CaptureSettings) -> dict[str, Any]:
+    def _write(self, settings: UsbCameraSettings) -> dict[str, Any]:
         requested = settings.requested()
         for name, value in requested.items():
             self._capture.set(_PROPERTIES[name].number, _PROPERTIES[name].to_camera(value))
@@ -309,8 +278,8 @@ class FrameReader:
     def __init__(
         self,
         name: str,
-        open_stream: Callable[[], "CaptureStream"],
-        settings: ReaderSettings,
+        open_stream: Callable[[], CaptureStream],
+        settings: UsbCameraSettings,
         *,
         clock: Clock = time.monotonic,
         backoff_s: tuple[float, float] = (0.1, 5.0),
@@ -334,25 +303,11 @@ class FrameReader:
         self._wait(self.settings.timeout_s + self.settings.warmup_s)
 
     def newest(self) -> Frame:
-        """Return the newest frame; wait if there is none yet or none since the stream was lost.
-
-        Raises:
-            DeviceError: No frame arrived within `timeout_s`.
-        """
+        """Return the newest frame; wait for it after a loss of the stream, or raise DeviceError after `timeout_s`."""
         return self._wait(self.settings.timeout_s)[-1]
 
-    def after(self, time_s: float, timeout_s: float | None = None) -> Frame:
-        """Wait for a frame newer than `time_s` and return the newest frame.
-
-        Args:
-            time_s: A time on the reader's clock.
-            timeout_s: Longest wait; None for `timeout_s` + `warmup_s` of the settings: a lost stream warms up again.
-
-        Raises:
-            DeviceError: No such frame arrived in this time.
-        """
-        if timeout_s is None:
-            timeout_s = self.settings.timeout_s + self.settings.warmup_s
+    def after(self, time_s: float, timeout_s: float) -> Frame:
+        """Wait at most `timeout_s` for a frame newer than `time_s` and return the newest; else raise DeviceError."""
         return self._wait(timeout_s, time_s)[-1]
 
     def near(self, time_s: float) -> Frame:
@@ -362,7 +317,7 @@ class FrameReader:
     def recover(self) -> None:
         """Open a lost stream without further delay and wait for a frame."""
         self._reopen.set()
-        self.after(self.clock())
+        self.after(self.clock(), self.settings.timeout_s + self.settings.warmup_s)  # it warms up again
 
     def close(self) -> None:
         """Stop the thread, which closes the stream; raise DeviceError if the camera's driver blocks it."""
@@ -377,7 +332,7 @@ class FrameReader:
                 "it closes when the driver returns. If the driver does not return, unplug the camera"
             )
 
-    def _open(self) -> "CaptureStream":
+    def _open(self) -> CaptureStream:
         stream = self._open_stream()
         self._warm_s = self.clock() + self.settings.warmup_s
         return stream
@@ -391,7 +346,7 @@ class FrameReader:
                 )
             return list(self._frames)
 
-    def _run(self, stream: "CaptureStream | None") -> None:
+    def _run(self, stream: CaptureStream | None) -> None:
         shortest, longest = self.backoff_s
         delay = shortest
         while not self._stopped.is_set():

@@ -11,7 +11,7 @@ import pytest
 
 from robot.drivers import discover
 from robot.drivers.usb_camera.driver import Digit, GelSight, GelSightMini, OpencvTactile, crop_and_resize
-from robot.drivers.usb_camera.stream import CaptureSettings, CaptureStream, stable_path
+from robot.drivers.usb_camera.stream import CaptureStream, UsbCameraSettings, stable_path
 from robot.errors import DeviceError, RobotConfigError
 from tests.fake_video import FakeVideoDevice, own_threads
 from tests.waiting import wait_until
@@ -221,10 +221,10 @@ def test_the_picture_of_a_gelsight_mini_is_cropped_and_resized(plug):
 
 def test_cropping_keeps_the_pixels_and_shrinking_takes_the_means():
     picture = np.arange(60, dtype=np.uint8).reshape(4, 5, 3)
-    np.testing.assert_array_equal(crop_and_resize(picture, (0.2, 0.25, 0.4, 0.0), ()), picture[1:, 1:3])
-    assert crop_and_resize(picture, (0.9, 0.9, 0.0, 0.0), ()).shape == (1, 1, 3)  # never empty
+    np.testing.assert_array_equal(crop_and_resize(picture, (0.2, 0.25, 0.4, 0.0), None), picture[1:, 1:3])
+    assert crop_and_resize(picture, (0.9, 0.9, 0.0, 0.0), None).shape == (1, 1, 3)  # never empty
     stripes = np.tile(np.uint8([0, 200]), (4, 4))[..., None].repeat(3, 2)
-    assert set(crop_and_resize(stripes, (), (4, 2)).ravel().tolist()) == {100}
+    assert set(crop_and_resize(stripes, (0.0,) * 4, (4, 2)).ravel().tolist()) == {100}
     assert set(stripes[::2, ::2].ravel().tolist()) == {0}  # every second pixel would show only the dark stripes
 
 
@@ -239,7 +239,7 @@ def test_pictures_without_three_colours_are_a_device_error_with_the_remedy(plug,
 
 def test_the_time_of_a_picture_is_that_at_which_its_buffer_was_filled(plug):
     camera = FakeVideoDevice(stamps=True)
-    stream = CaptureStream(plug(camera), CaptureSettings(), lambda: 1e6)
+    stream = CaptureStream(plug(camera), UsbCameraSettings(device="gel"), lambda: 1e6)
     capture = camera.captures[0]
     for taken_s, expected_s in ((1e6 - 0.03, 1e6 - 0.03), (1e6 - 2.0, 1e6), (1e6 + 1.0, 1e6), (0.0, 1e6)):
         capture.grab = lambda taken_s=taken_s: setattr(capture, "taken_s", taken_s) or True
@@ -249,7 +249,7 @@ def test_the_time_of_a_picture_is_that_at_which_its_buffer_was_filled(plug):
 
 def test_a_few_damaged_pictures_are_skipped_and_many_are_a_lost_stream(plug):
     camera = FakeVideoDevice(fps=1000.0)
-    stream = CaptureStream(plug(camera), CaptureSettings(), lambda: 0.0)
+    stream = CaptureStream(plug(camera), UsbCameraSettings(device="gel"), lambda: 0.0)
     for _ in range(2):  # a valid picture resets the count
         camera.damaged = 10
         assert stream.next().pixels.shape == (6, 8, 3)
@@ -269,7 +269,7 @@ def test_an_exception_of_opencv_is_a_device_error(plug, method, monkeypatch):
 
     monkeypatch.setattr("tests.fake_video.FakeCapture." + method, fail)
     with pytest.raises(DeviceError, match="OpenCV failed"):
-        CaptureStream(name, CaptureSettings(), lambda: 0.0).next()
+        CaptureStream(name, UsbCameraSettings(device="gel"), lambda: 0.0).next()
     if method == "set":
         assert not camera.open_captures
 
