@@ -1,15 +1,6 @@
-"""The HTTP service: queries over HTTP, and a web page.
+"""The HTTP service: queries over HTTP, and a web page; other packages need only `app.create_app` and `client`.
 
-    app             creates the application from its parts; other packages need only `create_app`
-    settings        options of the operator
-    security        access control (local requests, or a token), headers of every response, health
-    uploads         request bodies: limits, JSON, forms
-    decoders        image decoding in separate processes
-    queue           admission, deadlines and batches of requests
-    generations     the generation of the index that answers
-    queries, catalogue, history, human_baseline    the routes
-    store           SQLite database: queries, feedback, trials; recording of the feedback
-    client          `Searcher.query` for an index on another machine
-
-The layer follows `report` and does not import `robot`: the command passes callables.
+A request passes `security` (hosts and tokens), `uploads` (limits of its body), a route (`queries`, `catalogue`,
+`history`, `human_baseline`), `queue` (capacity and deadlines), `decoders` (pictures, in processes) and `generations`
+(the open index); `store` keeps it. The layer does not import `robot`: the command passes callables.
 """

@@ -85,9 +85,6 @@ class Decoders:
             named_files: Name (for messages) and file content of each picture.
             px: `touch_px` of the model.
 
-        Returns:
-            The gel images, in the order of `named_files`.
-
         Raises:
             ImageError: A picture cannot be used; the first one is reported.
             HttpProblem: The pictures are too large together.
@@ -124,10 +121,7 @@ class Decoders:
         return images
 
     async def _run(self, name: str, data: bytes, px: int, max_pixels: int) -> GelImage | PictureSize:
-        """Decode a picture in a process; cancelling ends the process.
-
-        Raises ImageError if the picture cannot be decoded, RetrievalError if no process can be started.
-        """
+        """Decode a picture in a process; cancelling ends the process. Raises ImageError or RetrievalError."""
         process = self._idle.pop() if self._idle else await _Process.start()
         try:
             document, content = await process.request({"name": name, "px": px, "max_pixels": max_pixels}, data)
@@ -224,12 +218,7 @@ def frame(document: dict[str, Any], *contents: bytes | memoryview) -> bytes:
 
 
 def image_of(document: dict[str, Any], content: bytes) -> GelImage | PictureSize:
-    """Return the picture, or the picture's size, from an answer.
-
-    Raises:
-        ImageError: The picture cannot be decoded.
-        MemoryError: The process ran out of memory.
-    """
+    """Return the picture, or its size, from an answer. Raises ImageError, or MemoryError of the process."""
     match document:
         case {"size": size}:
             return PictureSize(*size)

@@ -64,13 +64,7 @@ class ProblemDocument(BaseModel):
 
 
 class HttpProblem(HTTPException):
-    """An error that becomes a problem document.
-
-    Args:
-        kind: A key of `KINDS`.
-        detail: A sentence for people.
-        headers: Further headers of the response.
-    """
+    """An error that becomes a problem document: a key of `KINDS`, a sentence for people, and further headers."""
 
     def __init__(self, kind: str, detail: str, headers: Mapping[str, str] | None = None) -> None:
         super().__init__(KINDS[kind][0], detail, headers)

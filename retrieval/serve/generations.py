@@ -21,13 +21,7 @@ _RETRY_S = 10.0
 
 
 class ServedGeneration:
-    """A served generation: its searcher, and the whole model, which is loaded at the first use.
-
-    Attributes:
-        searcher: Searcher of the generation.
-        shard: Its index.
-        fingers: Gel images of one grasp.
-    """
+    """A served generation: its searcher, and the whole model, which is loaded at the first use."""
 
     def __init__(self, searcher: Searcher) -> None:
         self.searcher, self.shard = searcher, searcher.shard
@@ -45,12 +39,7 @@ class ServedGeneration:
 
 
 class Generations:
-    """The current generation of one index, replaced when a new generation appears.
-
-    Args:
-        settings: Options of the service.
-        shards: Opens the shards of a sharded index; None to open them in this process.
-    """
+    """The current generation of one index, replaced when a new generation appears."""
 
     def __init__(self, settings: ServiceSettings, shards: OpenShards | None = None) -> None:
         self._settings, self._shards = settings, shards

@@ -4,7 +4,7 @@ import base64
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from retrieval.serve.errors import DocumentResponse, HttpProblem
 from retrieval.serve.generations import ServedGeneration
@@ -84,19 +84,11 @@ MAX_OBJECT_NAMES = 1000
 ObjectParameter = Annotated[str | None, Query(max_length=1000, alias="object", description="Object to grasp.")]
 
 
-class GraspDocument(BaseModel):
-    """Gel images of one grasp of the simulated rig, as PNG files in base64, and the grasped object."""
-
-    object_id: str
-    touches: list[str]
-    background: list[str] | None
-
-
 @router.post("/v1/grasp", tags=["live"])
-async def grasp(request: Request, parts: Parts, name: ObjectParameter = None) -> GraspDocument:
+async def grasp(request: Request, parts: Parts, name: ObjectParameter = None) -> dict[str, Any]:
     """Grasp one of the catalogue's objects: the named one, else a random one.
 
-    The rig makes one grasp at a time.
+    The rig makes one grasp at a time. touches, background: a PNG file in base64 for each finger; object_id: the object.
     """
     close = parts.rig.grasp
     if close is None:
@@ -107,11 +99,12 @@ async def grasp(request: Request, parts: Parts, name: ObjectParameter = None) ->
         raise
     except Exception as error:  # of any rig
         raise HttpProblem("failed", f"The rig could not grasp: {error}") from error
-    encoded = [
-        [base64.b64encode(data).decode("ascii") for data in images]
-        for images in (grasped.touches, grasped.background or [])
-    ]
-    return GraspDocument(object_id=grasped.object_id, touches=encoded[0], background=encoded[1] or None)
+
+    def encoded(images: list[bytes]) -> list[str]:
+        return [base64.b64encode(data).decode("ascii") for data in images]
+
+    background = grasped.background and encoded(grasped.background)
+    return {"object_id": grasped.object_id, "touches": encoded(grasped.touches), "background": background}
 
 
 def _object_ids(generation: ServedGeneration, name: str | None) -> list[str]:

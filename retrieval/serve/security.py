@@ -12,7 +12,7 @@ from http.cookies import CookieError, SimpleCookie
 from urllib.parse import urlsplit
 
 from fastapi import APIRouter, Response
-from pydantic import BaseModel, Field
+from pydantic import Field
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -137,24 +137,18 @@ def _request_tokens(headers: Headers) -> list[str]:
 router = APIRouter(tags=["health"])
 
 
-class Health(BaseModel):
-    """State of the service. status: "ok" and, for readiness, the generation."""
-
-    status: str
-
-
 @router.get("/healthz")
-async def healthz() -> Health:
+async def healthz() -> dict[str, str]:
     """Return "ok" while the process runs."""
-    return Health(status="ok")
+    return {"status": "ok"}
 
 
 @router.get("/readyz")
-async def ready(parts: Parts) -> Health:
+async def ready(parts: Parts) -> dict[str, str]:
     """Return "ok" and the generation if an index is open and the service is not shutting down."""
     if parts.stopping.is_set():
         raise HttpProblem("not-ready", "The service is shutting down.")
-    return Health(status=f"ok: {parts.generations.current.name}")
+    return {"status": f"ok: {parts.generations.current.name}"}
 
 
 class SessionBody(RequestBody):

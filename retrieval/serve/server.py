@@ -84,13 +84,7 @@ class Connection(H11Protocol):
 
 
 class Server(uvicorn.Server):
-    """A uvicorn server that says when it listens, and when it ends.
-
-    Args:
-        config: Configuration of uvicorn.
-        parts: Parts of the service.
-        on_started: Called with the port when the server listens.
-    """
+    """A uvicorn server that calls `on_started` with the port when it listens, and says when it ends."""
 
     def __init__(self, config: uvicorn.Config, parts: Service, on_started: Callable[[int], object]) -> None:
         super().__init__(config)

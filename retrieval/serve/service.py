@@ -55,17 +55,7 @@ class LiveRig:
 class Service:
     """The parts of one service; the arguments are those of `retrieval.serve.app.create_app`.
 
-    Attributes:
-        settings: Options of the operator.
-        rig: Functions of the live rig.
-        generations: The served generation of the index.
-        decoders: Processes that decode pictures.
-        queue: Queue of the model.
-        grasps: Queue of the rig's gripper.
-        frames: Queue of each sensor, by name.
-        history_writer: Writer of the history; None if no history is stored.
-        trials: Trials of the human baseline; None if there is no recording for them.
-        stopping: Set at shutdown.
+    `queue` serves the model, `grasps` the rig's gripper, `frames` each sensor by name; `stopping` is set at shutdown.
     """
 
     def __init__(

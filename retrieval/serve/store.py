@@ -110,11 +110,7 @@ def new_id() -> str:
 
 
 class HistoryStore:
-    """The database in one file, which is created if it is missing.
-
-    Args:
-        path: File of the database.
-        max_queries: Maximum number of stored queries without feedback.
+    """The database in one file, which is created if it is missing, with at most `max_queries` without feedback.
 
     Raises:
         BadInput: The file is not a database of this version.
@@ -194,9 +190,6 @@ class HistoryStore:
             feedback: `RIGHT`, `OBJECT`, `NONE`, "missing" for queries without feedback, or None for all.
             offset: Number of matches to skip.
             limit: Maximum number of queries to return.
-
-        Returns:
-            The number of all matches, and the queries of the page.
         """
         text = "verdict || char(10) || best || char(10) || ifnull(feedback, '') || char(10) || ifnull(object_id, '')"
         conditions = [f"instr(casefold({text}), ?) > 0"] * len(words)
@@ -304,13 +297,7 @@ class Recorder(Protocol):
 
 
 class HistoryWriter:
-    """Writer of the database and of the recording in a folder.
-
-    Args:
-        folder: Folder of the history.
-        recorder: Writer of the recording in that folder.
-        max_queries: Maximum number of stored queries without feedback.
-    """
+    """Writer of the database, and of the recording in the same folder (`recorder`)."""
 
     def __init__(self, folder: Path, recorder: Recorder, max_queries: int) -> None:
         self.store = HistoryStore(folder / "history.sqlite", max_queries)

@@ -23,13 +23,7 @@ CHOICES = 10
 
 @dataclass(frozen=True)
 class Trial:
-    """One trial.
-
-    Attributes:
-        grasp: Grasp whose touch is shown.
-        photos: Photos to choose from.
-        truth: Number of the right photo, counted from 1.
-    """
+    """One trial: the grasp whose touch is shown, the photos to choose from, and the number from 1 of the right one."""
 
     grasp: Grasp
     photos: tuple[Path, ...]

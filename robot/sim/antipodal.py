@@ -7,7 +7,7 @@ cone (Nguyen 1988). Fingers and hand are boxes; on their approach they must meet
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -90,40 +90,24 @@ def find_grasps(body: MeshBody, settings: GraspSettings, stroke_mm: float) -> An
     return AntipodalGrasps(points, yaws, tilts, widths, backs, min_width_mm)
 
 
-@dataclass(frozen=True, eq=False)
-class _PadContacts:
-    """Contacts of two pads that close at each place.
+class _PadContacts(NamedTuple):
+    """Contacts of two pads that close at each place (H, Z)."""
 
-    Attributes:
-        opposite: (H, Z) whether the pads meet opposite sides.
-        width_mm: (H, Z) distance between these sides.
-        middle_mm: (H, Z) position of the middle between them along the closing direction.
-    """
-
-    opposite: Mask
-    width_mm: Array
-    middle_mm: Array
+    opposite: Mask  # whether the pads meet opposite sides
+    width_mm: Array  # distance between these sides
+    middle_mm: Array  # position of the middle between them along the closing direction
 
 
 @dataclass(frozen=True, eq=False)
 class _JawProfile:
-    """Extent of the object along one closing direction, on a grid of places across (H,) and up (Z,), in mm.
+    """Extent of the object along one closing direction, on a grid of places across (H,) and up (Z,), in mm."""
 
-    Attributes:
-        yaw_rad: yaw of the closing direction.
-        across_mm: (H,) places across the closing direction.
-        up_mm: (Z,) heights.
-        reach_mm: (2, H, Z) extent along the closing direction and against it; -inf where there is no object.
-        slopes: (2, 2, H, Z) tangents, across and up, of the surface normal there.
-        extent_mm: least and greatest place of the object across.
-    """
-
-    yaw_rad: float
-    across_mm: Array
-    up_mm: Array
-    reach_mm: Array
-    slopes: Array
-    extent_mm: tuple[float, float]
+    yaw_rad: float  # of the closing direction
+    across_mm: Array  # (H,) places across the closing direction
+    up_mm: Array  # (Z,) heights
+    reach_mm: Array  # (2, H, Z) extent along the closing direction and against it; -inf where there is no object
+    slopes: Array  # (2, 2, H, Z) tangents, across and up, of the surface normal there
+    extent_mm: tuple[float, float]  # least and greatest place of the object across
 
     @classmethod
     def of(cls, body: MeshBody, yaw_rad: float, floor_mm: float) -> "_JawProfile":
@@ -133,10 +117,8 @@ class _JawProfile:
         vertices = body.mesh.vertices
         places = vertices @ sideways
         low, high = float(places.min()), float(places.max())
-        first, last = (
-            math.ceil(max(low, -_WORKSPACE_RADIUS_MM) / _PITCH_MM),
-            math.floor(min(high, _WORKSPACE_RADIUS_MM) / _PITCH_MM),
-        )
+        first = math.ceil(max(low, -_WORKSPACE_RADIUS_MM) / _PITCH_MM)
+        last = math.floor(min(high, _WORKSPACE_RADIUS_MM) / _PITCH_MM)
         across = _PITCH_MM * np.arange(first, last + 1, dtype=np.float64)
         top = max(float(vertices[:, 2].max()), floor_mm)
         up = np.arange(floor_mm % _PITCH_MM or _PITCH_MM, top + 1e-9, _PITCH_MM, dtype=np.float64)
@@ -149,9 +131,8 @@ class _JawProfile:
             hit = np.flatnonzero(face >= 0)
             reach[side, hit] = far - distance
             normal = body.mesh.face_normals[face[hit]]
-            slopes[side][:, hit] = (normal @ np.stack([sideways, [0.0, 0.0, 1.0]], 1)).T / np.maximum(
-                normal @ direction, 0.05
-            )
+            tangents = (normal @ np.stack([sideways, [0.0, 0.0, 1.0]], 1)).T
+            slopes[side][:, hit] = tangents / np.maximum(normal @ direction, 0.05)
         shape = len(across), len(up)
         return cls(yaw_rad, across, up, reach.reshape(2, *shape), slopes.reshape(2, 2, *shape), (low, high))
 
@@ -179,23 +160,14 @@ class _JawProfile:
     def approach(
         self, tilt_rad: float, pads: _PadContacts, settings: GraspSettings, stroke_mm: float
     ) -> tuple[Mask, Array]:
-        """Return the places that open jaws can reach, and the distance to withdraw from each, clear of the object.
-
-        Returns:
-            Two arrays (H, Z): whether the place is reachable, and the retreat in mm.
-        """
+        """Return (H, Z) whether open jaws can reach each place, and the distance to withdraw clear of the object."""
         top = float(self.up_mm[-1])
         lowest, highest = settings.floor_mm, max(settings.floor_mm, top - settings.top_margin_mm)
         if tilt_rad:
             lowest, highest = _HAND_MM / 2 + _TABLE_CLEARANCE_MM, top
         back, end = self._retreat_axis(tilt_rad)
-        clear = _clear_places(
-            _along_approach(self.reach_mm, tilt_rad),
-            _along_approach(pads.middle_mm, tilt_rad),
-            back,
-            settings,
-            stroke_mm,
-        )
+        reach, middle = _along_approach(self.reach_mm, tilt_rad), _along_approach(pads.middle_mm, tilt_rad)
+        clear = _clear_places(reach, middle, back, settings, stroke_mm)
         withdrawn = np.broadcast_to(end - back + settings.floor_mm + settings.clearance_mm, clear.shape)
         within = (self.up_mm >= lowest) & (self.up_mm <= highest)
         return _along_approach(clear, tilt_rad, back=True) & within, _along_approach(withdrawn, tilt_rad, back=True)
@@ -231,10 +203,10 @@ def _along_approach(array: NDArray[Any], tilt_rad: float, back: bool = False) ->
     """Reorder (..., H, Z) to (..., across the approach, against it); with `back`, the other way round."""
     if not tilt_rad:
         return array
-    if back:
-        return (array[..., ::-1] if tilt_rad > 0 else array).swapaxes(-1, -2)
+    if tilt_rad > 0 and back:
+        array = array[..., ::-1]
     turned = array.swapaxes(-1, -2)
-    return turned[..., ::-1] if tilt_rad > 0 else turned
+    return turned[..., ::-1] if tilt_rad > 0 and not back else turned
 
 
 def _clear_places(
@@ -242,14 +214,7 @@ def _clear_places(
 ) -> Mask:
     """Return whether open fingers and the hand behind them can reach each place without touching the object.
 
-    The approach is along the last axis, from its end.
-
-    Args:
-        reach_mm: (2, across, along) as in `_JawProfile`.
-        middle_mm: (across, along) middle between the contacts along the closing direction.
-        retreat_mm: (along,) places along the approach, rising.
-        settings: limits of the grasp.
-        stroke_mm: greatest opening of the gripper.
+    The approach is along the last axis of `reach_mm` (2, across, along) and `middle_mm` (across, along), from its end.
     """
     widened = _dilated(reach_mm, settings.finger_mm)
     swept = np.maximum.accumulate(widened[..., ::-1], axis=-1)[..., ::-1]

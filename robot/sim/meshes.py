@@ -23,9 +23,6 @@ class MeshFolder:
         folder: the folder of mesh files.
         seed: seed of the objects' appearance and material.
         settings: grasp settings of the rig; they decide the resting pose.
-
-    Raises:
-        RobotConfigError: `folder` is not a folder.
     """
 
     def __init__(self, folder: str, seed: int, settings: GraspSettings) -> None:

@@ -69,12 +69,13 @@ class ContactProblem:
             tolerance: upper bound on the residual.
             max_iterations: maximum number of steps.
         """
-        descent = _Descent(self, start)
-        for iteration in range(max_iterations):
-            if descent.residual <= tolerance:
-                return descent.solution(iteration, True)
+        descent, iterations = _Descent(self, start), 0
+        while not descent.residual <= tolerance and iterations < max_iterations:
             descent.step()
-        return descent.solution(max_iterations, descent.residual <= tolerance)
+            iterations += 1
+        residual = float(descent.residual)
+        state = descent.pressure, descent.displacement, descent.approach
+        return Solution(*state, iterations, residual, residual <= tolerance)
 
     def initial_pressure(self) -> Floats:
         """Return a start pressure: that of independent springs."""
@@ -160,10 +161,6 @@ class _Descent:
         pressure = np.zeros_like(target)
         pressure[has_object] = project_to_simplex(target[has_object], self.problem.load)
         return pressure
-
-    def solution(self, iterations: int, converged: bool) -> Solution:
-        """Return the current state as a Solution."""
-        return Solution(self.pressure, self.displacement, self.approach, iterations, float(self.residual), converged)
 
 
 def project_to_simplex(values: Floats, total: float) -> Floats:

@@ -23,6 +23,7 @@ _WINDOW_STEPS = 8  # a window's sides are multiples of 1/8 of the grid's, so few
 
 Mask = npt.NDArray[np.bool_]
 Window = tuple[slice, slice]
+_EVERYTHING: Window = (slice(None), slice(None))
 
 
 @dataclass(frozen=True)
@@ -83,9 +84,7 @@ class ScaledProblem:
     def solve(self) -> Solution:
         """Solve, starting from the coarse grid's pressure if the grid is large enough."""
         start = self._coarse_start() if min(self.gap.shape) >= _MIN_NESTED_PIXELS else None
-        if start is None:
-            start = self._problem(_full_window(self.gap.shape)).initial_pressure()
-        return self._refine(start)
+        return self._refine(self._problem(_EVERYTHING).initial_pressure() if start is None else start)
 
     def _problem(self, window: Window) -> ContactProblem:
         gap = np.ascontiguousarray(self.gap[window])
@@ -125,17 +124,13 @@ class ScaledProblem:
         pressure[window] = part.pressure
         if part.pressure.size == pressure.size:
             return part, missed
-        displacement = self._problem(_full_window(self.gap.shape)).operator(pressure)
+        displacement = self._problem(_EVERYTHING).operator(pressure)
         distance = displacement + self.gap - part.approach
         distance[window] = 0.0
         scale = float(np.abs(displacement).max()) or 1.0
         deepest = GAP_WEIGHT * max(0.0, -float(distance.min())) / scale
         whole = replace(part, pressure=pressure, displacement=displacement, residual=max(part.residual, deepest))
         return whole, np.asarray(distance * GAP_WEIGHT < -self.tolerance * scale)
-
-
-def _full_window(shape: tuple[int, ...]) -> Window:
-    return slice(0, shape[0]), slice(0, shape[1])
 
 
 def _padded_span(active: Mask) -> slice:

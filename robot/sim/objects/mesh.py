@@ -237,13 +237,38 @@ class MeshBody(Body):
 def read_mesh(path: str | Path) -> Mesh:
     """Read a closed solid and place it on the table.
 
-    The file's z axis is up. Its unit is the metre if its largest extent is below 2, else the mm.
+    The file's z axis is up. Its unit is the metre if its largest extent is below 2, else the mm. Equal vertices are
+    merged, and faces without area are dropped.
 
     Raises:
         SceneError: The file is not a closed solid, or the packages of the extra are missing.
     """
     file = Path(path)
-    return _place_on_table(_read(file), file)
+    vertices, faces = _read(file)
+    if faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces) or vertices.ndim != 2:
+        raise SceneError(f"{file} has no triangles; export the surface, not points or curves")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise SceneError(f"{file} has faces that refer to missing vertices; export it again")
+    if not np.isfinite(vertices[faces]).all():
+        raise SceneError(f"{file} has vertices that are NaN or infinite; export it again")
+    size = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max()) or 1.0
+    _, first, number = np.unique(np.rint(vertices / (1e-7 * size)), axis=0, return_index=True, return_inverse=True)
+    vertices, faces = vertices[first], number.reshape(-1)[faces]
+    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+    _check_closed(faces, file)
+    scale = 1000.0 if np.ptp(vertices, axis=0).max() < _MAX_METRE_EXTENT else 1.0
+    mesh = Mesh(vertices * scale, faces).rest_on_table(UP)
+    thin = np.ptp(mesh.vertices, axis=0).min()
+    if thin < MIN_THICKNESS_MM:
+        hint = f"at {scale:g} mm a unit; export it in mm or m, with z up"
+        raise SceneError(f"{file} must be at least {MIN_THICKNESS_MM:g} mm thick, got {thin:.3g} mm {hint}")
+    if mesh.solid.volume < 0:  # the faces point inwards
+        mesh = Mesh(mesh.vertices, np.ascontiguousarray(faces[:, ::-1]))
+    if mesh.solid.volume < 1.0:
+        raise SceneError(
+            f"{file} must enclose a volume, got {mesh.solid.volume:g} mm3; export a solid, not a flat surface"
+        )
+    return mesh
 
 
 def mesh_object(file: Path, mesh: Mesh, seed: int, *, up: Vectors = UP, relief: str | None = None) -> SimObject:
@@ -291,75 +316,36 @@ def _import_packages() -> tuple[Any, Any]:
     return trimesh, RayMeshIntersector
 
 
-def _read(file: Path) -> Mesh:
-    """Read vertices and faces; merge equal vertices and drop faces without area. Raise SceneError."""
+def _read(file: Path) -> tuple[Vectors, Faces]:
+    """Return vertices and faces as the file has them; raise SceneError."""
     kind = file.suffix.lower().lstrip(".")
     if kind not in FORMATS:
         raise SceneError(f"a mesh must be a file of {', '.join(FORMATS)}, got {file.name!r}")
     trimesh, _ = _import_packages()
     try:
-        data = file.read_bytes()
         # From memory and without a resolver: the reader cannot open files that the mesh names.
-        loaded = trimesh.load(io.BytesIO(data), file_type=kind, force="mesh", process=False, skip_materials=True)
-        vertices, faces = np.array(loaded.vertices, np.float64), np.array(loaded.faces, np.int64)
+        data = io.BytesIO(file.read_bytes())
+        loaded = trimesh.load(data, file_type=kind, force="mesh", process=False, skip_materials=True)
+        return np.array(loaded.vertices, np.float64), np.array(loaded.faces, np.int64)
     except OSError as error:
         raise SceneError(f"{file} cannot be read: {error.strerror or error}") from error
     except Exception as error:  # a damaged file can raise any exception in the parser
         reason = "it is damaged and not text" if isinstance(error, ImportError) else error  # encoding detection
         raise SceneError(f"{file} is not a readable {kind.upper()} mesh: {reason}") from error
-    _check_arrays(file, vertices, faces)
-    return _merge_vertices(vertices, faces)
 
 
-def _check_arrays(file: Path, vertices: Vectors, faces: Faces) -> None:
-    if faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces) or vertices.ndim != 2:
-        raise SceneError(f"{file} has no triangles; export the surface, not points or curves")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise SceneError(f"{file} has faces that refer to missing vertices; export it again")
-    if not np.isfinite(vertices[faces]).all():
-        raise SceneError(f"{file} has vertices that are NaN or infinite; export it again")
-
-
-def _merge_vertices(vertices: Vectors, faces: Faces) -> Mesh:
-    """Merge vertices at one place and drop faces that lose their area."""
-    size = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max()) or 1.0
-    _, first, number = np.unique(np.rint(vertices / (1e-7 * size)), axis=0, return_index=True, return_inverse=True)
-    faces = number.reshape(-1)[faces]
-    has_area = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    return Mesh(vertices[first], faces[has_area])
-
-
-def _place_on_table(mesh: Mesh, file: Path) -> Mesh:
-    """Return the mesh in mm, centred on z = 0, with outward faces, after all checks. Raise SceneError."""
-    _check_closed(mesh, file)
-    scale = 1000.0 if np.ptp(mesh.vertices, axis=0).max() < _MAX_METRE_EXTENT else 1.0
-    standing = Mesh(mesh.vertices * scale, mesh.faces).rest_on_table(UP)
-    thin = np.ptp(standing.vertices, axis=0).min()
-    if thin < MIN_THICKNESS_MM:
-        hint = f"at {scale:g} mm a unit; export it in mm or m, with z up"
-        raise SceneError(f"{file} must be at least {MIN_THICKNESS_MM:g} mm thick, got {thin:.3g} mm {hint}")
-    if standing.solid.volume < 0:
-        standing = Mesh(standing.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]))
-    if standing.solid.volume < 1.0:
-        raise SceneError(
-            f"{file} must enclose a volume, got {standing.solid.volume:g} mm3; export a solid, not a flat surface"
-        )
-    return standing
-
-
-def _check_closed(mesh: Mesh, file: Path) -> None:
+def _check_closed(faces: Faces, file: Path) -> None:
     """Check that each edge borders an even number of faces, half of them in each direction."""
-    if not len(mesh.faces):
+    if not len(faces):
         raise SceneError(f"{file} has no triangles with an area; export the surface again")
-    edges = mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    edges = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     _, number, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
     if opened := int((counts % 2).sum()):
         raise SceneError(
             f"{file} must be a closed surface, but {opened} edges border a hole. Close it, for example "
             "with trimesh.repair.fill_holes, the 3D print tools of Blender or MeshLab's Close Holes"
         )
-    balance = np.bincount(number.reshape(-1), np.where(edges[:, 0] < edges[:, 1], 1, -1))
-    if balance.any():
+    if np.bincount(number.reshape(-1), np.where(edges[:, 0] < edges[:, 1], 1, -1)).any():
         raise SceneError(f"{file} must have all faces turned outwards; repair it with trimesh.repair.fix_normals")
 
 

@@ -200,7 +200,12 @@ def hammered(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
     if relief.aspect > 1.3:
         sigma = relief.pitch_mm * 0.22 * relief.aspect / coarse.pixel_mm[0]
         image = cv2.GaussianBlur(image, (1, 2 * int(3 * sigma) + 1), sigmaX=0.1, sigmaY=sigma)
-    image = _enlarge(image, sheet)
+    # Resample at the sheet's nodes.
+    wide = cv2.copyMakeBorder(image, 0, 0, 2, 2, cv2.BORDER_WRAP)
+    u = 2 + np.arange(sheet.columns, dtype=np.float32) * np.float32(image.shape[1] / sheet.columns)
+    v = np.arange(sheet.rows, dtype=np.float32) * np.float32((image.shape[0] - 1) / max(sheet.rows - 1, 1))
+    x, y = np.meshgrid(u, v)
+    image = cv2.remap(wide, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return _crest(image / np.float32(2 * image.std() + 1e-9), relief.sharpness)
 
 
@@ -210,13 +215,13 @@ def scratches(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
     start = rng.uniform(0, 1, (count, 2)) * [sheet.width_mm, sheet.height_mm]
     angle = relief.angle_rad + np.pi / 2 + rng.normal(0, 0.5 / relief.aspect, count)
     ends = start + rng.uniform(5, 30, (count, 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    canvas = _canvas(sheet)
+    canvas = np.zeros((sheet.rows, 2 * sheet.columns), np.uint8)
     per_mm = 16 / np.array(sheet.pixel_mm[::-1])
     for one, two in zip(np.rint(start * per_mm).astype(int), np.rint(ends * per_mm).astype(int), strict=True):
         cv2.line(
             canvas, one.tolist(), two.tolist(), int(rng.integers(90, 256)), int(rng.integers(1, 4)), cv2.LINE_AA, 4
         )
-    return np.float32(1.5) * sheet.blur(_fold_seam(canvas, sheet), 0.12)
+    return np.float32(1.5) * sheet.blur(_fold_seam(canvas), 0.12)
 
 
 def layers(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
@@ -231,7 +236,7 @@ def layers(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
 
 def glyphs(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
     """Rows of letters and digits, each row once around the object."""
-    canvas, font = _canvas(sheet), cv2.FONT_HERSHEY_SIMPLEX
+    canvas, font = np.zeros((sheet.rows, 2 * sheet.columns), np.uint8), cv2.FONT_HERSHEY_SIMPLEX
     down = sheet.pixel_mm[0]
     size = relief.pitch_mm / down / 21  # cv2's capitals are 21 px high at scale 1
     thick = max(round((0.1 + 0.12 * relief.sharpness) * relief.pitch_mm / down), 1)
@@ -242,7 +247,7 @@ def glyphs(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
             text = text[:-1]
         place = (int((2 + row % 2 * 9) * size), int(line))
         cv2.putText(canvas, text, place, font, size, 255, thick, cv2.LINE_AA)
-    return sheet.blur(_fold_seam(np.ascontiguousarray(canvas[::-1]), sheet), _edge_blur_mm(relief))
+    return sheet.blur(_fold_seam(np.ascontiguousarray(canvas[::-1])), _edge_blur_mm(relief))
 
 
 def scales(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
@@ -271,55 +276,33 @@ def chevron(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
     return _crest(_cosine(phase), relief.sharpness)
 
 
-def _enlarge(image: Floats, sheet: Sheet) -> Floats:
-    """Resample a coarse periodic image at the sheet's nodes."""
-    wide = cv2.copyMakeBorder(image, 0, 0, 2, 2, cv2.BORDER_WRAP)
-    u = 2 + np.arange(sheet.columns, dtype=np.float32) * np.float32(image.shape[1] / sheet.columns)
-    v = np.arange(sheet.rows, dtype=np.float32) * np.float32((image.shape[0] - 1) / max(sheet.rows - 1, 1))
-    x, y = np.meshgrid(u, v)
-    return np.asarray(cv2.remap(wide, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
-
-
-def _canvas(sheet: Sheet) -> NDArray[np.uint8]:
-    """Return an empty sheet of twice the width, so that drawings across the seam can be folded back."""
-    return np.zeros((sheet.rows, 2 * sheet.columns), np.uint8)
-
-
-def _fold_seam(canvas: NDArray[np.uint8], sheet: Sheet) -> Floats:
-    folded = np.maximum(canvas[:, : sheet.columns], canvas[:, sheet.columns :])
-    return np.asarray(folded / np.float32(255))
+def _fold_seam(canvas: NDArray[np.uint8]) -> Floats:
+    """Fold the second half of a canvas of twice the width over the first: drawings across the seam continue."""
+    first, second = np.split(canvas, 2, axis=1)
+    return np.asarray(np.maximum(first, second) / np.float32(255))
 
 
 Pattern = Callable[[Relief, Sheet, Rng], Floats]
-RELIEFS: Mapping[str, Pattern] = MappingProxyType(
-    {
-        pattern.__name__: pattern
-        for pattern in (
-            *(smooth, ribs, knurl, weave, pebble, bumps, scratches, layers, glyphs),
-            *(dimples, honeycomb, hammered, scales, waffle, chevron),
-        )
-    }
-)
 # Ranges of the draws: pitch in mm, amplitude in mm, greatest amplitude per pitch, probability of engraving.
-_RANGES: Mapping[str, tuple[float, float, float, float, float, float]] = MappingProxyType(
-    {
-        "smooth": (2, 2, 0, 0, 0, 0),
-        "ribs": (1.8, 14, 0.25, 6, 0.4, 0.2),
-        "knurl": (1.8, 9, 0.2, 3, 0.35, 0.1),
-        "weave": (2, 10, 0.25, 2.5, 0.3, 0),
-        "pebble": (2.5, 13, 0.25, 3.5, 0.35, 0.1),
-        "bumps": (3, 14, 0.3, 4, 0.3, 0),
-        "scratches": (2, 10, 0.12, 0.5, 0.3, 1),
-        "layers": (1.5, 5, 0.15, 1.2, 0.35, 0),
-        "glyphs": (5, 14, 0.3, 1.5, 0.15, 0.35),
-        "dimples": (3, 13, 0.25, 2, 0.25, 0),
-        "honeycomb": (3.5, 14, 0.3, 3, 0.3, 0.2),
-        "hammered": (3, 14, 0.3, 3.5, 0.3, 0),
-        "scales": (4, 14, 0.3, 2, 0.2, 0),
-        "waffle": (3, 14, 0.3, 3, 0.3, 0.3),
-        "chevron": (2.5, 11, 0.25, 3, 0.35, 0.2),
-    }
+_FAMILIES: tuple[tuple[Pattern, tuple[float, ...]], ...] = (
+    (smooth, (2, 2, 0, 0, 0, 0)),
+    (ribs, (1.8, 14, 0.25, 6, 0.4, 0.2)),
+    (knurl, (1.8, 9, 0.2, 3, 0.35, 0.1)),
+    (weave, (2, 10, 0.25, 2.5, 0.3, 0)),
+    (pebble, (2.5, 13, 0.25, 3.5, 0.35, 0.1)),
+    (bumps, (3, 14, 0.3, 4, 0.3, 0)),
+    (scratches, (2, 10, 0.12, 0.5, 0.3, 1)),
+    (layers, (1.5, 5, 0.15, 1.2, 0.35, 0)),
+    (glyphs, (5, 14, 0.3, 1.5, 0.15, 0.35)),
+    (dimples, (3, 13, 0.25, 2, 0.25, 0)),
+    (honeycomb, (3.5, 14, 0.3, 3, 0.3, 0.2)),
+    (hammered, (3, 14, 0.3, 3.5, 0.3, 0)),
+    (scales, (4, 14, 0.3, 2, 0.2, 0)),
+    (waffle, (3, 14, 0.3, 3, 0.3, 0.3)),
+    (chevron, (2.5, 11, 0.25, 3, 0.35, 0.2)),
 )
+RELIEFS: Mapping[str, Pattern] = MappingProxyType({pattern.__name__: pattern for pattern, _ in _FAMILIES})
+_RANGES = {pattern.__name__: ranges for pattern, ranges in _FAMILIES}
 
 
 def draw_relief(name: str, rng: Rng, limit_mm: float) -> Relief:

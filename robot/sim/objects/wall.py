@@ -116,16 +116,11 @@ def _cast_chart_rays(shape: Shape, s: Floats, t: Floats) -> tuple[Points, NDArra
         if not ((step > 0.02) & (travelled < far)).any():
             break
     hit = (np.abs(shape.distance(p)) < 0.1) & (travelled < far)
-    gradient = _gradient(shape, p, 0.3)
+    sides = 0.3 * np.eye(3, dtype=np.float32)
+    gradient = np.stack([shape.distance(p + side) - shape.distance(p - side) for side in sides], axis=1) / 0.6
     gain = np.linalg.norm(gradient, axis=1)
     facing = -np.sum(gradient * d, axis=1) / np.maximum(gain, 1e-6)
     return p, hit, np.where(hit, facing, 0), np.clip(gain, 0, 1)
-
-
-def _gradient(shape: Shape, points: Points, step_mm: float) -> Points:
-    sides = [np.eye(3, dtype=np.float32)[axis] * np.float32(step_mm) for axis in range(3)]
-    columns = [shape.distance(points + side) - shape.distance(points - side) for side in sides]
-    return np.stack(columns, axis=1) / (2 * step_mm)
 
 
 def smoothstep(x: Points, low: float, high: float) -> Points:
