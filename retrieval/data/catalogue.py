@@ -12,15 +12,14 @@ Listing opens no photo. `read_photo` reads one photo, and one broken file never 
 """
 
 import hashlib
-import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import Any, Self, overload
+from typing import Any
 
 from _touch_retrieval.files import parse_json, read_regular
 from retrieval.data.catalogue_touches import CatalogueTouch, group_touches, touch_name
-from retrieval.data.folder_walk import FolderWalk, SkippedPhoto
+from retrieval.data.folder_walk import SkippedPhoto, list_files
 from retrieval.data.images import EXTENSIONS, decode_rgb, read_bytes
 from retrieval.data.naming import STEM, Naming
 from retrieval.data.resize import RgbImage
@@ -50,42 +49,6 @@ class CataloguePhoto:
     metadata: dict[str, Any] = field(default_factory=dict, hash=False)
 
 
-class PhotoTable(Sequence[CataloguePhoto]):
-    """Photos stored in columns; indexing makes a `CataloguePhoto`.
-
-    Columns are used because the garbage collector would otherwise traverse 100,000 Python objects again and again.
-
-    Attributes:
-        paths: N paths relative to the catalogue.
-        objects: N object ids.
-        metadata: Metadata by path, for the photos that have any.
-    """
-
-    def __init__(self, paths: Iterable[str], objects: Iterable[str], metadata: Mapping[str, dict[str, Any]]) -> None:
-        self.paths, self.objects, self.metadata = tuple(paths), tuple(objects), metadata
-
-    @classmethod
-    def of(cls, photos: Sequence[CataloguePhoto]) -> Self:
-        """Return a table of photos, whose paths must all differ."""
-        metadata = {photo.path: photo.metadata for photo in photos if photo.metadata}
-        return cls((photo.path for photo in photos), (photo.object_id for photo in photos), metadata)
-
-    def __len__(self) -> int:
-        return len(self.paths)
-
-    @overload
-    def __getitem__(self, index: int) -> CataloguePhoto: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> "PhotoTable": ...
-
-    def __getitem__(self, index: "int | slice") -> "CataloguePhoto | PhotoTable":
-        if isinstance(index, slice):
-            return PhotoTable(self.paths[index], self.objects[index], self.metadata)
-        path = self.paths[index]
-        return CataloguePhoto(path, self.objects[index], self.metadata.get(path, {}))
-
-
 @dataclass(frozen=True)
 class Catalogue:
     """The photos and touches of a catalogue folder.
@@ -100,7 +63,7 @@ class Catalogue:
     """
 
     folder: Path
-    photos: PhotoTable
+    photos: tuple[CataloguePhoto, ...]
     ignored: tuple[str, ...] = ()
     skipped: tuple[SkippedPhoto, ...] = ()
     notes: tuple[str, ...] = ()
@@ -120,9 +83,14 @@ class Catalogue:
         return read_bytes(self.folder / path)
 
     @property
+    def paths(self) -> list[str]:
+        """The paths of all photos and gel images."""
+        return [*(photo.path for photo in self.photos), *(path for touch in self.touches for path in touch.paths)]
+
+    @property
     def object_ids(self) -> tuple[str, ...]:
         """The distinct objects, sorted; some may have no readable photo."""
-        return tuple(sorted({*self.photos.objects, *(touch.object_id for touch in self.touches)}))
+        return tuple(sorted({photo.object_id for photo in self.photos} | {touch.object_id for touch in self.touches}))
 
 
 def require_separate_folders(catalogue: str | Path, index: str | Path) -> None:
@@ -163,8 +131,7 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
     if not root.is_dir():
         what = "is a file" if root.exists() else "does not exist"
         raise DatasetError(f"a catalogue must be a folder of photos, but {root} {what}: {_LAYOUT}")
-    walk = FolderWalk(Path(os.path.realpath(root)))
-    walk.walk(str(root), "")
+    names, unlisted = list_files(root)
     metadata_file = root / METADATA_FILE
     try:
         lines = read_regular(metadata_file)
@@ -172,22 +139,20 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
         lines = b""
     except OSError as error:
         raise DatasetError(f"{metadata_file} cannot be read: {error.strerror}") from error
-    found = _classify_files(walk.names, naming)
-    found.skipped[:0] = walk.skipped
+    found = _classify_files(names, naming)
+    found.skipped[:0] = unlisted
     if not found.photos and not found.gels:
         raise _no_photo_error(root, found, naming)
     by_object, by_photo = _read_metadata(metadata_file, lines, naming)
     touches = group_touches(found.gels, naming)
     unknown = sorted(by_photo.keys() - [*found.photos, *(path for path, _ in found.gels)])
     unknown += sorted(by_object.keys() - [*found.objects, *(touch.object_id for touch in touches)])
-    photo_metadata: _MetadataTable = {}
-    if by_object or by_photo:
-        for path, name in zip(found.photos, found.objects, strict=True):
-            if own := {**by_object.get(name, {}), **by_photo.get(path, {})}:
-                photo_metadata[path] = own
     return Catalogue(
         root,
-        PhotoTable(found.photos, found.objects, photo_metadata),
+        tuple(
+            CataloguePhoto(path, name, {**by_object.get(name, {}), **by_photo.get(path, {})})
+            for path, name in zip(found.photos, found.objects, strict=True)
+        ),
         tuple(found.ignored),
         tuple(found.skipped),
         tuple(f"{METADATA_FILE} names {name}, which is not in the catalogue" for name in unknown),

@@ -1,7 +1,7 @@
 """List the files of a folder and its subfolders; links are followed without endless loops."""
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 
@@ -17,61 +17,43 @@ class SkippedPhoto:
     reason: str
 
 
-@dataclass
-class FolderWalk:
-    """The walk through a folder and its subfolders.
+def list_files(folder: Path) -> tuple[list[str], list[SkippedPhoto]]:
+    """Return the files below a folder as posix paths relative to it, and what cannot be used.
 
-    Attributes:
-        root: The folder.
-        names: Files found so far, as posix paths relative to `root`.
-        skipped: Files and folders that cannot be used.
-        link_targets: Folders that links have led to.
+    Names that start with a dot are left out. A link to a folder is followed if it leads out of `folder`. Each target is
+    listed once, so links that form a loop cause no endless walk.
+
+    Raises:
+        DatasetError: A folder cannot be listed.
     """
+    root = Path(os.path.realpath(folder))
+    names: list[str] = []
+    skipped: list[SkippedPhoto] = []
+    targets: set[Path] = set()
 
-    root: Path
-    names: list[str] = field(default_factory=list)
-    skipped: list[SkippedPhoto] = field(default_factory=list)
-    link_targets: set[Path] = field(default_factory=set)
-
-    def walk(self, folder: str, prefix: str) -> None:
-        """Add the files of a folder and its subfolders to `names`, with `prefix` before each name.
-
-        A link to a folder is followed when it leads out of the catalogue. Each target is walked once, so links
-        that form a loop cause no endless walk.
-
-        Raises:
-            DatasetError: The folder cannot be listed.
-        """
+    def walk(place: str, prefix: str) -> None:
         try:
-            entries = sorted(os.scandir(folder), key=attrgetter("name"))
+            entries = sorted(os.scandir(place), key=attrgetter("name"))
         except OSError as error:
-            raise DatasetError(f"cannot list the catalogue folder {folder}: {error.strerror}") from error
+            raise DatasetError(f"cannot list the catalogue folder {place}: {error.strerror}") from error
         for entry in entries:
-            name = entry.name
-            if name.startswith("."):
+            path = prefix + entry.name
+            if entry.name.startswith("."):
                 continue
-            path = prefix + name
             if not path.isascii() and not is_utf8(path):
                 printable = path.encode(errors="surrogateescape").decode(errors="backslashreplace")
-                self.skipped.append(SkippedPhoto(printable, "the name is not valid UTF-8; rename it"))
-                continue
-            try:
-                is_folder = entry.is_dir()
-            except OSError:  # a link that leads to itself
-                is_folder = False
-            if not is_folder:
-                self.names.append(path)
-            elif entry.is_symlink():
-                self._follow(entry.path, path)
+                skipped.append(SkippedPhoto(printable, "the name is not valid UTF-8; rename it"))
+            elif not os.path.isdir(entry):  # False for a link that leads to itself
+                names.append(path)
+            elif not entry.is_symlink():
+                walk(entry.path, f"{path}/")
+            elif (target := Path(os.path.realpath(entry.path))).is_relative_to(root) or root.is_relative_to(target):
+                skipped.append(SkippedPhoto(path, "a link into or around the catalogue itself is not followed"))
+            elif target in targets:
+                skipped.append(SkippedPhoto(path, f"a link to {target}, which another link has listed already"))
             else:
-                self.walk(entry.path, path + "/")
+                targets.add(target)
+                walk(entry.path, f"{path}/")
 
-    def _follow(self, link: str, path: str) -> None:
-        target = Path(os.path.realpath(link))
-        if target.is_relative_to(self.root) or self.root.is_relative_to(target):
-            self.skipped.append(SkippedPhoto(path, "a link into or around the catalogue itself is not followed"))
-        elif target in self.link_targets:
-            self.skipped.append(SkippedPhoto(path, f"a link to {target}, which another link has listed already"))
-        else:
-            self.link_targets.add(target)
-            self.walk(link, path + "/")
+    walk(str(folder), "")
+    return names, skipped

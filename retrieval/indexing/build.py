@@ -129,8 +129,7 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
     store = IndexStore(out)
     with store.lock(), CodeCache(out) as cache:
         previous, why = _current(store, checkpoint)
-        gels = [path for touch in catalogue.touches for path in touch.paths]
-        files = FileDigests(catalogue.folder, [*catalogue.photos.paths, *gels], cache)
+        files = FileDigests(catalogue.folder, catalogue.paths, cache)
         references = embed_references(catalogue, checkpoint, cache, files.known, options.quiet)
         catalogue = references.with_gel_images(catalogue)
         start = time.perf_counter()
@@ -140,9 +139,10 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
         job = _Build(catalogue, checkpoint, options, references, photos, previous)
         generation, is_written = job.write(store, cache)
         if is_written:
-            job.prune(cache, [*catalogue.photos.paths, *gels])
+            job.prune(cache, catalogue.paths)
     manifest, objects = generation.manifest, Counter(row.object_id for row in job.rows)
     names, inside = sorted(objects), out.resolve()
+    first_photo = {photo.object_id: photo.path for photo in reversed(catalogue.photos)}
     shown = dict.fromkeys((names[0], names[len(names) // 2], names[-1]))
     return BuildReport(
         index=str(out),
@@ -152,7 +152,7 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
         photos=generation.count,
         objects=len(names),
         objects_from=options.naming.text,
-        examples=[(name, catalogue.photos.paths[catalogue.photos.objects.index(name)]) for name in shown],
+        examples=[(name, first_photo[name]) for name in shown],
         warnings=naming_warnings(objects, options.naming),
         embedded=photos.encoded,
         reused=generation.count - photos.encoded,

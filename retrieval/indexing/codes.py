@@ -136,7 +136,7 @@ def find_codes(
     layout = code_layout(checkpoint)
     model, threads = code_model(checkpoint, layout), torch.get_num_threads()
     stored = cache.known(model)
-    found = PhotoCodes({path: known[path] for path in catalogue.photos.paths if known.get(path) in stored})
+    found = PhotoCodes({one.path: known[one.path] for one in catalogue.photos if known.get(one.path) in stored})
     unread = [photo for photo in catalogue.photos if photo.path not in found.digests]
     encode_images = _photo_encoder(checkpoint, len(unread))
     unusable: dict[str, str] = {}

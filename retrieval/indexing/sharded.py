@@ -28,7 +28,7 @@ from indexes.store.sharded import (
     shard_number,
     write_sharded_manifest,
 )
-from retrieval.data.catalogue import Catalogue, CataloguePhoto, PhotoTable, list_catalogue
+from retrieval.data.catalogue import Catalogue, CataloguePhoto, list_catalogue
 from retrieval.data.catalogue_touches import CatalogueTouch
 from retrieval.data.folder_walk import SkippedPhoto
 from retrieval.data.naming import Naming, naming_warnings
@@ -206,7 +206,7 @@ def _split_catalogue(catalogue: Catalogue, shards: int) -> list[tuple[str, Catal
     return [
         (
             shard_folder(number, shards),
-            replace(none, photos=PhotoTable.of(photos[number]), touches=tuple(touches[number])),
+            replace(none, photos=tuple(photos[number]), touches=tuple(touches[number])),
         )
         for number in sorted(photos.keys() | touches.keys())
     ]
@@ -235,7 +235,7 @@ def _report(
         model=str(checkpoint.path),
         objects=sum(report.objects for report in reports),
         objects_from=naming.text,
-        warnings=naming_warnings(Counter(catalogue.photos.objects), naming),
+        warnings=naming_warnings(Counter(photo.object_id for photo in catalogue.photos), naming),
         skipped=skipped,
         ignored=list(catalogue.ignored),
         without_photo=sorted(lost),

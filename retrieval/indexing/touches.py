@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from indexes.store.codes import CodeCache
 from retrieval.console.progress import Bar
-from retrieval.data.catalogue import Catalogue, CataloguePhoto, PhotoTable
+from retrieval.data.catalogue import Catalogue, CataloguePhoto
 from retrieval.data.catalogue_touches import CatalogueTouch
 from retrieval.data.folder_walk import SkippedPhoto
 from retrieval.data.images import decode_rgb
@@ -86,7 +86,7 @@ class ReferenceBuild:
             return catalogue
         pictures = [CataloguePhoto(touch.paths[0], touch.object_id, touch.metadata) for touch in first.values()]
         photos = sorted([*catalogue.photos, *pictures], key=lambda photo: photo.path)
-        return replace(catalogue, photos=PhotoTable.of(photos))
+        return replace(catalogue, photos=tuple(photos))
 
 
 def embed_references(
@@ -143,7 +143,7 @@ def embed_references(
             rows.append({"object_id": touch.object_id, **named})
         else:
             skipped.append(SkippedPhoto(touch.paths[0], f"{_SHOWS[shows]}: not usable as a reference touch"))
-    photographed, counts = set(catalogue.photos.objects), Counter(row["object_id"] for row in rows)
+    photographed, counts = {photo.object_id for photo in catalogue.photos}, Counter(row["object_id"] for row in rows)
     return ReferenceBuild(
         rows, records["partial"][is_used], sorted(counts.keys() - photographed), skipped, encoded, digests, keys
     )
