@@ -174,17 +174,21 @@ def searcher(index: Path) -> Iterator[Any]:
 @pytest.fixture
 def embedded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Count the photos in each batch that the photo tower encodes in this process."""
-    from retrieval.model import photo_encoder
-    from retrieval.model.encode import encode_photos
+    from retrieval.indexing import codes
 
     sizes: list[int] = []
+    make = codes.torch_photo_encoder
 
-    def counting_encode(matcher: Any, photos: Any, batch: int) -> Any:
-        photos = list(photos)
-        sizes.append(len(photos))
-        return encode_photos(matcher, photos, batch)
+    def counting_encoder(matcher: Any) -> Any:
+        encode = make(matcher)
 
-    monkeypatch.setattr(photo_encoder, "encode_photos", counting_encode)
+        def counting_encode(images: Any) -> Any:
+            sizes.append(len(images))
+            return encode(images)
+
+        return counting_encode
+
+    monkeypatch.setattr(codes, "torch_photo_encoder", counting_encoder)
     return sizes
 
 

@@ -265,22 +265,23 @@ def test_without_the_cache_everything_is_read_and_embedded_again(catalogue_copy,
 KILLED = """
 import os, signal, sys, torch
 from pathlib import Path
-from retrieval.model import photo_encoder
 from retrieval.indexing import codes
 from retrieval.indexing.build import build_index
 from retrieval.model.checkpoint import load_checkpoint
 
 catalogue, model, index, fatal = sys.argv[1:]
 torch.set_num_threads(1)
-codes.BATCH, encode, calls = 4, photo_encoder.encode_photos, []
+codes.BATCH, make, calls = 4, codes.torch_photo_encoder, []
 
-def counted(*arguments):
-    calls.append(1)
-    if len(calls) == int(fatal):
-        os.kill(os.getpid(), signal.SIGKILL)
-    return encode(*arguments)
+def counted(matcher):
+    def encode(images):
+        calls.append(1)
+        if len(calls) == int(fatal):
+            os.kill(os.getpid(), signal.SIGKILL)
+        return make(matcher)(images)
+    return encode
 
-photo_encoder.encode_photos = counted
+codes.torch_photo_encoder = counted
 build_index(Path(catalogue), load_checkpoint(Path(model)), Path(index), quiet=True)
 """
 
