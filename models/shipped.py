@@ -290,7 +290,7 @@ def calibrated(made: Checkpoint, folder: Path, fingers: int) -> Checkpoint:
     validation, verification, gels = parts
     every, device = [*validation, *verification, *gels], default_device()
     features = encode_recording(every, made.matcher, made.config, folder / "features")
-    source = FrozenFeatures(made.config, device, features_by_image(every, features, device))
+    source = FrozenFeatures(made.config, features_by_image(every, features, device))
     known = [*verification, *gels]
     made = calibrate_checkpoint(made, source, known, validation, foreign=FOREIGN, max_grasps=len(every))
     touches, photos = recorded_features(made.matcher, source, verification, what="verification")

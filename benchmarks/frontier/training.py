@@ -51,7 +51,7 @@ class _Step:
 
     def __init__(self, sample: Sample, touches: int, number: int) -> None:
         config = sample.checkpoint.config
-        images = BatchImages(config)
+        images = BatchImages(config.preprocessing)
         self.settings = dataclasses.replace(config.training, freeze_towers=False)
         self.batch: PairBatch = PairSampler(sample.grasps, seed=sample.seed, share_photos=True).batch(number, touches)
         self.touches = touch_batch([images.touch(grasp) for grasp in self.batch.grasps])

@@ -229,7 +229,7 @@ def _method_times(by_seed: Sequence[Mapping[str, float]]) -> dict[str, float | N
 def _tower_times(data: EvaluationData, count: int = 4, repeats: int = 3) -> dict[str, Any]:
     """Return the median times of the towers for one touch and one photo, on one thread, without reading files."""
     grasps = data.grasps[:count]
-    images = BatchImages(data.config, keep_bytes=0)
+    images = BatchImages(data.config.preprocessing)
     touches, photos = [images.touch(grasp) for grasp in grasps], [images.photo(grasp.photo) for grasp in grasps]
     times: dict[str, list[float]] = {"touch_ms": [], "photo_ms": []}
     for touch, photo in zip(touches * repeats, photos * repeats, strict=True):

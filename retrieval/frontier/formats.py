@@ -35,7 +35,7 @@ Encode = Callable[[list[Any]], Array]
 def towers(sample: Sample) -> ApproximationResult:
     """Measure formats of the touch tower: errors of match logits against float64, and the time of one touch."""
     rows = sample.touch_rows[: min(MAX_TOUCHES, sample.scale.queries)]
-    loader, photos = BatchImages(sample.checkpoint.config), sample.real_photo_codes["partial"]
+    loader, photos = BatchImages(sample.checkpoint.config.preprocessing), sample.real_photo_codes["partial"]
     images = [loader.touch(sample.grasps[row]) for row in rows]
     exact = _logits(sample, _touch_partials(copy.deepcopy(sample.checkpoint.matcher).double(), images), photos)
     points, works = list[Tradeoff](), list[Callable[[], object]]()

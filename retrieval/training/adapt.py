@@ -569,5 +569,5 @@ def _with_gel_check(checkpoint: Checkpoint, grasps: list[Grasp], features: Featu
     names = sorted({grasp.object_id for grasp in grasps})
     groups = [[grasp for grasp in grasps if grasp.object_id in names[side::2]] for side in (0, 1)]
     checkpoint.matcher.to(device)
-    source = FrozenFeatures(checkpoint.config, device, features_by_image(grasps, features, device))
+    source = FrozenFeatures(checkpoint.config, features_by_image(grasps, features, device))
     return with_gel_check(checkpoint, source, *groups, quiet=quiet)

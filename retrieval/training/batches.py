@@ -15,6 +15,7 @@ from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, ImageCache
 from retrieval.data.loading import map_in_order, worker_count, worker_pool
 from retrieval.data.pairs import PairBatch
+from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import DatasetError, RetrievalError
 from retrieval.model.config import Config
 from retrieval.model.encode import (
@@ -48,10 +49,9 @@ class LoadedBatch:
 
 
 class BatchImages:
-    """The preprocessed images of grasps; decoded ones are kept in memory."""
+    """The preprocessed images of grasps; up to `keep_bytes` of touches, and of photos, are kept in memory."""
 
-    def __init__(self, config: Config, *, keep_bytes: int = _KEEP_BYTES) -> None:
-        settings = config.preprocessing
+    def __init__(self, settings: Preprocessing, keep_bytes: int = 0) -> None:
         self.uses_background = settings.background != "none"
         self._touch, self._photo = (ImageCache(load, keep_bytes) for load in (settings.load_touch, settings.load_photo))
 
@@ -136,7 +136,7 @@ class TrainedFeatures:
         # On a CPU the towers use every core, so workers would only take time from them.
         self._workers = workers if isinstance(workers, int) else worker_count() if device.type == "cuda" else 0
         self.config, self.device = config, device
-        self.images = BatchImages(config, keep_bytes=_KEEP_BYTES // max(1, self._workers))
+        self.images = BatchImages(config.preprocessing, _KEEP_BYTES // max(1, self._workers))
 
     def batches(self, matcher: Matcher, batches: Iterable[tuple[int, PairBatch]]) -> Iterator[LoadedBatch]:
         """Yield this rank's part of each batch, given with its step; the same parts for any number of workers."""
@@ -176,32 +176,22 @@ class TrainedFeatures:
             photo = matcher.photo_features(loaded.photos)
         return distributed.gather_rows(touch, touches), distributed.gather_rows(photo, photos)
 
-    def eval_features(self, matcher: Matcher, pairs: PairBatch) -> tuple[Tensor, Tensor]:
-        """Return features of the pairs' touches and photos, encoded without gradients."""
-        return _encoded(matcher, self.images, pairs.grasps, pairs.photos)
+    def eval_features(self, matcher: Matcher, grasps: Sequence[Grasp], photos: Sequence[Path]) -> tuple[Tensor, Tensor]:
+        """Return features of touches and photos, encoded without gradients."""
+        return _encoded(matcher, self.images, grasps, photos)
 
 
 class FrozenFeatures:
     """Features of frozen towers: each image is encoded once."""
 
-    def __init__(self, config: Config, device: torch.device, known: Mapping[str | Path, Tensor]) -> None:
+    def __init__(self, config: Config, known: Mapping[str | Path, Tensor]) -> None:
         """Start with features by grasp id (of the touch) and by photo file that need no encoding."""
-        self.device, self.images = device, BatchImages(config, keep_bytes=0)  # images are read once
+        self.images = BatchImages(config.preprocessing)  # images are read once
         self._features: dict[str | Path, Tensor] = dict(known)
 
     def batches(self, matcher: Matcher, batches: Iterable[tuple[int, PairBatch]]) -> Iterator[LoadedBatch]:
         """Yield the features of each batch, given with its step; new images are encoded when their batch comes."""
-        return (self._cached_features(matcher, batch) for _, batch in batches)
-
-    @torch.inference_mode()
-    def _cached_features(self, matcher: Matcher, batch: PairBatch) -> LoadedBatch:
-        new = {grasp.grasp_id: grasp for grasp in batch.grasps if grasp.grasp_id not in self._features}
-        photos = [path for path in batch.photos if path not in self._features]
-        touch, photo = _encoded(matcher, self.images, list(new.values()), photos)
-        self._features.update(zip(new, touch, strict=True))
-        self._features.update(zip(photos, photo, strict=True))
-        touches = torch.stack([self._features[grasp.grasp_id] for grasp in batch.grasps])
-        return LoadedBatch(batch, touches, torch.stack([self._features[path] for path in batch.photos]))
+        return (LoadedBatch(batch, *self.eval_features(matcher, batch.grasps, batch.photos)) for _, batch in batches)
 
     def step_context(self) -> AbstractContextManager[None]:
         """Return the context of a training step: one thread, since more do not speed up the head's small products."""
@@ -211,10 +201,16 @@ class FrozenFeatures:
         """Return the features of the batch's touches and photos, as constants of the step."""
         return loaded.touches.clone(), loaded.photos.clone()
 
-    def eval_features(self, matcher: Matcher, pairs: PairBatch) -> tuple[Tensor, Tensor]:
-        """Return the features of the pairs' touches and photos."""
-        loaded = self._cached_features(matcher, pairs)
-        return loaded.touches, loaded.photos
+    @torch.inference_mode()
+    def eval_features(self, matcher: Matcher, grasps: Sequence[Grasp], photos: Sequence[Path]) -> tuple[Tensor, Tensor]:
+        """Return the features of touches and photos; new images are encoded."""
+        new = {grasp.grasp_id: grasp for grasp in grasps if grasp.grasp_id not in self._features}
+        new_photos = [path for path in photos if path not in self._features]
+        touch, photo = _encoded(matcher, self.images, list(new.values()), new_photos)
+        self._features.update(zip(new, touch, strict=True))
+        self._features.update(zip(new_photos, photo, strict=True))
+        touches = torch.stack([self._features[grasp.grasp_id] for grasp in grasps])
+        return touches, torch.stack([self._features[path] for path in photos])
 
 
 FeatureSource = TrainedFeatures | FrozenFeatures
@@ -247,15 +243,13 @@ def recorded_features(
 
     `what` names their purpose, for the progress bar.
     """
-    none = np.zeros(0, dtype=np.int64)
     touches: list[Tensor] = []
     photos: dict[Path, Tensor] = {}
     with Bar(f"encode for {what}", len(grasps), "grasps", quiet=quiet) as bar:
         for start in range(0, len(grasps), _CHUNK):
-            part = list(grasps[start : start + _CHUNK])
+            part = grasps[start : start + _CHUNK]
             files = list(dict.fromkeys(grasp.photo for grasp in part))
-            batch = PairBatch(part, files, none, none, np.zeros(0, dtype=np.float32), none, none)
-            touch, photo = source.eval_features(matcher, batch)
+            touch, photo = source.eval_features(matcher, part, files)
             touches.append(touch)
             photos |= zip(files, photo, strict=True)
             bar.advance(len(part))

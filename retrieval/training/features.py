@@ -3,8 +3,8 @@
 import dataclasses
 import hashlib
 import json
-import logging
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import nullcontext
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from _touch_retrieval.cache import Cache, cache_key
 from _touch_retrieval.files import file_digest
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp
@@ -23,8 +24,8 @@ from retrieval.data.images import read_rgb
 from retrieval.data.loading import map_in_order, worker_pool
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import RgbImage, resize
-from retrieval.errors import BadInput, CheckpointError, DatasetError, NumericalError
-from retrieval.model.checkpoint import read_tensors, tensors_digest, write_tensors
+from retrieval.errors import DatasetError, NumericalError
+from retrieval.model.checkpoint import tensors_digest
 from retrieval.model.config import Config
 from retrieval.model.encode import batches, default_device, photo_features, touch_features
 from retrieval.model.fusion import Matcher
@@ -32,14 +33,12 @@ from retrieval.model.towers.tower import Tower
 from retrieval.training.batches import BatchImages
 
 T = TypeVar("T")
-log = logging.getLogger(__name__)
 
 TOUCH_VARIANTS = ("touch", "low_pass", "no_contact")
 """Inputs of the touch tower: gel images; low-pass gel images (8 x 6); no-contact frames."""
 PHOTO_VARIANTS = ("photo", "margin")
 """Inputs of the photo tower: whole photos; only the margin, which rarely shows the object."""
 _MARGIN_DIVISOR = 8  # the margin is 1 / _MARGIN_DIVISOR of each side
-_PART = 512
 _BATCH = 32
 _FORMAT = 1  # raised if the features of the same images change
 
@@ -55,7 +54,6 @@ class Features:
         photo: (G, F_photo) float32, of the photo taken before the grasp.
 
     Raises:
-        BadInput: An array has the wrong shape or type.
         NumericalError: A feature is not finite.
     """
 
@@ -65,14 +63,6 @@ class Features:
     photo: NDArray[np.float32]
 
     def __post_init__(self) -> None:
-        rows = (len(self.grasp_ids), len(self.object_ids), len(self.touch), len(self.photo))
-        if self.touch.ndim != 3 or self.photo.ndim != 2 or len(set(rows)) != 1:
-            raise BadInput(
-                "features must be touch (G, fingers, F) and photo (G, F) with G grasp ids and G object ids; got "
-                f"touch {self.touch.shape}, photo {self.photo.shape}, {rows[0]} and {rows[1]} ids"
-            )
-        if self.touch.dtype != np.float32 or self.photo.dtype != np.float32:
-            raise BadInput(f"features must be float32; got touch {self.touch.dtype}, photo {self.photo.dtype}")
         for what, part in (("touch", self.touch), ("photo", self.photo)):
             bad = np.flatnonzero(~np.isfinite(part).all(axis=tuple(range(1, part.ndim))))
             if len(bad):
@@ -200,24 +190,26 @@ def encode_recording(
         grasps: The grasps.
         matcher: The matcher.
         config: The configuration, for preprocessing.
-        cache: Folder of cached parts of 512 images; a later or resumed run reads them. A part's name is a digest of
-            tower, preprocessing, variant and image files. None to store nothing.
+        cache: Folder of the cache of features, so that a later or continued run reads them. A key is a digest of tower,
+            preprocessing, variant and image files. None to store nothing.
         touch_variant: One of `TOUCH_VARIANTS`.
         photo_variant: One of `PHOTO_VARIANTS`; "margin" only with whole touches.
         photo_features_from: Features of at least these grasps; their photo features are used without encoding.
         quiet: No progress on stderr.
 
     Raises:
-        BadInput: A variant is unknown.
-        DatasetError: A required no-contact frame is missing.
+        DatasetError: A required no-contact frame is missing, or a file cannot be read.
     """
-    touched = [_grasp_for_variant(grasp, touch_variant) for grasp in grasps]
-    device = default_device()
-    matcher = deepcopy(matcher).to(device).eval()
-    settings = _config_for_variants(config, touch_variant, photo_variant)
-    images, digest = BatchImages(settings, keep_bytes=0), settings.preprocessing.digest()
-    made_by, encode = (touch_variant, _tower_digest(matcher.touch_tower), digest), partial(touch_features, matcher)
-    touch = _encoded(cache, made_by, touched, images.touch, encode, images.files, quiet)
+    touched = [_with_no_contact_touch(grasp) for grasp in grasps] if touch_variant == "no_contact" else grasps
+    preprocessing = config.preprocessing
+    if kind := {"low_pass": _LowPassPreprocessing, "margin": _MarginPreprocessing}.get(
+        touch_variant if photo_variant == "photo" else photo_variant
+    ):
+        preprocessing = kind(**preprocessing.to_dict())
+    matcher = deepcopy(matcher).to(default_device()).eval()
+    images, digest = BatchImages(preprocessing), preprocessing.digest()
+    made_by = touch_variant, _tower_digest(matcher.touch_tower), digest
+    touch = _encoded(cache, made_by, touched, images.touch, partial(touch_features, matcher), images.files, quiet)
     if photo_features_from is None:
         files = {path: row for row, path in enumerate(dict.fromkeys(grasp.photo for grasp in grasps))}
         made_by, encode = (photo_variant, _tower_digest(matcher.photo_tower), digest), partial(photo_features, matcher)
@@ -234,23 +226,7 @@ def encode_recording(
     )
 
 
-def _config_for_variants(config: Config, touch_variant: str, photo_variant: str) -> Config:
-    for what, one, known in (
-        ("touch_variant", touch_variant, TOUCH_VARIANTS),
-        ("photo_variant", photo_variant, PHOTO_VARIANTS),
-    ):
-        if one not in known:
-            raise BadInput(f"{what} must be one of {', '.join(known)}; got {one!r}")
-    if touch_variant != "low_pass" and photo_variant != "margin":
-        return config
-    kind = _LowPassPreprocessing if touch_variant == "low_pass" else _MarginPreprocessing
-    return dataclasses.replace(config, preprocessing=kind(**config.preprocessing.to_dict()))
-
-
-def _grasp_for_variant(grasp: Grasp, touch_variant: str) -> Grasp:
-    """Return the grasp with its touch replaced by the files of the variant."""
-    if touch_variant != "no_contact":
-        return grasp
+def _with_no_contact_touch(grasp: Grasp) -> Grasp:
     if len(grasp.backgrounds) != len(grasp.touches):
         raise DatasetError(
             f"each finger needs a no-contact frame; {grasp.grasp_id} has {len(grasp.backgrounds)} for "
@@ -272,46 +248,34 @@ def _encoded(
     files: Callable[[T], tuple[Path, ...]],
     quiet: bool,
 ) -> NDArray[np.float32]:
-    """Return the features (len(items), F) of items, in parts: read from the cache folder, or encoded and stored.
+    """Return the features (len(items), F) of items: read from the cache, or encoded and stored.
 
     `made_by` are variant, tower and preprocessing. `load` returns the image (or images) of an item, `encode` the
     features (B, F) of a list of images, `files` the files of an item.
     """
-    unit, parts = "photos" if made_by[0] in PHOTO_VARIANTS else "grasps", []
-    with Bar(f"encode {made_by[0]}", len(items), unit, quiet=quiet) as bar, worker_pool() as pool:
-        for part in batches(items, _PART):
-            path = _cache_path(cache, made_by, [files(item) for item in part]) if cache else None
-            features = _read_cached(path) if path else None
-            if features is None or len(features) != len(part):
-                encoded = []
-                for batch in batches(map_in_order(pool, load, part, _BATCH), _BATCH):
-                    encoded.append(encode(batch).cpu())
-                    bar.advance(len(batch))
-                features = torch.cat(encoded)
-                if path:
-                    write_tensors(path, {"features": features}, {"made_by": made_by})
-            else:
-                bar.advance(len(part))
-            parts.append(features.numpy())
-    return np.concatenate(parts)
+    unit = "photos" if made_by[0] in PHOTO_VARIANTS else "grasps"
+    with (
+        Bar(f"encode {made_by[0]}", len(items), unit, quiet=quiet) as bar,
+        worker_pool() as pool,
+        Cache(cache / "cache.sqlite") if cache else nullcontext() as store,
+    ):
+        keys = [_cache_key(made_by, files(item)) for item in items] if store else []
+        found = {row: content for row, key in enumerate(keys) if store and (content := store.get(key)) is not None}
+        missing = [row for row in range(len(items)) if row not in found]
+        bar.advance(len(found))
+        images = map_in_order(pool, load, [items[row] for row in missing], _BATCH)
+        for rows, batch in zip(batches(missing, _BATCH), batches(images, _BATCH), strict=True):
+            encoded = {row: each.tobytes() for row, each in zip(rows, encode(batch).cpu().numpy(), strict=True)}
+            if store:
+                store.add({keys[row]: content for row, content in encoded.items()})
+            found |= encoded
+            bar.advance(len(rows))
+    return np.stack([np.frombuffer(found[row], np.float32) for row in range(len(items))])
 
 
-def _cache_path(cache: Path, made_by: tuple[str, ...], files: list[tuple[Path, ...]]) -> Path:
-    """Return the cache file of a part. Raises DatasetError if an image cannot be read."""
+def _cache_key(made_by: tuple[str, ...], files: tuple[Path, ...]) -> str:
+    """Return the key of an item. Raises DatasetError if an image cannot be read."""
     try:
-        digests = [[file_digest(path) for path in each] for each in files]
+        return cache_key("features", _FORMAT, *made_by, [file_digest(path) for path in files])
     except OSError as error:
         raise DatasetError(f"{error.filename} cannot be read ({error.strerror}); run `retrieve check`") from error
-    key = hashlib.sha256(json.dumps([_FORMAT, *made_by, digests]).encode()).hexdigest()
-    return cache / f"{made_by[0]}-{key[:32]}.safetensors"
-
-
-def _read_cached(path: Path) -> Tensor | None:
-    """Return cached features, or None if there are none or the file is damaged."""
-    if not path.is_file():
-        return None
-    try:
-        return read_tensors(path)[0]["features"]
-    except CheckpointError as error:
-        log.warning("%s; its images are encoded again", error)
-        return None

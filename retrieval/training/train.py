@@ -155,7 +155,7 @@ class Trainer:
         held_out = split.select(grasps, "validation")
         self.validation = self._sampler(held_out).evaluation_pairs() if split.validation else None
         self.features: FeatureSource = (
-            FrozenFeatures(config, self.device, features_by_image(grasps, known, self.device) if known else {})
+            FrozenFeatures(config, features_by_image(grasps, known, self.device) if known else {})
             if settings.freeze_towers
             else TrainedFeatures(config, self.device)
         )
@@ -269,7 +269,7 @@ class Trainer:
         if pairs is None:
             return {}
         matcher.eval()
-        features = self.features.eval_features(matcher, pairs)
+        features = self.features.eval_features(matcher, pairs.grasps, pairs.photos)
         with self.features.step_context():
             touch, photo = matcher.touch_encoding(features[0]), matcher.photo_encoding(features[1])
             logits = matcher.head(touch.partial[pairs.touch_index], photo.partial[pairs.photo_index]).cpu().numpy()
