@@ -24,7 +24,6 @@ _SCHEMA = """
     PRAGMA page_size = 16384;
     PRAGMA synchronous = OFF;  -- commits survive a kill, but not a power failure
     CREATE TABLE IF NOT EXISTS entries (key TEXT PRIMARY KEY, content BLOB, checksum INTEGER);
-    CREATE TEMP TABLE kept (key TEXT PRIMARY KEY) WITHOUT ROWID;
 """
 
 
@@ -106,9 +105,9 @@ class Cache:
     def keep(self, keys: Iterable[str]) -> None:
         """Delete all other entries, and give their room back to the disk."""
         with self._disk_errors(), self._connection:
-            self._connection.executemany("INSERT OR IGNORE INTO kept VALUES (?)", ((key,) for key in keys))
-            self._connection.execute("DELETE FROM entries WHERE key NOT IN (SELECT key FROM kept)")
-            self._connection.execute("DELETE FROM kept")
+            stored = {key for (key,) in self._connection.execute("SELECT key FROM entries")}
+            unused = stored.difference(keys)
+            self._connection.executemany("DELETE FROM entries WHERE key = ?", ((key,) for key in unused))
 
     def _open(self) -> sqlite3.Connection:
         connection = sqlite3.connect(self.path, timeout=_WAIT_S)

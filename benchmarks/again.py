@@ -28,10 +28,10 @@ import numpy as np
 import torch
 from PIL import Image
 
+from _touch_retrieval.cache import Cache
 from indexes.kinds.faiss_index import load_faiss
-from indexes.store.codes import CodeCache
-from retrieval.indexing.build import build_index
-from retrieval.indexing.codes import code_layout, code_model
+from retrieval.indexing.build import CACHE, build_index
+from retrieval.indexing.codes import photo_encoder
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import batches, encode_photos
 from retrieval.model.fusion_scorer import to_stored
@@ -135,18 +135,17 @@ def _write(path: Path, content: bytes) -> None:
 def write_codes(catalogue: Path, out: Path, checkpoint: Checkpoint) -> None:
     """Put random codes of all photos into the cache of the index."""
     rng, matcher = np.random.default_rng(0), checkpoint.config.matcher
-    layout = code_layout(checkpoint)
-    with CodeCache(out) as cache:
+    encoder = photo_encoder(checkpoint)
+    with Cache(out / CACHE) as cache:
         for some in batches(sorted(catalogue.rglob("*.jpg")), 1000):
-            records = np.zeros(len(some), layout)
+            records = np.zeros(len(some), encoder.layout)
             embeddings = rng.normal(size=(len(some), matcher.embedding_dim)).astype(np.float32)
             records["embeddings"] = embeddings / np.linalg.norm(embeddings, axis=1, keepdims=True)
             partials = rng.uniform(-1, 1, (len(some), matcher.partial_width)).astype(np.float32)
             for name, array in to_stored(partials, matcher.pooled_width).items():
                 records[name] = array
-            digests = [hashlib.sha256(path.read_bytes()).hexdigest() for path in some]
-            codes = dict(zip(digests, map(bytes, records), strict=True))
-            cache.add(code_model(checkpoint, layout), codes)
+            keys = [encoder.key([hashlib.sha256(path.read_bytes()).hexdigest()]) for path in some]
+            cache.add(dict(zip(keys, map(bytes, records), strict=True)))
 
 
 def _cpu_s(work: Callable[[], object]) -> float:

@@ -31,7 +31,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,7 @@ from indexes.errors import ParameterError
 from indexes.kinds.faiss_index import FLAT, FaissIndex
 from indexes.kinds.vector_index import VectorIndex
 from indexes.store.folder import IndexStore
-from indexes.store.generation import Arrays, Generation, GenerationContent
+from indexes.store.generation import Arrays, Generation
 from indexes.store.manifest import FileChecksum
 from indexes.store.rows import Row
 from retrieval.commands.main import main as retrieve
@@ -78,7 +78,7 @@ before, start = anonymous(), time.perf_counter()
 found = IndexStore(sys.argv[1]).open(verify=False, threads=1)
 opened = time.perf_counter() - start
 query = np.ascontiguousarray(found.embeddings[:1])
-found.search(query, 1000)
+found.index.search(query, 1000)
 print(opened, (anonymous() - before) / 1024)
 """
 
@@ -164,9 +164,7 @@ def measure(crowd: BlendedPhotos, photos: int, kinds: Sequence[str], folder: Pat
         start = time.perf_counter()
         FaissIndex.build(generation.embeddings, name, threads=torch.get_num_threads())
         figures = {"structure_s": time.perf_counter() - start}
-        indexed = store.write_content(
-            GenerationContent(rows_of(photos), blocks_of(generation), {}, name, threads=torch.get_num_threads())
-        )
+        indexed = write_blocks(store, photos, blocks_of(generation), name)
         figures |= opened(folder) | on_disk(indexed)
         size.kinds[kind] = figures | _operating_point(crowd, indexed, touches, exhaustive_top1, chosen)
         point = size.kinds[kind]
@@ -179,6 +177,16 @@ def blocks_of(generation: Generation) -> Iterator[Arrays]:
     arrays = {"embeddings": generation.embeddings, **generation.arrays}
     for start in range(0, generation.count, BLOCK):
         yield {name: array[start : start + BLOCK] for name, array in arrays.items()}
+
+
+def write_blocks(store: IndexStore, photos: int, blocks: Iterable[Arrays], kind: str = FLAT) -> Generation:
+    """Write a generation of blocks of arrays, and return it opened."""
+    threads = torch.get_num_threads()
+    with store.lock(), store.draft() as draft:
+        draft.write_rows(rows_of(photos))
+        draft.build_index(draft.write_arrays(blocks)["embeddings"], kind, threads=threads)
+        draft.finish()
+    return store.open(name=draft.name, verify=False, threads=threads)
 
 
 def rows_of(photos: int) -> list[Row]:
@@ -204,7 +212,7 @@ def _build(crowd: BlendedPhotos, store: IndexStore, size: Size) -> Generation:
             peak_mb = max(peak_mb, anonymous_mb() - before)
 
     start = time.perf_counter()
-    generation = store.write_content(GenerationContent(rows_of(size.photos), blocks(), {}))
+    generation = write_blocks(store, size.photos, blocks())
     size.figures |= {"build_s": time.perf_counter() - start - drawing_s, "build_mb": peak_mb}
     return generation
 
@@ -233,10 +241,13 @@ def _operating_point(
         made.index = index
         k = _candidates(made, queries[:choosing], exhaustive_top1[:choosing])
         contained = np.array(
-            [top1 in made.search(query[None], k)[1][0] for query, top1 in zip(queries, exhaustive_top1, strict=True)]
+            [
+                top1 in made.index.search(query[None], k)[1][0]
+                for query, top1 in zip(queries, exhaustive_top1, strict=True)
+            ]
         )
         evaluated = contained[choosing:]
-        search = _median(lambda n, k=k: made.search(queries[n : n + 1], k), timed)
+        search = _median(lambda n, k=k: made.index.search(queries[n : n + 1], k), timed)
         found = [made.index.candidates(queries[n : n + 1], k)[0] for n in timed]
         rerank = _median(lambda n, found=found: crowd.scorer.logits(touches[n : n + 1], partials, found[n]), timed)
         low, high = binomial_interval(int(evaluated.sum()), len(evaluated))
@@ -271,7 +282,7 @@ def _candidates(made: Generation, queries: np.ndarray, exhaustive_top1: np.ndarr
 def _needed(made: Generation, queries: np.ndarray, exhaustive_top1: np.ndarray) -> int:
     """Return the least number of candidates that contain the target fraction of exhaustive top-1s, up to a limit."""
     limit = min(MAX_CANDIDATES, made.count)
-    found = (made.search(query[None], limit)[1][0] for query in queries)
+    found = (made.index.search(query[None], limit)[1][0] for query in queries)
     places = [np.flatnonzero(rows == top1) for rows, top1 in zip(found, exhaustive_top1, strict=True)]
     needed = np.sort([int(place[0]) + 1 if len(place) else limit for place in places])
     return int(needed[int(np.ceil(TARGET * len(needed))) - 1])

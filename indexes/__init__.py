@@ -83,12 +83,11 @@ def build(vectors: "Floats", kind: "str | type[VectorIndex]" = "flat", *, thread
     return load_kind(name).build(vectors, name, threads=threads)
 
 
-def open(folder: str | Path, *, verify: bool = True) -> "Generation":
+def open(folder: str | Path) -> "Generation":
     """Open the current generation of an index folder for searching.
 
     Args:
         folder: The index folder, as `retrieve build-index` writes it.
-        verify: Compare the SHA-256 of every file with the manifest.
 
     Raises:
         IndexesError: The index is missing or damaged, or has another format.
@@ -99,7 +98,7 @@ def open(folder: str | Path, *, verify: bool = True) -> "Generation":
     """
     from indexes.store.folder import IndexStore
 
-    return IndexStore(Path(folder)).open(verify=verify)
+    return IndexStore(Path(folder)).open()
 
 
 _MODULES = {

@@ -9,7 +9,7 @@
       NAME.npy            per-row arrays, and documents that are arrays
       vectors.faiss       structure of the index, for kinds that have one
       NAME.json           documents
-    codes/                cache of the codes of photos, for all generations (`indexes.store.codes`)
+    codes/                cache of the codes of photos, for all generations (`_touch_retrieval.cache`)
     LOCK                  locked by the writer
 
 A generation is self-contained. You can copy its folder and a CURRENT file elsewhere; the copy is a complete index.
@@ -19,7 +19,8 @@ current and complete; the next writer deletes the unfinished files.
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from os import getpid
 from pathlib import Path
 from typing import Any
@@ -28,8 +29,8 @@ from _touch_retrieval import files
 from _touch_retrieval.files import read_regular
 from indexes.errors import AGAIN, CorruptIndex, NoIndex, WriteFailed
 from indexes.kinds.vector_index import Floats
-from indexes.store.generation import Arrays, Generation, GenerationContent, read_generation, write_generation
-from indexes.store.locking import WriterLock
+from indexes.store.generation import EMBEDDINGS, Arrays, Draft, Generation, read_generation
+from indexes.store.locking import writer_lock
 from indexes.store.rows import Row
 
 GENERATION = re.compile(r"gen-(\d{6,})")
@@ -51,7 +52,6 @@ class IndexStore:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self._lock = WriterLock(self.path / "LOCK")
 
     def open(
         self,
@@ -98,13 +98,34 @@ class IndexStore:
             raise CorruptIndex(f"{path}: must name a generation such as gen-000001, got {text!r}; {AGAIN}")
         return text
 
-    def lock(self) -> WriterLock:
-        """Return the writer lock.
+    def lock(self) -> AbstractContextManager[None]:
+        """Return the writer lock: within `with store.lock():` other writers get `LockedIndex`."""
+        return writer_lock(self.path / "LOCK")
 
-        Within `with store.lock():` you may call `write` and do other steps. Other writers get `LockedIndex` until the
-        block ends.
+    @contextmanager
+    def draft(self) -> Iterator[Draft]:
+        """Yield the next generation to write, and make it current when the block ends; use it within `lock()`.
+
+        After `WriteFailed` the current generation is the old or the new one, and complete. After any other error the
+        index is unchanged.
         """
-        return self._lock
+        try:
+            self._require_index_folder()
+            self._sweep()
+            name = f"gen-{max(self._numbers(), default=0) + 1:06d}"
+            folder = self.path / f"{name}.tmp-{getpid()}"
+            try:
+                folder.mkdir()
+                yield Draft(folder, name)
+                folder.rename(self.path / name)
+            except BaseException:
+                _discard(folder)
+                raise
+            files.sync(self.path)
+            files.write_atomically(self.path / "CURRENT", f"{name}\n".encode())
+        except OSError as error:
+            where = error.filename or self.path
+            raise WriteFailed(f"{where}: writing failed ({error.strerror or error}); write again") from error
 
     def write(
         self,
@@ -112,9 +133,10 @@ class IndexStore:
         embeddings: Floats,
         arrays: Arrays | None = None,
         *,
-        fingerprint: Mapping[str, str] | None = None,
-        keep: int = 2,
-        **content: Any,
+        kind: str = "flat",
+        documents: Mapping[str, Any] | None = None,
+        threads: int | None = None,
+        **about: Any,
     ) -> Generation:
         """Write a new generation of arrays in memory, make it current, and return it opened.
 
@@ -122,25 +144,10 @@ class IndexStore:
             rows: The N rows, sorted by path.
             embeddings: Unit vectors (N, d) float32.
             arrays: Name to per-row array (N, ...) of finite numbers.
-            fingerprint: Origin of the vectors.
-            keep: As for `write_content`.
-            **content: Other fields of `indexes.store.generation.GenerationContent`.
-
-        Raises:
-            IndexesError: As for `write_content`.
-        """
-        block = {"embeddings": embeddings, **(arrays or {})}
-        return self.write_content(GenerationContent(rows, [block], fingerprint or {}, **content), keep=keep)
-
-    def write_content(self, content: GenerationContent, *, keep: int = 2) -> Generation:
-        """Write a new generation, with one block in memory at a time, make it current, and return it opened.
-
-        After `WriteFailed` the current generation is the old or the new one, and complete. After any other error the
-        index is unchanged.
-
-        Args:
-            content: Its content.
-            keep: Number of earlier generations that stay on the disk for readers that are opening them.
+            kind: Name of the kind of index.
+            documents: Name to JSON document or array.
+            threads: Number of threads; None for the library's own setting.
+            **about: Arguments of `Draft.finish`, such as the fingerprint.
 
         Raises:
             RowError: A row, array or document is invalid.
@@ -149,26 +156,15 @@ class IndexStore:
             LockedIndex: Another writer is writing the index.
             WriteFailed: A file could not be written.
         """
-        self._require_index_folder()
-        try:
-            with self._lock:
-                self._sweep()
-                name = generation_name(max(self._numbers(), default=0) + 1)
-                folder = self.path / f"{name}.tmp-{getpid()}"
-                try:
-                    folder.mkdir()
-                    write_generation(folder, name, content)
-                    folder.rename(self.path / name)
-                except BaseException:
-                    _discard(folder)
-                    raise
-                self.make_current(name)
-                self.discard_before(name, keep)
-                # no need to verify: the digests were just computed from these files
-                return self.open(name=name, verify=False, threads=content.threads)
-        except OSError as error:
-            where = error.filename or self.path
-            raise WriteFailed(f"{where}: writing failed ({error.strerror or error}); write again") from error
+        with self.lock():
+            with self.draft() as draft:
+                draft.write_rows(rows)
+                written = draft.write_arrays([{EMBEDDINGS: embeddings, **(arrays or {})}])
+                draft.write_documents(documents or {})
+                draft.build_index(written[EMBEDDINGS], kind, threads=threads)
+                draft.finish(**about)
+            self.discard_before(draft.name)
+        return self.open(name=draft.name, verify=False, threads=threads)
 
     def _require_index_folder(self) -> None:
         """Raise NoIndex for a folder without generations that has a file CURRENT: it belongs to another program."""
@@ -182,21 +178,11 @@ class IndexStore:
         if is_other:
             raise NoIndex(f"{path} does not belong to an index and was not changed; give another folder for the index")
 
-    def make_current(self, name: str) -> None:
-        """Switch to the complete generation of that name. Raises OSError."""
-        files.sync(self.path)
-        files.write_atomically(self.path / "CURRENT", f"{name}\n".encode())
-
-    def discard_before(self, name: str, keep: int = 2) -> None:
-        """Delete old generations.
-
-        Args:
-            name: Name of the current generation.
-            keep: Number of generations before it that stay for readers that are opening them.
-        """
+    def discard_before(self, name: str) -> None:
+        """Delete old generations, except the two before `name`, which readers may be opening."""
         for number in self._numbers():
-            if number < int(name.removeprefix("gen-")) - keep:
-                _discard(self.path / generation_name(number))
+            if number < int(name.removeprefix("gen-")) - 2:
+                _discard(self.path / f"gen-{number:06d}")
 
     def _read(self, name: str, verify: bool, threads: int | None) -> Generation:
         folder = self.path / name
@@ -218,11 +204,6 @@ class IndexStore:
         for path in [path for path in self.path.iterdir() if UNFINISHED_FOLDER.fullmatch(path.name)]:
             if path.is_dir() and not path.is_symlink():
                 files.remove_folder(path)
-
-
-def generation_name(number: int) -> str:
-    """Return the name of a generation, such as gen-000007."""
-    return f"gen-{number:06d}"
 
 
 def _discard(folder: Path) -> None:

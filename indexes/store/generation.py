@@ -1,11 +1,10 @@
-"""A generation of an index: its folder is written as a whole, and opened for searching."""
+"""A generation of an index: its folder is written part by part, and opened for searching as a whole."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,46 +21,15 @@ from indexes.errors import (
     RowError,
     UnsupportedFormat,
 )
-from indexes.kinds.measure import query_ms, recall_against_exact, sample_queries
-from indexes.kinds.vector_index import NORM_TOLERANCE, Floats, RowNumbers, VectorIndex, check_unit, row_norms
+from indexes.kinds.measure import measured_recall
+from indexes.kinds.vector_index import NORM_TOLERANCE, Floats, VectorIndex, check_unit, row_norms
 from indexes.store.manifest import Manifest, check_files, file_checksums, read_manifest, write_manifest
 from indexes.store.rows import TABLE, TEXT, Row, Rows, read_rows, write_rows
 
 EMBEDDINGS, STRUCTURE = "embeddings", "vectors.faiss"
-RECALL_AT, RECALL_QUERIES = 10, 100
-TIMED_QUERIES = 20
 
 Arrays = Mapping[str, NDArray[Any]]
 """Name to per-row array (N, ...)."""
-
-
-@dataclass(frozen=True)
-class GenerationContent:
-    """What a generation contains.
-
-    Attributes:
-        rows: The N rows, sorted by path.
-        blocks: Arrays of consecutive rows by name, (n, ...) each; "embeddings" are unit vectors (n, d) float32.
-        fingerprint: Origin of the vectors, compared by `IndexStore.open(expect=...)`.
-        kind: Name of the kind of index.
-        documents: Name to JSON document or array.
-        about: Further entries of the manifest.
-        measure: Returns more such entries, from the index and its arrays, when they are on the disk.
-        queries: Unit vectors (Q, d) to measure recall with; None to draw them near the vectors of the index.
-        software: Version of the writing software.
-        threads: Number of threads; None for the library's own setting.
-    """
-
-    rows: Sequence[Row]
-    blocks: Iterable[Arrays]
-    fingerprint: Mapping[str, str]
-    kind: str = "flat"
-    documents: Mapping[str, Any] = field(default_factory=dict)
-    about: Mapping[str, Any] = field(default_factory=dict)
-    measure: Callable[[VectorIndex, Arrays], Mapping[str, Any]] | None = None
-    queries: Floats | None = None
-    software: str = ""
-    threads: int | None = None
 
 
 class Generation:
@@ -114,10 +82,6 @@ class Generation:
         """Check that the fingerprint has these values. Raises `MismatchedIndex` with the first difference."""
         check_fingerprint(self.folder.parent, self.fingerprint, expect)
 
-    def search(self, queries: Floats, k: int) -> tuple[Floats, RowNumbers]:
-        """Return scores and rows of the best k rows for each query, as `VectorIndex.search`."""
-        return self.index.search(queries, k)
-
 
 def check_fingerprint(where: str | Path, fingerprint: Mapping[str, str], expect: Mapping[str, str]) -> None:
     """Check that a fingerprint has these values.
@@ -140,69 +104,119 @@ def check_fingerprint(where: str | Path, fingerprint: Mapping[str, str], expect:
             )
 
 
-def write_generation(folder: Path, name: str, content: GenerationContent) -> None:
-    """Write a generation into an empty folder, the manifest last.
+class Draft:
+    """A generation while it is written, each part once: rows, arrays, documents, index, and at last the manifest.
 
-    Args:
-        folder: The folder.
+    `IndexStore.draft` makes it. Only one block of arrays is in memory at a time.
+
+    Attributes:
+        folder: Its temporary folder.
         name: Name of the generation.
-        content: Its content.
-
-    Raises:
-        RowError: A row, array or document is invalid.
-        VectorError: A vector is invalid.
-        ParameterError: The kind needs more vectors.
     """
-    write_rows(folder, content.rows)
-    arrays = _write_arrays(folder, content)
-    for document, value in content.documents.items():
-        is_array = isinstance(value, np.ndarray)
-        with files.durable_file(folder / f"{document}.{'npy' if is_array else 'json'}") as file:
-            if is_array:
-                np.save(file, value)
-            else:
-                file.write(files.encoded(value, indent=2) + b"\n")
-    vectors = arrays.pop(EMBEDDINGS)
-    index = load_kind(content.kind).build(vectors, content.kind, threads=content.threads)
-    if index.save(folder / STRUCTURE):
-        files.sync(folder / STRUCTURE)
-    about = {**content.about, **(content.measure(index, arrays) if content.measure else {})}
-    manifest = Manifest(
-        generation=name,
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
-        software=content.software,
-        fingerprint=dict(content.fingerprint),
-        about=about,
-        dim=index.dim,
-        kind=content.kind,
-        recall=_recall(index, content.queries),
-        photos=len(content.rows),
-        objects=len({row.object_id for row in content.rows}),
-        arrays=sorted(arrays),
-        documents=sorted(content.documents),
-        files=file_checksums(folder),
-    )
-    write_manifest(folder, manifest)
-    files.sync(folder)
 
+    def __init__(self, folder: Path, name: str) -> None:
+        self.folder, self.name = folder, name
+        self._rows: Sequence[Row] = ()
+        self._arrays: list[str] = []
+        self._documents: list[str] = []
+        self._index: VectorIndex | None = None
+        self._recall: dict[str, Any] = {}
 
-def _write_arrays(folder: Path, content: GenerationContent) -> dict[str, NDArray[Any]]:
-    """Write the blocks to `.npy` files, with one block in memory at a time, and return the arrays, memory-mapped."""
-    count, names = len(content.rows), list[str]()
-    with ExitStack() as stack:
-        done, opened = 0, {}
-        for block in content.blocks:
-            _check_block(block, content.rows[done : done + len(block[EMBEDDINGS])])
-            for name, array in block.items():
-                if not done:
-                    opened[name] = stack.enter_context(files.durable_file(folder / f"{name}.npy"))
-                    header = {"descr": array.dtype.str, "fortran_order": False, "shape": (count, *array.shape[1:])}
-                    np.lib.format.write_array_header_1_0(opened[name], header)
-                opened[name].write(np.ascontiguousarray(array).data)
-            names, done = list(opened), done + len(block[EMBEDDINGS])
-        if done != count:
-            raise RowError(f"every row needs an embedding; got {done} for {count} rows")
-    return {name: _open_array(folder / f"{name}.npy") for name in names}
+    def write_rows(self, rows: Sequence[Row]) -> None:
+        """Write the N rows, sorted by path. Raises RowError if a row is invalid, or there is none."""
+        write_rows(self.folder, rows)
+        self._rows = rows
+
+    def write_arrays(self, blocks: Iterable[Arrays]) -> dict[str, NDArray[Any]]:
+        """Write arrays of consecutive rows, and return the whole arrays (N, ...), memory-mapped.
+
+        Args:
+            blocks: Arrays (n, ...) by name; "embeddings" are unit vectors (n, d) float32.
+
+        Raises:
+            RowError: An array has not one entry for each row, or one that is not finite.
+            VectorError: A vector is invalid.
+        """
+        count, done, opened = len(self._rows), 0, dict[str, BinaryIO]()
+        with ExitStack() as stack:
+            for block in blocks:
+                _check_block(block, self._rows[done : done + len(block[EMBEDDINGS])])
+                for name, array in block.items():
+                    if not done:
+                        opened[name] = stack.enter_context(files.durable_file(self.folder / f"{name}.npy"))
+                        header = {"descr": array.dtype.str, "fortran_order": False, "shape": (count, *array.shape[1:])}
+                        np.lib.format.write_array_header_1_0(opened[name], header)
+                    opened[name].write(np.ascontiguousarray(array).data)
+                done += len(block[EMBEDDINGS])
+            if done != count:
+                raise RowError(f"every row needs an embedding; got {done} for {count} rows")
+        self._arrays = [name for name in opened if name != EMBEDDINGS]
+        return {name: _open_array(self.folder / f"{name}.npy") for name in opened}
+
+    def write_documents(self, documents: Mapping[str, Any]) -> None:
+        """Write JSON documents and arrays by name."""
+        for name, value in documents.items():
+            is_array = isinstance(value, np.ndarray)
+            with files.durable_file(self.folder / f"{name}.{'npy' if is_array else 'json'}") as file:
+                if is_array:
+                    np.save(file, value)
+                else:
+                    file.write(files.encoded(value, indent=2) + b"\n")
+        self._documents = sorted(documents)
+
+    def build_index(
+        self, embeddings: Floats, kind: str, *, queries: Floats | None = None, threads: int | None = None
+    ) -> VectorIndex:
+        """Build and write the index over the embeddings (N, d), and measure its recall.
+
+        Args:
+            embeddings: The embeddings that `write_arrays` returned.
+            kind: Name of the kind.
+            queries: Unit vectors (Q, d) to measure recall with; None to draw them near the embeddings.
+            threads: Number of threads; None for the library's own setting.
+
+        Raises:
+            ParameterError: The kind is unknown or needs more vectors.
+        """
+        index = load_kind(kind).build(embeddings, kind, threads=threads)
+        if index.save(self.folder / STRUCTURE):
+            files.sync(self.folder / STRUCTURE)
+        self._index, self._recall = index, measured_recall(index, queries)
+        return index
+
+    def finish(
+        self,
+        *,
+        fingerprint: Mapping[str, str] | None = None,
+        about: Mapping[str, Any] | None = None,
+        software: str = "",
+    ) -> Manifest:
+        """Write the manifest, and return it.
+
+        Args:
+            fingerprint: Origin of the vectors, compared by `IndexStore.open(expect=...)`.
+            about: Further entries of the manifest.
+            software: Version of the writing software.
+        """
+        assert self._index is not None, "build_index comes before finish"
+        manifest = Manifest(
+            generation=self.name,
+            created=datetime.now(UTC).isoformat(timespec="seconds"),
+            software=software,
+            fingerprint=dict(fingerprint or {}),
+            about=dict(about or {}),
+            dim=self._index.dim,
+            kind=self._index.kind,
+            recall=self._recall,
+            photos=len(self._rows),
+            objects=len({row.object_id for row in self._rows}),
+            arrays=sorted(self._arrays),
+            documents=self._documents,
+            files=file_checksums(self.folder),
+        )
+        write_manifest(self.folder, manifest)
+        files.sync(self.folder)
+        return manifest
 
 
 def _check_block(block: Arrays, rows: Sequence[Row]) -> None:
@@ -215,19 +229,6 @@ def _check_block(block: Arrays, rows: Sequence[Row]) -> None:
         if not finite.all():
             row = paths[int(np.argmin(finite))]
             raise RowError(f"array {name!r}: row {row!r} has NaN or infinity (too large for its type?)")
-
-
-def _recall(index: VectorIndex, queries: Floats | None) -> dict[str, Any]:
-    """Return recall and time of a kind next to those of exact search."""
-    if index.exact:
-        return {"value": 1.0, "at": RECALL_AT, "queries": 0, "how": "exact by construction"}
-    how = "measured on displaced vectors of the index" if queries is None else "measured on the given queries"
-    if queries is None:
-        queries = sample_queries(index.vectors, RECALL_QUERIES)
-    exact = load_kind("flat").build(index.vectors, "flat", threads=index.threads)
-    times = {"ms": query_ms(index, queries[:TIMED_QUERIES]), "exact_ms": query_ms(exact, queries[:TIMED_QUERIES])}
-    value = recall_against_exact(index, queries, RECALL_AT)
-    return {"value": value, "at": RECALL_AT, "queries": len(queries), "how": how, **times}
 
 
 def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -> Generation:

@@ -1,24 +1,28 @@
-"""Build an index from a folder of photos: list, find codes, write one whole generation."""
+"""Build an index from a folder of photos: list, find codes, then write rows, arrays, index and manifest."""
 
 import hashlib
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
+from _touch_retrieval.cache import Cache
 from indexes import kind_name, load_kind
 from indexes.errors import CorruptIndex, IndexesError, NoIndex, UnsupportedFormat
+from indexes.kinds.measure import RECALL_QUERIES
 from indexes.kinds.vector_index import VectorIndex
-from indexes.store.codes import CodeCache
 from indexes.store.folder import IndexStore
-from indexes.store.generation import RECALL_QUERIES, Arrays, Generation, GenerationContent
-from indexes.store.manifest import read_manifest
+from indexes.store.generation import EMBEDDINGS
+from indexes.store.manifest import Manifest, read_manifest
 from indexes.store.rows import TEXT, Row, encode_rows
 from retrieval.data.catalogue import Catalogue, list_catalogue
+from retrieval.data.folder_walk import SkippedPhoto
 from retrieval.data.naming import FOLDER, Naming, naming_warnings
-from retrieval.errors import BadInput
+from retrieval.errors import BadInput, NoReadablePhoto
 from retrieval.indexing.candidates import (
     can_measure,
     candidates_sentence,
@@ -26,19 +30,21 @@ from retrieval.indexing.candidates import (
     measure_candidates,
     query_codes,
 )
-from retrieval.indexing.codes import FileDigests, PhotoCodes, code_blocks, code_layout, code_model, find_codes
+from retrieval.indexing.codes import FileDigests, code_blocks, find_codes, photo_encoder
 from retrieval.indexing.report import BuildReport
-from retrieval.indexing.touches import ReferenceBuild, embed_references, touch_code_digest, touch_layout
+from retrieval.indexing.touches import ReferenceTouches, find_references
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.checkpoint_info import fingerprint
 from retrieval.model.fusion_scorer import CELLS, PARTIALS, StoredPartials, largest_rounding
-from retrieval.model.references import REFERENCE_CALIBRATION, REFERENCE_ROWS
+from retrieval.model.references import REFERENCE_ROWS
 from retrieval.version import __version__
 
 PARTS = {"checkpoint": "model", "preprocessing": "preprocessing of photos"}
 """Parts of a fingerprint, by their keys."""
-CODES = "codes"
-"""Entry of the manifest: keys of the codes of photos and of touches in the cache."""
+CACHE = Path("codes", "cache.sqlite")
+"""Cache of codes in the folder of an index, for all generations."""
+_USED = "files/used"
+"""Entry of the cache: the keys of the codes of the last generation."""
 
 
 def build_index(
@@ -87,7 +93,9 @@ def build_index(
         before = {}
     naming, note = naming_by(objects_from, before)
     options = BuildOptions(naming, kind_name(kind), quiet, note, cells=stores_cells(cells, before, checkpoint))
-    return build_listed(list_catalogue(folder, naming), checkpoint, out, options)
+    report = build_listed(list_catalogue(folder, naming), checkpoint, out, options)
+    IndexStore(out).discard_before(report.generation)
+    return report
 
 
 @dataclass(frozen=True)
@@ -100,7 +108,6 @@ class BuildOptions:
         quiet: Show no progress.
         note: First sentence of the report's reason.
         about: Further entries of the manifest.
-        keep: Number of earlier generations that stay on the disk.
         cells: Store the cells of photos; None for a model without cells.
     """
 
@@ -109,12 +116,11 @@ class BuildOptions:
     quiet: bool = False
     note: str = ""
     about: Mapping[str, Any] = field(default_factory=dict)
-    keep: int = 2
     cells: bool | None = None
 
 
 def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, options: BuildOptions) -> BuildReport:
-    """Write the next generation of an index of listed photos; as `build_index`.
+    """Write the next generation of an index of listed photos; as `build_index`, but old generations stay.
 
     Args:
         catalogue: The listed photos and touches.
@@ -124,52 +130,82 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
     """
     if options.cells is False:
         checkpoint = checkpoint.without_cells()
-    dim = checkpoint.config.matcher.embedding_dim
-    load_kind(options.kind).require(options.kind, len(catalogue.photos), dim)
+    load_kind(options.kind).require(options.kind, len(catalogue.photos), checkpoint.config.matcher.embedding_dim)
     store = IndexStore(out)
-    with store.lock(), CodeCache(out) as cache:
-        previous, why = _current(store, checkpoint)
-        files = FileDigests(catalogue.folder, catalogue.paths, cache)
-        references = embed_references(catalogue, checkpoint, cache, files.known, options.quiet)
-        catalogue = references.with_gel_images(catalogue)
-        start = time.perf_counter()
-        photos = find_codes(catalogue, checkpoint, cache, files.known, options.quiet)
+    with store.lock(), Cache(out / CACHE) as cache:
+        files = FileDigests(catalogue, cache)
+        references, catalogue = find_references(catalogue, checkpoint, cache, files.known, options.quiet)
+        start, encoder = time.perf_counter(), photo_encoder(checkpoint)
+        paths = [(photo.path,) for photo in catalogue.photos]
+        photos = find_codes(catalogue, paths, encoder, cache, files.known, options.quiet)
         seconds = time.perf_counter() - start
-        files.note(references.digests | photos.digests)
-        job = _Build(catalogue, checkpoint, options, references, photos, previous)
-        generation, is_written = job.write(store, cache)
+        files.store(references.codes.digests | photos.digests)
+        if not photos.keys:
+            raise no_photo(catalogue, [*catalogue.skipped, *photos.skipped])
+        rows = [
+            Row(photo.path, photo.object_id, photos.digests[photo.path], photo.metadata)
+            for photo in catalogue.photos
+            if (photo.path,) in photos.keys
+        ]
+        about = {
+            "checkpoint": str(checkpoint.path.resolve()),
+            "catalogue": catalogue.where,
+            "objects_from": options.naming.text,
+            **({} if options.cells is None else {CELLS: options.cells}),
+            **references.about(checkpoint),
+            **options.about,
+        }
+        manifest, why = _current(store, checkpoint)
+        is_written = manifest is None or _differs(manifest, checkpoint, options, rows, about)
+        if manifest is not None and not is_written:
+            try:
+                store.open(name=manifest.generation)
+            except CorruptIndex as error:
+                is_written, why = True, f"The existing index is not usable ({error})."
         if is_written:
-            job.prune(cache, catalogue.paths)
-    manifest, objects = generation.manifest, Counter(row.object_id for row in job.rows)
-    names, inside = sorted(objects), out.resolve()
-    first_photo = {photo.object_id: photo.path for photo in reversed(catalogue.photos)}
-    shown = dict.fromkeys((names[0], names[len(names) // 2], names[-1]))
-    return BuildReport(
-        index=str(out),
-        generation=generation.name,
-        written=is_written,
-        model=str(checkpoint.path),
-        photos=generation.count,
-        objects=len(names),
-        objects_from=options.naming.text,
-        examples=[(name, first_photo[name]) for name in shown],
-        warnings=naming_warnings(objects, options.naming),
+            with store.draft() as draft:
+                draft.write_rows(rows)
+                keys = [photos.keys[row.path,] for row in rows]
+                arrays = draft.write_arrays(code_blocks(cache, encoder, keys))
+                calibration = {"calibration": checkpoint.posterior.to_dict()} if checkpoint.posterior else {}
+                draft.write_documents(calibration | references.documents)
+                queries = query_codes(checkpoint, RECALL_QUERIES)[1] if can_measure(checkpoint) else None
+                index = draft.build_index(arrays[EMBEDDINGS], options.kind, queries=queries)
+                candidates = _measured_before(manifest, checkpoint, options, len(rows), photos.encoded)
+                if candidates is None:
+                    candidates = measure_candidates(checkpoint, index, StoredPartials(arrays), quiet=options.quiet)
+                measured = {"candidates": candidates, "partial_error": largest_rounding(arrays[PARTIALS])}
+                manifest = draft.finish(
+                    fingerprint=fingerprint(checkpoint), about=about | measured, software=__version__
+                )
+            _forget_unused(cache, [*keys, *references.codes.keys.values()])
+    assert manifest is not None
+    return _report(
+        out,
+        catalogue,
+        checkpoint,
+        options,
+        manifest,
+        rows,
+        references,
+        why,
+        is_written=is_written,
         embedded=photos.encoded,
-        reused=generation.count - photos.encoded,
-        skipped=[*catalogue.skipped, *photos.skipped, *references.skipped],
-        ignored=[name for name in catalogue.ignored if not (catalogue.folder / name).resolve().is_relative_to(inside)],
-        without_photo=sorted(set(catalogue.object_ids) - objects.keys()),
-        notes=list(catalogue.notes),
-        kind=manifest.kind,
-        reason=" ".join(
-            filter(None, (options.note, why, candidates_sentence(manifest.about["candidates"], generation.count)))
-        ),
-        recall=manifest.recall,
-        candidates=manifest.about["candidates"],
-        partial_error=manifest.about["partial_error"],
-        cells=options.cells,
         seconds=seconds,
-        references=references.summary,
+        skipped=photos.skipped,
+    )
+
+
+def no_photo(catalogue: Catalogue, skipped: list[SkippedPhoto]) -> NoReadablePhoto:
+    """Return the error for a catalogue without a readable photo.
+
+    Args:
+        catalogue: The catalogue.
+        skipped: Its photos that could not be read, at least one.
+    """
+    first = skipped[0]
+    return NoReadablePhoto(
+        f"no photo in {catalogue.where} can be read; the first: {first.path}: {first.reason}", skipped
     )
 
 
@@ -215,101 +251,93 @@ def stores_cells(requested: bool | None, about: Mapping[str, Any], checkpoint: C
     )
 
 
-def _current(store: IndexStore, checkpoint: Checkpoint) -> tuple[Generation | None, str]:
-    """Return the current generation, and what changed since."""
+def _current(store: IndexStore, checkpoint: Checkpoint) -> tuple[Manifest | None, str]:
+    """Return the manifest of the current generation, and what changed since."""
     try:
-        current = store.open()
+        current = read_manifest(store.path / store.current())
     except NoIndex:
         return None, ""
     except (CorruptIndex, UnsupportedFormat) as error:
         return None, f"The existing index is not usable ({error})."
     before, now = current.fingerprint, fingerprint(checkpoint)
     changed = " and the ".join(name for key, name in PARTS.items() if before.get(key) != now[key])
-    return current, f"The {changed} changed since version {current.manifest.software}." if changed else ""
+    return current, f"The {changed} changed since version {current.software}." if changed else ""
 
 
-class _Build:
-    """A build whose codes are in the cache.
+def _differs(
+    manifest: Manifest, checkpoint: Checkpoint, options: BuildOptions, rows: Sequence[Row], about: Mapping[str, Any]
+) -> bool:
+    """Whether a new generation would differ from the current one."""
+    return (
+        manifest.fingerprint != fingerprint(checkpoint)
+        or manifest.kind != options.kind
+        # Compare `REFERENCE_ROWS` even if it is not in `about`: all references may have been removed.
+        or any(manifest.about.get(key) != about.get(key) for key in (REFERENCE_ROWS, *about))
+        or manifest.files[TEXT].sha256 != hashlib.sha256(encode_rows(rows)).hexdigest()
+    )
 
-    Attributes:
-        rows: Rows of the photos that have a code.
-        about: Entries of the manifest that need no measurement.
-    """
 
-    def __init__(
-        self,
-        catalogue: Catalogue,
-        checkpoint: Checkpoint,
-        options: BuildOptions,
-        references: ReferenceBuild,
-        photos: PhotoCodes,
-        previous: Generation | None,
-    ) -> None:
-        self.checkpoint, self.options, self.references, self.photos = checkpoint, options, references, photos
-        self.previous = previous
-        self.rows = [
-            Row(photo.path, photo.object_id, photos.digests[photo.path], photo.metadata)
-            for photo in catalogue.photos
-            if photo.path in photos.digests
-        ]
-        layouts = code_layout(checkpoint), touch_layout(checkpoint)
-        self.about = {
-            "checkpoint": str(checkpoint.path.resolve()),
-            "catalogue": catalogue.where,
-            "objects_from": options.naming.text,
-            CODES: [code_model(checkpoint, layout) for layout in layouts],
-            **({} if options.cells is None else {CELLS: options.cells}),
-            **references.about,
-            **options.about,
-        }
+def _measured_before(
+    manifest: Manifest | None, checkpoint: Checkpoint, options: BuildOptions, photos: int, encoded: int
+) -> dict[str, Any] | None:
+    """Return the measured number of candidates of the current generation if it still holds; else None."""
+    if manifest is None or manifest.kind != options.kind or manifest.about.get(CELLS) != options.cells:
+        return None
+    if manifest.fingerprint != fingerprint(checkpoint):
+        return None
+    return kept_measurement(manifest.about["candidates"], photos, encoded)
 
-    def write(self, store: IndexStore, cache: CodeCache) -> tuple[Generation, bool]:
-        """Return the new generation and True; or the previous one and False if the new one would be equal."""
-        if self.previous is not None and not self._differs(self.previous):
-            return self.previous, False
-        checkpoint = self.checkpoint
-        calibration = {"calibration": checkpoint.posterior.to_dict()} if checkpoint.posterior else {}
-        content = GenerationContent(
-            self.rows,
-            code_blocks(cache, checkpoint, [row.digest for row in self.rows]),
-            fingerprint(checkpoint),
-            self.options.kind,
-            calibration | self.references.documents,
-            self.about,
-            self._measure,
-            query_codes(checkpoint, RECALL_QUERIES)[1] if can_measure(checkpoint) else None,
-            __version__,
-        )
-        return store.write_content(content, keep=self.options.keep), True
 
-    def prune(self, cache: CodeCache, paths: list[str]) -> None:
-        """Delete the codes that neither the new nor the previous generation uses, and the files that are gone."""
-        models, digests = set(self.about[CODES]), {row.digest for row in self.rows} | set(self.references.codes)
-        if self.previous is not None:
-            models |= set(self.previous.manifest.about[CODES])
-            digests |= {row.digest for row in self.previous.rows}
-            touches = self.previous.documents.get(REFERENCE_ROWS, {"touches": []})["touches"]
-            digests |= {touch_code_digest(touch["digests"]) for touch in touches}
-        cache.keep(models, digests, paths)
+def _forget_unused(cache: Cache, keys: list[str]) -> None:
+    """Delete the codes that neither the new nor the previous generation uses."""
+    before = cache.get(_USED)
+    used = [] if before is None else msgspec.json.decode(before, type=list[str])
+    cache.keep([*keys, *used, *cache.keys("files")])
+    cache.add({_USED: msgspec.json.encode(keys)})
 
-    def _differs(self, previous: Generation) -> bool:
-        manifest = previous.manifest
-        return (
-            manifest.fingerprint != fingerprint(self.checkpoint)
-            or manifest.kind != self.options.kind
-            # Compare `REFERENCE_ROWS` even if it is not in `about`: all references may have been removed.
-            or any(manifest.about.get(key) != self.about.get(key) for key in (REFERENCE_ROWS, *self.about))
-            or manifest.files[TEXT].sha256 != hashlib.sha256(encode_rows(self.rows)).hexdigest()
-        )
 
-    def _measure(self, index: VectorIndex, arrays: Arrays) -> dict[str, Any]:
-        """Return the entries of the manifest that are measured when the arrays are on the disk."""
-        manifest, candidates = self.previous.manifest if self.previous else None, None
-        if manifest and manifest.kind == self.options.kind and manifest.about[CODES] == self.about[CODES]:
-            candidates = kept_measurement(manifest.about["candidates"], len(self.rows), self.photos.encoded)
-        if candidates is None:
-            candidates = measure_candidates(self.checkpoint, index, StoredPartials(arrays), quiet=self.options.quiet)
-        measured = {"candidates": candidates, "partial_error": largest_rounding(arrays[PARTIALS])}
-        if self.references.rows and self.checkpoint.references is not None:
-            measured[REFERENCE_CALIBRATION] = {"calibration": self.checkpoint.references.to_dict()}
-        return measured
+def _report(
+    out: Path,
+    catalogue: Catalogue,
+    checkpoint: Checkpoint,
+    options: BuildOptions,
+    manifest: Manifest,
+    rows: Sequence[Row],
+    references: ReferenceTouches,
+    why: str,
+    *,
+    is_written: bool,
+    embedded: int,
+    seconds: float,
+    skipped: list[SkippedPhoto],
+) -> BuildReport:
+    objects, inside, candidates = Counter(row.object_id for row in rows), out.resolve(), manifest.about["candidates"]
+    names, first_photo = sorted(objects), {row.object_id: row.path for row in reversed(rows)}
+    shown = dict.fromkeys((names[0], names[len(names) // 2], names[-1]))
+    sentences = (options.note, why, candidates_sentence(candidates, len(rows)))
+    encoded = {"touch_only": len(references.touch_only), "encoded": references.codes.encoded}
+    return BuildReport(
+        index=str(out),
+        generation=manifest.generation,
+        written=is_written,
+        model=str(checkpoint.path),
+        photos=len(rows),
+        objects=len(names),
+        objects_from=options.naming.text,
+        examples=[(name, first_photo[name]) for name in shown],
+        warnings=naming_warnings(objects, options.naming),
+        embedded=embedded,
+        reused=len(rows) - embedded,
+        skipped=[*catalogue.skipped, *skipped, *references.skipped],
+        ignored=[name for name in catalogue.ignored if not (catalogue.folder / name).resolve().is_relative_to(inside)],
+        without_photo=sorted(set(catalogue.object_ids) - objects.keys()),
+        notes=list(catalogue.notes),
+        kind=manifest.kind,
+        reason=" ".join(filter(None, sentences)),
+        recall=manifest.recall,
+        candidates=candidates,
+        partial_error=manifest.about["partial_error"],
+        cells=options.cells,
+        seconds=seconds,
+        references={**references.counts, **encoded} if references.rows else None,
+    )

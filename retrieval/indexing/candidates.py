@@ -151,9 +151,12 @@ def query_codes(checkpoint: Checkpoint, count: int | None = None) -> tuple[Float
 def _queries(checkpoint: Checkpoint, photos: int) -> tuple[Floats, Floats]:
     """Return `query_codes` of some touches: as many as can score every photo within `MEASUREMENT_FLOPS`.
 
-    At least `MIN_QUERIES` are used. One score is a product with a square matrix: 2 hidden^2 operations.
+    At least `MIN_QUERIES` are used. One score is a product with a square matrix, and one of the cells of the touch with
+    those of the photo.
     """
-    affordable = MEASUREMENT_FLOPS / (2.0 * photos * checkpoint.config.matcher.hidden**2)
+    settings = checkpoint.config.matcher
+    cells = settings.fingers * settings.touch_cells**2 * settings.photo_cells**2 * settings.cell_dim
+    affordable = MEASUREMENT_FLOPS / (2.0 * photos * (settings.hidden**2 + cells))
     return query_codes(checkpoint, max(MIN_QUERIES, int(affordable)))
 
 

@@ -16,7 +16,7 @@ from indexes import kind_name
 from indexes.errors import CorruptIndex, NoIndex, UnsupportedFormat
 from indexes.kinds.vector_index import VectorIndex
 from indexes.store.folder import IndexStore
-from indexes.store.locking import WriterLock
+from indexes.store.locking import writer_lock
 from indexes.store.sharded import (
     MAX_SHARDS,
     SHARD_FOLDER,
@@ -33,8 +33,7 @@ from retrieval.data.catalogue_touches import CatalogueTouch
 from retrieval.data.folder_walk import SkippedPhoto
 from retrieval.data.naming import Naming, naming_warnings
 from retrieval.errors import BadInput, NoReadablePhoto
-from retrieval.indexing.build import BuildOptions, build_listed, naming_by, stores_cells
-from retrieval.indexing.codes import no_photo
+from retrieval.indexing.build import BuildOptions, build_listed, naming_by, no_photo, stores_cells
 from retrieval.indexing.report import BuildReport
 from retrieval.indexing.touches import require_reference_calibration
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
@@ -43,7 +42,6 @@ from retrieval.model.fusion_scorer import CELLS
 from retrieval.model.references import REFERENCE_CALIBRATION, REFERENCE_ROWS
 from retrieval.version import __version__
 
-_KEEP_ALL = 10**6
 ADDITIVE_FIELDS = ("photos", "embedded", "reused", "seconds")
 """Fields of a report that add up over the shards."""
 
@@ -125,7 +123,7 @@ def build_sharded(
     if (own / "CURRENT").is_file():
         raise BadInput(f"{out} is an index folder; give another folder for a sharded index of {shards} shards")
     name = kind_name(kind)
-    with WriterLock(own / "LOCK"):
+    with writer_lock(own / "LOCK"):
         before: ShardedManifest | None = None
         note = ""
         try:
@@ -143,7 +141,7 @@ def build_sharded(
         if catalogue.touches:
             require_reference_calibration(checkpoint)
         _delete_old_shards(own, before, shards)
-        options = BuildOptions(naming, name, quiet, keep=_KEEP_ALL, cells=cells)
+        options = BuildOptions(naming, name, quiet, cells=cells)
         jobs = [
             ShardJob(own, folder, part, checkpoint.path, replace(options, about={"shard": folder}))
             for folder, part in _split_catalogue(catalogue, shards)

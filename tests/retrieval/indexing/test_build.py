@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 import torch
 
+from _touch_retrieval.cache import Cache
 from indexes.errors import LockedIndex, ParameterError, VectorError
 from indexes.store.folder import IndexStore
 from retrieval.commands.main import main
 from retrieval.data import preprocessing
-from retrieval.data.catalogue import list_catalogue, read_photo
+from retrieval.data.catalogue import Catalogue, list_catalogue
 from retrieval.errors import DatasetError, NumericalError
 from retrieval.indexing import codes
 from retrieval.indexing.build import build_index
@@ -41,11 +42,13 @@ def read(monkeypatch):
     """Paths of the files that were read, unordered."""
     paths = []
 
-    def noted(catalogue, photo):
-        paths.append(photo.path)
-        return read_photo(catalogue, photo)
+    read_file = Catalogue.read
 
-    monkeypatch.setattr(codes, "read_photo", noted)
+    def noted(catalogue, path):
+        paths.append(path)
+        return read_file(catalogue, path)
+
+    monkeypatch.setattr(Catalogue, "read", noted)
     return paths
 
 
@@ -273,15 +276,16 @@ catalogue, model, index, fatal = sys.argv[1:]
 torch.set_num_threads(1)
 codes.BATCH, make, calls = 4, codes.torch_photo_encoder, []
 
-def counted(matcher):
-    def encode(images):
+def counting(matcher):
+    encode = make(matcher)
+    def counted(images):
         calls.append(1)
         if len(calls) == int(fatal):
             os.kill(os.getpid(), signal.SIGKILL)
-        return make(matcher)(images)
-    return encode
+        return encode(images)
+    return counted
 
-codes.torch_photo_encoder = counted
+codes.torch_photo_encoder = counting
 build_index(Path(catalogue), load_checkpoint(Path(model)), Path(index), quiet=True)
 """
 
@@ -325,7 +329,7 @@ def test_a_killed_rebuild_leaves_the_old_index(catalogue_copy, model, tmp_path, 
 def test_ctrl_c_keeps_the_finished_embeddings_and_reports_it(
     catalogue_copy, model, tmp_path, embedded, monkeypatch, capsys
 ):
-    index, keep = tmp_path / "index", codes.CodeCache.add
+    index, keep = tmp_path / "index", Cache.add
 
     def interrupted(self, *arguments):
         keep(self, *arguments)
@@ -333,7 +337,7 @@ def test_ctrl_c_keeps_the_finished_embeddings_and_reports_it(
 
     command = ["build-index", str(catalogue_copy), "--model", str(model), "--out", str(index)]
     with monkeypatch.context() as patch:
-        patch.setattr(codes.CodeCache, "add", interrupted)
+        patch.setattr(Cache, "add", interrupted)
         assert main(command) == 1
     assert f"stored in {index}; run the same command to continue" in capsys.readouterr().err
     assert main([*command, "--json"]) == 0

@@ -131,7 +131,7 @@ def test_the_inner_product_of_embeddings_is_the_score_of_candidate_search(search
     np.testing.assert_allclose(np.linalg.norm(touches.embeddings, axis=1), 1, atol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(photos.embeddings, axis=1), 1, atol=1e-6)
     scores = touches.embeddings @ photos.embeddings.T
-    theirs, numbers = searcher.generation.search(touches.embeddings, len(rows))
+    theirs, numbers = searcher.generation.index.search(touches.embeddings, len(rows))
     # other batches round in another order
     np.testing.assert_allclose(np.take_along_axis(scores, numbers, axis=1), theirs, atol=1e-5)
 
