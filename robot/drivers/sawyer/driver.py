@@ -23,7 +23,6 @@ import contextlib
 import itertools
 import logging
 import math
-import socket
 import threading
 import time
 from collections import deque
@@ -86,7 +85,6 @@ class RosbridgeLink:
         try:
             connection = connect(
                 self.url,
-                sock=_tcp(self.url, self.timeout_s),
                 open_timeout=self.timeout_s,
                 close_timeout=1.0,
                 ping_interval=_PING_S,
@@ -217,16 +215,6 @@ def _shorten(text: object) -> str:
     return "".join(each if each.isprintable() else repr(each)[1:-1] for each in str(text)[:_MAX_ERROR_CHARACTERS])
 
 
-def _tcp(url: str, timeout_s: float) -> socket.socket:
-    """Return a connected socket that fails when the peer acknowledges nothing for `timeout_s`; raise OSError."""
-    host, _, port = url.removeprefix("ws://").rpartition(":")
-    found = socket.create_connection((host.strip("[]"), int(port)), timeout_s)
-    found.settimeout(None)
-    if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux; elsewhere the pings detect it later
-        found.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, max(1, round(1000 * timeout_s)))
-    return found
-
-
 # The arm ------------------------------------------------------------------------------------------------------
 
 _STATE_TOPICS = (codec.JOINT_STATES, codec.ROBOT_STATE, codec.TIP_STATES, codec.COLLISION)
@@ -245,7 +233,6 @@ _RAMP_S = 0.3
 """Duration of the acceleration to full speed."""
 _ARRIVAL_RAD, _SETTLE_S = 0.01, 5.0
 """Tolerance of every joint at the goal, and time to arrive after the last command."""
-_IK_TRIES = 3
 _BACK_OFF_S, _LONGEST_BACK_OFF_S = 0.25, 5.0
 """First and longest wait between two tries to connect; without the limit, doubling 20 times would take days."""
 _MARGIN_MM = 20.0
@@ -377,29 +364,25 @@ class Sawyer(Arm):
 
     def _recover(self) -> None:
         """Connect again with back-off if the link or a state is lost; raise DeviceError if a person must act."""
-        try:
-            self._link.check()
-            self._fresh_joints()
-            self._robot_state()
-            self._collisions()
-        except DeviceError as error:
-            _LOG.warning("%s: %s; connecting again", self.name, error)
-            self._reconnect()
+        tries = self._options.reconnect_tries
+        for number in range(tries + 1):
+            try:
+                if number:
+                    self._open_link()
+                self._link.check()
+                self._fresh_joints()
+                self._robot_state()
+                self._collisions()
+                break
+            except DeviceError as error:
+                self._link.close()
+                if number == tries:
+                    raise
+                _LOG.warning("%s: %s; connecting again, try %d of %d", self.name, error, number + 1, tries)
+            time.sleep(min(_BACK_OFF_S * 2**number, _LONGEST_BACK_OFF_S) if number else 0.0)
         if self._has_collided_since(-math.inf, newest=True):
             raise DeviceError(f"{self.name}: recovery is refused: {codec.COLLIDED}")
         self._make_ready()
-
-    def _reconnect(self) -> None:
-        for number in range(self._options.reconnect_tries):
-            self._link.close()
-            try:
-                return self._open_link()
-            except DeviceError as error:
-                _LOG.warning("%s: try %d of %d: %s", self.name, number + 1, self._options.reconnect_tries, error)
-                if number + 1 == self._options.reconnect_tries:
-                    raise
-            time.sleep(min(_BACK_OFF_S * 2**number, _LONGEST_BACK_OFF_S))
-        raise AssertionError("the loop returns or raises")
 
     def _pose(self) -> Pose:
         return self._pose_since(self.clock() - self._options.max_state_age_s)
@@ -440,11 +423,11 @@ class Sawyer(Arm):
         return np.array(solved)
 
     def _solve_one(self, pose: Pose, before: Joints, start: Joints) -> Joints:
-        """Solve one way-point; after a failure, try other seeds up to _IK_TRIES tries in all."""
-        tip, seeds = self._mount.tip_of(pose), (before, start, None)
-        for number in range(_IK_TRIES):
-            request = codec.ik_request(tip, self._options.tip, seeds[number % len(seeds)])
+        """Solve one way-point; after a failure, try another seed."""
+        tip = self._mount.tip_of(pose)
+        for seed in (before, start, None):
             try:
+                request = codec.ik_request(tip, self._options.tip, seed)
                 joints = codec.ik_answer(self._link.call(codec.IK_SERVICE, request))
             except DeviceError as error:
                 self._link.check()
@@ -455,7 +438,7 @@ class Sawyer(Arm):
                 return joints
             problem = f"its solution turns a joint by {turn:.2f} rad at once"
         raise DeviceError(
-            f"{self.name}: no solution for {pose} after {_IK_TRIES} tries: {problem}; the arm has not moved. "
+            f"{self.name}: no solution for {pose} after 3 tries: {problem}; the arm has not moved. "
             "Choose a smaller workspace or check base_xyz_mm and tool_mm"
         )
 
