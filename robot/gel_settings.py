@@ -35,14 +35,9 @@ class GelSettings(TypedSettings):
 
 
 def parse_gel_settings(tables: Mapping[str, Any], fingers: Iterable[str]) -> dict[str, GelSettings]:
-    """Return the gel of each finger, from the tables [gel.a] and [gel.b] of a rig's file.
+    """Return the gel of each finger that has a sensor, from the tables [gel.a] and [gel.b] of a rig's file.
 
-    Args:
-        tables: Tables by finger.
-        fingers: The fingers that have a sensor.
-
-    Raises:
-        RobotConfigError: A table names another finger, or has an invalid setting.
+    Raise RobotConfigError if a table names another finger, or has an invalid setting.
     """
     gels = {finger: GelSettings() for finger in sorted(fingers)}
     for finger, table in tables.items():

@@ -4,43 +4,20 @@
     source = "bench 3"                        # written into recording.json
     sensor = "gelsight mini"
     licence = "CC BY 4.0"                     # of the recorded data; default: not stated
-
-    [limits]                                  # upper limits of every commanded motion
+    [limits]                                  # upper limits of every commanded motion (Limits)
     workspace_lower_mm = [-150, -150, 10]     # of the point between the fingertips; z = 0 is the table
     workspace_upper_mm = [150, 150, 400]
-    arm_speed_mm_s = 200
-    force_n = 20                              # on each finger
-    jaw_speed_mm_s = 60
-    state_age_s = 0.5                         # wsg50, sawyer: a moving actuator is stopped if it reports no state for
-                                              # this long; the drivers own and manual do not use it
-
-    [arm]
-    driver = "manual"                         # a person moves the hand
-    [gripper]
-    driver = "wsg50"
-    port = "socket://192.168.1.20:1000"
-    [sensors.a]
-    driver = "gelsight_mini"
-    device = "/dev/v4l/by-id/usb-..."         # `retrieve rig check` lists them
-    [sensors.b]
-    ...
+    [arm]                                     # also [gripper], [sensors.a], [sensors.b]
+    driver = "manual"                         # its other keys are settings of the driver
     [camera]
     driver = "realsense"
     hand_eye = "hand_eye.json"                # camera pose in the rig's frame, from `retrieve rig calibrate`
     hand_eye_days = 30                        # oldest accepted calibration
-
     [gel.a]                                   # known material constants (robot.gel_settings)
-    thickness_mm = 3.0
-    modulus_mpa = 0.35
     [grasp]                                   # random grasps (robot.grasping.settings.GraspSettings)
-    force_n = [5, 15]
     [attempt]                                 # speeds, waits, retries (robot.grasping.settings.AttemptSettings)
-    settle_s = 1.0
-    [object]                                  # instead of depth: position and size of every object
-    x_mm = 0
-    ...
+    [object]                                  # instead of depth: position and size of every object (ObjectSettings)
     [planner]                                 # the grasp planner (robot.rig)
-    name = "cylinder"                         # its other keys are the planner's settings
 
 The limits do not apply to homing, which has the gripper's own speed. A manual arm's limits apply only to the
 requested poses and speeds. Sawyer's robot and collision states may be as old as the larger of 2 s and `state_age_s`.
@@ -57,7 +34,7 @@ import numpy as np
 
 from _touch_retrieval.documents import NonNegative, Positive, typed
 from _touch_retrieval.registry import Registry
-from robot.devices import Camera, Device, TactileSensor
+from robot.devices import Camera, Device
 from robot.errors import RobotConfigError, UnknownName
 from robot.gel_settings import parse_gel_settings
 from robot.grasping.settings import AttemptSettings, GraspSettings, parse_attempt_settings
@@ -163,18 +140,17 @@ class RealRig(Rig):
     ) -> None:
         """Build the devices without connecting them; raise RobotConfigError, or UnknownName for a driver."""
         maxima = build(Limits, limits, where="[limits]")
-        state_age = {"max_state_age_s": maxima.state_age_s}
-        moving: dict[str, Any] = {
-            "workspace": Region(maxima.workspace_lower_mm, maxima.workspace_upper_mm),
-            "max_speed_mm_s": maxima.arm_speed_mm_s,
-            "ask": ask_on_terminal,
-        }
-        closing = {"max_force_n": maxima.force_n, "max_speed_mm_s": maxima.jaw_speed_mm_s}
+        common = {"max_state_age_s": maxima.state_age_s}
+        moving = common | {"max_speed_mm_s": maxima.arm_speed_mm_s, "ask": ask_on_terminal}
+        closing = common | {"max_speed_mm_s": maxima.jaw_speed_mm_s, "max_force_n": maxima.force_n}
+        workspace = Region(maxima.workspace_lower_mm, maxima.workspace_upper_mm)
         gels = parse_gel_settings(gel, sensors)
+        if not sensors or not sensors.keys() <= {"a", "b"}:
+            raise RobotConfigError(f"a rig requires gels: [sensors.a], [sensors.b] or both; got {', '.join(sensors)}")
         super().__init__(
-            load_driver("arm", arm, "[arm]", **moving, **state_age),
-            load_driver("gripper", gripper, "[gripper]", **closing, **state_age),
-            _sensors(sensors),
+            load_driver("arm", arm, "[arm]", workspace=workspace, **moving),
+            load_driver("gripper", gripper, "[gripper]", **closing),
+            {name: load_driver("sensors", sensors[name], f"[sensors.{name}]", finger=name) for name in sensors},
             _camera(camera),
             info={
                 "source": source,
@@ -204,20 +180,14 @@ def load_driver(role: str, table: Mapping[str, Any], where: str, **arguments: An
     return build_named(DRIVERS[role], table, "driver", where=where, clock=time.monotonic, **arguments)
 
 
-def _sensors(tables: Mapping[str, Any]) -> dict[str, TactileSensor]:
-    if not tables or not tables.keys() <= {"a", "b"}:
-        raise RobotConfigError(f"a rig requires gels: [sensors.a], [sensors.b] or both; got {', '.join(tables)}")
-    return {
-        finger: load_driver("sensors", table, f"[sensors.{finger}]", finger=finger) for finger, table in tables.items()
-    }
-
-
 def _camera(table: Mapping[str, Any]) -> Camera:
     settings = dict(table)
     file, days = settings.pop("hand_eye", None), settings.pop("hand_eye_days", MAX_HAND_EYE_AGE_DAYS)
-    typed(file, str | None, "[camera]: hand_eye", error=RobotConfigError)  # type: ignore[arg-type]  # mypy: a union
-    typed(days, float, "[camera]: hand_eye_days", error=RobotConfigError)
-    extrinsics = np.eye(4) if file is None else hand_eye.load_hand_eye(Path(file), max_age_days=days).rigid
+    extrinsics = np.eye(4)
+    if file is not None:
+        path = Path(typed(file, str, "[camera]: hand_eye", error=RobotConfigError))
+        typed(days, float, "[camera]: hand_eye_days", error=RobotConfigError)
+        extrinsics = hand_eye.load_hand_eye(path, max_age_days=days).rigid
     camera: Camera = load_driver("camera", settings, "[camera]", extrinsics=extrinsics)
     if camera.has_depth and file is None:
         raise RobotConfigError(

@@ -53,13 +53,10 @@ class DeviceReport:
 
 
 def check_rig(rig: Rig, *, motion: bool = True) -> Iterator[DeviceReport]:
-    """Check each device, then the time skew between the fingers' frames; yield the reports.
+    """Check each device of an unconnected rig, then the time skew between the fingers' frames; yield the reports.
 
-    A RobotError of a check becomes the `failure` of its report.
-
-    Args:
-        rig: The rig, not connected.
-        motion: Whether arm and jaws may move; if true, connecting may home the gripper.
+    With `motion`, arm and jaws may move, and connecting may home the gripper. A RobotError of a check becomes the
+    `failure` of its report.
     """
     rig.arm.may_move = rig.gripper.may_move = motion
     if rig.can_run_jobs:  # a simulated rig needs an object for its gel images

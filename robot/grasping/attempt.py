@@ -73,17 +73,10 @@ class AttemptRunner:
         self.rig, self.seed, self.settings = rig, seed, settings
 
     def run(self, object_id: str, number: int) -> GraspAttempt:
-        """Make one attempt; after a DeviceError, recover the rig and repeat the attempt.
+        """Make attempt `number`; after a DeviceError, recover the rig and repeat it, or raise after all retries.
 
         After any exception, Ctrl-C included, the jaws are opened. If this fails, the exception's message, or a note on
         the exception, states it.
-
-        Args:
-            object_id: The object.
-            number: Number of the attempt.
-
-        Raises:
-            DeviceError: All retries failed.
         """
         for retry in range(self.settings.retries + 1):
             try:

@@ -54,15 +54,7 @@ Gate = Callable[[Mapping[str, GraspFrames]], bool | float]
 
 
 def apply_gate(gate: Gate, touches: Mapping[str, GraspFrames]) -> tuple[bool, float]:
-    """Return the decision of a gate and its score, 0 to 1.
-
-    Args:
-        gate: The gate.
-        touches: Frames by finger.
-
-    Raises:
-        RobotError: The score is not between 0 and 1.
-    """
+    """Return the decision of a gate on the frames by finger, and its score; raise RobotError unless it is in 0..1."""
     score = float(gate(touches))
     if not 0.0 <= score <= 1.0:  # also rejects NaN
         raise RobotError(f"a gate must return true, false or a probability, got {score}")

@@ -509,11 +509,6 @@ class WSG50(Gripper):
         packet = codec.command(CommandId.GRASP, self._options.grasp_width_mm, speed_mm_s)
         return self._as_state(self._run_at(speed_mm_s, packet, lambda reading, _: reading.grasping in _CLOSED_STATES))
 
-    def home(self) -> GripperState:
-        """Home the jaws over the whole stroke, at the gripper's own speed; raise DeviceError if this fails."""
-        with self._moving("cannot be homed"):
-            return self._as_state(self._home())
-
     # Reading.
 
     def _query(self, command: CommandId, parse: Callable[[bytes], Any]) -> Any:

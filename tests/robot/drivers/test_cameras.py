@@ -128,12 +128,6 @@ def test_settings_of_a_realsense_out_of_range_are_refused(setting):
 # Missing packages -------------------------------------------------------------------------------------------
 
 
-def test_a_missing_package_is_a_device_error_with_the_install_command(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    with pytest.raises(DeviceError, match=r"pip install 'touch-retrieval\[realsense\]'"):
-        realsense().connect()
-
-
 def test_a_missing_system_library_is_named(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "pyrealsense2", raising=False)

@@ -3,8 +3,6 @@
 import os
 import socket
 import struct
-import subprocess
-import sys
 import threading
 import time
 from contextlib import closing
@@ -14,7 +12,6 @@ import pytest
 from robot.drivers.wsg50 import codec
 from robot.drivers.wsg50.codec import CommandId, Packet, Status, decode, encode
 from robot.drivers.wsg50.driver import CommandFailed, Link, LinkLost, NoEcho, NoReply
-from robot.errors import DeviceError
 from tests.wsg50_bench import quick_close
 
 OK = bytes(2)
@@ -248,13 +245,3 @@ def test_a_closed_terminal_is_a_lost_link():
     with pytest.raises(LinkLost):
         link.sync()
     assert not link.is_open
-
-
-def test_without_pyserial_the_driver_can_be_imported_and_the_message_names_the_install_command(monkeypatch):
-    blocked = (
-        "import sys; sys.modules['serial'] = None; import robot.drivers.wsg50.driver, tests.emulators.wsg50.server"
-    )
-    subprocess.run([sys.executable, "-c", blocked], check=True, timeout=60)
-    monkeypatch.setitem(sys.modules, "serial", None)
-    with pytest.raises(DeviceError, match=r"run pip install 'touch-retrieval\[gripper\]'"):
-        Link("socket://127.0.0.1:1").open()
