@@ -19,6 +19,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from _touch_retrieval.files import write_atomically
+from retrieval.data.dataset import Split
 from retrieval.data.licences import stored_licences
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.checkpoint_info import (
@@ -46,6 +47,7 @@ class Checkpoint(CheckpointInfo):
 
     Attributes:
         matcher: The towers, the fusion head and the projections.
+        split: Training, validation and test objects; None if the training run had no split.
         queries: (Q, partial) float16 partial activations of touches of validation objects, with which an index measures
             its own search.
 
@@ -55,6 +57,7 @@ class Checkpoint(CheckpointInfo):
     """
 
     matcher: Matcher = field(kw_only=True)
+    split: Split | None = None
     queries: NDArray[np.float16] | None = None
 
     def without_cells(self) -> "Checkpoint":
@@ -90,7 +93,7 @@ def store_checkpoint(checkpoint: Checkpoint, path: Path) -> None:
     """
     require_writable(path)
     header: dict[str, Any] = {"config": checkpoint.config.to_dict(), "provenance": checkpoint.provenance}
-    for name in PARTS:
+    for name in ("split", *PARTS):
         if checkpoint.config.matcher.cell_dim or not name.startswith("pooled"):
             part = getattr(checkpoint, name)
             header[name] = None if part is None else asdict(part)
@@ -143,6 +146,7 @@ def load_checkpoint(path: str | Path, *, info: CheckpointInfo | None = None) -> 
     queries = state.pop(_QUERIES, None)
     width = info.config.matcher.touch_partial_width
     try:
+        split = None if header["split"] is None else Split.from_dict(header["split"])
         if queries is not None and (queries.dtype != torch.float16 or queries.shape[1:] != (width,)):
             raise CheckpointError(
                 f"{_QUERIES} must be float16 (touches, {width}); got {queries.dtype} {tuple(queries.shape)}"
@@ -163,6 +167,7 @@ def load_checkpoint(path: str | Path, *, info: CheckpointInfo | None = None) -> 
         info.config,
         info.provenance,
         matcher=matcher.eval(),
+        split=split,
         queries=None if queries is None else np.asarray(queries.numpy()),
         **contents,
     )

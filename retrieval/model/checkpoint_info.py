@@ -9,7 +9,6 @@ from safetensors import SafetensorError, safe_open
 
 from _touch_retrieval.documents import typed
 from _touch_retrieval.files import file_digest, open_regular, parse_json
-from retrieval.data.dataset import Split
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.config import Config
 from retrieval.model.fusion_scorer import FusionScorer
@@ -33,7 +32,6 @@ class CheckpointInfo:
         digest: SHA-256 of the file, in hexadecimal; empty for a model that is not written yet.
         config: Settings of towers, head and preprocessing.
         provenance: Source, step, seed, data digest, licences of the data and metrics of the training.
-        split: Training, validation and test objects; None if the training run had no split.
         posterior: Calibration of the match logits; None for an uncalibrated model.
         gel_check: Thresholds that separate touches, no-contact gels and other images; None without a gel head.
         verification: Error rates of `Searcher.verify`; None if there were too few validation objects.
@@ -46,7 +44,6 @@ class CheckpointInfo:
     digest: str
     config: Config
     provenance: dict[str, Any]
-    split: Split | None = None
     posterior: Posterior | None = None
     gel_check: GelCheck | None = None
     verification: VerificationCalibration | None = None
@@ -56,7 +53,6 @@ class CheckpointInfo:
 
 
 PARTS: dict[str, type[Any]] = {
-    "split": Split,
     "posterior": Posterior,
     "gel_check": GelCheck,
     "verification": VerificationCalibration,
@@ -64,7 +60,7 @@ PARTS: dict[str, type[Any]] = {
     "pooled_posterior": Posterior,
     "pooled_references": ReferenceCalibration,
 }
-"""Types of the optional entries of a header."""
+"""Types of the optional entries of a header that a query may need."""
 
 
 def fingerprint(checkpoint: CheckpointInfo) -> dict[str, str]:

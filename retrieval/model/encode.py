@@ -130,11 +130,7 @@ class TorchEncoder:
         """Encode grasps, each a sequence of its fingers' images."""
         if self._threads is not None:
             torch.set_num_threads(self._threads)  # applies to the calling thread
-        features = self._fast.touch_features(touch_batch(touches))
-        encoding, readings = self._fast.touch_search_encoding(features), self._fast.gel_readings(features)
-        return TouchEncodings(
-            encoding.partial.numpy(), encoding.embedding.numpy(), None if readings is None else readings.numpy()
-        )
+        return TouchEncodings(*(output.numpy() for output in self._fast.encode_touches(touch_batch(touches))))
 
 
 class PhotoEncodings(NamedTuple):

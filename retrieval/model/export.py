@@ -1,6 +1,5 @@
 """Encoders as ONNX: that of touches for queries without PyTorch (`retrieve export`), that of photos for long builds."""
 
-import copy
 import json
 import logging
 import warnings
@@ -26,8 +25,7 @@ from retrieval.model.encode import (
     for_inference,
     torch_photo_encoder,
 )
-from retrieval.model.fusion import Matcher, Standardise
-from retrieval.model.late_interaction import CellEncoder
+from retrieval.model.fusion import Matcher
 from retrieval.model.onnx_encoder import (
     CHECKPOINT_KEY,
     EXPORT_SUFFIX,
@@ -156,23 +154,14 @@ def _trace(encoder: nn.Module, shape: tuple[int, ...], outputs: list[str], check
 
 
 class _TouchEncoder(nn.Module):
-    """Images (B, fingers, H, W, 3) to partial activations, embeddings and, with a gel head, readings.
-
-    ONNX cannot check values, so the checks of `Tower.forward` are left out.
-    """
+    """Images (B, fingers, H, W, 3) to partial activations, embeddings and, with a gel head, readings."""
 
     def __init__(self, matcher: Matcher) -> None:
         super().__init__()
-        self.matcher = _exportable_matcher(matcher, "touch")
+        self.matcher = for_inference(matcher, ["touch_tower"])
 
     def forward(self, images: Tensor) -> tuple[Tensor, ...]:
-        tower = self.matcher.touch_tower
-        pictures = images.permute(0, 1, 4, 2, 3).flatten(0, 1)
-        features = tower.encode_unchecked(pictures)
-        features = features.reshape(-1, self.matcher.config.fingers * tower.output_count)
-        encoding, readings = self.matcher.touch_search_encoding(features), self.matcher.gel_readings(features)
-        outputs = encoding.partial, encoding.embedding
-        return outputs if readings is None else (*outputs, readings)
+        return self.matcher.encode_touches(images.permute(0, 1, 4, 2, 3))
 
 
 class _PhotoEncoder(nn.Module):
@@ -180,40 +169,10 @@ class _PhotoEncoder(nn.Module):
 
     def __init__(self, matcher: Matcher) -> None:
         super().__init__()
-        self.matcher = _exportable_matcher(matcher, "photo")
+        self.matcher = for_inference(matcher, ["photo_tower"])
 
     def forward(self, images: Tensor) -> tuple[Tensor, ...]:
-        tower, views = self.matcher.photo_tower, self.matcher.views
-        side = images.shape[1]
-        pictures = images.reshape(-1, side, views, side, 3).permute(0, 2, 4, 1, 3).flatten(0, 1)
-        features = self.matcher.joined_views(tower.encode_unchecked(pictures))
-        encoding = self.matcher.photo_search_encoding(features)
-        return encoding.partial, encoding.embedding
-
-
-def _exportable_matcher(matcher: Matcher, side: str) -> Matcher:
-    """Return a matcher whose tower is folded and whose feature normalisation is plain arithmetic."""
-    fast = for_inference(matcher, [f"{side}_tower"])
-    norm = matcher.get_submodule(f"{side}_norm")
-    if isinstance(norm, Standardise):
-        fast.add_module(f"{side}_norm", _FrozenNorm(norm))
-    cells = fast.get_submodule(f"{side}_cells") if matcher.config.cell_dim else None
-    if isinstance(cells, CellEncoder) and isinstance(cells.norm, Standardise):
-        frozen = copy.copy(cells)
-        frozen._modules = {**cells._modules, "norm": _FrozenNorm(cells.norm)}
-        fast.add_module(f"{side}_cells", frozen)
-    return fast
-
-
-class _FrozenNorm(nn.Module):
-    """Feature normalisation in evaluation mode: the exporter requires the width of its input."""
-
-    def __init__(self, norm: Standardise) -> None:
-        super().__init__()
-        self.mean, self.scale = norm.mean_and_scale()
-
-    def forward(self, x: Tensor) -> Tensor:
-        return (x - self.mean) * self.scale
+        return self.matcher.photo_search_encoding(self.matcher.photo_features(images.permute(0, 3, 1, 2)))
 
 
 def _difference(by_torch: TouchEncodings | PhotoEncodings, by_onnx: TouchEncodings | PhotoEncodings) -> float:

@@ -57,16 +57,12 @@ class Standardise(nn.BatchNorm1d):
 
     def forward(self, features: Tensor) -> Tensor:
         """Return standardised features (B, F)."""
+        if not self.training:  # plain arithmetic, also for the exporter to ONNX
+            mean, variance = self.get_buffer("running_mean"), self.get_buffer("running_var")
+            return (features - mean) * torch.rsqrt(self._floored_variance(mean, variance))
         scaled: Tensor = super().forward(features)
-        mean, variance = self.get_buffer("running_mean"), self.get_buffer("running_var")
-        if self.training:
-            variance, mean = torch.var_mean(features.detach(), dim=0, correction=0)
+        variance, mean = torch.var_mean(features.detach(), dim=0, correction=0)
         return scaled * ((variance + self.eps) / self._floored_variance(mean, variance)).sqrt()
-
-    def mean_and_scale(self) -> tuple[Tensor, Tensor]:
-        """Return mean (F,) and scale (F,): in evaluation mode the output is `(features - mean) * scale`."""
-        mean, variance = self.get_buffer("running_mean"), self.get_buffer("running_var")
-        return mean, torch.rsqrt(self._floored_variance(mean, variance))
 
     def _floored_variance(self, mean: Tensor, variance: Tensor) -> Tensor:
         """Return variances (F,), raised for features that hardly vary."""
@@ -228,7 +224,7 @@ class Matcher(nn.Module):
             got = f"{touches.shape[1]} image(s)" if touches.ndim == 5 else f"an array of shape {tuple(touches.shape)}"
             raise BadInput(f"this matcher takes {fingers} gel image(s) for one touch; got {got}")
         features: Tensor = self.touch_tower(touches.flatten(0, 1))
-        return features.float().view(len(touches), -1)
+        return features.float().reshape(-1, fingers * self.touch_tower.output_count)
 
     def photo_features(self, photos: Tensor) -> Tensor:
         """Return features (B, photo_feature_count) of photos (B, 3, H, views * W) in 0..1."""
@@ -237,17 +233,9 @@ class Matcher(nn.Module):
             count, _, height, _ = photos.shape
             side_by_side = photos.permute(0, 2, 3, 1).reshape(count, height, self.views, -1, 3)
             photos = side_by_side.transpose(1, 2).flatten(0, 1).permute(0, 3, 1, 2)
-        features: Tensor = self.photo_tower(photos)
-        return self.joined_views(features.float())
-
-    def joined_views(self, outputs: Tensor) -> Tensor:
-        """Return features (B, photo_feature_count) of the tower's outputs (B * views, output_count).
-
-        These are the features of every view, then the cells of the last view: a zoom into the object, if the
-        preprocessing has one.
-        """
-        outputs = outputs.view(-1, self.views, self.photo_tower.output_count)
+        outputs: Tensor = self.photo_tower(photos).float().reshape(-1, self.views, self.photo_tower.output_count)
         pooled = self.photo_tower.feature_count
+        # The cells are those of the last view: a zoom into the object, if the preprocessing has one.
         return torch.cat([outputs[..., :pooled].flatten(1), outputs[:, -1, pooled:]], dim=1)
 
     @property
@@ -263,69 +251,63 @@ class Matcher(nn.Module):
 
     def touch_encoding(self, features: Tensor) -> ImageEncoding:
         """Return partial activations of touch features, and their embeddings by the contrastive projection."""
-        tower, fingers = self.touch_tower, self.config.fingers
-        each = features.reshape(-1, fingers, tower.output_count)
-        pooled = self.touch_norm(each[..., : tower.feature_count].flatten(1))
-        parts, embedding = [self.head.touch_partial(pooled)], _unit(self.touch_projection(pooled))
-        if self.touch_cells is not None:
-            cells = each[..., tower.feature_count :].reshape(-1, fingers * tower.cells**2, tower.cell_channels)
-            return self._encoding(parts, embedding, self.touch_cells(cells))
-        return self._encoding(parts, embedding)
+        each = features.reshape(-1, self.config.fingers, self.touch_tower.output_count)
+        pooled, cells = each.tensor_split((self.touch_tower.feature_count,), dim=-1)
+        layers = self.touch_norm, self.head.touch_partial, self.touch_projection, self.touch_cells
+        return self._encoding(pooled.flatten(1), cells.flatten(1), *layers)
 
     def photo_encoding(self, features: Tensor) -> ImageEncoding:
         """Return partial activations of photo features, and their embeddings by the contrastive projection."""
-        tower = self.photo_tower
-        count = self.views * tower.feature_count
-        pooled = self.photo_norm(features[:, :count])
-        parts, embedding = [self.head.photo_partial(pooled)], _unit(self.photo_projection(pooled))
-        if self.photo_cells is not None:
-            cells = features[:, count:].reshape(-1, tower.cells**2, tower.cell_channels)
-            return self._encoding(parts, embedding, self.photo_cells(cells))
-        return self._encoding(parts, embedding)
+        pooled, cells = features.tensor_split((self.pooled_counts[1],), dim=1)
+        layers = self.photo_norm, self.head.photo_partial, self.photo_projection, self.photo_cells
+        return self._encoding(pooled, cells, *layers)
 
-    def _encoding(self, parts: list[Tensor], embedding: Tensor, cells: Tensor | None = None) -> ImageEncoding:
-        """Return the encoding of images.
-
-        Args:
-            parts: The first parts of the partial activations.
-            embedding: (B, embedding_dim) unit embeddings.
-            cells: (B, N, cell_dim) vectors of cells.
-        """
+    def _encoding(
+        self,
+        pooled: Tensor,
+        cells: Tensor,
+        norm: nn.Module,
+        partial: nn.Module,
+        projection: nn.Module,
+        cell_encoder: CellEncoder | None,
+    ) -> ImageEncoding:
+        """Return the encoding of features (B, F) and cells (B, cells * channels) by the layers of a modality."""
+        pooled = norm(pooled)
+        parts, embedding = [partial(pooled)], _unit(projection(pooled))
         if self.cosine_scale is not None:
             parts.append(embedding * self.cosine_scale.clamp(min=0.0).sqrt())
-        if cells is not None:
-            parts.append(cells.flatten(1))
+        if cell_encoder is not None:
+            count = cells.shape[1] // cell_encoder.channels
+            parts.append(cell_encoder(cells.reshape(-1, count, cell_encoder.channels)).flatten(1))
         return ImageEncoding(torch.cat(parts, dim=-1), embedding)
 
     def touch_search_encoding(self, features: Tensor) -> ImageEncoding:
         """Return partial activations and search embeddings of touch features."""
-        encoding = self.touch_encoding(features)
-        return (
-            encoding
-            if self.candidate_encoder is None
-            else ImageEncoding(encoding.partial, self.candidate_encoder.touch(self._pooled(encoding.partial)))
-        )
+        partial, embedding = self.touch_encoding(features)
+        if self.candidate_encoder is not None:
+            embedding = self.candidate_encoder.touch(partial[:, : self.config.pooled_width])
+        return ImageEncoding(partial, embedding)
+
+    def photo_search_encoding(self, features: Tensor) -> ImageEncoding:
+        """Return partial activations and search embeddings of photo features, as an index stores them."""
+        partial, embedding = self.photo_encoding(features)
+        if self.candidate_encoder is not None:
+            embedding = self.candidate_encoder.photo(partial[:, : self.config.pooled_width])
+        return ImageEncoding(partial, embedding)
 
     def gel_readings(self, features: Tensor) -> Tensor | None:
         """Return the readings (B, fingers, 2) of each finger's features (`GelHead`); None without a gel head."""
         if self.gel_head is None:
             return None
-        each = features.view(-1, self.config.fingers, self.touch_tower.output_count)
+        each = features.reshape(-1, self.config.fingers, self.touch_tower.output_count)
         readings: Tensor = self.gel_head(each[..., : self.touch_tower.feature_count])
         return readings
 
-    def _pooled(self, partial: Tensor) -> Tensor:
-        """Return partial activations without their cells."""
-        return partial[..., : self.config.pooled_width]
-
-    def photo_search_encoding(self, features: Tensor) -> ImageEncoding:
-        """Return partial activations and search embeddings of photo features, as an index stores them."""
-        encoding = self.photo_encoding(features)
-        return (
-            encoding
-            if self.candidate_encoder is None
-            else ImageEncoding(encoding.partial, self.candidate_encoder.photo(self._pooled(encoding.partial)))
-        )
+    def encode_touches(self, touches: Tensor) -> tuple[Tensor, ...]:
+        """Return partial activations, search embeddings and, with a gel head, readings of touches (B, ...)."""
+        features = self.touch_features(touches)
+        readings = self.gel_readings(features)
+        return *self.touch_search_encoding(features), *(() if readings is None else (readings,))
 
     def forward(self, touches: Tensor, photos: Tensor) -> Tensor:
         """Return match logits (P,) of pairs: touches (P, fingers, 3, H, W) with photos (P, 3, H, views * W)."""

@@ -28,7 +28,7 @@ class CellEncoder(nn.Module):
             weighted: The length of a vector is a learned weight; otherwise it is 1.
         """
         super().__init__()
-        self.norm, self.weighted = norm, weighted
+        self.norm, self.channels, self.weighted = norm, channels, weighted
         self.network = nn.Sequential(
             nn.Linear(channels, CELL_HIDDEN), nn.ReLU(), nn.Linear(CELL_HIDDEN, dim + int(weighted))
         )

@@ -244,7 +244,7 @@ def test_a_weight_that_is_not_finite_is_refused(saved, value):
         ({"config": {"matcher": {"colour": 1}}}, "matcher has no setting 'colour'; known settings:"),
         ({"config": {"matcher": {"tower": "vgg"}}}, "tower must be one of"),
         ({"config": [1]}, "it must be a table"),
-        ({"split": {"train": ["a"]}}, "split must have seed, train, validation, test; seed is missing"),
+        ({"split": {"train": ["a"]}}, "split must have seed, train, validation, test; validation is missing"),
         ({"split": []}, "split must be a table"),
         (
             {"posterior": {"slope": 1.0}},
