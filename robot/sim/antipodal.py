@@ -68,13 +68,7 @@ class AntipodalGrasps:
 
 
 def find_grasps(body: MeshBody, settings: GraspSettings, stroke_mm: float) -> AntipodalGrasps:
-    """Find all grasps on a grid of places and closing directions, from above and from both sides.
-
-    Args:
-        body: the mesh in its resting pose.
-        settings: limits of the grasp.
-        stroke_mm: greatest opening of the gripper.
-    """
+    """Find all grasps on a grid of places and closing directions, from above and from both sides."""
     parts: list[tuple[Array, ...]] = []
     min_width_mm = math.inf
     for yaw in _YAWS:

@@ -152,10 +152,7 @@ class Lighting:
     @classmethod
     def draw(cls, rng: np.random.Generator) -> "Lighting":
         """Draw a lamp on the camera's side of the room, 30 to 65 degrees high, warm or cool."""
-        turn, height = (
-            rng.uniform(math.radians(185), math.radians(355)),
-            rng.uniform(math.radians(30), math.radians(65)),
-        )
+        turn, height = rng.uniform(np.radians([185, 30]), np.radians([355, 65]))
         warmth = rng.uniform(-0.08, 0.08)
         lamp = rng.uniform(0.75, 1.0) * np.array([1 + warmth, 1.0, 1 - warmth])
         sky = rng.uniform(0.18, 0.32) * np.array([1 - warmth, 1.0, 1 + warmth])
@@ -218,13 +215,7 @@ def cast_camera_rays(obj: SimObject, placement: Placement, camera: PinholeCamera
 
 
 def photo(view: CameraView, lighting: Lighting, noise_seed: int) -> Picture:
-    """Render the photo (px, px, 3), RGB uint8.
-
-    Args:
-        view: the geometry pass.
-        lighting: the lamp and the sky.
-        noise_seed: seed of the sensor noise.
-    """
+    """Render the photo (px, px, 3), RGB uint8."""
     px = view.camera.px
     linear = radiance(*shading_inputs(view, lighting)).reshape(px, px, 3)
     linear = cv2.GaussianBlur(linear, (0, 0), _LENS_BLUR_PX)
@@ -256,10 +247,7 @@ def shading_inputs(view: CameraView, lighting: Lighting) -> tuple[GBuffer, Lamps
 def _lamp_visibility(view: CameraView, own: Array, light: Array) -> Floats:
     """Return how much of the lamp each point receives, 0..1, with an edge softened as by a lamp of some size.
 
-    Args:
-        view: the geometry pass.
-        own: (n, 3) normals at the object's pixels.
-        light: (3,) unit direction to the lamp.
+    `own` (n, 3) are the normals at the object's pixels, `light` is the unit direction to the lamp.
     """
     px, facing, table = view.camera.px, own @ light > 0, shadow_pixels(view, light)
     pixels, up = np.concatenate([view.pixels[facing], table]), np.broadcast_to([0.0, 0.0, 1.0], (len(table), 3))

@@ -31,13 +31,7 @@ class MeshPlanner(GraspPlanner):
             )
 
     def plan(self, rig: Rig, image: RGBD, settings: GraspSettings, rng: np.random.Generator) -> GraspPlan:
-        """Draw a grasp of the object on the table.
-
-        Args:
-            rig: a simulated rig with meshes.
-            image: not used.
-            settings: limits of the grasp.
-            rng: source of the random draws.
+        """Draw a grasp of the object on the table; the image is not used.
 
         Raises:
             UngraspableError: No attempt on this object can succeed.

@@ -17,13 +17,7 @@ _ENOUGH_GRASPS = 100
 
 
 class MeshFolder:
-    """The STL, OBJ and PLY files of a folder as objects of one seed.
-
-    Args:
-        folder: the folder of mesh files.
-        seed: seed of the objects' appearance and material.
-        settings: grasp settings of the rig; they decide the resting pose.
-    """
+    """The STL, OBJ and PLY files of a folder as objects of one seed; grasp settings decide their resting pose."""
 
     def __init__(self, folder: str, seed: int, settings: GraspSettings) -> None:
         if not Path(folder).is_dir():

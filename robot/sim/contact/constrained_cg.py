@@ -62,13 +62,7 @@ class ContactProblem:
     depth: float = 0.0
 
     def solve(self, start: Floats, tolerance: float, max_iterations: int) -> Solution:
-        """Solve from a start pressure.
-
-        Args:
-            start: (rows, cols) pressure with the right sum that is zero wherever the gap is infinite.
-            tolerance: upper bound on the residual.
-            max_iterations: maximum number of steps.
-        """
+        """Solve from a start pressure with the right sum that is zero wherever the gap is infinite."""
         descent, iterations = _Descent(self, start), 0
         while not descent.residual <= tolerance and iterations < max_iterations:
             descent.step()

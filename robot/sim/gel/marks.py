@@ -102,27 +102,25 @@ def _grains(rng: np.random.Generator, count: int, field: Field) -> Array:
 
 # Markers ---------------------------------------------------------------------------------------------------
 
+_SPREAD, _REACH_MM = 0.5, 1.0  # factor and smoothing length of the shift
+
 
 @dataclass(frozen=True)
 class Markers:
     """Black dots printed on the gel that move with its surface.
 
-    A press spreads them: the shift is `spread` times sum u (x - x_i) exp(-|x - x_i|^2 / (2 reach^2)), normalised, which
-    is -spread * reach * the slope of the smoothed displacement (the form of FOTS, RA-L 2024).
+    A press spreads them: the shift is _SPREAD times sum u (x - x_i) exp(-|x - x_i|^2 / (2 _REACH_MM^2)), normalised,
+    which is -_SPREAD * _REACH_MM * the slope of the smoothed displacement (the form of FOTS, RA-L 2024).
 
     Attributes:
         pitch_mm: distance between dots.
         radius_mm: radius of a dot.
         darkness: fraction of the light that a dot absorbs.
-        spread: factor of the shift.
-        reach_mm: smoothing length of the shift.
     """
 
     pitch_mm: float = 1.5
     radius_mm: float = 0.2
     darkness: float = 0.75
-    spread: float = 0.5
-    reach_mm: float = 1.0
 
 
 def marker_positions(markers: Markers, surface: Surface) -> Array:
@@ -131,14 +129,14 @@ def marker_positions(markers: Markers, surface: Surface) -> Array:
     heights = surface.coarse(4)
     height, width = surface.field.size_mm
     steps = np.array([width / heights.shape[1], height / heights.shape[0]])
-    smooth = cv2.GaussianBlur(heights, (0, 0), *(markers.reach_mm / steps))
+    smooth = cv2.GaussianBlur(heights, (0, 0), *(_REACH_MM / steps))
     pixels = ((at_rest / (width, height) + 0.5) * heights.shape[::-1] - 0.5).astype(np.float32)
     out = at_rest.copy()
     for axis, step in enumerate(steps):
         if heights.shape[1 - axis] > 1:
             slope = np.gradient(smooth, axis=1 - axis) / np.float32(step)
             found = cv2.remap(slope, pixels[:, :1], pixels[:, 1:], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            out[:, axis] -= np.clip(found[:, 0] * markers.spread * markers.reach_mm, -width, width)
+            out[:, axis] -= np.clip(found[:, 0] * _SPREAD * _REACH_MM, -width, width)
     return out
 
 

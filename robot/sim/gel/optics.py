@@ -185,16 +185,9 @@ def led_strengths(bar: LedBar, field: Field) -> Array:
 def _shade_by_bars(slopes, leds, strengths, axes, shades, mix, ambient, backdrop, out):  # type: ignore[no-untyped-def]
     """Write the picture (rows, cols, 3) of LedOptics into `out`; all arrays are float32.
 
-    Args:
-        slopes: (2, rows, cols) slopes of the surface.
-        leds: (bars, points, 3) places of the LEDs, mm.
-        strengths: (bars, points, rows, cols); an LED contributes its strength times (normal . vector to it), or 0.
-        axes: x (cols,) and y (rows,) of the pixels in mm.
-        shades: (bars, rows, cols) fraction of a bar's light that reaches a pixel.
-        mix: (3, bars) contribution of each bar to each channel.
-        ambient: fraction of the light from all directions.
-        backdrop: (rows, cols, 3) picture of the flat gel.
-        out: (rows, cols, 3) result.
+    `slopes` (2, rows, cols); `leds` (bars, points, 3) in mm; `strengths` (bars, points, rows, cols): an LED contributes
+    its strength times (normal . vector to it), or 0; `axes`: x (cols,) and y (rows,) in mm; `shades` (bars, rows,
+    cols): fraction of a bar's light that reaches a pixel; `mix` (3, bars); `backdrop` (rows, cols, 3).
     """
     bars, points = leds.shape[0], leds.shape[1]
     rows, cols = slopes.shape[1], slopes.shape[2]

@@ -168,15 +168,10 @@ def _draw_noise(rows: int, cols: int, seed: int) -> tuple[Array, tuple[int, int,
 
 @jit
 def _add_camera_noise(clean, tile, place, read, shot, out):  # type: ignore[no-untyped-def]
-    """Write rounded grey levels with noise of variance read^2 + shot * level into `out`.
+    """Write rounded grey levels with noise of variance read^2 + shot * level into `out` (rows, n) uint8.
 
-    Args:
-        clean: (rows, n) grey levels; n is the number of columns times 3.
-        tile: (tile rows, tile n) noise of variance 1.
-        place: first row, step from row to row (1 or -1), and first value of a row in the tile; then the noise's sign.
-        read: standard deviation of the read noise.
-        shot: variance of the shot noise per grey level.
-        out: (rows, n) uint8 result.
+    `clean` (rows, n) are grey levels, n is columns times 3; `tile` has noise of variance 1; `place` is the first row,
+    the step from row to row (1 or -1) and the first value of a row in the tile, then the noise's sign.
     """
     square = read * read
     first_row, step, first, sign = place

@@ -272,17 +272,9 @@ def read_mesh(path: str | Path) -> Mesh:
 
 
 def mesh_object(file: Path, mesh: Mesh, seed: int, *, up: Vectors = UP, relief: str | None = None) -> SimObject:
-    """Draw relief, material and appearance for a mesh from `seed` and the file's name.
+    """Draw relief, material and appearance for the mesh of a file, from `seed` and the file's name.
 
-    Args:
-        file: the mesh file.
-        mesh: its surface.
-        seed: seed of the draws.
-        up: (3,) unit direction of the mesh that points up.
-        relief: relief family; drawn if None.
-
-    Raises:
-        UnknownName: There is no such relief.
+    `up` (3,) is the unit direction of the mesh that points up; the relief family is drawn if None.
     """
     stream = [seed, zlib.crc32(file.stem.encode())]
     relief_name = str(np.random.default_rng([*stream, 0]).choice(list(RELIEFS))) if relief is None else relief

@@ -183,14 +183,7 @@ Rays = tuple[Vectors, Vectors, Vectors, Vectors]
 
 
 def first_hits(solid: DisplacedSolid, rays: Rays, step_mm: float, max_steps: int = MAX_STEPS) -> Vectors:
-    """Return the distance (n,) along each ray to the first zero of f; inf if there is none.
-
-    Args:
-        solid: the solid.
-        rays: the rays.
-        step_mm: finest detail of interest.
-        max_steps: a ray without a hit after this many steps is a miss.
-    """
+    """Return the distance (n,) along each ray to the first zero of f; inf if there is none after `max_steps`."""
     origins, directions, near, _ = rays
     rows, found = _rows_of(solid), _find_crossings(solid, rays, step_mm, max_steps)
     out = np.full(len(near), np.inf)

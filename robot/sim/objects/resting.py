@@ -27,12 +27,7 @@ _MAX_POSES = 6
 def stable_up_directions(vertices: Array, centre_of_mass: Array) -> list[Array]:
     """Return directions (3,) of the solid that point up at rest: its own z or one near it first, then the most stable.
 
-    Args:
-        vertices: (V, 3) vertices of the solid.
-        centre_of_mass: (3,) its centre of mass.
-
-    Returns:
-        At most 6 directions; only its own z if no pose is stable.
+    There are at most 6 directions; only its own z if no pose is stable.
     """
     try:
         hull = ConvexHull(vertices)
@@ -55,9 +50,7 @@ def stable_up_directions(vertices: Array, centre_of_mass: Array) -> list[Array]:
 def tipping_angle(corners: Array, down: Array) -> float:
     """Return how far (rad) a solid can be tilted before it tips over; below 0 if it does not rest.
 
-    Args:
-        corners: (N, 3) corners of its convex hull, from the centre of mass.
-        down: (3,) unit direction of the table.
+    `corners` (N, 3) are those of its convex hull from the centre of mass; `down` (3,) is the direction of the table.
     """
     depth = corners @ down
     height = float(depth.max())

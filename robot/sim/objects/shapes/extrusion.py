@@ -84,13 +84,7 @@ class RoundedRectangle(Outline):
 
 
 class Polygon(Outline):
-    """A regular polygon with rounded corners.
-
-    Args:
-        sides: number of sides.
-        apothem_mm: distance from its middle to a face.
-        corner_mm: radius of the corners, above 0.
-    """
+    """A regular polygon, `apothem_mm` from its middle to a face, with corners of radius `corner_mm` > 0."""
 
     def __init__(self, sides: int, apothem_mm: float, corner_mm: float) -> None:
         self.sides, self.apothem_mm, self.corner_mm = sides, apothem_mm, corner_mm
@@ -165,14 +159,9 @@ class OutlineChart(Chart):
 
 
 class Extrusion(Shape):
-    """An outline from z = 0 to `height_mm`, with rounded upper and lower edges.
+    """An outline from z = 0 to `height_mm`, with upper and lower edges rounded by `rim_mm`.
 
-    Args:
-        outline: the outline at the base.
-        height_mm: height.
-        rim_mm: radius of the edges.
-        taper: relative shrinkage of the outline at the top.
-        twist_rad: rotation of the outline at the top.
+    At the top, the outline is smaller by the fraction `taper` and rotated by `twist_rad`.
     """
 
     def __init__(

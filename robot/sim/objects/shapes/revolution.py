@@ -75,14 +75,7 @@ class Cone(Profile):
 
 
 class Revolution(Shape):
-    """Union of parts, minus a hollow; cut flat at z = 0 and at the top.
-
-    Args:
-        parts: the parts.
-        height_mm: height of the upper cut.
-        blend_mm: width of the rounded seams.
-        hollow: the part to subtract, or None.
-    """
+    """Union of `parts`, minus the part `hollow`; cut flat at z = 0 and at `height_mm`; seams are `blend_mm` wide."""
 
     def __init__(
         self, parts: tuple[Profile, ...], height_mm: float, *, blend_mm: float = 0.0, hollow: Profile | None = None
@@ -124,15 +117,9 @@ class Revolution(Shape):
 
 
 class ThreadedRod(Revolution):
-    """A cylinder with a screw thread.
+    """A cylinder with a screw thread on a foot without thread.
 
-    Args:
-        radius_mm: radius of the crests.
-        height_mm: height.
-        pitch_mm: distance between neighbouring crests.
-        depth_mm: depth of the thread; its profile is a trapezoid.
-        starts: number of threads.
-        foot: a part without thread at the bottom.
+    `radius_mm` is that of the crests, `depth_mm` the depth of the trapezoidal profile, `starts` the number of threads.
     """
 
     def __init__(
@@ -155,12 +142,8 @@ class ThreadedRod(Revolution):
 class FlutedCylinder(Revolution):
     """A cylinder with lobes around it, straight or twisted: a knob, a column, a grip.
 
-    Args:
-        drum: the cylinder.
-        count: number of lobes.
-        depth_mm: depth between lobes.
-        turns: twist over the height, in lobes.
-        sharpness: exponent of the lobes' profile.
+    It has `count` lobes, `depth_mm` deep and twisted by `turns` lobes over the height; `sharpness` is the exponent of
+    their profile.
     """
 
     def __init__(self, drum: Drum, *, count: int, depth_mm: float, turns: float = 0.0, sharpness: float = 1.0) -> None:

@@ -77,12 +77,7 @@ def _norm(a: Floats, b: Floats, power: float) -> Floats:
 
 
 class Blobs(Shape):
-    """Blended balls, cut flat at z = 0.
-
-    Args:
-        balls: (x, y, z, radius) of each, mm.
-        blend_mm: width of the seams.
-    """
+    """Blended balls, each (x, y, z, radius) in mm, with seams of `blend_mm`, cut flat at z = 0."""
 
     def __init__(self, balls: tuple[tuple[float, float, float, float], ...], *, blend_mm: float) -> None:
         self.balls, self.blend_mm = balls, blend_mm
@@ -110,10 +105,7 @@ class Blobs(Shape):
 class Ring(Shape):
     """A torus on a flat foot, with its hole to the front, optionally stretched upwards.
 
-    Args:
-        ring_mm: radius of the tube's centre line.
-        tube_mm: radius of the tube.
-        stretch_mm: length of the straight parts.
+    `ring_mm` is the radius of the tube's centre line, `tube_mm` that of the tube; straight parts are `stretch_mm` long.
     """
 
     def __init__(self, ring_mm: float, tube_mm: float, *, stretch_mm: float = 0.0) -> None:
@@ -135,13 +127,7 @@ class Ring(Shape):
 
 
 class Mug(Revolution):
-    """A cup, open at the top, with a handle on its right.
-
-    Args:
-        outside: outer wall.
-        inside: inner wall.
-        ear_mm: radius of the handle's centre line, and its thickness.
-    """
+    """A cup, open at the top, with a handle on its right: radius of its centre line and its thickness are `ear_mm`."""
 
     def __init__(self, outside: Drum, inside: Drum, ear_mm: tuple[float, float]) -> None:
         super().__init__((outside,), outside.top_mm, hollow=inside)
@@ -201,14 +187,9 @@ class Bricks(Shape):
 
 
 class Comb(Shape):
-    """A slab with slots.
+    """A slab with slots `gap_mm` wide every `pitch_mm`, from `slot_mm` above (to the right of) its middle.
 
-    Args:
-        slab: the slab.
-        pitch_mm: distance between slots.
-        gap_mm: width of a slot.
-        slot_mm: start of the slots above (to the right of) the slab's middle.
-        lying: whether the slots are open at the right instead of the top.
+    The slots are open at the top or, if it is lying, at the right.
     """
 
     def __init__(self, slab: Brick, *, pitch_mm: float, gap_mm: float, slot_mm: float, lying: bool) -> None:
@@ -230,14 +211,7 @@ class Comb(Shape):
 
 
 class Brush(Shape):
-    """A block with upright bristles.
-
-    Args:
-        block: the block.
-        bristle_mm: radius of a bristle.
-        pitch_mm: distance between bristles.
-        top_mm: height of the bristles' tops.
-    """
+    """A block with upright bristles of radius `bristle_mm` every `pitch_mm`, whose tops are at `top_mm`."""
 
     def __init__(self, block: Brick, *, bristle_mm: float, pitch_mm: float, top_mm: float) -> None:
         self.block, self.bristle_mm, self.pitch_mm, self.top_mm = block, bristle_mm, pitch_mm, top_mm
