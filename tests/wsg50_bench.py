@@ -6,7 +6,7 @@ from unittest.mock import patch
 import pytest
 from serial.urlhandler import protocol_socket
 
-from robot.drivers.wsg50.codec import Packet, encode
+from robot.drivers.wsg50.codec import encode
 from robot.drivers.wsg50.driver import WSG50
 from robot.errors import DeviceError
 from tests.emulators.wsg50.faults import LineFaults, Piece
@@ -25,7 +25,6 @@ class ScriptedFaults(LineFaults):
     """Damages packets by a plan: (id, number of the packet with this id) -> kind of damage, or id -> kind for all.
 
     Counting starts when a plan is set. Commands and replies count together: 1 is the command, 2 its first reply.
-    "after a result" sends a false SUCCESS before the packet.
     """
 
     def __init__(self):
@@ -41,9 +40,7 @@ class ScriptedFaults(LineFaults):
         plain = encode(packet)
         if kind == "long":  # claims 255 bytes, so the next packets are read as its payload
             return [Piece(plain[:4] + b"\xff\x00" + plain[6:])]
-        if kind == "after a result":
-            return [Piece(encode(Packet(packet.id, bytes(2))) + plain)]
-        return list(self._damaged(kind, packet, plain) if kind else [Piece(plain)])
+        return list(self._damaged(kind, plain) if kind else [Piece(plain)])
 
 
 def quick_close():

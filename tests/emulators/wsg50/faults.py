@@ -1,4 +1,4 @@
-"""Faults of the line of an emulated WSG-50: lost, duplicated, damaged, late, split and misnamed packets, and cuts.
+"""Faults of the line of an emulated WSG-50: lost, damaged, late and split packets, and cuts.
 
 A line is a stream: a late packet delays all packets behind it, and the order never changes.
 """
@@ -8,7 +8,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from robot.drivers.wsg50.codec import Packet, WireError, encode
+from robot.drivers.wsg50.codec import Packet, encode
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class LineFaults:
     `delay_s` is the delay of a delayed packet, and the pause within a split one.
     """
 
-    KINDS = ("dropped", "duplicated", "corrupted", "delayed", "split", "wrong id", "disconnect")
+    KINDS = ("dropped", "corrupted", "delayed", "split", "disconnect")
 
     def __init__(
         self, rate: float = 0.0, kinds: Sequence[str] | None = None, *, seed: int = 0, delay_s: float = 0.05
@@ -41,12 +41,10 @@ class LineFaults:
             if self._random.random() < self.rate:
                 kind = self._random.choice(self.kinds)
                 self.counts[kind] += 1
-        yield from self._damaged(kind, packet, data) if kind else [Piece(data)]
+        yield from self._damaged(kind, data) if kind else [Piece(data)]
 
-    def _damaged(self, kind: str, packet: Packet, data: bytes) -> Iterator[Piece]:
-        if kind == "duplicated":
-            yield Piece(data + data)
-        elif kind == "corrupted":
+    def _damaged(self, kind: str, data: bytes) -> Iterator[Piece]:
+        if kind == "corrupted":
             damaged = bytearray(data)
             damaged[self._random.randrange(len(data))] ^= 1 << self._random.randrange(8)
             yield Piece(bytes(damaged))
@@ -56,17 +54,5 @@ class LineFaults:
             cut = self._random.randrange(1, len(data))
             yield Piece(data[:cut])
             yield Piece(data[cut:], self.delay_s)
-        elif kind == "wrong id":
-            yield Piece(self._misnamed(packet))
         elif kind == "disconnect":
             yield Piece(None)
-
-    def _misnamed(self, packet: Packet) -> bytes:
-        """Return the same packet with another id and a valid checksum."""
-        while True:
-            try:
-                other = Packet(self._random.randrange(256), packet.payload)
-            except WireError:
-                continue
-            if other.id != packet.id:
-                return encode(other)

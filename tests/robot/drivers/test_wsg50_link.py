@@ -188,15 +188,6 @@ def test_a_late_reply_is_never_returned_for_the_next_query():
         assert link.query(FORCE, codec.number) == 2.0
 
 
-def test_a_doubled_reply_requires_synchronisation_before_the_next_command():
-    with Peer(lambda packet: echoing(packet) or 2 * reply(packet, ONE)) as peer, linked(peer) as link:
-        link.query(FORCE, codec.number)
-        link.pump(0.05)
-        loops = peer.received.count(CommandId.LOOP)
-        link.query(codec.query(CommandId.GET_ACCELERATION), codec.number)
-        assert peer.received.count(CommandId.LOOP) == loops + 1
-
-
 def test_an_incomplete_packet_hides_no_packet_after_it():
     truncated = b"\xaa\xaa\xaa\x06\xff\x00"  # claims 255 bytes that never arrive
     with (
