@@ -25,6 +25,7 @@ import select
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from operator import methodcaller
 from typing import Annotated, Any, TypeVar
 
@@ -56,8 +57,6 @@ _log = logging.getLogger(__name__)
 # The link -----------------------------------------------------------------------------------------------------
 
 _TRIES = 3
-_GAP_FRACTION = 0.25
-"""Fraction of the time-out without bytes after which an incomplete packet is abandoned."""
 _PADDING = bytes(MAX_PAYLOAD + 8)
 """Completes any packet whose rest the gripper may still expect, and begins none."""
 _CHUNK = 1 << 16
@@ -108,7 +107,6 @@ class Link:
         self.has_echoed = False
         self._port: Any = None
         self._buffer = bytearray()
-        self._last_byte_s = 0.0
         self.needs_sync = True
         self._tokens = itertools.count(int.from_bytes(os.urandom(6), "little"))
 
@@ -133,7 +131,6 @@ class Link:
             )
         except Exception as error:  # pyserial raises termios.error, ValueError and others too
             raise LinkLost(f"the gripper's port {self.name} cannot be opened: {_first_line(error)}") from error
-        self._buffer.clear()
         self.updates.clear()
         self.needs_sync = True
 
@@ -193,6 +190,7 @@ class Link:
         for number in range(_TRIES):
             if number:
                 self.pad()
+            self._buffer.clear()  # also an incomplete packet, whose rest may never arrive
             token = next(self._tokens).to_bytes(8, "little")
             self._write(encode(Packet(CommandId.LOOP, token)))
             echo = Packet(CommandId.LOOP, bytes(2) + token)
@@ -230,9 +228,8 @@ class Link:
                 yield codec.reply(packet)
 
     def _packets(self, seconds: float) -> Iterator[Packet]:
-        """Yield the packets that arrive within `seconds`, store updates, and abandon an incomplete packet."""
-        deadline, gap_s = time.monotonic() + seconds, _GAP_FRACTION * self.timeout_s
-        is_last = False
+        """Yield the packets that arrive within `seconds`, and store updates."""
+        deadline, is_last = time.monotonic() + seconds, False
         while True:
             used, packet = decode(self._buffer)
             del self._buffer[:used]
@@ -243,19 +240,10 @@ class Link:
                 continue
             if is_last:
                 return
-            now = time.monotonic()
-            is_last = now >= deadline
-            limit = min(deadline, self._last_byte_s + gap_s) if self._buffer else deadline
-            if not self._fill(limit - now) and self._buffer and time.monotonic() >= self._last_byte_s + gap_s:
-                del self._buffer[:1]
-
-    def _fill(self, seconds: float) -> bool:
-        """Read bytes into the buffer; return False if none arrive within `seconds`."""
-        with_bytes = self._use_port(lambda port: select.select([port.fileno()], [], [], max(0.0, seconds))[0])
-        if with_bytes:
-            self._buffer += self._use_port(methodcaller("read", _CHUNK))  # its time-out is 0, so it does not wait
-            self._last_byte_s = time.monotonic()
-        return bool(with_bytes)
+            wait_s = deadline - time.monotonic()
+            is_last = wait_s <= 0
+            if self._use_port(partial(_has_bytes, wait_s)):
+                self._buffer += self._use_port(methodcaller("read", _CHUNK))  # its time-out is 0, so it does not wait
 
     def _write(self, data: bytes) -> None:
         while data:
@@ -273,6 +261,10 @@ class Link:
         raise LinkLost(
             f"the gripper's port {self.name} was lost: {reason}; check its cable and power, recover() opens it again"
         )
+
+
+def _has_bytes(wait_s: float, port: Any) -> bool:
+    return bool(select.select([port.fileno()], [], [], max(0.0, wait_s))[0])
 
 
 def _first_line(error: Exception) -> str:
