@@ -39,7 +39,7 @@ from retrieval.model.shipped import SHIPPED, shipped_model
 from retrieval.training import distil
 from retrieval.training.batches import FrozenFeatures, recorded_features
 from retrieval.training.calibration.calibrate import calibrate_checkpoint
-from retrieval.training.calibration.touches import calibration_touches
+from retrieval.training.calibration.touches import score_grasps
 from retrieval.training.calibration.verification import fit_verification
 from retrieval.training.features import Features, encode_recording, features_by_image
 
@@ -294,7 +294,7 @@ def calibrated(made: Checkpoint, folder: Path, fingers: int) -> Checkpoint:
     known = [*verification, *gels]
     made = calibrate_checkpoint(made, source, known, validation, foreign=FOREIGN, max_grasps=len(every))
     touches, photos = recorded_features(made.matcher, source, verification, what="verification")
-    trials = calibration_touches(made.matcher, verification, touches, photos)
+    trials = score_grasps(made.matcher, verification, touches, photos)
     assert trials is not None
     assert made.posterior is not None
     return dataclasses.replace(made, verification=fit_verification([trials], made.posterior))

@@ -9,7 +9,7 @@ to 100 % of cases; a bootstrap over objects did so in 76 to 97 %, least for smal
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -83,8 +83,8 @@ def _rate(value: float, objects: int, needed: int | None) -> dict[str, float | N
 
 def _test_touches(
     experiment: Experiment, predictions: Predictions, checkpoint: Checkpoint, seed: int
-) -> tuple[ScoredTouches, NDArray[np.floating[Any]], Posterior] | None:
-    """Return match logits and photo embeddings of test objects, and the posterior; None for too few objects.
+) -> tuple[ScoredTouches, Posterior] | None:
+    """Return the scored touches of test objects, and the posterior; None for too few objects.
 
     A head that was trained on features has no posterior; a posterior is fitted on validation objects, as in training.
     """
@@ -98,7 +98,7 @@ def _test_touches(
     features = torch.from_numpy(experiment.features_for("late_fusion").photo[photos])
     with torch.inference_mode():
         embeddings = checkpoint.matcher.photo_encoding(features).embedding.numpy()
-    return test, embeddings, posterior
+    return replace(test, photo_embeddings=embeddings), posterior
 
 
 def false_rejects(far: float, genuine: Floats, impostors: Floats) -> float:

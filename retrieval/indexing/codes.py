@@ -143,14 +143,14 @@ def photo_encoder(checkpoint: Checkpoint) -> Encoder:
 
         def encode(images: Sequence[Any], paths: Sequence[Paths]) -> NDArray[Any]:
             encoded, records = run(images), np.empty(len(images), layout)
-            largest = np.abs(encoded.partial).max(axis=1)
+            largest = np.abs(encoded.partials).max(axis=1)
             if len(bad := np.flatnonzero(~(largest <= np.finfo(np.float16).max))):
                 raise NumericalError(
                     f"partial activations are stored as float16 and must be within 65504; {paths[bad[0]][0]} gives "
                     f"{largest[bad[0]]}: the model has diverged, train again with a lower learning rate"
                 )
-            records["embeddings"] = encoded.embedding
-            for name, array in to_stored(encoded.partial, settings.pooled_width).items():
+            records["embeddings"] = encoded.embeddings
+            for name, array in to_stored(encoded.partials, settings.pooled_width).items():
                 records[name] = array
             return records
 

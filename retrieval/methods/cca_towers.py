@@ -36,7 +36,7 @@ class CcaTowers(Method):
             return
         self._projections = choice.projections
         with suppress(BadInput):  # too few held-out objects, or one photo of each
-            posterior = fit_posterior(*(part.scored for part in choice.held_out_touches))
+            posterior = fit_posterior(*choice.held_out_touches)
             self.best_params["posterior"] = posterior.to_dict()
 
     def _encode_touch(self, touch: Array) -> Array:

@@ -32,13 +32,11 @@ from retrieval.model.checkpoint_info import (
     unreadable,
     unusable,
 )
-from retrieval.model.config import Config
 from retrieval.model.fusion import GelHead, Matcher
 from retrieval.model.verification import CARD_FAR
 from retrieval.version import __version__
 
 _QUERIES = "queries.touch_partials"
-_GEL_HEAD = "gel_head."
 
 
 @dataclass(frozen=True)
@@ -151,13 +149,10 @@ def load_checkpoint(path: str | Path, *, info: CheckpointInfo | None = None) -> 
             raise CheckpointError(
                 f"{_QUERIES} must be float16 (touches, {width}); got {queries.dtype} {tuple(queries.shape)}"
             )
-        try:
-            with torch.device("meta"):  # shapes only: a header may describe more weights than fit into memory
-                _require_fit(_empty_matcher(info.config, state), state)
-        except (RuntimeError, TypeError, ValueError, OverflowError) as error:
-            raise CheckpointError("its configuration describes weights that are too large to count") from error
-        matcher = _empty_matcher(info.config, state)
-        matcher.load_state_dict(state)
+        matcher = Matcher(info.config.matcher, len(info.config.preprocessing.views))
+        if any(name.startswith("gel_head.") for name in state):
+            matcher.gel_head = GelHead(matcher.touch_tower.feature_count)
+        load_weights(matcher, state)
     except BadInput as error:
         raise unusable(path, error) from error
     contents = {name: getattr(info, name) for name in PARTS}
@@ -173,21 +168,8 @@ def load_checkpoint(path: str | Path, *, info: CheckpointInfo | None = None) -> 
     )
 
 
-def _empty_matcher(config: Config, state: Mapping[str, Tensor]) -> Matcher:
-    """Return a matcher as configured, with a gel head if the file contains one."""
-    matcher = Matcher(config.matcher, len(config.preprocessing.views))
-    if any(name.startswith(_GEL_HEAD) for name in state):
-        matcher.gel_head = GelHead(matcher.touch_tower.feature_count)
-    return matcher
-
-
 def load_weights(module: nn.Module, state: Mapping[str, Tensor]) -> None:
     """Load `state` into `module`. Raises CheckpointError unless names and shapes are exactly the module's."""
-    _require_fit(module, state)
-    module.load_state_dict(state)
-
-
-def _require_fit(module: nn.Module, state: Mapping[str, Tensor]) -> None:
     got, expected = ({name: tuple(item.shape) for name, item in part.items()} for part in (state, module.state_dict()))
     for name in sorted(got.keys() | expected.keys()):
         if got.get(name) != expected.get(name):
@@ -195,6 +177,7 @@ def _require_fit(module: nn.Module, state: Mapping[str, Tensor]) -> None:
                 f"its weights do not fit its configuration: {name} is {got.get(name, 'absent')}, "
                 f"must be {expected.get(name, 'absent')}"
             )
+    module.load_state_dict(state)
 
 
 def write_tensors(path: Path, state: dict[str, Tensor], header: Mapping[str, Any]) -> None:

@@ -73,11 +73,6 @@ class MatcherConfig:
         return self.hidden + (self.embedding_dim if self.cosine else 0)
 
     @property
-    def cosine_columns(self) -> slice:
-        """The columns of a partial activation that are the scaled embedding."""
-        return slice(self.hidden, self.pooled_width)
-
-    @property
     def touch_partial_width(self) -> int:
         """Width of a touch's partial activation."""
         return self.pooled_width + self.fingers * self.touch_cells**2 * self.cell_dim

@@ -10,7 +10,7 @@ import copy
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from retrieval.errors import ConfigError
 from retrieval.model.fusion import ImageEncoding, Matcher
-from retrieval.model.touch_reader import TouchEncodings
+from retrieval.model.touch_reader import EncodedTouches, TouchEncodings
 from retrieval.model.towers.tower import Tower
 
 T = TypeVar("T")
@@ -133,19 +133,7 @@ class TorchEncoder:
         return TouchEncodings(*(output.numpy() for output in self._fast.encode_touches(touch_batch(touches))))
 
 
-class PhotoEncodings(NamedTuple):
-    """Encoding of photos as an index stores it, float32.
-
-    Attributes:
-        partial: (B, partial) partial activations.
-        embedding: (B, embedding_dim) unit embeddings.
-    """
-
-    partial: NDArray[np.float32]
-    embedding: NDArray[np.float32]
-
-
-PhotoEncoder = Callable[[Sequence[Image]], PhotoEncodings]
+PhotoEncoder = Callable[[Sequence[Image]], EncodedTouches]
 """Encodes images (H, views * W, 3) on the calling thread; several threads may call it at once."""
 
 
@@ -155,10 +143,10 @@ def torch_photo_encoder(matcher: Matcher) -> PhotoEncoder:
     device = next(matcher.parameters()).device
 
     @torch.inference_mode()
-    def encode(images: Sequence[Image]) -> PhotoEncodings:
+    def encode(images: Sequence[Image]) -> EncodedTouches:
         with one_thread():
             encoding = fast.photo_search_encoding(fast.photo_features(to_batch(images, device)))
-        return PhotoEncodings(encoding.partial.cpu().numpy(), encoding.embedding.cpu().numpy())
+        return EncodedTouches(encoding.embedding.cpu().numpy(), encoding.partial.cpu().numpy())
 
     return encode
 

@@ -20,7 +20,6 @@ from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import (
     Image,
     PhotoEncoder,
-    PhotoEncodings,
     TorchEncoder,
     for_inference,
     torch_photo_encoder,
@@ -34,7 +33,7 @@ from retrieval.model.onnx_encoder import (
     cached_export_path,
     open_session,
 )
-from retrieval.model.touch_reader import TouchEncodings
+from retrieval.model.touch_reader import EncodedTouches, TouchEncodings
 
 log = logging.getLogger(__name__)
 TOLERANCE = 5e-4
@@ -106,8 +105,9 @@ def choose_photo_encoder(checkpoint: Checkpoint) -> PhotoEncoder:
         log.warning("%s; PyTorch encodes the photos", error)
         return encode
 
-    def encode_by_onnx(images: Sequence[Image]) -> PhotoEncodings:
-        return PhotoEncodings(*session.run(None, {"images": np.stack(images)}))
+    def encode_by_onnx(images: Sequence[Image]) -> EncodedTouches:
+        partials, embeddings = session.run(None, {"images": np.stack(images)})
+        return EncodedTouches(embeddings, partials)
 
     settings = checkpoint.config.preprocessing
     shape = settings.photo_px, len(settings.views) * settings.photo_px, 3
@@ -175,8 +175,7 @@ class _PhotoEncoder(nn.Module):
         return self.matcher.photo_search_encoding(self.matcher.photo_features(images.permute(0, 3, 1, 2)))
 
 
-def _difference(by_torch: TouchEncodings | PhotoEncodings, by_onnx: TouchEncodings | PhotoEncodings) -> float:
+def _difference(by_torch: TouchEncodings | EncodedTouches, by_onnx: TouchEncodings | EncodedTouches) -> float:
     """Return the largest difference of two encodings, as `TOLERANCE` states it."""
-    (partial, embedding), (other_partial, other_embedding) = by_torch[:2], by_onnx[:2]
-    relative = np.abs(partial - other_partial).max() / np.abs(partial).max()
-    return float(max(relative, np.abs(embedding - other_embedding).max()))
+    relative = np.abs(by_torch.partials - by_onnx.partials).max() / np.abs(by_torch.partials).max()
+    return float(max(relative, np.abs(by_torch.embeddings - by_onnx.embeddings).max()))

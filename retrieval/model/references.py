@@ -76,7 +76,7 @@ def unit_embeddings(partials: NDArray[np.floating[Any]], columns: slice) -> Floa
 
     Args:
         partials: (B, partial) partial activations.
-        columns: Their d columns with the scaled embeddings (`MatcherConfig.cosine_columns`). d is 0 for a model whose
+        columns: Their d columns with the scaled embeddings (`FusionScorer.cosine_columns`). d is 0 for a model whose
             logit has no cosine.
     """
     embeddings = np.asarray(partials[:, columns], dtype=np.float32)

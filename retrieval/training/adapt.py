@@ -45,14 +45,13 @@ from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writ
 from retrieval.model.config import Config, load_config
 from retrieval.model.encode import default_device, one_thread
 from retrieval.model.fusion import Matcher
-from retrieval.model.references import unit_embeddings
 from retrieval.model.shipped import is_shipped, shipped_model
 from retrieval.model.towers import TOWER_SEPARATOR
 from retrieval.model.towers.tower import Tower
 from retrieval.model.towers.weights import GEL
 from retrieval.training.batches import FrozenFeatures
 from retrieval.training.calibration.calibrate import fit_calibrations, with_gel_check
-from retrieval.training.calibration.touches import CalibrationTouches, ScoredTouches
+from retrieval.training.calibration.touches import ScoredTouches, score_touches
 from retrieval.training.calibration.verification import fit_verification
 from retrieval.training.cca_towers import (
     GRID,
@@ -345,7 +344,7 @@ def estimate_accuracy(data: AdaptationData, start: Checkpoint, *, quiet: bool) -
             measures[f"held_out_{name}{suffix}"] = measure
     choice = _choose_settings(data.features, data)
     baseline = UnadaptedBaseline.of(start, data.grasps, quiet)
-    scored = [part.scored.logits for part in baseline.touches(folds)]
+    scored = [part.logits for part in baseline.touches(folds)]
     found = accuracies(scored, [baseline.features.of_objects(fold) for fold in folds])
     measures |= {f"baseline_{name}": measure for name, measure in found.items()}
     return Estimate(choice, folds, baseline, measures)
@@ -441,24 +440,18 @@ class UnadaptedBaseline:
         return cls(start, dataclasses.replace(found, touch=touch), wanted == config.fingers)
 
     @one_thread()
-    @torch.inference_mode()
     def touches(
         self, folds: Sequence[Sequence[str]], max_touches: int | None = None, *, pooled: bool = False
-    ) -> list[CalibrationTouches]:
+    ) -> list[ScoredTouches]:
         """Return the touches of each fold, at most `max_touches` of an object; `pooled`: without late interaction."""
-        matcher, parts = self.start.matcher, []
-        scorer, width = matcher.head.scorer, matcher.config.pooled_width if pooled else None
+        parts = []
         for features in map(self.features.of_objects, folds):
             if max_touches is not None:
                 rows = [np.flatnonzero(features.owner == name)[:max_touches] for name in np.unique(features.owner)]
                 features = features.select(np.concatenate(rows))
-            touch_partials = matcher.touch_encoding(torch.from_numpy(features.touch).flatten(1)).partial.numpy()
-            photos = matcher.photo_encoding(torch.from_numpy(features.photo))
-            photo_partials = photos.partial.numpy()[:, :width]
-            logits = np.stack([scorer.logits(partial[None], photo_partials) for partial in touch_partials])
-            scored = ScoredTouches(logits, features.owner, features.owner, np.eye(len(features), dtype=np.bool_))
-            embeddings = unit_embeddings(touch_partials, matcher.config.cosine_columns)
-            parts.append(CalibrationTouches(scored, embeddings, photos.embedding.numpy()))
+            tensors = torch.from_numpy(features.touch).flatten(1), torch.from_numpy(features.photo)
+            owners, own = (features.owner, features.owner), np.eye(len(features), dtype=np.bool_)
+            parts.append(score_touches(self.start.matcher, tensors, owners, own, pooled=pooled))
         return parts
 
 
@@ -471,7 +464,7 @@ def _fitted(data: AdaptationData, estimate: Estimate | None, out: Path) -> Check
     features = data.features
     if estimate:
         projections = estimate.choice.projections
-        scale, offset = _log_odds(part.scored for part in estimate.choice.held_out_touches)
+        scale, offset = _log_odds(estimate.choice.held_out_touches)
     else:
         largest, touch = max(GRID), touch_rows(features)
         projections = dict(fit_projections(touch, features.photo, features.owner, data.widths, [largest]))[largest]
@@ -483,8 +476,6 @@ def _fitted(data: AdaptationData, estimate: Estimate | None, out: Path) -> Check
         digest="",
         config=data.config,
         provenance={"step": 0, **data.provenance, "metrics": estimate.to_dict() if estimate else {}},
-        gel_check=None,
-        verification=None,
         matcher=data.matcher,
         split=Split(data.config.training.seed, train=objects, validation=(), test=()),
     )
@@ -533,8 +524,7 @@ def _calibrated_fit(checkpoint: Checkpoint, data: AdaptationData, estimate: Esti
     assert checkpoint.matcher.cosine_scale is not None
     scale, offset = checkpoint.matcher.cosine_scale.item(), checkpoint.matcher.head.out.bias.item()
     left_out = [
-        dataclasses.replace(part, scored=dataclasses.replace(part.scored, logits=scale * part.scored.logits + offset))
-        for part in estimate.choice.held_out_touches
+        dataclasses.replace(part, logits=scale * part.logits + offset) for part in estimate.choice.held_out_touches
     ]
     posterior, references = fit_calibrations(left_out)
     verification = fit_verification(left_out, posterior)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from retrieval.errors import BadInput
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
-from retrieval.training.calibration.touches import CalibrationTouches, ScoredTouches
+from retrieval.training.calibration.touches import ScoredTouches
 from retrieval.training.cca import MAX_DIRECTIONS, CcaView, Standardiser, canonical_correlations, decompose, unit_rows
 from retrieval.training.features import Features
 from retrieval.training.selection import ranking_auc, validation_rows
@@ -224,7 +224,7 @@ class CcaSelection:
     settings: CcaSettings
     auc: float
     projections: CcaProjections
-    held_out_touches: list[CalibrationTouches]
+    held_out_touches: list[ScoredTouches]
 
 
 def select_settings(
@@ -275,7 +275,7 @@ def select_settings(
 
 def held_out_touches(
     features: Features, projections: CcaProjections, touch: NDArray[np.floating], photo: NDArray[np.floating]
-) -> CalibrationTouches:
+) -> ScoredTouches:
     """Return touches of objects that the projections were fitted without, for the calibrations.
 
     Args:
@@ -286,10 +286,8 @@ def held_out_touches(
     """
     rows = validation_rows(features, MAX_CALIBRATION_TOUCHES * len(set(features.object_ids)))
     owner, own = features.owner[rows], np.eye(len(rows), dtype=np.bool_)
-    scored = ScoredTouches(projections.cosines(touch[rows], photo[rows]), owner, owner, own)
-    return CalibrationTouches(
-        scored, unit_rows(projections.touch(touch[rows])), unit_rows(projections.photo(photo[rows]))
-    )
+    embeddings = unit_rows(projections.touch(touch[rows])), unit_rows(projections.photo(photo[rows]))
+    return ScoredTouches(projections.cosines(touch[rows], photo[rows]), owner, owner, own, *embeddings)
 
 
 def touch_rows(features: Features) -> Rows:

@@ -19,7 +19,7 @@ from retrieval.training.calibration.gel_check import (
 )
 from retrieval.training.calibration.posterior import fit_posterior
 from retrieval.training.calibration.references import fit_references
-from retrieval.training.calibration.touches import CalibrationTouches, calibration_touches
+from retrieval.training.calibration.touches import ScoredTouches, score_grasps
 from retrieval.training.calibration.verification import fit_verification
 
 MAX_GRASPS = 400
@@ -51,25 +51,23 @@ def calibrate_checkpoint(
     if not train or not grasps:
         return checkpoint
     touches, photos = recorded_features(matcher, source, grasps, what="posterior", quiet=quiet)
-    if (scored := calibration_touches(matcher, grasps, touches, photos)) is not None:
+    if (scored := score_grasps(matcher, grasps, touches, photos)) is not None:
         posterior, references = fit_calibrations([scored], seed)
         verification = fit_verification([scored], posterior, seed)
         checkpoint = dataclasses.replace(
             checkpoint, posterior=posterior, references=references, verification=verification
         )
         if matcher.config.cell_dim:
-            pooled = calibration_touches(matcher, grasps, touches, photos, pooled=True)
+            pooled = score_grasps(matcher, grasps, touches, photos, pooled=True)
             assert pooled is not None  # the same touches and photos
             posterior, references = fit_calibrations([pooled], seed)
             checkpoint = dataclasses.replace(checkpoint, pooled_posterior=posterior, pooled_references=references)
     return with_gel_check(checkpoint, source, train, validation, foreign=foreign, max_grasps=max_grasps, quiet=quiet)
 
 
-def fit_calibrations(
-    parts: Sequence[CalibrationTouches], seed: int = 0
-) -> tuple[Posterior, ReferenceCalibration | None]:
+def fit_calibrations(parts: Sequence[ScoredTouches], seed: int = 0) -> tuple[Posterior, ReferenceCalibration | None]:
     """Return the posterior and the calibration of reference touches; `parts` come from one matcher or several."""
-    return fit_posterior(*(part.scored for part in parts), seed=seed), fit_references(*parts, seed=seed)
+    return fit_posterior(*parts, seed=seed), fit_references(*parts, seed=seed)
 
 
 def with_gel_check(

@@ -15,7 +15,7 @@ from retrieval.training.calibration.posterior import (
     fit_posterior_to_trials,
     identification_trials,
 )
-from retrieval.training.calibration.touches import CalibrationTouches, ScoredTouches
+from retrieval.training.calibration.touches import ScoredTouches
 
 Numbers = NDArray[np.int64]
 MAX_REFERENCES = 3
@@ -43,7 +43,7 @@ class _ReferenceTrials:
         return len(np.unique(self.photos.photo_owner)) >= MIN_OBJECTS and bool((own & ~self.photos.own).any())
 
 
-def fit_references(*parts: CalibrationTouches, seed: int = 0) -> ReferenceCalibration | None:
+def fit_references(*parts: ScoredTouches, seed: int = 0) -> ReferenceCalibration | None:
     """Fit on touches of objects that have at least two.
 
     References come from the first half of an object's touches, or from the first quarter if that suffices, at most
@@ -80,10 +80,9 @@ def fit_references(*parts: CalibrationTouches, seed: int = 0) -> ReferenceCalibr
     )
 
 
-def _reference_trials(part: CalibrationTouches, max_references: int) -> _ReferenceTrials | None:
+def _reference_trials(part: ScoredTouches, max_references: int) -> _ReferenceTrials | None:
     """Return the trials with at most `max_references` references per object; None for too few objects."""
-    scored = part.scored
-    rows = [np.flatnonzero(scored.touch_owner == name) for name in np.unique(scored.touch_owner)]
+    rows = [np.flatnonzero(part.touch_owner == name) for name in np.unique(part.touch_owner)]
     rows = [mine for mine in rows if len(mine) > 1]
     if len(rows) < MIN_OBJECTS:
         return None
@@ -95,12 +94,12 @@ def _reference_trials(part: CalibrationTouches, max_references: int) -> _Referen
     owner = np.repeat(np.arange(len(rows)), [len(mine) - len(mine) // 2 for mine in rows])
     cosines = part.touch_embeddings[queries] @ part.touch_embeddings[np.concatenate(references)].T
     near = reference_similarity(cosines, np.cumsum([0, *(len(some) for some in references[:-1])]))
-    number = {int(scored.touch_owner[mine[0]]): place for place, mine in enumerate(rows)}
-    known = np.flatnonzero(np.isin(scored.photo_owner, list(number)))
-    photo_owner = np.array([number[int(name)] for name in scored.photo_owner[known]], np.int64)
+    number = {int(part.touch_owner[mine[0]]): place for place, mine in enumerate(rows)}
+    known = np.flatnonzero(np.isin(part.photo_owner, list(number)))
+    photo_owner = np.array([number[int(name)] for name in part.photo_owner[known]], np.int64)
     return _ReferenceTrials(
         ScoredTouches(near, owner, np.arange(len(rows)), np.zeros(near.shape, np.bool_)),
-        ScoredTouches(scored.logits[np.ix_(queries, known)], owner, photo_owner, scored.own[np.ix_(queries, known)]),
+        ScoredTouches(part.logits[np.ix_(queries, known)], owner, photo_owner, part.own[np.ix_(queries, known)]),
     )
 
 

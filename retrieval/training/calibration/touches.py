@@ -1,7 +1,7 @@
 """Touches of objects that a model was not fitted to: the data of its calibrations."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,56 +15,74 @@ from retrieval.model.fusion import Matcher
 from retrieval.model.references import unit_embeddings
 
 Numbers = NDArray[np.int64]
+Embeddings = NDArray[np.floating[Any]]
+
+
+def _no_embeddings() -> Embeddings:
+    return np.zeros((0, 0), np.float32)
 
 
 @dataclass(frozen=True, eq=False)
 class ScoredTouches:
-    """Match logits of touches with photos, to fit a posterior on.
+    """Touches of known objects in the order of capture, and their match logits with photos, possibly none.
 
     Attributes:
         logits: (T, N) match logits.
         touch_owner: (T,) object of each touch.
         photo_owner: (N,) object of each photo.
         own: (T, N) whether the photo was taken in the grasp of that touch; such photos are masked for that touch.
+        touch_embeddings: (T, d) embeddings, for the calibration of reference touches; d is 0 for a model whose logit
+            has no cosine.
+        photo_embeddings: (N, d') embeddings, for verification.
     """
 
     logits: NDArray[np.floating[Any]]
     touch_owner: Numbers
     photo_owner: Numbers
     own: NDArray[np.bool_]
+    touch_embeddings: Embeddings = field(default_factory=_no_embeddings)
+    photo_embeddings: Embeddings = field(default_factory=_no_embeddings)
 
 
-@dataclass(frozen=True, eq=False)
-class CalibrationTouches:
-    """Touches of known objects in the order of capture.
-
-    Attributes:
-        scored: Match logits of the touches with photos, possibly none.
-        touch_embeddings: (T, d) embeddings of the touches; d is 0 for a model whose logit has no cosine.
-        photo_embeddings: (N, d') embeddings of the photos.
-    """
-
-    scored: ScoredTouches
-    touch_embeddings: NDArray[np.floating[Any]]
-    photo_embeddings: NDArray[np.floating[Any]]
-
-
-def calibration_touches(
+@torch.inference_mode()
+def score_touches(
     matcher: Matcher,
-    grasps: Sequence[Grasp],
-    touches: Tensor,
-    photos: dict[Path, Tensor],
+    features: tuple[Tensor, Tensor],
+    owners: tuple[Numbers, Numbers],
+    own: NDArray[np.bool_],
     *,
     pooled: bool = False,
-) -> CalibrationTouches | None:
-    """Return the data of the calibrations; None if there are too few objects or photos.
+) -> ScoredTouches:
+    """Score touches with photos.
+
+    Args:
+        matcher: The matcher.
+        features: Features of the touches (T, fingers * F) and of the photos (N, F').
+        owners: Objects of the touches (T,) and of the photos (N,).
+        own: (T, N) whether the photo was taken in the grasp of that touch.
+        pooled: Score without late interaction, as an index without cells does.
+    """
+    touch_partials = matcher.touch_encoding(features[0]).partial.cpu().numpy()
+    photo_partials, photo_embeddings = (part.cpu().numpy() for part in matcher.photo_encoding(features[1]))
+    scorer = matcher.head.scorer
+    if pooled:
+        photo_partials = photo_partials[:, : scorer.pooled_width]
+    logits = np.stack([scorer.logits(partial[None], photo_partials) for partial in touch_partials])
+    touch_embeddings = unit_embeddings(touch_partials, scorer.cosine_columns)
+    return ScoredTouches(logits, *owners, own, touch_embeddings, photo_embeddings)
+
+
+def score_grasps(
+    matcher: Matcher, grasps: Sequence[Grasp], touches: Tensor, photos: dict[Path, Tensor], *, pooled: bool = False
+) -> ScoredTouches | None:
+    """Score the touches of grasps with their photos; None if there are too few objects or photos.
 
     Args:
         matcher: The matcher.
         grasps: G grasps.
         touches: Touch features (G, fingers * F).
         photos: Features of each photo by file.
-        pooled: Score without late interaction, as an index without cells does.
+        pooled: Score without late interaction.
     """
     objects = sorted({grasp.object_id for grasp in grasps})
     object_of = {grasp.photo: grasp.object_id for grasp in grasps}
@@ -73,13 +91,5 @@ def calibration_touches(
     photo_owner = np.array([objects.index(object_of[photo]) for photo in photos])
     if len(objects) < 3 or not ((touch_owner[:, None] == photo_owner) & ~own).any():
         return None
-    with torch.inference_mode():
-        touch_partials = matcher.touch_encoding(touches).partial.cpu().numpy()
-        encoded = matcher.photo_encoding(torch.stack(list(photos.values())))
-    photo_partials, photo_embeddings = encoded.partial.cpu().numpy(), encoded.embedding.cpu().numpy()
-    if pooled:
-        photo_partials = photo_partials[:, : matcher.config.pooled_width]
-    scorer = matcher.head.scorer
-    logits = np.stack([scorer.logits(partial[None], photo_partials) for partial in touch_partials])
-    embeddings = unit_embeddings(touch_partials, matcher.config.cosine_columns)
-    return CalibrationTouches(ScoredTouches(logits, touch_owner, photo_owner, own), embeddings, photo_embeddings)
+    features = touches, torch.stack(list(photos.values()))
+    return score_touches(matcher, features, (touch_owner, photo_owner), own, pooled=pooled)

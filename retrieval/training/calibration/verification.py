@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from retrieval.model.posterior import Posterior
 from retrieval.model.verification import LEVELS, MAX_GRASPS, QUANTILES, VerificationCalibration, supports_calibration
 from retrieval.training.calibration.posterior import IdentificationTrials
-from retrieval.training.calibration.touches import CalibrationTouches, ScoredTouches
+from retrieval.training.calibration.touches import ScoredTouches
 
 SEQUENCES = 8
 """Sequences of grasps of each validation object."""
@@ -41,7 +41,6 @@ class VerificationSequences(NamedTuple):
 
 def verification_sequences(
     scored: ScoredTouches,
-    embeddings: NDArray[np.floating[Any]],
     posterior: Posterior,
     seed: int = 0,
     grasps: int = MAX_GRASPS,
@@ -49,8 +48,7 @@ def verification_sequences(
     """Draw and score `SEQUENCES` sequences of each object that has `grasps` grasps and a photo of another grasp.
 
     Args:
-        scored: Match logits of the touches with the photos.
-        embeddings: (N, d) embeddings of the photos, by which the most similar object is found.
+        scored: Match logits of the touches with the photos, whose embeddings give the most similar object.
         posterior: The posterior of the model.
         seed: Seed of the sequences. Shorter sequences of the same seed are the first grasps of longer ones.
         grasps: Number of grasps, G.
@@ -72,7 +70,7 @@ def verification_sequences(
     rows, true = np.arange(len(sets)), np.searchsorted(objects, owner)
     highest = np.maximum.accumulate(ratios, axis=0)
     is_impostor = np.arange(len(objects)) != true[:, None]
-    similar = _nearest_objects(objects, scored.photo_owner, embeddings)[true]
+    similar = _nearest_objects(objects, scored.photo_owner, scored.photo_embeddings)[true]
     return VerificationSequences(
         owner,
         ratios[:, rows, true].T,
@@ -83,7 +81,7 @@ def verification_sequences(
 
 
 def fit_verification(
-    parts: Sequence[CalibrationTouches], posterior: Posterior, seed: int = 0
+    parts: Sequence[ScoredTouches], posterior: Posterior, seed: int = 0
 ) -> VerificationCalibration | None:
     """Return the calibration from touches and photos of validation objects.
 
@@ -96,7 +94,7 @@ def fit_verification(
         The calibration; None if fewer than `MIN_OBJECTS` objects have sequences (`verification_sequences`), or if
         their pairs do not support `CARD_FAR`.
     """
-    found = [verification_sequences(part.scored, part.photo_embeddings, posterior, seed) for part in parts]
+    found = [verification_sequences(part, posterior, seed) for part in parts]
     found = [each for each in found if len(each.owner)]
     sizes = tuple(len(np.unique(each.owner)) for each in found)
     if not supports_calibration(sizes):

@@ -178,20 +178,20 @@ def test_onnx_runtime_gives_the_partial_activations_and_embeddings_of_several_vi
     shipped = load_checkpoint(shipped_model())
     encoders = torch_photo_encoder(shipped.matcher), choose_photo_encoder(shipped)
     ours, theirs = (encode(pictures(shipped)) for encode in encoders)
-    assert not np.array_equal(ours.partial, theirs.partial)  # another library
-    assert np.abs(ours.partial - theirs.partial).max() <= exporting.TOLERANCE * np.abs(ours.partial).max()
-    assert np.allclose(ours.embedding, theirs.embedding, atol=1e-4)
+    assert not np.array_equal(ours.partials, theirs.partials)  # another library
+    assert np.abs(ours.partials - theirs.partials).max() <= exporting.TOLERANCE * np.abs(ours.partials).max()
+    assert np.allclose(ours.embeddings, theirs.embeddings, atol=1e-4)
 
 
 def test_pytorch_encodes_if_onnx_runtime_is_missing_or_wrong(model, monkeypatch, caplog):
     checkpoint = load_checkpoint(model)
     images = pictures(checkpoint)
-    expected = torch_photo_encoder(checkpoint.matcher)(images).partial
+    expected = torch_photo_encoder(checkpoint.matcher)(images).partials
     with monkeypatch.context() as patch:
         patch.setattr(exporting, "find_spec", lambda name: None)
-        assert np.array_equal(choose_photo_encoder(checkpoint)(images).partial, expected)
+        assert np.array_equal(choose_photo_encoder(checkpoint)(images).partials, expected)
     monkeypatch.setattr(exporting, "TOLERANCE", -1.0)
-    assert np.array_equal(choose_photo_encoder(checkpoint)(images).partial, expected)
+    assert np.array_equal(choose_photo_encoder(checkpoint)(images).partials, expected)
     assert "gives other partial activations" in caplog.text
 
 

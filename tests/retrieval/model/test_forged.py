@@ -39,22 +39,6 @@ def template(tmp_path_factory):
     return path
 
 
-def with_settings(path, part="matcher", **changes):
-    """Write the checkpoint again with other settings and a matching checksum."""
-    _, header = read_tensors(path)
-    config = header["config"]
-    rewrite(path, config=config | {part: config[part] | changes})
-    return path
-
-
-@pytest.mark.parametrize("name", ["hidden", "embedding_dim", "fingers", "candidate_width"])
-@pytest.mark.parametrize("size", [10**9, 2**70])
-def test_weights_are_compared_with_the_settings_before_memory_is_allocated(saved, name, size):
-    with_settings(saved, **{name: size})
-    with pytest.raises(CheckpointError, match=r"do not fit its configuration|too large to count|fit into 64 bits"):
-        load_checkpoint(saved)
-
-
 @settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     part=st.sampled_from(["config", "split", "calibration", "provenance", "format", "software", "task"]),

@@ -9,7 +9,7 @@ import pytest
 from retrieval.errors import BadInput
 from retrieval.model.references import SHARPNESS, ReferenceCalibration, reference_similarity
 from retrieval.training.calibration.references import fit_references
-from retrieval.training.calibration.touches import CalibrationTouches, ScoredTouches
+from retrieval.training.calibration.touches import ScoredTouches
 from tests.reference_model import REFERENCE_CALIBRATION
 
 
@@ -48,8 +48,7 @@ def reference_touches(objects=10, touches=4, noise=0.3, photos=True, seed=0):
     embeddings = (embeddings / np.linalg.norm(embeddings, axis=1, keepdims=True)).astype(np.float32)
     photo_owner = np.arange(objects if photos else 0)
     logits = rng.normal(size=(len(owner), len(photo_owner))) + (owner[:, None] == photo_owner)
-    scored = ScoredTouches(logits, owner, photo_owner, np.zeros(logits.shape, bool))
-    return CalibrationTouches(scored, embeddings, np.zeros((len(photo_owner), 16), np.float32))
+    return ScoredTouches(logits, owner, photo_owner, np.zeros(logits.shape, bool), embeddings)
 
 
 def test_near_touches_get_a_large_weight_and_noise_a_small_one():

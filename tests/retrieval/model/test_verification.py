@@ -19,7 +19,7 @@ from retrieval.model.verification import (
     REJECT,
     VerificationCalibration,
 )
-from retrieval.training.calibration.touches import CalibrationTouches, ScoredTouches
+from retrieval.training.calibration.touches import ScoredTouches
 from retrieval.training.calibration.verification import fit_verification, verification_sequences
 
 POSTERIOR = Posterior(slope=1.0, offset=-2.0, dependence=0.5)
@@ -37,9 +37,7 @@ def scored_objects(objects, seed, grasps=MAX_GRASPS + 1):
     logits = of_objects[owner][:, owner] + rng.normal(size=(len(owner), len(owner))) * 1.3
     logits += 3.0 * (owner[:, None] == owner)
     embeddings = rng.normal(size=(len(owner), EMBEDDING_DIM))
-    return CalibrationTouches(
-        ScoredTouches(logits, owner, owner, np.eye(len(owner), dtype=bool)), embeddings, embeddings
-    )
+    return ScoredTouches(logits, owner, owner, np.eye(len(owner), dtype=bool), embeddings, embeddings)
 
 
 def sequences(scored, seed=3):
@@ -73,7 +71,7 @@ def fitted():
 
 
 def test_the_stated_false_accept_rate_holds_on_other_objects_whenever_the_decision_falls(fitted):
-    ratios, true = sequences(scored_objects(120, seed=1).scored)
+    ratios, true = sequences(scored_objects(120, seed=1))
     bounds = fitted.bounds(0.02)
     impostor = np.ones(ratios[:, 0].shape, dtype=bool)
     impostor[np.arange(len(true)), true] = False
@@ -85,7 +83,7 @@ def test_the_stated_false_accept_rate_holds_on_other_objects_whenever_the_decisi
 
 def test_a_threshold_for_one_grasp_accepts_too_many_impostors_over_a_sequence(fitted):
     """The naive way: the quantile of single grasps, applied after each grasp."""
-    ratios, true = sequences(scored_objects(120, seed=1).scored)
+    ratios, true = sequences(scored_objects(120, seed=1))
     impostor = np.ones(ratios[:, 0].shape, dtype=bool)
     impostor[np.arange(len(true)), true] = False
     naive = np.quantile(ratios[:, 0][impostor], 0.98)
@@ -130,11 +128,11 @@ def test_a_decision_follows_the_two_bounds(fitted, ratios, decision):
 
 
 def test_similar_impostors_are_the_objects_with_the_most_similar_photos():
-    scored = scored_objects(40, seed=5).scored
+    scored = scored_objects(40, seed=5)
     owner = scored.photo_owner
     embeddings = np.eye(20)[owner // 2]  # objects 2 k and 2 k + 1 look alike
     scored.logits[scored.touch_owner[:, None] // 2 == owner // 2] += 3.0
-    bounds = fit_verification([CalibrationTouches(scored, embeddings, embeddings)], POSTERIOR).bounds(0.1)
+    bounds = fit_verification([dataclasses.replace(scored, photo_embeddings=embeddings)], POSTERIOR).bounds(0.1)
     assert bounds.similar_false_accepts.value > 3 * bounds.false_accepts.value
 
 
@@ -148,7 +146,7 @@ def test_objects_of_two_groups_are_not_compared_with_each_other():
     first, second = scored_objects(50, seed=0), scored_objects(50, seed=6)
     both = fit_verification([first, second], POSTERIOR)
     assert (both.group_sizes, both.objects, both.pairs) == ((50, 50), 100, 2 * 50 * 49 // 2)
-    expected = [verification_sequences(part.scored, part.photo_embeddings, POSTERIOR) for part in (first, second)]
+    expected = [verification_sequences(part, POSTERIOR) for part in (first, second)]
     level = np.quantile(np.concatenate([part.impostor.ravel() for part in expected]), 0.95)
     assert both.bounds(0.05).accept == pytest.approx(level, abs=0.02)
     with pytest.raises(BadInput, match=r"0\.01 needs 111 validation objects; the model has 100"):

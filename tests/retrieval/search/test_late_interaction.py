@@ -23,7 +23,7 @@ from retrieval.model.references import ReferenceCalibration
 from retrieval.search.searcher import Searcher
 from retrieval.training.calibration import calibrate
 from retrieval.training.calibration.posterior import fit_posterior
-from retrieval.training.calibration.touches import calibration_touches
+from retrieval.training.calibration.touches import score_grasps
 from tests.conftest import TINY
 from tests.reference_model import REFERENCE_CALIBRATION, write_reference_model
 
@@ -207,13 +207,13 @@ def test_the_pooled_posterior_is_fitted_on_the_logits_of_the_matcher_without_cel
     each, count = pooled.touch_tower.feature_count, pooled.photo_feature_count
     short = {photo: features[:count] for photo, features in photos.items()}
     short_touches = touches.reshape(12, 2, -1)[..., :each].reshape(12, -1)
-    expected = calibration_touches(pooled, grasps, short_touches, short)
-    found = calibration_touches(matcher, grasps, touches, photos, pooled=True)
-    np.testing.assert_allclose(found.scored.logits, expected.scored.logits, atol=1e-5)
+    expected = score_grasps(pooled, grasps, short_touches, short)
+    found = score_grasps(matcher, grasps, touches, photos, pooled=True)
+    np.testing.assert_allclose(found.logits, expected.logits, atol=1e-5)
     monkeypatch.setattr(calibrate, "recorded_features", lambda *_, **__: (touches, photos))
     monkeypatch.setattr(calibrate, "_sample_grasps", lambda some, _: some)  # keeps their order
     made = calibrate.calibrate_checkpoint(checkpoint, None, grasps, grasps)
-    assert made.pooled_posterior.slope == pytest.approx(fit_posterior(expected.scored).slope, rel=1e-3)
+    assert made.pooled_posterior.slope == pytest.approx(fit_posterior(expected).slope, rel=1e-3)
     assert made.posterior != made.pooled_posterior
 
 

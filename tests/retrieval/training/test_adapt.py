@@ -20,7 +20,7 @@ from retrieval.training import adapt as adaptation
 from retrieval.training import cca_towers
 from retrieval.training.adapt import Estimate, accuracies, adapt, config_for, draw_folds, fit_folds, load_towers
 from retrieval.training.calibration.posterior import fit_posterior
-from retrieval.training.calibration.touches import CalibrationTouches, ScoredTouches
+from retrieval.training.calibration.touches import ScoredTouches
 from retrieval.training.calibration.verification import fit_verification, verification_sequences
 from retrieval.training.cca_towers import GRID, CcaSettings, TowerWidths, fit_projections, select_settings
 from retrieval.training.features import Features
@@ -219,17 +219,17 @@ def test_thresholds_of_verifications_come_from_objects_outside_the_fit():
     ids = tuple(str(row) for row in range(len(owner)))
     features, objects = Features(ids, names, touch[:, None], photo), sorted(set(names))
     choice = select_settings(features, TowerWidths((12,), (10,)), [objects[::2], objects[1::2]])
-    posterior = fit_posterior(*(part.scored for part in choice.held_out_touches))
+    posterior = fit_posterior(*choice.held_out_touches)
     found = fit_verification(choice.held_out_touches, posterior)
     assert found.group_sizes == (30, 30)
 
     def scored(touch, photo, owner):
         cosines = choice.projections.cosines(touch, photo)
         own, photos = np.eye(len(owner), dtype=bool), choice.projections.photo(photo)
-        return CalibrationTouches(ScoredTouches(cosines, owner, owner, own), photos, photos)
+        return ScoredTouches(cosines, owner, owner, own, photos, photos)
 
     unseen = scored(*correlated_features(objects=80, seed=1))
-    ratios = verification_sequences(unseen.scored, unseen.photo_embeddings, posterior).impostor
+    ratios = verification_sequences(unseen, posterior).impostor
     fitted = fit_verification([scored(touch, photo, owner)], posterior)
     assert (ratios >= found.bounds(0.05).accept).mean() == pytest.approx(0.05, abs=0.015)
     assert (ratios >= fitted.bounds(0.05).accept).mean() > 0.065
@@ -245,7 +245,7 @@ def test_the_calibrations_of_a_fit_are_fitted_on_held_out_touches(recording, mod
     assert len(given) == len(held_out) > 1
     scale, offset = made.checkpoint.matcher.cosine_scale.item(), made.checkpoint.matcher.head.out.bias.item()
     for part, expected in zip(given, held_out, strict=True):
-        np.testing.assert_allclose(part.scored.logits, scale * expected.scored.logits + offset, rtol=1e-5)
+        np.testing.assert_allclose(part.logits, scale * expected.logits + offset, rtol=1e-5)
 
 
 @pytest.mark.usefixtures("unchecked")
