@@ -18,7 +18,7 @@ SKILL = {
     "cca": 0.7,
     "chance": 0.0,
 }
-RANKS = ("recall_1", "recall_5", "recall_10", "mrr", "map")
+RANKS = ("recall_1", "recall_5", "recall_10", "map")
 
 
 def summary(

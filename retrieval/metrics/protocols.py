@@ -92,11 +92,6 @@ def recall(table: ScoreTable, k: int) -> Measure:
     return _rank_measure(table, lambda queries: ranking.recall_at(k, queries.first))
 
 
-def reciprocal_rank(table: ScoreTable) -> Measure:
-    """1 / rank of the first photo of the object in the whole gallery, without own photos."""
-    return _rank_measure(table, lambda queries: ranking.reciprocal_rank(queries.first))
-
-
 def average_precision(table: ScoreTable) -> Measure:
     """Average precision over the whole gallery, without own photos.
 

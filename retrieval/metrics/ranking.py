@@ -4,7 +4,7 @@ Each row is a query; the items of its gallery are ranked by score, and some are 
 item among the first k". All orders of equal scores are equally likely, so a constant scorer has exactly the value of
 chance.
 
-Without ties the values equal those of trec_eval: R@k is its success_k, the others are recip_rank and map. trec_eval
+Without ties the values equal those of trec_eval: R@k is its success_k, average precision its map. trec_eval
 orders equal scores by the names of the items, compares scores in single precision, and gives a query without a relevant
 item the value 0; here such a query is left out. R@k is not trec_eval's recall_k, which
 is the fraction of the relevant items among the first k.
@@ -63,25 +63,6 @@ def recall_at(k: int, first: FirstRelevant) -> NDArray[np.float64]:
         fraction = np.clip((left - first.right) / np.maximum(left, 1), 0, 1)
         none *= np.where(turn < k - first.before, fraction, 1)
     return 1 - none
-
-
-def reciprocal_rank(first: FirstRelevant) -> NDArray[np.float64]:
-    """Return the expected 1 / rank (Q,) of the first relevant item, over all orders of ties."""
-    expected = 1 / (first.before + 1.0)
-    rows = np.flatnonzero(first.tied > first.right)
-    cases, place = np.unique(np.transpose(first)[rows], axis=0, return_inverse=True)
-    values = np.array([_expected_reciprocal(*map(int, case)) for case in cases])
-    expected[rows] = values[place] if len(rows) else 0
-    return expected
-
-
-def _expected_reciprocal(before: int, tied: int, right: int) -> float:
-    """Return the sum over j of P(j irrelevant come first) / (before + 1 + j)."""
-    j = np.arange(tied - right + 1)
-    # P(0) = r / m, and P(j + 1) = P(j) (m - r - j) / (m - 1 - j).
-    steps = (tied - right - j[:-1]) / (tied - 1.0 - j[:-1])
-    chance = right / tied * np.cumprod(np.append(1.0, steps))
-    return float((chance / (before + 1 + j)).sum())
 
 
 def average_precision(scores: Scores, relevant: Mask, in_gallery: Mask) -> NDArray[np.float64]:

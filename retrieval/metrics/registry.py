@@ -98,7 +98,6 @@ METRICS: dict[str, Metric] = {
     "topn_k5_all_objects": _top1_of(5, lambda tables: tables.all_objects, ", all objects"),
     **{grasps_metric_name(count): _grasps_metric(count) for count in SET_SIZES},
     **{f"recall_{k}": _gallery_metric(f"R@{k}", partial(protocols.recall, k=k)) for k in (1, 5, 10)},
-    "mrr": _gallery_metric("MRR", protocols.reciprocal_rank),
     "map": _gallery_metric("mAP", protocols.average_precision),
 }
 """Name in results.json -> metric, in the order of every table."""

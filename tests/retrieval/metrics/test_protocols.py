@@ -13,7 +13,6 @@ from retrieval.metrics.protocols import (
     pair_accuracy,
     pair_auc,
     recall,
-    reciprocal_rank,
 )
 from retrieval.metrics.registry import (
     METRICS,
@@ -28,7 +27,7 @@ from retrieval.metrics.table import ScoreTable, object_scores
 def full_gallery(table):
     """Return every measure of the whole gallery."""
     recalls = {f"recall_{k}": recall(table, k) for k in (1, 5, 10)}
-    return {**recalls, "mrr": reciprocal_rank(table), "map": average_precision(table)}
+    return {**recalls, "map": average_precision(table)}
 
 
 def table_of(scores, touch_owner, photo_owner=None, own=None):
@@ -167,7 +166,6 @@ def full_by_loops(table, row, own_shown=False):
         "recall_1": np.mean([places[0] <= 1 for places in cases]),
         "recall_5": np.mean([places[0] <= 5 for places in cases]),
         "recall_10": np.mean([places[0] <= 10 for places in cases]),
-        "mrr": np.mean([1 / places[0] for places in cases]),
         "map": np.mean([np.mean([count / place for count, place in enumerate(places, 1)]) for places in cases]),
     }
 
@@ -179,7 +177,7 @@ def test_measures_of_the_full_gallery_equal_those_of_two_loops(transposed):
     found = full_gallery(table)
     for row in range(14):
         expected = full_by_loops(table, row)
-        for name in ("recall_1", "recall_5", "recall_10", "mrr", "map"):
+        for name in ("recall_1", "recall_5", "recall_10", "map"):
             assert found[name].values[row, 0] == pytest.approx(expected[name], abs=0.055), name
 
 

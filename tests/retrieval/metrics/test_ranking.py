@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from retrieval.metrics.ranking import FirstRelevant, average_precision, first_relevant, recall_at, reciprocal_rank
+from retrieval.metrics.ranking import FirstRelevant, average_precision, first_relevant, recall_at
 
 
 def measures(scores, relevant, shown=None):
@@ -17,7 +17,6 @@ def measures(scores, relevant, shown=None):
     shown = np.ones_like(relevant) if shown is None else np.array([shown], dtype=bool)
     first = first_relevant(scores, relevant, shown)
     found = {k: float(recall_at(k, first)[0]) for k in (1, 2, 3, 5)}
-    found["mrr"] = float(reciprocal_rank(first)[0])
     found["map"] = float(average_precision(scores, relevant, shown)[0])
     return found
 
@@ -31,7 +30,7 @@ def measures_of_order(relevant_in_order):
         if good:
             precisions.append(count / place)
     found = {k: float(first <= k) for k in (1, 2, 3, 5)}
-    return found | {"mrr": 1 / first, "map": sum(precisions) / len(precisions)}
+    return found | {"map": sum(precisions) / len(precisions)}
 
 
 def measures_by_enumeration(scores, relevant):
@@ -46,8 +45,8 @@ def measures_by_enumeration(scores, relevant):
 def test_a_stable_sort_would_give_a_constant_scorer_the_order_of_its_input():
     relevant = np.array([1, 0, 0, 0, 0], dtype=bool)
     naive = relevant[np.argsort(-np.zeros(5), kind="stable")]
-    assert measures_of_order(naive)["mrr"] == 1
-    assert measures(np.zeros(5), relevant)["mrr"] == pytest.approx((1 + 1 / 2 + 1 / 3 + 1 / 4 + 1 / 5) / 5)
+    assert measures_of_order(naive)["map"] == 1
+    assert measures(np.zeros(5), relevant)["map"] == pytest.approx((1 + 1 / 2 + 1 / 3 + 1 / 4 + 1 / 5) / 5)
 
 
 def test_the_average_precision_of_ties_is_not_the_mean_of_its_best_and_worst_order():
@@ -83,8 +82,6 @@ def test_a_constant_scorer_has_the_value_of_a_random_order(count, right, hidden,
     missed = [comb(count - right, k) / comb(count, k) for k in range(count + 1)]
     for k in (1, 5, 10):
         assert recall_at(k, first)[0] == pytest.approx(1 - missed[min(k, count)], abs=1e-12)
-    reciprocal = sum((missed[k] - missed[k + 1]) / (k + 1) for k in range(count))
-    assert reciprocal_rank(first)[0] == pytest.approx(reciprocal, rel=1e-10)
     p = (right - 1) / max(count - 1, 1)
     precision = 1 if right == count else p + (1 - p) * sum(1 / place for place in range(1, count + 1)) / count
     assert average_precision(scores, relevant, shown)[0] == pytest.approx(precision, rel=1e-10)
@@ -97,5 +94,4 @@ def test_many_ties_neither_overflow_nor_lose_precision():
     first = FirstRelevant(*(np.array([value]) for value in (5, 4000, 44)))
     rng = np.random.default_rng(0)
     drawn = np.array([rng.choice(4000, 44, replace=False).min() for _ in range(20_000)])
-    assert reciprocal_rank(first)[0] == pytest.approx((1 / (6 + drawn)).mean(), rel=0.02)  # standard error 0.4 %
     assert recall_at(10, first)[0] == pytest.approx((drawn < 5).mean(), abs=0.006)

@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 
 from retrieval.metrics import protocols
-from retrieval.metrics.ranking import average_precision, first_relevant, recall_at, reciprocal_rank
+from retrieval.metrics.ranking import average_precision, first_relevant, recall_at
 from retrieval.metrics.table import ScoreTable
 
 trec_eval = pytest.importorskip("pytrec_eval")
 
 KS = (1, 2, 3, 5)
-NAMES = {"map": "map", "mrr": "recip_rank", **{k: f"success_{k}" for k in KS}}
+NAMES = {"map": "map", **{k: f"success_{k}" for k in KS}}
 """Our measure -> that of trec_eval. R@k is "any relevant item among the first k", which trec_eval calls success."""
 
 
 def ours(scores, relevant, in_gallery):
     first = first_relevant(scores, relevant, in_gallery)
-    measures = {"map": average_precision(scores, relevant, in_gallery), "mrr": reciprocal_rank(first)}
+    measures = {"map": average_precision(scores, relevant, in_gallery)}
     return measures | {k: recall_at(k, first) for k in KS}
 
 
@@ -28,7 +28,7 @@ def theirs(scores, relevant, in_gallery, names=None):
     queries = range(len(scores))
     qrels = {str(q): {names[i]: int(relevant[q, i]) for i in np.flatnonzero(in_gallery[q])} for q in queries}
     run = {str(q): {names[i]: float(scores[q, i]) for i in np.flatnonzero(in_gallery[q])} for q in queries}
-    evaluator = trec_eval.RelevanceEvaluator(qrels, {"map", "recip_rank", "success." + ",".join(map(str, KS))})
+    evaluator = trec_eval.RelevanceEvaluator(qrels, {"map", "success." + ",".join(map(str, KS))})
     found = evaluator.evaluate(run)
     return {key: np.array([found[str(q)][name] for q in queries]) for key, name in NAMES.items()}
 
@@ -68,9 +68,9 @@ def test_a_name_decides_the_value_of_trec_eval_for_a_constant_scorer():
     """By hand: of two items with equal scores one is relevant. trec_eval puts the later name first."""
     scores, every = np.zeros((1, 2), np.float32), np.ones((1, 2), bool)
     relevant = np.array([[True, False]])
-    assert theirs(scores, relevant, every, ["a", "b"])["mrr"] == 0.5
-    assert theirs(scores, relevant, every, ["b", "a"])["mrr"] == 1
-    assert ours(scores, relevant, every)["mrr"] == 0.75
+    assert theirs(scores, relevant, every, ["a", "b"])["map"] == 0.5
+    assert theirs(scores, relevant, every, ["b", "a"])["map"] == 1
+    assert ours(scores, relevant, every)["map"] == 0.75
 
 
 def test_a_query_without_a_relevant_item_is_0_for_trec_eval_and_no_query_for_us():
@@ -79,9 +79,9 @@ def test_a_query_without_a_relevant_item_is_0_for_trec_eval_and_no_query_for_us(
     owner, photos = np.array([0, 7]), np.array([1, 0, 0])
     table = ScoreTable(scores, owner, photos, np.zeros((2, 3), bool))
     every = np.ones((2, 3), bool)
-    assert theirs(scores, table.relevant, every)["mrr"].tolist() == [0.5, 0]
-    measure = protocols.reciprocal_rank(table)
-    assert measure.values.tolist() == [[0.5]]
+    assert theirs(scores, table.relevant, every)["map"] == pytest.approx([7 / 12, 0])
+    measure = protocols.average_precision(table)
+    assert measure.values == pytest.approx(7 / 12)
     assert "1 touches left out" in measure.gallery
 
 
@@ -92,6 +92,6 @@ def test_own_photos_are_neither_in_the_run_nor_in_the_qrels():
     scores = rng.permuted(np.tile(np.arange(24, dtype=np.float32), (24, 1)), axis=1)
     table = ScoreTable(scores, touch_owner, touch_owner, np.eye(24, dtype=bool))
     expected = theirs(scores, table.relevant, ~table.own)
-    found = {"map": protocols.average_precision(table), "mrr": protocols.reciprocal_rank(table)}
+    found = {"map": protocols.average_precision(table)}
     found |= {k: protocols.recall(table, k) for k in KS}
     assert_equal({key: measure.values[:, 0] for key, measure in found.items()}, expected)
