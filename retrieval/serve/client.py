@@ -86,8 +86,14 @@ class Client:
             RetrievalError: No answer is available.
         """
         grasps = self._grasps(touches)
-        body = {"touches": _encoded(grasps), **_request_options(options)}
-        return _result(_document(self._send("POST", "query", json=body)), grasps)
+        body: dict[str, Any] = {**options, "touches": [_encoded(grasp) for grasp in grasps]}
+        if (frames := options.get("background")) is not None:
+            body["background"] = _encoded(
+                [InputImage(image, f"background {number}") for number, image in enumerate(frames, start=1)]
+            )
+        result = QueryResult.from_dict(_document(self._send("POST", "query", json=body)))
+        names = [[image.name for image in grasp] for grasp in grasps]  # those of this machine
+        return replace(result, touches=names[: len(result.touches)])
 
     def query_many(self, objects: Sequence[AnyTouches], **options: Unpack[QueryOptions]) -> list[QueryResult]:
         """Run `query` for each object."""
@@ -156,28 +162,8 @@ def _error(response: httpx.Response) -> RetrievalError:
     return BadInput(detail) if kind in _BAD_INPUT_KINDS else RetrievalError(detail)
 
 
-def _result(answer: dict[str, Any], grasps: list[list[InputImage]]) -> QueryResult:
-    """Return the answer, with the image names of this machine."""
-    result = QueryResult.from_dict(answer)
-    names = [[image.name for image in grasp] for grasp in grasps]
-    return replace(result, touches=names[: len(result.touches)])
-
-
-def _request_options(options: QueryOptions) -> dict[str, Any]:
-    """Return the options of a query as keys of a request body."""
-    frames = options.get("background")
-    if frames is None:
-        return dict(options)
-    images = [InputImage(image, f"background {number}") for number, image in enumerate(frames, start=1)]
-    return {**options, "background": [_base64(image) for image in images]}
-
-
-def _encoded(grasps: list[list[InputImage]]) -> list[list[str]]:
-    return [[_base64(image) for image in grasp] for grasp in grasps]
-
-
-def _base64(source: InputImage) -> str:
-    return base64.b64encode(_file(source)).decode("ascii")
+def _encoded(images: Sequence[InputImage]) -> list[str]:
+    return [base64.b64encode(_file(image)).decode("ascii") for image in images]
 
 
 def _file(source: InputImage) -> bytes:
