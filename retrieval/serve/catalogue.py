@@ -17,12 +17,10 @@ from retrieval.errors import ImageError
 from retrieval.report.pages import jpeg, thumbnail
 from retrieval.serve.errors import HttpProblem
 from retrieval.serve.service import Parts
-from retrieval.serve.store import as_png_or_jpeg
+from retrieval.serve.store import IMAGE_TYPES, as_png_or_jpeg
 from retrieval.version import __version__
 
 router = APIRouter(tags=["catalogue"])
-BROWSER_IMAGE_TYPES = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
-"""First bytes of the image formats that every browser shows -> media type. Other formats are converted."""
 IMAGE_RESPONSES: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/jpeg": {}, "image/png": {}}, "description": "The picture."}
 }
@@ -94,7 +92,7 @@ def photo(
     path = generation.searcher.catalogue / listed.path
     try:
         data = read_bytes(path) if px is None else b""
-        if not data.startswith(tuple(BROWSER_IMAGE_TYPES)):
+        if not data.startswith(tuple(IMAGE_TYPES)):
             data = _thumbnail(path, listed.digest, px or MAX_PHOTO_PX)
     except ImageError as error:
         detail = f"The photo {photo!r} cannot be read any more. Run `retrieve build-index` again."
@@ -112,13 +110,9 @@ def _thumbnail(path: Path, digest: str, px: int) -> bytes:
 
 
 def image_response(data: bytes, headers: Mapping[str, str] | None = None) -> Response:
-    """Return an image file as a response; formats other than PNG and JPEG become PNG.
-
-    Raises:
-        ImageError: The image cannot be decoded.
-    """
+    """Return an image file as a response, as PNG or JPEG. Raises ImageError if it cannot be decoded."""
     data = as_png_or_jpeg(data)
-    kind = next(kind for magic, kind in BROWSER_IMAGE_TYPES.items() if data.startswith(magic))
+    kind = next(kind for magic, kind in IMAGE_TYPES.items() if data.startswith(magic))
     return Response(data, media_type=kind, headers=headers)
 
 

@@ -35,7 +35,8 @@ STORE_S = 1.0
 """Maximum time for which an answer waits until its query is stored; a slow or hanging disk takes longer."""
 MAX_PENDING_WRITES = 16
 """Maximum number of queries that wait for the disk; further queries are not stored."""
-_PNG_OR_JPEG = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff")
+IMAGE_TYPES = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
+"""First bytes of the image formats that every browser shows, and a recording may contain -> media type."""
 RIGHT, OBJECT, NONE = "right", "object", "none"
 """Values of the feedback: the answer is right, it is another object, the catalogue lacks the object."""
 _VERSION = 3
@@ -368,12 +369,8 @@ class HistoryWriter:
 
 
 def as_png_or_jpeg(data: bytes) -> bytes:
-    """Return an image file in a format that a recording may contain; formats other than PNG and JPEG become PNG.
-
-    Raises:
-        ImageError: The image cannot be decoded.
-    """
-    if data.startswith(_PNG_OR_JPEG):
+    """Return an image file as PNG or JPEG; other formats become PNG. Raises ImageError if it cannot be decoded."""
+    if data.startswith(tuple(IMAGE_TYPES)):
         return data
     samples = decode(data, "a picture")
     pixels = samples if samples.dtype == np.uint8 else np.rint(255 * samples)
