@@ -43,9 +43,9 @@ if TYPE_CHECKING:
     from retrieval.report.evaluation import write_report as write_report
     from retrieval.search.answer import Match as Match
     from retrieval.search.answer import QueryResult as QueryResult
+    from retrieval.search.answer import Verification as Verification
     from retrieval.search.embeddings import embed_photos as embed_photos
     from retrieval.search.searcher import Searcher as Searcher
-    from retrieval.search.verification import Verification as Verification
     from retrieval.serve.client import Client as Client
     from retrieval.training.adapt import Adaptation as Adaptation
     from retrieval.training.adapt import adapt as adapt
@@ -70,7 +70,7 @@ _MODULES = {
     "Searcher": "search.searcher:Searcher",
     "MethodSettings": "methods.method:MethodSettings",
     "Tower": "model.towers.tower:Tower",
-    "Verification": "search.verification:Verification",
+    "Verification": "search.answer:Verification",
     "adapt": "training.adapt:adapt",
     "benchmark": "evaluation.real.benchmark:benchmark",
     "build_index": "indexing.build:build_index",

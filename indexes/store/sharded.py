@@ -134,7 +134,6 @@ def open_shard(
     entry: ShardEntry,
     fingerprint: Mapping[str, str],
     *,
-    verify: bool = True,
     threads: int | None = None,
 ) -> Generation:
     """Open and check a shard, as `IndexStore.open`.
@@ -143,14 +142,13 @@ def open_shard(
         index: Folder of the sharded index.
         entry: Manifest entry of the shard.
         fingerprint: Fingerprint of the sharded index.
-        verify: Compare the SHA-256 of the files.
         threads: Number of threads of a search; None for the library's own setting.
 
     Raises:
         IndexesError: The shard is missing, damaged, or not the generation in the manifest.
     """
     store = IndexStore(index / entry.folder)
-    generation = store.open(name=entry.generation, verify=verify, threads=threads)
+    generation = store.open(name=entry.generation, threads=threads)
     try:
         generation.require(fingerprint)
     except MismatchedIndex as error:

@@ -14,7 +14,6 @@ import weakref
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,18 +27,8 @@ from indexes.store.sharded import ShardedManifest, ShardEntry, open_shard
 from retrieval.console.output import say
 from retrieval.errors import BadInput, IncompleteSearch, RetrievalError
 from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_checkpoint_info
-from retrieval.model.posterior import Posterior
-from retrieval.search.objects import ListedPhoto
 from retrieval.search.opening import folder_shard, sharded_index_info
-from retrieval.search.shard import (
-    IndexInfo,
-    Page,
-    ShardQuery,
-    ShardResult,
-    merge_pages,
-    merge_photos,
-    merge_results,
-)
+from retrieval.search.shard import IndexInfo, Shards
 
 OWNERS = "touch-retrieval"
 APPLICATION = re.compile(r"shard-\d+-of-\d+-[0-9a-f]{16}-([0-9a-f]{8})")
@@ -75,14 +64,14 @@ class OwnerActor:
 class ShardReplica:
     """One shard in a process of Ray Serve."""
 
-    def __init__(self, index: str, entry: ShardEntry, fingerprint: dict[str, str], model: str, verify: bool) -> None:
+    def __init__(self, index: str, entry: ShardEntry, fingerprint: dict[str, str], model: str) -> None:
         stored = read_checkpoint_info(Path(model))
-        generation = open_shard(Path(index), entry, fingerprint, verify=verify, threads=1)
+        generation = open_shard(Path(index), entry, fingerprint, threads=1)
         self._shard = folder_shard(generation, stored)
         threadpool_limits(1, "blas")  # for the whole process: idle BLAS threads spin on CPUs that others need
 
     def call(self, method: str, *arguments: Any) -> Any:
-        """Return the result or the error of a method of `Shard`.
+        """Return the result or the error of a method of `FolderShard`.
 
         A raised error would contain the tracebacks of all processes.
         """
@@ -92,8 +81,8 @@ class ShardReplica:
             return error
 
 
-class RayShardGroup:
-    """A sharded index that Ray Serve serves.
+class RayShards(Shards):
+    """A sharded index that Ray Serve serves; the shards are their entries in the manifest.
 
     Args:
         info: Information about the index.
@@ -105,30 +94,13 @@ class RayShardGroup:
     def __init__(
         self, info: IndexInfo, entries: Sequence[ShardEntry], handles: dict[str, Any], settings: ReplicaSettings
     ) -> None:
-        self.info, self.entries, self._handles, self._settings = info, list(entries), handles, settings
+        super().__init__(info, entries)
+        self._handles, self._settings = handles, settings
 
-    def search(self, query: ShardQuery, top: int, candidates: int | None, posterior: Posterior | None) -> ShardResult:
-        """As `Shard.search`. Raises IncompleteSearch if a shard does not answer."""
-        return merge_results(self._call_shards("search", query, top, candidates, posterior), top)
-
-    def photos(self, paths: Sequence[str]) -> list[ListedPhoto | None]:
-        """As `Shard.photos`. Raises IncompleteSearch if a shard does not answer."""
-        return merge_photos(self._call_shards("photos", list(paths)))
-
-    def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
-        """As `Shard.page`. Raises IncompleteSearch if a shard does not answer."""
-
-        def of_shard(entry: ShardEntry, offset: int, limit: int) -> Page:
-            found: Page = self._call_shards("page", list(words), object_id, offset, limit, entries=[entry])[0]
-            return found
-
-        return merge_pages([partial(of_shard, entry) for entry in self.entries], offset, limit)
-
-    def _call_shards(self, method: str, *arguments: Any, entries: Sequence[ShardEntry] | None = None) -> list[Any]:
-        """Return the results of a method of some shards (None: all)."""
+    def call(self, shards: Sequence[ShardEntry], method: str, *arguments: Any) -> list[Any]:
+        """As `Shards.call`, with all shards at once. Raises IncompleteSearch if a shard does not answer."""
         until = time.monotonic() + self._settings.wait_s
-        called = self.entries if entries is None else entries
-        waiting = [(entry, self._send(entry, method, arguments)) for entry in called]
+        waiting = [(entry, self._send(entry, method, arguments)) for entry in shards]
         results, missing = [], []
         for entry, response in waiting:
             result = self._result(entry, response, method, arguments, until)
@@ -176,11 +148,10 @@ class Deployments:
     Args:
         ray: The Ray module of a session (`retrieval.cluster.session`).
         settings: Settings of the replicas.
-        verify: Compare the checksums of the files of a shard when it is opened.
     """
 
-    def __init__(self, ray: Any, settings: ReplicaSettings, verify: bool = True) -> None:
-        self._ray, self._settings, self._verify = ray, settings, verify
+    def __init__(self, ray: Any, settings: ReplicaSettings) -> None:
+        self._ray, self._settings = ray, settings
         self._owner_id = secrets.token_hex(4)
         self._owner = ray.remote(num_cpus=0)(OwnerActor).options(name=self._owner_id, namespace=OWNERS).remote()
         self._users: Counter[str] = Counter()
@@ -189,7 +160,7 @@ class Deployments:
         ray.serve.start(proxy_location="Disabled")
         self._delete_orphans()
 
-    def open(self, index: str | Path, manifest: ShardedManifest, stored: CheckpointInfo) -> RayShardGroup:
+    def open(self, index: str | Path, manifest: ShardedManifest, stored: CheckpointInfo) -> RayShards:
         """Open a sharded index on Ray Serve, and return when all its shards are ready.
 
         Args:
@@ -211,7 +182,7 @@ class Deployments:
                 # Create its router now: concurrent first calls would create several, and only one could be shut down.
                 self._handles[name] = self._ray.serve.get_app_handle(name).options()
             handles = {folder: self._handles[name] for folder, name in names.items()}
-        opened = RayShardGroup(sharded_index_info(manifest), manifest.shards, handles, self._settings)
+        opened = RayShards(sharded_index_info(manifest), manifest.shards, handles, self._settings)
         weakref.finalize(opened, self._release, list(names.values()))
         return opened
 
@@ -255,7 +226,7 @@ class Deployments:
         )
         targets = [
             serve.RunTarget(
-                deployment.bind(index, entry, required, model, self._verify),
+                deployment.bind(index, entry, required, model),
                 name=names[entry.folder],
                 route_prefix=None,
             )

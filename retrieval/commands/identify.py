@@ -68,9 +68,8 @@ def identify(
     if far is not None and expect is None:
         raise BadInput("--far is the false-accept rate of --expect; give both, or neither")
     path = resolve_index(index)
-    from retrieval.search.answer import EXIT_CODES
+    from retrieval.search.answer import EXIT_CODES, VERIFY_EXIT_CODES
     from retrieval.search.searcher import Searcher
-    from retrieval.search.verification import VERIFY_EXIT_CODES
     from robot.collection import CollectSettings, collect
     from robot.grasping.planner import SpreadPlanner
     from robot.rig import load_rig

@@ -24,8 +24,8 @@ def verify(
 ) -> int:
     """Accept or reject the object in the hand as the expected one, at a stated false-accept rate."""
     path = resolve_index(index)
+    from retrieval.search.answer import VERIFY_EXIT_CODES
     from retrieval.search.searcher import Searcher
-    from retrieval.search.verification import VERIFY_EXIT_CODES
 
     with Searcher.open(path, model=model) as searcher:
         result = searcher.verify(

@@ -24,7 +24,6 @@ from retrieval.data.folder_walk import SkippedPhoto
 from retrieval.data.naming import FOLDER, Naming, naming_warnings
 from retrieval.errors import BadInput, NoReadablePhoto
 from retrieval.indexing.candidates import (
-    can_measure,
     candidates_sentence,
     kept_measurement,
     measure_candidates,
@@ -169,8 +168,8 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
                 arrays = draft.write_arrays(code_blocks(cache, encoder, keys))
                 calibration = {"calibration": checkpoint.posterior.to_dict()} if checkpoint.posterior else {}
                 draft.write_documents(calibration | references.documents)
-                queries = query_codes(checkpoint, RECALL_QUERIES)[1] if can_measure(checkpoint) else None
-                index = draft.build_index(arrays[EMBEDDINGS], options.kind, queries=queries)
+                touches = query_codes(checkpoint, RECALL_QUERIES)
+                index = draft.build_index(arrays[EMBEDDINGS], options.kind, queries=touches and touches[1])
                 candidates = _measured_before(manifest, checkpoint, options, len(rows), photos.encoded)
                 if candidates is None:
                     candidates = measure_candidates(checkpoint, index, StoredPartials(arrays), quiet=options.quiet)

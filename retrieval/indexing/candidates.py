@@ -19,7 +19,6 @@ import torch
 
 from indexes.kinds.vector_index import Floats, RowNumbers, VectorIndex
 from retrieval.console.progress import Bar
-from retrieval.errors import BadInput
 from retrieval.metrics.intervals import binomial_interval
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.fusion_scorer import FusionScorer, Partials
@@ -53,9 +52,10 @@ def measure_candidates(
     photos = len(partials)
     if photos <= EXHAUSTIVE_LIMIT or not checkpoint.config.has_embeddings:
         return {"k": photos, "top1_agreement": 1.0, "queries": 0, "photos": photos}
-    if not can_measure(checkpoint):
+    stored = query_codes(checkpoint, _affordable(checkpoint, photos))
+    if stored is None:
         return None
-    scorer, (touches, queries) = checkpoint.matcher.head.scorer, _queries(checkpoint, photos)
+    scorer, (touches, queries) = checkpoint.matcher.head.scorer, stored
     top1, taken = [], []
     with Bar("measure", len(queries), "touches", quiet=quiet) as bar:
         for touch in touches:
@@ -115,49 +115,34 @@ def candidate_steps(photos: int) -> list[int]:
     return [*doubled, photos]
 
 
-def can_measure(checkpoint: Checkpoint) -> bool:
-    """Whether the checkpoint has touches to measure with, and a candidate encoder that embeds them."""
-    return (
-        bool(checkpoint.queries is not None and len(checkpoint.queries))
-        and checkpoint.matcher.candidate_encoder is not None
-    )
-
-
 @torch.inference_mode()
-def query_codes(checkpoint: Checkpoint, count: int | None = None) -> tuple[Floats, Floats]:
-    """Return partial activations and embeddings of the touches that a checkpoint stores to measure with.
+def query_codes(checkpoint: Checkpoint, count: int | None = None) -> tuple[Floats, Floats] | None:
+    """Return the touches that a checkpoint stores to measure with.
 
     Args:
         checkpoint: The model.
-        count: Number of touches; None for all.
+        count: Largest number of touches; None for all.
 
     Returns:
-        Partial activations (Q, partial_width) and unit embeddings (Q, d), float32.
-
-    Raises:
-        BadInput: The checkpoint stores no touches or has no candidate encoder (`can_measure`).
+        Partial activations (Q, partial_width) and unit embeddings (Q, d), float32. None if the checkpoint stores no
+        touches or has no candidate encoder that embeds them.
     """
-    candidate_encoder = checkpoint.matcher.candidate_encoder
-    if checkpoint.queries is None or candidate_encoder is None:
-        raise BadInput(
-            f"{checkpoint.path} must have touches to measure with and a candidate encoder; train it again with "
-            "`retrieve train` (a preset with candidate_width above 0)"
-        )
+    encoder = checkpoint.matcher.candidate_encoder
+    if checkpoint.queries is None or not len(checkpoint.queries) or encoder is None:
+        return None
     partials = checkpoint.queries[:count].astype(np.float32)
     pooled = torch.from_numpy(partials[:, : checkpoint.config.matcher.pooled_width])
-    return partials, candidate_encoder.touch(pooled.to(next(candidate_encoder.parameters()).device)).cpu().numpy()
+    return partials, encoder.touch(pooled.to(next(encoder.parameters()).device)).cpu().numpy()
 
 
-def _queries(checkpoint: Checkpoint, photos: int) -> tuple[Floats, Floats]:
-    """Return `query_codes` of some touches: as many as can score every photo within `MEASUREMENT_FLOPS`.
+def _affordable(checkpoint: Checkpoint, photos: int) -> int:
+    """Return the number of touches that can score every photo within `MEASUREMENT_FLOPS`, at least `MIN_QUERIES`.
 
-    At least `MIN_QUERIES` are used. One score is a product with a square matrix, and one of the cells of the touch with
-    those of the photo.
+    One score is a product with a square matrix, and one of the cells of the touch with those of the photo.
     """
     settings = checkpoint.config.matcher
     cells = settings.fingers * settings.touch_cells**2 * settings.photo_cells**2 * settings.cell_dim
-    affordable = MEASUREMENT_FLOPS / (2.0 * photos * (settings.hidden**2 + cells))
-    return query_codes(checkpoint, max(MIN_QUERIES, int(affordable)))
+    return max(MIN_QUERIES, int(MEASUREMENT_FLOPS / (2.0 * photos * (settings.hidden**2 + cells))))
 
 
 def candidates_sentence(candidates: Mapping[str, Any] | None, photos: int) -> str:

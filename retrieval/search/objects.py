@@ -11,7 +11,6 @@ from indexes.errors import AGAIN, CorruptIndex
 from indexes.store.generation import Generation
 from indexes.store.rows import Row
 from retrieval.data.text import is_inside
-from retrieval.model.fusion_scorer import Layout
 from retrieval.model.posterior import Posterior
 
 Floats = NDArray[np.float32]
@@ -51,30 +50,6 @@ def listed_photo(row: Row) -> ListedPhoto:
     if not is_inside(row.path):
         raise CorruptIndex(f"the index must list photos inside the catalogue, but has {row.path!r}; {AGAIN}")
     return ListedPhoto(row.object_id, row.path, row.metadata, row.digest)
-
-
-def check_usable(generation: Generation, layout: Layout) -> None:
-    """Check the manifest entries of catalogue, checkpoint and candidates, and the partial activations.
-
-    Args:
-        generation: The opened generation.
-        layout: Required type and shape of the stored partial activations.
-
-    Raises:
-        CorruptIndex: A check fails.
-    """
-    about = generation.manifest.about
-    candidates = about.get("candidates")
-    k = candidates.get("k") if isinstance(candidates, dict) else None
-    if candidates is not None and not (type(k) is int and 1 <= k < 2**31):
-        raise CorruptIndex(f"{generation.folder}: its number of candidates must be 1 or more; {AGAIN}")
-    if not all(isinstance(about.get(name), str) and "\0" not in about[name] for name in ("catalogue", "checkpoint")):
-        raise CorruptIndex(f"{generation.folder}: the manifest must name its catalogue and its checkpoint; {AGAIN}")
-    for name, (dtype, shape) in layout.items():
-        array = generation.arrays.get(name)
-        if array is None or array.shape[1:] != shape or array.dtype != dtype:
-            got = "none" if array is None else f"{array.dtype} {array.shape}"
-            raise CorruptIndex(f"{generation.folder}: {name} must be {dtype} (photos, {shape[0]}), got {got}; {AGAIN}")
 
 
 class ScoredObjects(NamedTuple):

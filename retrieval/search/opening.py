@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from _touch_retrieval.files import file_digest
-from indexes.errors import IndexesError
+from indexes.errors import AGAIN, CorruptIndex, IndexesError
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation, check_fingerprint
 from indexes.store.manifest import Manifest, read_manifest
@@ -17,8 +17,7 @@ from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_ch
 from retrieval.model.fusion_scorer import CELLS, FusionScorer, stored_layout
 from retrieval.model.shipped import SHIPPED_NAMES, shipped_model
 from retrieval.model.touch_reader import TouchEncoder
-from retrieval.search.objects import check_usable
-from retrieval.search.shard import FolderShard, IndexInfo, Shard, Shards
+from retrieval.search.shard import FolderShard, IndexInfo, Shards
 
 INDEX = Path("index")
 """Default index folder of `build-index` and `query`."""
@@ -95,19 +94,18 @@ def model_of(manifest: Manifest | ShardedManifest) -> Path:
     )
 
 
-OpenShards = Callable[[str | Path, ShardedManifest, CheckpointInfo], Shard]
+OpenShards = Callable[[str | Path, ShardedManifest, CheckpointInfo], Shards]
 """Opens the shards of a sharded index, in this process or elsewhere."""
 
 
 def open_index(
-    index: str | Path, model: str | Path | None, verify: bool, shards: OpenShards | None
-) -> tuple[Shard, CheckpointInfo]:
+    index: str | Path, model: str | Path | None, shards: OpenShards | None
+) -> tuple[FolderShard | Shards, CheckpointInfo]:
     """Open the current generation of an index folder or of a sharded index.
 
     Args:
         index: Its folder.
         model: Path of the checkpoint, if it was moved.
-        verify: Compare the checksums of the files.
         shards: Opens the shards; None to open them in this process.
 
     Returns:
@@ -119,12 +117,16 @@ def open_index(
     """
     index = Path(index)
     if not is_sharded(index):
-        generation = IndexStore(index).open(verify=verify, threads=1)  # one query at a time
+        generation = IndexStore(index).open(threads=1)  # one query at a time
         stored = read_checkpoint_of(generation.manifest, model)
         return folder_shard(generation, stored), stored
     manifest = read_sharded_manifest(index)
     stored = read_checkpoint_of(manifest, model)
-    return shards(index, manifest, stored) if shards else open_sharded_index(index, manifest, stored, verify), stored
+    if shards is not None:
+        return shards(index, manifest, stored), stored
+    check_fingerprint(index, manifest.fingerprint, fingerprint(stored))
+    opened = [open_shard(index, entry, manifest.fingerprint, threads=1) for entry in manifest.shards]
+    return Shards(sharded_index_info(manifest), [folder_shard(generation, stored) for generation in opened]), stored
 
 
 def read_checkpoint_of(manifest: Manifest | ShardedManifest, model: str | Path | None) -> CheckpointInfo:
@@ -152,7 +154,11 @@ def folder_shard(generation: Generation, stored: CheckpointInfo) -> FolderShard:
     generation.require(fingerprint(stored))
     matcher, scorer = stored.config.matcher, scorer_for(stored, generation.manifest.about)
     width = matcher.partial_width if scorer.cell_dim else matcher.pooled_width
-    check_usable(generation, stored_layout(matcher.pooled_width, width))
+    for name, (dtype, shape) in stored_layout(matcher.pooled_width, width).items():
+        array = generation.arrays.get(name)
+        if array is None or array.shape[1:] != shape or array.dtype != dtype:
+            got = "none" if array is None else f"{array.dtype} {array.shape}"
+            raise CorruptIndex(f"{generation.folder}: {name} must be {dtype} (photos, {shape[0]}), got {got}; {AGAIN}")
     return FolderShard(generation, scorer, stored.config.has_embeddings)
 
 
@@ -165,27 +171,6 @@ def scorer_for(stored: CheckpointInfo, about: Mapping[str, Any]) -> FusionScorer
     """
     scorer = read_scorer(stored)
     return replace(scorer, cell_dim=0) if about.get(CELLS) is False else scorer
-
-
-def open_sharded_index(
-    index: str | Path, manifest: ShardedManifest, stored: CheckpointInfo, verify: bool = True
-) -> Shard:
-    """Open all shards of a sharded index in this process.
-
-    Args:
-        index: Its folder.
-        manifest: Its manifest.
-        stored: Header of the checkpoint.
-        verify: Compare the checksums of the files.
-
-    Raises:
-        IndexesError: A shard is missing or damaged, or the index is of another model.
-    """
-    check_fingerprint(index, manifest.fingerprint, fingerprint(stored))
-    opened = (
-        open_shard(Path(index), entry, manifest.fingerprint, verify=verify, threads=1) for entry in manifest.shards
-    )
-    return Shards([folder_shard(generation, stored) for generation in opened], sharded_index_info(manifest))
 
 
 def sharded_index_info(manifest: ShardedManifest) -> IndexInfo:

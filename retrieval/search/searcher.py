@@ -24,16 +24,15 @@ from retrieval.model.verification import MAX_GRASPS, DecisionBounds
 from retrieval.search.answer import (
     Match,
     QueryResult,
+    Verification,
     gel_classes,
     is_clear,
-    require_counts,
     verdict_of,
 )
 from retrieval.search.objects import Objects
 from retrieval.search.opening import OpenShards, open_index, scorer_for, torch_encoder
 from retrieval.search.references import reference_summary
-from retrieval.search.shard import FolderShard, RankedObject, Shard, ShardQuery, ShardResult
-from retrieval.search.verification import Verification
+from retrieval.search.shard import FolderShard, RankedObject, ShardQuery, ShardResult, Shards
 
 
 class Searcher:
@@ -52,7 +51,12 @@ class Searcher:
     """
 
     def __init__(
-        self, index: str | Path, shard: Shard, checkpoint: CheckpointInfo, encoder: TouchEncoder, scorer: FusionScorer
+        self,
+        index: str | Path,
+        shard: FolderShard | Shards,
+        checkpoint: CheckpointInfo,
+        encoder: TouchEncoder,
+        scorer: FusionScorer,
     ) -> None:
         self.index, self.shard, self.checkpoint = index, shard, checkpoint
         self.encoder, self.scorer, self.info = encoder, scorer, shard.info
@@ -76,7 +80,6 @@ class Searcher:
         index: str | Path,
         *,
         model: str | Path | None = None,
-        verify: bool = True,
         threads: int | None = None,
         shards: OpenShards | None = None,
     ) -> Searcher:
@@ -88,7 +91,6 @@ class Searcher:
         Args:
             index: Its folder.
             model: Path of the checkpoint, if it was moved.
-            verify: Compare the checksums of the index's files.
             threads: Number of threads of the encoder (with PyTorch: of the process). Default: the library's choice.
             shards: Function that opens the shards of a sharded index. Default: open them in this process.
 
@@ -104,9 +106,10 @@ class Searcher:
         >>> from_arrays.results == from_files.results
         True
         """
-        shard, stored = open_index(index, model, verify, shards)
+        shard, stored = open_index(index, model, shards)
         encoder = find_export(stored, threads) or torch_encoder(stored, threads)
-        return cls(Path(index), shard, stored, encoder, scorer_for(stored, shard.info.about))
+        scorer = shard.scorer if isinstance(shard, FolderShard) else scorer_for(stored, shard.info.about)
+        return cls(Path(index), shard, stored, encoder, scorer)
 
     def close(self) -> None:
         """Release the index and the model; running queries continue. A second call does nothing."""
@@ -180,7 +183,7 @@ class Searcher:
         """
         opened = self._snapshot()
         grasps = parse_grasps(touches, opened.reader.fingers)
-        return opened._results(grasps, [slice(len(grasps))], background, top, candidates, none_prior)[0]
+        return opened._results([grasps], background, top, candidates, none_prior)[0]
 
     def query_many(
         self,
@@ -199,10 +202,7 @@ class Searcher:
         opened = self._snapshot()
         fingers = opened.reader.fingers
         parsed = [parse_grasps(one, fingers, of=f"object {number}, ") for number, one in enumerate(objects, 1)]
-        ends = np.cumsum([len(grasps) for grasps in parsed]).tolist()
-        spans = [slice(end - len(grasps), end) for end, grasps in zip(ends, parsed, strict=True)]
-        every = [grasp for grasps in parsed for grasp in grasps]
-        return opened._results(every, spans, background, top, candidates, none_prior)
+        return opened._results(parsed, background, top, candidates, none_prior)
 
     def encode(self, touches: AnyTouches, *, background: Sequence[AnyImage] | None = None) -> EncodedTouches:
         """Return the unit embeddings (G, embedding_dim) and partial activations (G, touch_partial_width) of G grasps.
@@ -282,32 +282,35 @@ class Searcher:
 
     def _results(
         self,
-        grasps: Sequence[Sequence[InputImage]],
-        spans: Sequence[slice],
+        objects: Sequence[Sequence[Sequence[InputImage]]],
         background: Sequence[AnyImage] | None,
         top: int,
         candidates: int | None,
         none_prior: float,
     ) -> list[QueryResult]:
-        """Return a result for each object in the hand; each span selects the grasps of one object."""
-        require_counts(top, candidates)
+        """Return a result for each object in the hand, which is given by its grasps."""
+        counts: list[object] = [top] if candidates is None else [top, candidates]
+        if not all(isinstance(count, int | np.integer) and count >= 1 for count in counts):
+            raise BadInput(f"top and candidates must be whole numbers of 1 or more; got {top} and {candidates}")
         require_prior(none_prior)
-        if not grasps:
+        if not objects:
             return []
-        clock = Stopwatch()
-        codes = self.reader.encode(grasps, self.reader.no_contact_frames(background), clock)
-        classes = gel_classes(self.gel_check, codes)
-        found = []
-        for span in spans:
-            in_contact = (classes[span] == CONTACT) & (classes[span] != NOT_A_GEL).all()
-            query = ShardQuery(codes.embeddings[span][in_contact], codes.partials[span][in_contact])
-            one = self.shard.search(query, top, candidates, self.posterior) if in_contact.any() else None
-            clock.add({stage: one.timing_ms[stage] if one else 0.0 for stage in ("candidates", "rerank")})
-            found.append(one)
-        timing_ms = clock.finish(len(spans))
+        clock, every = Stopwatch(), [grasp for grasps in objects for grasp in grasps]
+        codes = self.reader.encode(every, self.reader.no_contact_frames(background), clock)
+        shown, found, start = gel_classes(self.gel_check, codes), list[tuple[list[str], ShardResult | None]](), 0
+        for grasps in objects:
+            span = slice(start, start := start + len(grasps))
+            classes, result = shown[span], None
+            in_contact = (classes == CONTACT) & (classes != NOT_A_GEL).all()
+            if in_contact.any():
+                query = ShardQuery(codes.embeddings[span][in_contact], codes.partials[span][in_contact])
+                result = self.shard.search(query, top, candidates, self.posterior)
+            clock.add({stage: result.timing_ms[stage] if result else 0.0 for stage in ("candidates", "rerank")})
+            found.append((classes.tolist(), result))
+        timing_ms = clock.finish(len(objects))
         return [
-            self._result(grasps[span], classes[span].tolist(), timing_ms, one, none_prior)
-            for span, one in zip(spans, found, strict=True)
+            self._result(grasps, classes, timing_ms, result, none_prior)
+            for grasps, (classes, result) in zip(objects, found, strict=True)
         ]
 
     def _result(

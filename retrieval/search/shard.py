@@ -8,17 +8,16 @@ All photos of an object are in one shard, which therefore computes the object's 
 include the best of the catalogue, and the sums of the shards add up to the sums of the catalogue.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from threading import Lock
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from indexes.store.generation import Generation
-from retrieval.errors import BadInput
 from retrieval.model.fusion_scorer import FusionScorer, StoredPartials
 from retrieval.model.posterior import EvidenceMass, Posterior
 from retrieval.model.references import REFERENCE_ROWS
@@ -102,41 +101,6 @@ class Page(NamedTuple):
     photos: list[ListedPhoto]
 
 
-class Shard(Protocol):
-    """Photos that a searcher searches. Any number of threads may call the methods at once."""
-
-    @property
-    def info(self) -> IndexInfo:
-        """Information that needs no search."""
-
-    def search(self, query: ShardQuery, top: int, candidates: int | None, posterior: Posterior | None) -> ShardResult:
-        """Return the best objects for the grasps of a query, and the evidence mass of all objects.
-
-        Args:
-            query: The grasps.
-            top: Number of objects to return.
-            candidates: Number of photos that each index folder reranks, raised to `top` if smaller. Default: the number
-                that was measured when that folder was built.
-            posterior: Converts logits to probabilities; None if the model is not calibrated.
-
-        Raises:
-            NumericalError: A logit is not finite.
-        """
-
-    def photos(self, paths: Sequence[str]) -> list[ListedPhoto | None]:
-        """Return the photo with each path, or a reference touch's gel image; None if missing."""
-
-    def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
-        """Return a page of the photos that contain all words in object, path or metadata.
-
-        Args:
-            words: Lower-case words.
-            object_id: Return only photos of this object. Default: photos of all objects.
-            offset: Number of photos to skip.
-            limit: Largest number of photos to return.
-        """
-
-
 class FolderShard:
     """The photos of one generation of an index folder, opened in this process.
 
@@ -175,7 +139,20 @@ class FolderShard:
         )
 
     def search(self, query: ShardQuery, top: int, candidates: int | None, posterior: Posterior | None) -> ShardResult:
-        """As `Shard.search`. Remaining photos of the best objects are scored too."""
+        """Return the best objects for the grasps of a query, and the evidence mass of all objects.
+
+        Remaining photos of the best objects are scored too.
+
+        Args:
+            query: The grasps.
+            top: Number of objects to return.
+            candidates: Number of photos to rerank, raised to `top` if smaller. Default: the number that was measured
+                when the index was built.
+            posterior: Converts logits to probabilities; None if the model is not calibrated.
+
+        Raises:
+            NumericalError: A logit is not finite.
+        """
         clock = Stopwatch()
         with clock("candidates"):
             limit = self.limit(top, candidates)
@@ -203,7 +180,7 @@ class FolderShard:
         return float(scored.logits[0])
 
     def photos(self, paths: Sequence[str]) -> list[ListedPhoto | None]:
-        """As `Shard.photos`."""
+        """Return the photo with each path, or a reference touch's gel image; None if missing."""
         return [self._photo(path) for path in paths]
 
     def _photo(self, path: str) -> ListedPhoto | None:
@@ -214,7 +191,14 @@ class FolderShard:
         return None if number < 0 else listed_photo(self.generation.rows[number])
 
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
-        """As `Shard.page`."""
+        """Return a page of the photos that contain all words in object, path or metadata.
+
+        Args:
+            words: Lower-case words.
+            object_id: Return only photos of this object. Default: photos of all objects.
+            offset: Number of photos to skip.
+            limit: Largest number of photos to return.
+        """
         rows = self.generation.rows
         found = np.arange(len(rows))
         if object_id is not None:
@@ -321,27 +305,40 @@ def combined_embedding(embeddings: Floats) -> Floats:
 
 
 class Shards:
-    """Several shards of this process as one shard: a search visits one after another and merges their results.
+    """The shards of a sharded index as one shard: each call goes to the shards, and their results are merged.
+
+    This class calls shards of this process, one after another; a subclass may call others.
 
     Args:
-        shards: The shards.
         info: Information about all of them together.
+        shards: The shards.
     """
 
-    def __init__(self, shards: Sequence[Shard], info: IndexInfo) -> None:
-        self.shards, self.info = list(shards), info
+    def __init__(self, info: IndexInfo, shards: Sequence[Any]) -> None:
+        self.info, self.shards = info, list(shards)
+
+    def call(self, shards: Sequence[Any], method: str, *arguments: Any) -> list[Any]:
+        """Return the results of a method of `FolderShard` for some shards."""
+        return [getattr(shard, method)(*arguments) for shard in shards]
 
     def search(self, query: ShardQuery, top: int, candidates: int | None, posterior: Posterior | None) -> ShardResult:
-        """As `Shard.search`."""
-        return merge_results([shard.search(query, top, candidates, posterior) for shard in self.shards], top)
+        """As `FolderShard.search`; each shard reranks `candidates` photos."""
+        return merge_results(self.call(self.shards, "search", query, top, candidates, posterior), top)
 
     def photos(self, paths: Sequence[str]) -> list[ListedPhoto | None]:
-        """As `Shard.photos`."""
-        return merge_photos([shard.photos(paths) for shard in self.shards])
+        """As `FolderShard.photos`."""
+        found = self.call(self.shards, "photos", list(paths))
+        return [next((photo for photo in photos if photo is not None), None) for photos in zip(*found, strict=True)]
 
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
-        """As `Shard.page`, in the order of the shards."""
-        return merge_pages([partial(shard.page, words, object_id) for shard in self.shards], offset, limit)
+        """As `FolderShard.page`, in the order of the shards."""
+        total, photos = 0, list[ListedPhoto]()
+        for shard in self.shards:
+            start, rest = max(0, offset - total), limit - len(photos)
+            (found,) = self.call([shard], "page", list(words), object_id, start, rest)
+            total += found.total
+            photos += found.photos
+        return Page(total, photos)
 
 
 def merge_results(results: Sequence[ShardResult], top: int) -> ShardResult:
@@ -350,12 +347,7 @@ def merge_results(results: Sequence[ShardResult], top: int) -> ShardResult:
     Args:
         results: Results of at least one shard.
         top: Number of objects to return.
-
-    Raises:
-        BadInput: There is no result.
     """
-    if not results:
-        raise BadInput("there are no results to merge; a sharded index needs at least one shard")
     best = sorted((one for result in results for one in result.best), key=lambda one: (-one.logit, one.photo.object_id))
     masses = [result.mass for result in results if result.mass is not None]
     stages = dict.fromkeys(stage for result in results for stage in result.timing_ms)
@@ -366,24 +358,3 @@ def merge_results(results: Sequence[ShardResult], top: int) -> ShardResult:
         EvidenceMass.merged(masses) if masses else None,
         {stage: max(result.timing_ms.get(stage, 0.0) for result in results) for stage in stages},
     )
-
-
-def merge_pages(pages: Sequence[Callable[[int, int], Page]], offset: int, limit: int) -> Page:
-    """Return one page over all shards.
-
-    Args:
-        pages: For each shard, a function of offset and limit that returns its page.
-        offset: Number of photos to skip.
-        limit: Largest number of photos to return.
-    """
-    total, photos = 0, list[ListedPhoto]()
-    for page in pages:
-        found = page(max(0, offset - total), limit - len(photos))
-        total += found.total
-        photos += found.photos
-    return Page(total, photos)
-
-
-def merge_photos(found: Sequence[Sequence[ListedPhoto | None]]) -> list[ListedPhoto | None]:
-    """Return each photo from the shard that has it; `found` has one list of photos per shard."""
-    return [next((photo for photo in photos if photo is not None), None) for photos in zip(*found, strict=True)]

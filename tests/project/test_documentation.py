@@ -21,8 +21,7 @@ from benchmarks.reference import commands as commands_page
 from retrieval import load_config
 from retrieval.commands.main import main
 from retrieval.model.towers.tower import build_tower
-from retrieval.search.answer import EXIT_CODES
-from retrieval.search.verification import VERIFY_EXIT_CODES
+from retrieval.search.answer import EXIT_CODES, VERIFY_EXIT_CODES
 from robot.rig import load_rig
 from tests import real_data_sets, serving, synthetic
 from tests.documents import PAGES, README, ROOT, RUN_TOGETHER, blocks, text_of

@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -92,6 +93,17 @@ def test_modules_of_retrieval_import_only_earlier_layers():
             parts = name.split(".")
             if parts[0] == "retrieval" and len(parts) > 1 and parts[1] in layer_of:
                 assert layer_of[parts[1]] <= layer_of[own], f"{path} imports {name}"
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_no_modules_import_each_other_in_a_circle(package):
+    """Neither between rooms nor inside one; imports inside functions count, those of the package's public names not."""
+    names = {
+        ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
+        for path in modules(package)
+    }
+    imports = {name: (imported(path) & names.keys()) - {name, package} for name, path in names.items()}
+    TopologicalSorter(imports).prepare()  # raises CycleError, which contains the circle
 
 
 def test_contributing_and_the_package_document_the_layers():
