@@ -142,30 +142,16 @@ def load_checkpoint(path: str | Path, *, info: CheckpointInfo | None = None) -> 
     state, header = read_tensors(path, check=info is None)
     info = info or checkpoint_info(path, header)
     queries = state.pop(_QUERIES, None)
-    width = info.config.matcher.touch_partial_width
     try:
         split = None if header["split"] is None else Split.from_dict(header["split"])
-        if queries is not None and (queries.dtype != torch.float16 or queries.shape[1:] != (width,)):
-            raise CheckpointError(
-                f"{_QUERIES} must be float16 (touches, {width}); got {queries.dtype} {tuple(queries.shape)}"
-            )
         matcher = Matcher(info.config.matcher, len(info.config.preprocessing.views))
         if any(name.startswith("gel_head.") for name in state):
             matcher.gel_head = GelHead(matcher.touch_tower.feature_count)
         load_weights(matcher, state)
     except BadInput as error:
         raise unusable(path, error) from error
-    contents = {name: getattr(info, name) for name in PARTS}
-    return Checkpoint(
-        path,
-        info.digest,
-        info.config,
-        info.provenance,
-        matcher=matcher.eval(),
-        split=split,
-        queries=None if queries is None else np.asarray(queries.numpy()),
-        **contents,
-    )
+    stored = None if queries is None else np.asarray(queries.numpy())
+    return Checkpoint(**vars(info), matcher=matcher.eval(), split=split, queries=stored)
 
 
 def load_weights(module: nn.Module, state: Mapping[str, Tensor]) -> None:

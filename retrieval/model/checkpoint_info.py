@@ -113,13 +113,8 @@ def read_scorer(info: CheckpointInfo) -> FusionScorer:
             parts = [file.get_tensor(name) for name in _SCORER_TENSORS]
     except (SafetensorError, OSError, TypeError) as error:  # TypeError: data types that numpy does not have
         raise unreadable(path, error) from error
-    hidden = parts[1].size
-    shapes = [(hidden, hidden), (hidden,), (1, hidden), (1,)]
-    for name, part, shape in zip(_SCORER_TENSORS, parts, shapes, strict=True):
-        if part.shape != shape or part.dtype.kind != "f":
-            raise unusable(path, f"{name} is {part.dtype} {part.shape}, must be floats of shape {shape}")
     second, second_bias, out, out_bias = (part.astype(np.float32) for part in parts)
-    cosine_dim = matcher.pooled_width - hidden
+    cosine_dim = matcher.pooled_width - matcher.hidden
     return FusionScorer(second, second_bias, out[0], out_bias, cosine_dim=cosine_dim, cell_dim=matcher.cell_dim)
 
 

@@ -2,16 +2,8 @@
 
 import numpy as np
 import pytest
-import torch
 
-from retrieval.data.dataset import load_grasps
-from retrieval.data.preprocessing import Preprocessing
-from retrieval.model.config import MatcherConfig
-from retrieval.model.encode import touch_features
-from retrieval.model.fusion import Matcher
 from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck, contact_level
-from retrieval.training.calibration.gel_check import GelCheckFeatures, contact_threshold, fit_gel_check, fit_gel_head
-from retrieval.training.foreign_images import SYNTHETIC_KINDS, draw_foreign
 
 CHECK = GelCheck(foreign_above=1.0, contact_above=0.5, level_above=4.0, rates={"touches_rejected_as_foreign": 0.0})
 
@@ -48,92 +40,3 @@ def test_the_level_is_the_largest_difference_of_block_means_in_grey_levels():
     assert contact_level(no_contact, no_contact) == 0
     # The two files may have different sizes.
     assert contact_level(touch, no_contact[:16]) == pytest.approx(20, abs=1e-3)
-
-
-def test_the_contact_threshold_is_above_no_contact_gels_and_as_high_as_it_costs_few_touches():
-    no_contact, touches = np.arange(201.0), np.arange(500.0, 601.0)
-    assert contact_threshold(no_contact, touches) == pytest.approx(502)  # 2 % of the touches lie below
-    assert contact_threshold(no_contact, np.arange(101.0)) == pytest.approx(199)  # exceeded by .5 % of no-contact gels
-
-
-# Foreign pictures ------------------------------------------------------------------------------------------
-
-
-def test_every_kind_takes_its_turn_and_a_seed_draws_the_same_pictures_again():
-    photo, gel = np.full((40, 60, 3), 0.4, dtype=np.float32), np.full((30, 40, 3), 0.6, dtype=np.float32)
-    drawn = list(draw_foreign(24, 16, [photo], [gel], seed=3))
-    assert [name for name, _ in drawn[:8]] == [*SYNTHETIC_KINDS, "photo", "piece of a photo", "false colours"]
-    for _, picture in drawn:
-        assert picture.shape == (16, 16, 3)
-        assert picture.dtype == np.float32
-        assert (picture >= 0).all()
-        assert (picture <= 1).all()
-    again = list(draw_foreign(24, 16, [photo], [gel], seed=3))
-    assert all((one == other).all() for (_, one), (_, other) in zip(drawn, again, strict=True))
-    assert {name for name, _ in draw_foreign(9, 16, [], [])} == set(SYNTHETIC_KINDS)
-
-
-# Fitting ---------------------------------------------------------------------------------------------------
-
-
-def pictures(seed, no_contact=60):
-    """Return features (8) around three distant centres: touches, no-contact gels and foreign pictures.
-
-    Half of the foreign pictures have false colours and are among the touches.
-    """
-    rng = np.random.default_rng(seed)
-
-    def around(place, *shape):
-        return torch.from_numpy(place + rng.normal(size=(*shape, 8))).float()
-
-    places = np.eye(8)[:3] * 9
-    foreign = torch.cat([around(places[2], 40), around(places[0], 40)])
-    is_plainly_foreign = np.repeat([True, False], 40)
-    return GelCheckFeatures(around(places[0], 80, 2), around(places[1], no_contact, 2), foreign, is_plainly_foreign)
-
-
-def test_distant_kinds_are_separated_on_other_pictures_of_the_same_kinds():
-    head = fit_gel_head(pictures(0))
-    check = fit_gel_check(head, pictures(1), levels=([0.5, 0.7, 0.9], [12.0, 30.0]))
-    assert check.rates["foreign_rejected"] == 1
-    assert check.rates["touches_rejected_as_foreign"] <= 0.02
-    assert check.rates["touches_rejected_as_no_contact"] == 0.025  # 2 of 80, the accepted loss
-    assert check.rates["no_contact_accepted"] == 0
-    assert check.level_above == pytest.approx(12.36)  # 2 % of the way from 12 to 30
-    with torch.inference_mode():
-        others = pictures(2)
-        assert check.classify(head(others.touch).numpy()).count(CONTACT) >= 78
-        assert check.classify(head(others.no_contact).numpy()).count(NO_CONTACT) >= 58
-
-
-def test_without_no_contact_frames_every_gel_is_a_contact():
-    head = fit_gel_head(pictures(0, no_contact=0))
-    check = fit_gel_check(head, pictures(1, no_contact=0), levels=([], []))
-    assert (check.contact_above, check.level_above) == (None, None)
-    with torch.inference_mode():
-        assert set(check.classify(head(pictures(2).touch).numpy())) <= {CONTACT, NOT_A_GEL}
-    assert check.rates["foreign_rejected"] == 1
-
-
-def test_a_feature_that_never_varies_gives_no_infinite_weight():
-    features = pictures(0)
-    for part in (features.touch, features.no_contact, features.foreign):
-        part[..., 7] = 3.0
-    assert bool(torch.isfinite(fit_gel_head(features).classifier.weight).all())
-
-
-def test_the_gel_head_of_a_matcher_with_cells_reads_the_features_without_them(recording):
-    """A head that was fitted on features and cells did not fit the checkpoint that stored it."""
-    torch.manual_seed(0)
-    config = MatcherConfig(
-        "small", "stages", hidden=8, embedding_dim=4, cosine=True, cell_dim=2, touch_cells=2, photo_cells=2
-    )
-    matcher, settings = Matcher(config).eval(), Preprocessing(touch_px=32, photo_px=32)
-    grasps = load_grasps(recording)[:6]
-    images = [[settings.load_touch(path) for path in grasp.touches] for grasp in grasps]
-    found = GelCheckFeatures.of(matcher, settings, grasps, touch_features(matcher, images), 8, seed=0)
-    pooled = matcher.touch_tower.feature_count
-    assert pooled < matcher.touch_tower.output_count
-    assert [part.shape[-1] for part in (found.touch, found.no_contact, found.foreign)] == [pooled] * 3
-    expected = touch_features(matcher, images).view(6, 2, -1)[..., :pooled]
-    assert torch.equal(found.touch, expected)

@@ -1,43 +1,13 @@
-"""Calibration of reference touches, by hand."""
+"""The fit of the calibration of reference touches."""
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
 
-from retrieval.errors import BadInput
-from retrieval.model.references import SHARPNESS, ReferenceCalibration, reference_similarity
+from retrieval.model.references import reference_similarity
 from retrieval.training.calibration.references import fit_references
 from retrieval.training.calibration.touches import ScoredTouches
-from tests.reference_model import REFERENCE_CALIBRATION
-
-
-def test_one_reference_gives_its_cosine_and_a_copy_of_it_changes_nothing():
-    cosines = np.float32([[0.3, -0.2], [0.9, 0.1]])
-    one = reference_similarity(cosines, np.array([0, 1]))
-    np.testing.assert_allclose(one, cosines, atol=1e-7)
-    copied = reference_similarity(cosines[:, [0, 0, 0, 1]], np.array([0, 3]))
-    np.testing.assert_allclose(copied, cosines, atol=1e-7)
-
-
-def test_several_references_are_averaged_as_likelihoods():
-    """Compare with two plain loops, over objects with one, three and two references."""
-    cosines = np.random.default_rng(0).uniform(-1, 1, (4, 6)).astype(np.float32)
-    parts = ([0], [1, 2, 3], [4, 5])
-    for grasp, row in enumerate(reference_similarity(cosines, np.array([0, 1, 4]))):
-        for part, got in zip(parts, row, strict=True):
-            mean = sum(math.exp(SHARPNESS * float(cosines[grasp, place])) for place in part) / len(part)
-            assert got == pytest.approx(math.log(mean) / SHARPNESS, abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{"weight": math.inf}, {"weight": -1.0}, {"weight": None}, {"objects": "many"}, {"touch_only": {}}, {"more": 1}],
-)
-def test_an_invalid_calibration_is_refused(change):
-    with pytest.raises(BadInput):
-        ReferenceCalibration.from_dict(REFERENCE_CALIBRATION.to_dict() | change)
 
 
 def reference_touches(objects=10, touches=4, noise=0.3, photos=True, seed=0):
