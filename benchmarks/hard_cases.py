@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from retrieval.console.files import text_bytes, write_output
-from retrieval.report.document import Document, Section, Table, Text, to_html
+from retrieval.console.files import write_output
+from retrieval.report.document import Document, Section, Table, Text, write_document
 from retrieval.version import __version__
 from tests.hard_case import HardCase
 
@@ -79,7 +79,7 @@ def lines(document: Mapping[str, Any]) -> list[str]:
 
 
 def write_page(out: Path, document: Mapping[str, Any]) -> Path:
-    """Write `out`/stability.html for the document of stability.json, a table for each package; return the file."""
+    """Write `out`/stability.html and .md for stability.json, a table for each package; return the page."""
     cases, failed = document["cases"], document["failed"]
     kernels = dict.fromkeys(case["kernel"] for case in cases)
     wrong = sum(not case["naive_holds"] for case in cases)
@@ -93,10 +93,7 @@ def write_page(out: Path, document: Mapping[str, Any]) -> Path:
     )
     packages = dict.fromkeys(case["package"] for case in cases)
     sections = tuple(_section(name, [case for case in cases if case["package"] == name]) for name in packages)
-    page = out / "stability.html"
-    html = to_html(Document("Hard cases of every numerical kernel", lead, sections), out)
-    write_output(page, text_bytes(html))
-    return page
+    return write_document(Document("Hard cases of every numerical kernel", lead, sections), out, "stability")[1]
 
 
 def _section(package: str, cases: Sequence[Mapping[str, Any]]) -> Section:
@@ -111,9 +108,7 @@ def _section(package: str, cases: Sequence[Mapping[str, Any]]) -> Section:
         )
         for case in cases
     )
-    failing = frozenset((number, 5) for number, case in enumerate(cases) if not case["holds"])
-    table = Table(_HEADER, rows, words=frozenset({1, 2, 3, 4, 5}), bold=failing)
-    return Section(_TITLES.get(package, package), (table,))
+    return Section(_TITLES.get(package, package), (Table(_HEADER, rows, words=frozenset({1, 2, 3, 4, 5})),))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -9,9 +9,18 @@ import numpy as np
 
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, format_duration
 from retrieval.report.canvas import MUTED_COLOUR, Axes, Figure, canvas, logarithmic
-from retrieval.report.document import Block, Details, Document, Picture, Section, Table, Text, write_document
+from retrieval.report.document import (
+    Block,
+    Details,
+    Document,
+    Picture,
+    Section,
+    Table,
+    Text,
+    capitalized,
+    write_document,
+)
 from retrieval.report.numbers import format_number, interval
-from retrieval.report.results import capitalized
 
 # Palette of Okabe and Ito; the markers distinguish series without colour.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6f4e37", "#222222", "#aa3377")

@@ -2,9 +2,9 @@
 
 from collections.abc import Callable, Iterator
 
-from retrieval.report.document import Block, Details
+from retrieval.report.document import Block, Details, capitalized
 from retrieval.report.numbers import percent
-from retrieval.report.results import Results, capitalized, measure_label, method_label
+from retrieval.report.results import Results, measure_label, method_label
 
 
 class Builder:

@@ -51,7 +51,6 @@ class Table:
         rows: Cells of each row.
         notes: Paragraphs below the table.
         words: Columns of text, which are left-aligned.
-        bold: (row, column) of bold cells.
     """
 
     kind: ClassVar[str] = "table"
@@ -59,7 +58,6 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
     notes: tuple[str, ...] = ()
     words: frozenset[int] = frozenset()
-    bold: frozenset[tuple[int, int]] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -194,10 +192,7 @@ def _blocks(blocks: tuple[Block, ...], level: int) -> Iterator[str]:
             yield _plain(block.caption)
         else:
             ruler = ["---" if column in block.words | {0} else "---:" for column in range(len(block.header))]
-            lines = [block.header, ruler]
-            for number, row in enumerate(block.rows):
-                cells = [(_plain(cell), (number, column) in block.bold) for column, cell in enumerate(row)]
-                lines.append([f"**{text}**" if bold else text for text, bold in cells])
+            lines = [block.header, ruler, *(map(_plain, row) for row in block.rows)]
             yield "\n".join(f"| {' | '.join(line)} |" for line in lines)
             yield from map(_plain, block.notes)
 
@@ -205,3 +200,8 @@ def _blocks(blocks: tuple[Block, ...], level: int) -> Iterator[str]:
 def _plain(text: str) -> str:
     """Return the text on one line, with the markup characters of Markdown and HTML escaped."""
     return re.sub(r"([\\`*_\[\]|<>&])", r"\\\1", " ".join(text.split()))
+
+
+def capitalized(label: str) -> str:
+    """Return the label with an upper-case first letter; CCA stays CCA."""
+    return label[:1].upper() + label[1:]

@@ -8,9 +8,19 @@ from pathlib import Path
 
 from retrieval.report import error_analysis, method_comparison, tables
 from retrieval.report.builder import Builder
-from retrieval.report.document import Block, Details, Document, Listing, Section, Table, Text, write_document
+from retrieval.report.document import (
+    Block,
+    Details,
+    Document,
+    Listing,
+    Section,
+    Table,
+    Text,
+    capitalized,
+    write_document,
+)
 from retrieval.report.numbers import FEW_OBJECTS_MARK, FEW_OBJECTS_NOTE, percent, with_interval
-from retrieval.report.results import capitalized, measure_label, method_label, read_results
+from retrieval.report.results import measure_label, method_label, read_results
 
 PAPER = (
     "For orientation only: on its own data (98 real objects, real GelSight fingers) the paper reports a pair accuracy "

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from retrieval.metrics.registry import SET_SIZES, grasps_metric_name
 from retrieval.report import plots, tables
 from retrieval.report.builder import Builder
-from retrieval.report.document import Block, Details, Picture, Text
+from retrieval.report.document import Block, Picture, Text
 
 INTERVALS = (
     "Brackets contain 95 % intervals of a bootstrap that resamples objects, because queries of one object are "
@@ -40,9 +40,6 @@ def topn_curves(builder: Builder) -> Iterator[Block | None]:
         "intervals.",
         lambda: plots.topn_curves(builder.results),
     )
-    for k in (5, 10):
-        if table := tables.ranks(builder.results, f"topn_k{k}"):
-            yield Details(f"Numbers for {k} candidates", (table,))
 
 
 def grasps(builder: Builder) -> Iterator[Block | None]:

@@ -34,11 +34,14 @@ def interval(value: float, low: float, high: float, write: Callable[[float], str
     return f"{write(value)} [{write(low)}, {write(high)}]"
 
 
-def with_interval(summary: Summary | None, place: int = 0) -> str:
-    """Return value and interval of a measure in percent, with a mark if there are too few objects."""
-    if summary is None or summary["value"][place] is None:
+def with_interval(summary: Summary | None) -> str:
+    """Return value and interval of a measure in percent, with a mark if there are too few objects.
+
+    Of a top-n curve, this is the top-1 accuracy.
+    """
+    if summary is None or summary["value"][0] is None:
         return MISSING_VALUE
-    return interval(*(summary[key][place] for key in ("value", "low", "high"))) + _mark(summary)
+    return interval(*(summary[key][0] for key in ("value", "low", "high"))) + _mark(summary)
 
 
 def points(comparison: Mapping[str, Any]) -> str:

@@ -1,7 +1,6 @@
 """Parts of pages: templates, scripts, thumbnails, embedded images; and contact sheets of photo views."""
 
 import base64
-import io
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
@@ -12,7 +11,6 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
-from PIL import Image
 
 from retrieval.console.files import write_output
 from retrieval.data.images import read_rgb
@@ -72,12 +70,8 @@ def write_views(photos: Sequence[Path], settings: Preprocessing, out: Path) -> N
     Raises:
         ImageError: A photo cannot be read.
     """
-    strips = [np.rint(255 * settings.load_photo(path)).astype(np.uint8) for path in photos]
-    height, width = strips[0].shape[:2]
-    columns = min(COLUMNS, len(strips))
-    sheet = Image.new("RGB", (columns * width, -(-len(strips) // columns) * height), "white")
-    for place, strip in enumerate(strips):
-        sheet.paste(Image.fromarray(strip), (place % columns * width, place // columns * height))
-    content = io.BytesIO()
-    sheet.save(content, "PNG")
-    write_output(out, content.getvalue())
+    views = [np.rint(255 * settings.load_photo(path)).astype(np.uint8) for path in photos]
+    blanks = [np.full_like(views[0], 255)] * (-len(views) % COLUMNS)
+    sheet = np.concatenate([*views, *blanks]).reshape(-1, COLUMNS, *views[0].shape)
+    sheet = np.vstack([np.hstack(list(row)) for row in sheet])
+    write_output(out, cv2.imencode(".png", sheet[..., ::-1])[1].tobytes())

@@ -151,7 +151,7 @@ RELIABILITIES = {
     "pairs": "one touch, one photo, even odds",
     "k5": "5 candidates, one grasp",
     "k10": "10 candidates, one grasp",
-    "k5_g5": "5 candidates, 3 photos each, five grasps",
+    "k5_g5": "5 candidates, 3 photos, 5 grasps",
 }
 
 
@@ -172,6 +172,7 @@ def reliability(results: Results, method: str) -> Figure:
         panel.set_title(f"{RELIABILITIES[kind]}\nECE {percent(diagrams[kind]['ece'])} %", fontsize=9)
         counts.bar(stated, [one["count"] for one in bins], width=6, color=colour, alpha=0.6)
         counts.set_yscale("log")
+        logarithmic(counts.yaxis, (1,))
         counts.set_xlabel("stated probability, %")
     percent_axis(grid[0][0], "right answers, %")
     grid[1][0].set_ylabel("answers")

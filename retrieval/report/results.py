@@ -104,11 +104,6 @@ def method_label(name: str) -> str:
     return METHOD_LABELS.get(name, name.rpartition(":")[2].replace("_", " "))
 
 
-def capitalized(label: str) -> str:
-    """Return the label with an upper-case first letter; CCA stays CCA."""
-    return label[:1].upper() + label[1:]
-
-
 def measure_label(name: str) -> str:
     """Return the report's label of a measure."""
     return METRICS[name].label if name in METRICS else name.replace("_", " ")

@@ -21,24 +21,18 @@ from retrieval.report.numbers import (
 )
 from retrieval.report.results import IMPOSTORS, Results, measure_label, method_label
 
-Column = tuple[str, str, int]
-"""Heading, measure, index in the measure's list of values."""
+Column = tuple[str, str]
+"""Heading and measure."""
 
 
 def section(results: Results, name: str) -> Table | None:
     """Return a row for each method and a column for each measured metric of a section; None if there is none."""
-    return _table(results, [(metric.column, key, 0) for key, metric in METRICS.items() if metric.section == name])
+    return _table(results, [(metric.column, key) for key, metric in METRICS.items() if metric.section == name])
 
 
 def measures(results: Results, keys: Sequence[str]) -> Table | None:
     """Return a row for each method and a column for each of these measures; None if there is none."""
-    return _table(results, [(measure_label(key), key, 0) for key in keys])
-
-
-def ranks(results: Results, measure: str) -> Table | None:
-    """Return the top-N accuracies, with a column for each N; None if there are none."""
-    lengths = [len(found["value"]) for name in results.methods if (found := results.summary(name, measure))]
-    return _table(results, [(f"N = {place + 1}", measure, place) for place in range(max(lengths, default=0))])
+    return _table(results, [(measure_label(key), key) for key in keys])
 
 
 def _with_notes(table: Table) -> Table:
@@ -49,23 +43,23 @@ def _with_notes(table: Table) -> Table:
 
 
 def _table(results: Results, columns: Sequence[Column]) -> Table | None:
-    notes = _without_threshold(results) if any(key == "pair_accuracy" for _, key, _ in columns) else []
+    notes = _without_threshold(results) if any(key == "pair_accuracy" for _, key in columns) else []
     columns = [column for column in columns if any(results.summary(name, column[1]) for name in results.methods)]
     if not columns:
         return None
     rows = [
-        (method_label(name), *(with_interval(results.summary(name, key), place) for _, key, place in columns))
+        (method_label(name), *(with_interval(results.summary(name, key)) for _, key in columns))
         for name in results.methods
     ]
     chance = ["chance, closed form"]
-    for _, key, place in columns:
+    for _, key in columns:
         found = [summary for name in results.methods if (summary := results.summary(name, key))]
-        chance.append(" or ".join(sorted({percent(summary["chance"][place]) for summary in found})) or MISSING_VALUE)
+        chance.append(" or ".join(sorted({percent(summary["chance"][0]) for summary in found})) or MISSING_VALUE)
     return _with_notes(
         Table(
-            ("method, %", *(heading for heading, _, _ in columns)),
+            ("method, %", *(heading for heading, _ in columns)),
             (*rows, tuple(chance)),
-            (*_basis(results, list(dict.fromkeys(key for _, key, _ in columns))), *notes),
+            (*_basis(results, list(dict.fromkeys(key for _, key in columns))), *notes),
         )
     )
 
