@@ -36,9 +36,7 @@ def demo(
     *,
     out: Annotated[Path, typer.Option(help="folder to write")] = Path("demo"),
     objects: Objects = 20,
-    serve: Annotated[
-        bool, typer.Option("--serve", help="then serve the index and open its page, until Ctrl-C")
-    ] = False,
+    serve: Annotated[bool, typer.Option("--serve", help="then serve the index and its page, until Ctrl-C")] = False,
 ) -> None:
     """Run all steps on the simulated rig, from collection to query, and write an HTML page."""
     from retrieval.data.dataset import load_grasps
@@ -61,7 +59,7 @@ def demo(
     say(f"{TOUCHES} grasps of each object: {_accuracy_summary(index, queries)}")
     say(f"open {out / 'query.html'} and {out / 'recording-preview.png'}")
     if serve:
-        _run(serve_index, index=str(index), trials=recording, open_page=True)
+        _run(serve_index, index=str(index), trials=recording)
 
 
 def _run(command: Callable[..., object], *arguments: Path, **options: object) -> None:

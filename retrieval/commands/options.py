@@ -28,9 +28,6 @@ Index = Annotated[
     typer.Option(help="index folder (default: ./index)"),
 ]
 IndexModel = Annotated[str | None, typer.Option(help="checkpoint (default: that of the index)")]
-NoVerify = Annotated[
-    bool, typer.Option("--no-verify", help="skip the checksums of the index files, for a fast start with a huge index")
-]
 Model = Annotated[
     str | None,
     typer.Option(
@@ -208,5 +205,5 @@ def training_config(preset: str | None, iterations: int | None, **overrides: str
 
     config = load_config(preset or DEFAULT_PRESET)
     changed: dict[str, Any] = {name: value for name, value in overrides.items() if value is not None}
-    steps = config.training.iterations if iterations is None else iterations
-    return dataclasses.replace(config, training=dataclasses.replace(config.training.with_iterations(steps), **changed))
+    training = config.training if iterations is None else config.training.with_iterations(iterations)
+    return dataclasses.replace(config, training=dataclasses.replace(training, **changed))

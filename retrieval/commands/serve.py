@@ -1,7 +1,6 @@
 """`retrieve serve`: answer queries over HTTP, with a page."""
 
 import os
-import webbrowser
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -78,7 +77,6 @@ def serve(
             metavar="SECONDS", parser=SECONDS, help="with --cluster: maximum time to wait for a shard (default: 5)"
         ),
     ] = None,
-    open_page: Annotated[bool, typer.Option("--open-page", help="open the page in a browser")] = False,
 ) -> None:
     """Answer queries over HTTP and serve a page, until Ctrl-C or SIGTERM."""
     try:
@@ -117,10 +115,7 @@ def serve(
         )
 
         def on_start(bound_port: int) -> None:
-            address = f"http://{f'[{host}]' if ':' in host else host}:{bound_port}"
-            say(f"listening on {address}")
-            if open_page:
-                webbrowser.open(address)
+            say(f"listening on http://{f'[{host}]' if ':' in host else host}:{bound_port}")
 
         run(app, on_start)
 

@@ -340,9 +340,9 @@ def test_the_whole_job_from_recording_to_ranking(recording, workplace, capsys):
     config = workplace / "tiny.toml"
     config.write_text(
         '[matcher]\ntower = "small"\ntower_output = "pooled"\nhidden = 16\nembedding_dim = 8\n'
-        '[training]\ninit = "random"\niterations = 2\ntouches_per_batch = 2\nvalidation_fraction = 0.25\n'
+        '[training]\nseed = 3\ninit = "random"\niterations = 2\ntouches_per_batch = 2\nvalidation_fraction = 0.25\n'
     )
-    assert main(["train", str(recording), "--out", "m.safetensors", "--config", "tiny.toml", "--seed", "3"]) == 0
+    assert main(["train", str(recording), "--out", "m.safetensors", "--config", "tiny.toml"]) == 0
     assert "best step 2" in capsys.readouterr().err
     assert main(["build-index", "catalog", "--model", "m.safetensors"]) == 0
     assert "model: m.safetensors (given)" in capsys.readouterr().err
