@@ -19,7 +19,7 @@ import contextlib
 import json
 import os
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -74,45 +74,39 @@ def export_lerobot(recording: Recording, out: Path, progress: Progress | None = 
     if not (grasps := recording.grasps):
         raise RecordingError(f"{recording.folder} must contain grasps, but contains none")
     fingers = sorted(grasps[0].touches)
+    counts = dict.fromkeys(MOMENT_SUFFIXES, 0)
     for grasp in grasps:
         if sorted(grasp.touches) != fingers:
             raise RecordingError(
                 f"every grasp must have the same fingers; {grasps[0].grasp_id} has {', '.join(fingers)}, "
                 f"{grasp.grasp_id} has {', '.join(sorted(grasp.touches))}"
             )
-    counts = {moment: sum(_has(grasp, fingers, moment) for grasp in grasps) for moment in MOMENT_SUFFIXES}
+        for moment, suffix in MOMENT_SUFFIXES.items():
+            counts[moment] += grasp.images().keys() >= {f"touch_{finger}{suffix}" for finger in fingers}
     moments = [moment for moment, count in counts.items() if count == len(grasps)]
-    columns = {"photo": ["photo"] * len(moments)}
-    columns |= {f"touch_{each}": [f"touch_{each}{MOMENT_SUFFIXES[moment]}" for moment in moments] for each in fingers}
-    sizes = {
-        camera: _read_picture(recording.folder / grasps[0].images()[names[0]]).shape[:2]
-        for camera, names in columns.items()
-    }
+    suffixes = [MOMENT_SUFFIXES[moment] for moment in moments]
+    cameras = [_Camera("photo", ["photo"] * len(moments))]
+    cameras += [_Camera(f"touch_{each}", [f"touch_{each}{suffix}" for suffix in suffixes]) for each in fingers]
+    numbers = [list(MOMENT_SUFFIXES).index(moment) for moment in moments]
     tasks = {name: number for number, name in enumerate(dict.fromkeys(grasp.object_id for grasp in grasps))}
-    stats = {name: _Stats() for name in (*_STEP_COLUMNS, *map(_key, columns))}
     steps: list[dict[str, Any]] = []
     episodes: list[dict[str, Any]] = []
     with _new_folder(out) as folder:
-        with contextlib.ExitStack() as stack:
-            videos = {
-                camera: stack.enter_context(
-                    _video(av, folder / _VIDEO.format(video_key=_key(camera), **_NUMBERS), size)
-                )
-                for camera, size in sizes.items()
-            }
+        with contextlib.ExitStack() as videos:
+            for camera in cameras:
+                camera.size = _read_picture(recording.folder / grasps[0].images()[camera.columns[0]]).shape[:2]
+                path = folder / _VIDEO.format(video_key=camera.key, **_NUMBERS)
+                camera.add = videos.enter_context(_video(av, path, camera.size))
             for episode, grasp in enumerate(grasps):
-                task = tasks[grasp.object_id]
-                for step, moment in enumerate(moments):
-                    values = (step / FPS, step, episode, len(steps), task, list(MOMENT_SUFFIXES).index(moment))
+                for step, moment_number in enumerate(numbers):
+                    values = (step / FPS, step, episode, len(steps), tasks[grasp.object_id], moment_number)
                     steps.append(dict(zip(_STEP_COLUMNS, values, strict=True)))
-                    for name, value in steps[-1].items():
-                        stats[name].add(np.array([[value]], dtype=np.float64))
-                for camera, names in columns.items():
-                    for name in names:
-                        frame = letterbox(_read_picture(recording.folder / grasp.images()[name]), sizes[camera])
-                        videos[camera](frame)
-                        stats[_key(camera)].add(frame.reshape(-1, 3) / 255.0)
-                episodes.append(_episode(episode, grasp, len(moments), list(columns)))
+                for camera in cameras:
+                    for column in camera.columns:
+                        frame = letterbox(_read_picture(recording.folder / grasp.images()[column]), camera.size)
+                        camera.add(frame)
+                        camera.stats.add(frame.reshape(-1, 3) / 255.0)
+                episodes.append(_episode(episode, grasp, len(moments), cameras))
                 if progress is not None:
                     progress(episode + 1, len(grasps))
         kinds = {"string": pa.string(), "bool": pa.bool_(), "double": pa.float64(), "list": pa.list_(pa.float64())}
@@ -120,17 +114,15 @@ def export_lerobot(recording: Recording, out: Path, progress: Progress | None = 
         types = {key: kinds[kind] for key, kind in _FIELDS.items()}
         _write_table(folder / f"meta/episodes/{_FILE}.parquet".format(**_NUMBERS), episodes, types)
         _write_tasks(folder / "meta" / "tasks.parquet", tasks)
+        stats = {name: _Stats(np.array([[step[name]] for step in steps], np.float64)) for name in _STEP_COLUMNS}
+        stats |= {camera.key: camera.stats for camera in cameras}
         _write_json(folder / "meta" / "stats.json", {name: values.to_dict() for name, values in stats.items()})
-        _write_json(folder / "meta" / "info.json", _info(recording, moments, sizes, len(tasks)))
+        _write_json(folder / "meta" / "info.json", _info(recording, moments, cameras, len(tasks)))
     return tuple(
         f"the frames {moment} the touch are left out because some grasps do not have them"
         for moment, count in counts.items()
         if 0 < count < len(grasps)
     )
-
-
-def _has(grasp: RecordedGrasp, fingers: Sequence[str], moment: str) -> bool:
-    return grasp.images().keys() >= {f"touch_{finger}{MOMENT_SUFFIXES[moment]}" for finger in fingers}
 
 
 @contextlib.contextmanager
@@ -197,9 +189,11 @@ def _video(av: Any, path: Path, size: tuple[int, int]) -> Iterator[Any]:
 class _Stats:
     """Minimum, maximum, mean and standard deviation of each channel."""
 
-    def __init__(self) -> None:
+    def __init__(self, values: NDArray[np.float64] | None = None) -> None:
         self._count, self._sum, self._squares = 0, np.zeros(1), np.zeros(1)
         self._low, self._high = np.full(1, np.inf), np.full(1, -np.inf)
+        if values is not None:
+            self.add(values)
 
     def add(self, values: NDArray[np.float64]) -> None:
         """Add values (n, c)."""
@@ -217,21 +211,27 @@ class _Stats:
         return {name: value.reshape(shape).tolist() for name, value in statistics.items()} | {"count": [self._count]}
 
 
+class _Camera:
+    """A camera of the data set: its columns of a recording, step by step, and its video."""
+
+    size: tuple[int, int]
+    add: Callable[[Picture], None]
+
+    def __init__(self, name: str, columns: Sequence[str]) -> None:
+        self.key, self.columns, self.stats = f"observation.images.{name}", columns, _Stats()
+
+
 # Tables ----------------------------------------------------------------------------------------------------
 
 
-def _key(camera: str) -> str:
-    return f"observation.images.{camera}"
-
-
-def _episode(episode: int, grasp: RecordedGrasp, length: int, cameras: Sequence[str]) -> dict[str, Any]:
+def _episode(episode: int, grasp: RecordedGrasp, length: int, cameras: Sequence[_Camera]) -> dict[str, Any]:
     row: dict[str, Any] = {"episode_index": episode, "tasks": [grasp.object_id], "length": length}
     row |= {"dataset_from_index": episode * length, "dataset_to_index": (episode + 1) * length}
-    for table in ("data", "meta/episodes", *(f"videos/{_key(camera)}" for camera in cameras)):
+    for table in ("data", "meta/episodes", *(f"videos/{camera.key}" for camera in cameras)):
         row |= {f"{table}/{key}": value for key, value in _NUMBERS.items()}
     for camera in cameras:
-        row[f"videos/{_key(camera)}/from_timestamp"] = float(episode * length / FPS)
-        row[f"videos/{_key(camera)}/to_timestamp"] = float((episode + 1) * length / FPS)
+        row[f"videos/{camera.key}/from_timestamp"] = float(episode * length / FPS)
+        row[f"videos/{camera.key}/to_timestamp"] = float((episode + 1) * length / FPS)
     fields = grasp.to_row()
     return row | {key: fields.get(key) for key in _FIELDS}
 
@@ -246,19 +246,14 @@ def _write_table(path: Path, rows: Sequence[Mapping[str, Any]], types: Mapping[s
 
 def _write_tasks(path: Path, tasks: Mapping[str, int]) -> None:
     """Write tasks like a pandas frame with column task_index and the tasks as index, the layout that LeRobot reads."""
-    pa = import_extra("pyarrow", _WHAT)
-    index = "__index_level_0__"
+    pa, index = import_extra("pyarrow", _WHAT), "__index_level_0__"
+    kinds = {"task_index": ("task_index", "int64", "int64"), index: (None, "unicode", "object")}
     columns = [
         {"name": name, "field_name": field, "pandas_type": kind, "numpy_type": numpy_type, "metadata": None}
-        for name, field, kind, numpy_type in (
-            ("task_index", "task_index", "int64", "int64"),
-            (None, index, "unicode", "object"),
-        )
+        for field, (name, kind, numpy_type) in kinds.items()
     ]
     metadata = {"index_columns": [index], "column_indexes": [], "columns": columns, "pandas_version": "2.0.0"}
-    table = pa.table(
-        {"task_index": pa.array(list(tasks.values()), pa.int64()), index: pa.array(list(tasks), pa.string())}
-    )
+    table = pa.table({"task_index": pa.array(tasks.values(), pa.int64()), index: pa.array(tasks, pa.string())})
     table = table.replace_schema_metadata({b"pandas": json.dumps(metadata).encode()})
     import_extra("pyarrow.parquet", _WHAT).write_table(table, path)
 
@@ -267,10 +262,21 @@ def _write_json(path: Path, value: Any) -> None:
     path.write_text(json.dumps(value, indent=4) + "\n", "utf-8")
 
 
-def _info(
-    recording: Recording, moments: Sequence[str], sizes: Mapping[str, tuple[int, int]], tasks: int
-) -> dict[str, Any]:
+def _info(recording: Recording, moments: Sequence[str], cameras: Sequence[_Camera], tasks: int) -> dict[str, Any]:
     episodes = len(recording.grasps)
+    video = {"video.codec": "h264", "video.pix_fmt": "yuv444p", "video.is_depth_map": False, "video.fps": FPS}
+    features: dict[str, Any] = {
+        camera.key: {
+            "dtype": "video",
+            "shape": [*camera.size, 3],
+            "names": ["height", "width", "channels"],
+            "info": {"video.height": camera.size[0], "video.width": camera.size[1], **video, "video.channels": 3}
+            | {"has_audio": False},
+        }
+        for camera in cameras
+    }
+    for name in _STEP_COLUMNS:
+        features[name] = {"dtype": "float32" if name == "timestamp" else "int64", "shape": [1], "names": None}
     return {
         "codebase_version": "v3.0",
         "robot_type": None,
@@ -284,24 +290,6 @@ def _info(
         "splits": {"train": f"0:{episodes}"},
         "data_path": _DATA,
         "video_path": _VIDEO,
-        "features": {_key(camera): _video_feature(*size) for camera, size in sizes.items()}
-        | {
-            name: {"dtype": "float32" if name == "timestamp" else "int64", "shape": [1], "names": None}
-            for name in _STEP_COLUMNS
-        },
+        "features": features,
         "recording": {key: recording.info.get(key) for key in _FACTS} | {"moments": list(moments)},
     }
-
-
-def _video_feature(height: int, width: int) -> dict[str, Any]:
-    info = {
-        "video.height": height,
-        "video.width": width,
-        "video.codec": "h264",
-        "video.pix_fmt": "yuv444p",
-        "video.is_depth_map": False,
-        "video.fps": FPS,
-        "video.channels": 3,
-        "has_audio": False,
-    }
-    return {"dtype": "video", "shape": [height, width, 3], "names": ["height", "width", "channels"], "info": info}

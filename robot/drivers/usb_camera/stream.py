@@ -44,6 +44,8 @@ _CLOSING_S = 5.0
 """Time in which the thread must return from the camera's driver before `close` raises."""
 
 
+BACKOFF_S = 0.1, 5.0
+"""First and longest wait before a lost stream is opened again."""
 _GRAB_LIMIT_S = 1
 _DAMAGED_IN_A_ROW = 10
 """Number of consecutive undecodable pictures that are skipped before the stream is considered lost."""
@@ -103,10 +105,6 @@ class UsbCameraSettings(TypedSettings):
         for name, is_automatic in (("exposure_ms", self.auto_exposure), ("white_balance_k", self.auto_white_balance)):
             if is_automatic and getattr(self, name) is not None:
                 raise RobotConfigError(f"a camera's {name} must be left out if it is automatic")
-
-    def requested(self) -> dict[str, Any]:
-        """Return the settings to write, in order of writing."""
-        return {name: value for name in _PROPERTIES if (value := getattr(self, name)) is not None}
 
 
 @dataclass(frozen=True)
@@ -194,7 +192,7 @@ class CaptureStream:
             self._capture.release()
 
     def _write(self, settings: UsbCameraSettings) -> dict[str, Any]:
-        requested = settings.requested()
+        requested = {name: value for name in _PROPERTIES if (value := getattr(settings, name)) is not None}
         for name, value in requested.items():
             self._capture.set(_PROPERTIES[name].number, _PROPERTIES[name].to_camera(value))
         actual = {name: self._read(each) for name, each in _PROPERTIES.items() if name != "led" or name in requested}
@@ -231,15 +229,7 @@ def open_capture(device: str) -> Any:
 
 
 def stable_path(device: str, allow_index: bool) -> str:
-    """Return the path to open for a `device` of a rig's file.
-
-    Args:
-        device: Path, or number of the camera.
-        allow_index: Whether a number or a path such as /dev/video0 is accepted.
-
-    Raises:
-        RobotConfigError: The device is not a path, or not a stable one.
-    """
+    """Return the path of a `device` of a rig's file; raise RobotConfigError unless it is stable or `allow_index`."""
     path = f"/dev/video{device}" if device.isascii() and device.isdigit() else device
     if not os.path.isabs(path):
         raise RobotConfigError(f"a camera must be named by its absolute path, got {device!r}.{_connected_cameras()}")
@@ -268,7 +258,6 @@ class FrameReader:
         open_stream: Opens the stream.
         settings: Settings of the reader.
         clock: Clock of the frames' times.
-        backoff_s: First and longest wait before a lost stream is opened again.
 
     Attributes:
         frame_count: Frames read, dropped ones included.
@@ -282,9 +271,8 @@ class FrameReader:
         settings: UsbCameraSettings,
         *,
         clock: Clock = time.monotonic,
-        backoff_s: tuple[float, float] = (0.1, 5.0),
     ) -> None:
-        self.name, self.settings, self.clock, self.backoff_s = name, settings, clock, backoff_s
+        self.name, self.settings, self.clock = name, settings, clock
         self.frame_count = self.lost_count = 0
         self._open_stream = open_stream
         self._frames: deque[Frame] = deque(maxlen=settings.keep)
@@ -347,7 +335,7 @@ class FrameReader:
             return list(self._frames)
 
     def _run(self, stream: CaptureStream | None) -> None:
-        shortest, longest = self.backoff_s
+        shortest, longest = BACKOFF_S
         delay = shortest
         while not self._stopped.is_set():
             try:

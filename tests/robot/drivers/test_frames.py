@@ -55,12 +55,13 @@ def script():
 
 
 @pytest.fixture
-def make(script):
+def make(script, monkeypatch):
     """Return a maker of readers, which are closed at the end of the test without leftover threads."""
     made = []
 
     def reader(settings=SETTINGS, script=script, backoff_s=(1e-3, 4e-3)):
-        made.append((script, FrameReader("eye", script.open, settings, clock=lambda: 0.0, backoff_s=backoff_s)))
+        monkeypatch.setattr(frames, "BACKOFF_S", backoff_s)
+        made.append((script, FrameReader("eye", script.open, settings, clock=lambda: 0.0)))
         return made[-1][1]
 
     yield reader
