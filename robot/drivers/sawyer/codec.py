@@ -303,13 +303,9 @@ def waypoints(start: Pose, goal: Pose) -> list[Pose]:
     turn = math.remainder(goal.yaw_rad - start.yaw_rad, math.tau)
     length = math.dist(start.as_tuple()[:3], goal.as_tuple()[:3])
     steps = max(1, math.ceil(length / STEP_MM), math.ceil(abs(turn) / STEP_RAD))
-    fractions = (number / steps for number in range(1, steps))
-    return [start, *(_between(start, goal, turn, fraction) for fraction in fractions), goal]
-
-
-def _between(start: Pose, goal: Pose, turn: float, fraction: float) -> Pose:
-    point = [a + fraction * (b - a) for a, b in zip(start.as_tuple()[:3], goal.as_tuple()[:3], strict=True)]
-    return Pose(point[0], point[1], point[2], start.yaw_rad + fraction * turn)
+    first = np.array([*start.as_tuple()[:3], start.yaw_rad])
+    last = np.array([*goal.as_tuple()[:3], start.yaw_rad + turn])
+    return [start, *(Pose(*point) for point in np.linspace(first, last, steps + 1)[1:-1].tolist()), goal]
 
 
 @dataclass(frozen=True)
