@@ -20,7 +20,6 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from retrieval.console.output import say
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import (
     AnyRecording,
@@ -54,12 +53,10 @@ from retrieval.training.calibration.calibrate import fit_calibrations, with_gel_
 from retrieval.training.calibration.touches import ScoredTouches, score_touches
 from retrieval.training.calibration.verification import fit_verification
 from retrieval.training.cca_towers import (
-    GRID,
     MAX_CALIBRATION_TOUCHES,
     CcaProjections,
     CcaSelection,
     TowerWidths,
-    fit_projections,
     select_settings,
     touch_rows,
     tower_widths,
@@ -104,7 +101,7 @@ def adapt(
 
     Raises:
         DatasetError: The recording cannot be read.
-        BadInput: The recording has fewer than two objects.
+        BadInput: The recording has fewer than six objects.
         CheckpointError: `start` cannot be read, or `out` cannot be written.
 
     >>> from pathlib import Path
@@ -119,26 +116,23 @@ def adapt(
         start = load_checkpoint(start or shipped_model(min(finger_count(grasps), 2)))
     if split is not None:
         grasps = [grasp for grasp in grasps if grasp.object_id not in split.test]
-    if len({grasp.object_id for grasp in grasps}) < 2:
-        raise BadInput("A fit needs a recording of at least 2 objects. Record more.")
+    folds = draw_folds(grasps, load_config(PRESET).training.seed)
     data = AdaptationData.of(recording, grasps, start, init, quiet)
-    estimate = estimate_accuracy(data, start, quiet=quiet)
-    if estimate and estimate.is_baseline_better:
-        checkpoint = _calibrated_baseline(start, data, estimate, quiet)
-    else:
-        checkpoint = _calibrated_fit(_fitted(data, estimate, out), data, estimate, quiet)
+    estimate = estimate_accuracy(data, start, folds, quiet)
+    calibrated = _calibrated_baseline if estimate.is_baseline_better else _calibrated_fit
+    checkpoint = calibrated(start, data, estimate, quiet)
     store_checkpoint(checkpoint, out)
-    return Adaptation(load_checkpoint(out), data, estimate)
+    return Adaptation(load_checkpoint(out), data.features, estimate)
 
 
 @dataclass(frozen=True, eq=False)
 class Adaptation:
-    """Result of `adapt`: the checkpoint and its accuracy on held-out objects.
+    """Result of `adapt`.
 
     Attributes:
         checkpoint: The written checkpoint.
-        data: The fitted grasps and their features.
-        estimate: The accuracy estimate; None for fewer than six objects; the checkpoint then has no probabilities.
+        features: Features of the fitted grasps.
+        estimate: Accuracy on held-out objects.
 
     >>> from pathlib import Path
     >>> made = retrieval.adapt("lab", Path("own.safetensors"), "model.safetensors", init="none", quiet=True)
@@ -149,15 +143,13 @@ class Adaptation:
     """
 
     checkpoint: Checkpoint
-    data: "AdaptationData"
-    estimate: "Estimate | None"
+    features: Features
+    estimate: "Estimate"
 
     def lines(self) -> list[str]:
         """Return the result as lines of text."""
-        lines = self.estimate.lines() if self.estimate else []
-        grasps = self.data.grasps
-        objects = len({grasp.object_id for grasp in grasps})
-        return [*lines, f"{self.checkpoint.path}: fitted to {objects} objects, {len(grasps)} touches"]
+        objects, touches = len(set(self.features.object_ids)), len(self.features)
+        return [*self.estimate.lines(), f"{self.checkpoint.path}: fitted to {objects} objects, {touches} touches"]
 
 
 # Features of the combined towers ---------------------------------------------------------------------------
@@ -209,16 +201,13 @@ class AdaptationData:
 def config_for(start: Checkpoint, fingers: int, init: str) -> Config:
     """Return the preset with the towers of the fit; with `init` "none" those of the start model only."""
     preset, source = load_config(PRESET), start.config.matcher
-    touch, photo = [source.tower], [source.photo_tower or source.tower]
-    if init != NO_TOWER:
-        touch += [PUBLISHED_TOWER] * (1 + _has_gel_tower(start))
-        photo = [PUBLISHED_TOWER] if is_shipped(start.path) else [*photo, PUBLISHED_TOWER]
+    names = {start.matcher.touch_tower: source.tower, start.matcher.photo_tower: source.photo_tower or source.tower}
+    touch, photo = (
+        TOWER_SEPARATOR.join(PUBLISHED_TOWER if isinstance(part, str) else names[part] for part in parts)
+        for parts in _tower_sources(start, init)
+    )
     matcher = dataclasses.replace(
-        preset.matcher,
-        tower=TOWER_SEPARATOR.join(touch),
-        photo_tower=TOWER_SEPARATOR.join(photo),
-        tower_output=source.tower_output,
-        fingers=fingers,
+        preset.matcher, tower=touch, photo_tower=photo, tower_output=source.tower_output, fingers=fingers
     )
     training = dataclasses.replace(preset.training, init="random", init_touch="", init_photo="")
     return dataclasses.replace(preset, matcher=matcher, training=training)
@@ -226,25 +215,24 @@ def config_for(start: Checkpoint, fingers: int, init: str) -> Config:
 
 def load_towers(matcher: Matcher, start: Checkpoint, init: str) -> None:
     """Load the weights of the towers of `config_for`; `init` are those of the published tower, or "none"."""
-    published = [] if init == NO_TOWER else [init]
-    gel = [GEL] if published and _has_gel_tower(start) else []
-    _load_parts(matcher.touch_tower, start.matcher.touch_tower.backbones, [*gel, *published])
-    only_published = published and is_shipped(start.path)
-    _load_parts(matcher.photo_tower, [] if only_published else start.matcher.photo_tower.backbones, published)
+    for tower, sources in zip((matcher.touch_tower, matcher.photo_tower), _tower_sources(start, init), strict=True):
+        parts = [part for one in sources for part in ([one] if isinstance(one, str) else one.backbones)]
+        for backbone, source in zip(tower.backbones, parts, strict=True):
+            if isinstance(source, str):
+                backbone.initialise(source)
+            else:
+                backbone.load_state_dict(source.state_dict())
 
 
-def _load_parts(tower: Tower, start: Sequence[Tower], inits: Sequence[str]) -> None:
-    """Load the weights of the start model into the first parts of a tower, and those of `inits` into the others."""
-    parts = tower.backbones
-    for part, source in zip(parts, start, strict=False):
-        part.load_state_dict(source.state_dict())
-    for part, init in zip(parts[len(start) :], inits, strict=True):
-        part.initialise(init)
-
-
-def _has_gel_tower(start: Checkpoint) -> bool:
-    """Return whether the gel tower is used with the towers of this model: its features are statistics of stages."""
-    return start.config.matcher.tower_output == "stages"
+def _tower_sources(start: Checkpoint, init: str) -> tuple[list[Tower | str], list[Tower | str]]:
+    """Return the parts of the touch tower and of the photo tower: towers of the start model, or initial weights."""
+    touch: list[Tower | str] = [start.matcher.touch_tower]
+    photo: list[Tower | str] = [start.matcher.photo_tower]
+    if init == NO_TOWER:
+        return touch, photo
+    if start.config.matcher.tower_output == "stages":  # as the features of the gel tower
+        touch.append(GEL)
+    return [*touch, init], [init] if is_shipped(start.path) else [*photo, init]
 
 
 # Accuracy on held-out objects ------------------------------------------------------------------------------
@@ -257,24 +245,21 @@ class Estimate:
     Attributes:
         choice: The fit to all objects; its settings were selected by holding out half of each kind.
         folds: Objects that are left out together. The fit to the others selects its settings among them.
-        baseline: The unadapted start model.
+        baseline: Features of the grasps by the unadapted start model; None if it has another number of fingers.
         measures: "top1" and "pair_accuracy" of each, such as "held_out_top1", "held_out_top1_low_pass" and
             "baseline_top1".
     """
 
     choice: CcaSelection
     folds: list[tuple[str, ...]]
-    baseline: "UnadaptedBaseline"
+    baseline: Features | None
     measures: dict[str, Measure]
 
     @property
     def is_baseline_better(self) -> bool:
-        """Whether the unadapted model has at least the pair accuracy of the fit.
-
-        A model for another number of fingers cannot be used and is never better.
-        """
+        """Whether the unadapted model has at least the pair accuracy of the fit."""
         means = self.to_dict()
-        return self.baseline.fits_fingers and means["baseline_pair_accuracy"] >= means["held_out_pair_accuracy"]
+        return means.get("baseline_pair_accuracy", 0.0) >= means["held_out_pair_accuracy"]
 
     def lines(self) -> list[str]:
         """Return the estimate as lines of text."""
@@ -287,8 +272,10 @@ class Estimate:
                 f"chance {touched.chance[0]:.3f}; "
                 f"difference {gain['difference']:+.3f} [{gain['low']:+.3f}, {gain['high']:+.3f}]"
             )
-        baseline = [f"{label} {interval(self.measures[f'baseline_{name}'])}" for name, label in _LABELS.items()]
-        lines += [f"  {self.verdict}", f"unadapted model: {', '.join(baseline)}"]
+        lines.append(f"  {self.verdict}")
+        if self.baseline:
+            found = [f"{label} {interval(self.measures[f'baseline_{name}'])}" for name, label in _LABELS.items()]
+            lines.append(f"unadapted model: {', '.join(found)}")
         if self.is_baseline_better:
             lines.append(
                 "  The unadapted model is used: its pair accuracy is at least that of the fit. "
@@ -322,32 +309,24 @@ def interval(measure: Measure) -> str:
 
 
 @one_thread()
-def estimate_accuracy(data: AdaptationData, start: Checkpoint, *, quiet: bool) -> Estimate | None:
-    """Return the accuracy on held-out objects; None if there are too few objects."""
-    try:
-        folds = draw_folds(data.grasps, data.config.training.seed)
-    except BadInput as error:
-        if not quiet:
-            say(f"no accuracy estimate: {error}")
-        return None
-    measures = {}
-    for suffix, features, label in (
-        ("", data.features, "touches"),
-        ("_low_pass", data.low_pass, "low-pass touches"),
-    ):
+def estimate_accuracy(data: AdaptationData, start: Checkpoint, folds: list[tuple[str, ...]], quiet: bool) -> Estimate:
+    """Return the accuracy on the objects of each fold, of fits to the other objects."""
+    measures: dict[str, Measure] = {}
+    for suffix, features in (("", data.features), ("_low_pass", data.low_pass)):
+        fits = fit_folds(features, folds, data, f"estimate{suffix}".replace("_", " "), quiet)
         left_out = [features.of_objects(fold) for fold in folds]
-        fits = fit_folds(features, folds, data, label=label, quiet=quiet)
         scores = [
             fit.projections.cosines(touch_rows(part), part.photo) for fit, part in zip(fits, left_out, strict=True)
         ]
-        for name, measure in accuracies(scores, left_out).items():
-            measures[f"held_out_{name}{suffix}"] = measure
-    choice = _choose_settings(data.features, data)
-    baseline = UnadaptedBaseline.of(start, data.grasps, quiet)
-    scored = [part.logits for part in baseline.touches(folds)]
-    found = accuracies(scored, [baseline.features.of_objects(fold) for fold in folds])
-    measures |= {f"baseline_{name}": measure for name, measure in found.items()}
-    return Estimate(choice, folds, baseline, measures)
+        found = accuracies(scores, left_out)
+        measures |= {f"held_out_{name}{suffix}": measure for name, measure in found.items()}
+    baseline = None
+    if start.config.matcher.fingers == finger_count(data.grasps):
+        baseline = encode_recording(data.grasps, start.matcher, start.config, None, quiet=quiet)
+        scores = [part.logits for part in _baseline_touches(start, baseline, folds)]
+        found = accuracies(scores, [baseline.of_objects(fold) for fold in folds])
+        measures |= {f"baseline_{name}": measure for name, measure in found.items()}
+    return Estimate(_choose_settings(data.features, data), folds, baseline, measures)
 
 
 def draw_folds(grasps: Sequence[Grasp], seed: int) -> list[tuple[str, ...]]:
@@ -359,7 +338,7 @@ def draw_folds(grasps: Sequence[Grasp], seed: int) -> list[tuple[str, ...]]:
     groups = linked_objects(grasps)
     total = sum(map(len, groups))
     if total < MIN_OBJECTS:
-        raise BadInput(f"Leaving each object out once needs at least {MIN_OBJECTS} objects, got {total}.")
+        raise BadInput(f"A fit needs a recording of at least {MIN_OBJECTS} objects, got {total}. Record more.")
     folds: list[list[str]] = [[] for _ in range(min(max(round(total / GALLERY), 2), total // 3))]
     for place in np.random.default_rng([seed, 7]).permutation(len(groups)):
         min(folds, key=len).extend(groups[place])
@@ -367,11 +346,11 @@ def draw_folds(grasps: Sequence[Grasp], seed: int) -> list[tuple[str, ...]]:
 
 
 def fit_folds(
-    features: Features, folds: Sequence[Sequence[str]], data: AdaptationData, *, label: str, quiet: bool
+    features: Features, folds: Sequence[Sequence[str]], data: AdaptationData, title: str, quiet: bool
 ) -> Iterator[CcaSelection]:
     """Yield the fit to the objects outside each fold. The settings are selected on the same objects."""
     everyone = {name for fold in folds for name in fold}
-    with Bar(f"estimate, {label}", len(folds), "folds", quiet=quiet) as bar:
+    with Bar(title, len(folds), "folds", quiet=quiet) as bar:
         for fold in folds:
             yield _choose_settings(features.of_objects(everyone.difference(fold)), data)
             bar.advance()
@@ -414,71 +393,28 @@ def accuracies(scores: Sequence[NDArray[np.float32]], folds: Sequence[Features])
     return {name: dataclasses.replace(pooled(each), gallery=gallery) for name, each in parts.items()}
 
 
-@dataclass(frozen=True, eq=False)
-class UnadaptedBaseline:
-    """A start model without any fit, and the features of the recorded grasps with its own preprocessing.
-
-    Attributes:
-        start: The model.
-        features: Tower features of the recorded grasps.
-        fits_fingers: Whether the model has the number of fingers of the grasps. Else their touches are repeated.
-    """
-
-    start: Checkpoint
-    features: Features
-    fits_fingers: bool
-
-    @classmethod
-    def of(cls, start: Checkpoint, grasps: list[Grasp], quiet: bool) -> "UnadaptedBaseline":
-        """Encode the grasps."""
-        config = dataclasses.replace(start.config.matcher, fingers=len(grasps[0].touches))
-        encoder = Matcher(config, start.matcher.views).eval()
-        encoder.touch_tower, encoder.photo_tower = start.matcher.touch_tower, start.matcher.photo_tower
-        found = encode_recording(grasps, encoder, dataclasses.replace(start.config, matcher=config), None, quiet=quiet)
-        wanted = start.config.matcher.fingers
-        touch = np.ascontiguousarray(found.touch[:, np.arange(wanted) % config.fingers])
-        return cls(start, dataclasses.replace(found, touch=touch), wanted == config.fingers)
-
-    @one_thread()
-    def touches(
-        self, folds: Sequence[Sequence[str]], max_touches: int | None = None, *, pooled: bool = False
-    ) -> list[ScoredTouches]:
-        """Return the touches of each fold, at most `max_touches` of an object; `pooled`: without late interaction."""
-        parts = []
-        for features in map(self.features.of_objects, folds):
-            if max_touches is not None:
-                rows = [np.flatnonzero(features.owner == name)[:max_touches] for name in np.unique(features.owner)]
-                features = features.select(np.concatenate(rows))
-            tensors = torch.from_numpy(features.touch).flatten(1), torch.from_numpy(features.photo)
-            owners, own = (features.owner, features.owner), np.eye(len(features), dtype=np.bool_)
-            parts.append(score_touches(self.start.matcher, tensors, owners, own, pooled=pooled))
-        return parts
+@one_thread()
+def _baseline_touches(
+    start: Checkpoint,
+    features: Features,
+    folds: Sequence[Sequence[str]],
+    max_touches: int | None = None,
+    *,
+    pooled: bool = False,
+) -> list[ScoredTouches]:
+    """Return the touches of each fold, at most `max_touches` of an object; `pooled`: without late interaction."""
+    parts = []
+    for part in map(features.of_objects, folds):
+        if max_touches is not None:
+            rows = [np.flatnonzero(part.owner == name)[:max_touches] for name in np.unique(part.owner)]
+            part = part.select(np.concatenate(rows))
+        tensors = torch.from_numpy(part.touch).flatten(1), torch.from_numpy(part.photo)
+        own = np.eye(len(part), dtype=np.bool_)
+        parts.append(score_touches(start.matcher, tensors, (part.owner, part.owner), own, pooled=pooled))
+    return parts
 
 
 # The checkpoint --------------------------------------------------------------------------------------------
-
-
-@one_thread()
-def _fitted(data: AdaptationData, estimate: Estimate | None, out: Path) -> Checkpoint:
-    """Return a checkpoint with projections fitted to all objects; without an estimate, those of the largest ridge."""
-    features = data.features
-    if estimate:
-        projections = estimate.choice.projections
-        scale, offset = _log_odds(estimate.choice.held_out_touches)
-    else:
-        largest, touch = max(GRID), touch_rows(features)
-        projections = dict(fit_projections(touch, features.photo, features.owner, data.widths, [largest]))[largest]
-        scale, offset = 1.0, 0.0
-    install_projections(data.matcher, projections, scale, offset)
-    objects = tuple(sorted(set(features.object_ids)))
-    return Checkpoint(
-        path=out,
-        digest="",
-        config=data.config,
-        provenance={"step": 0, **data.provenance, "metrics": estimate.to_dict() if estimate else {}},
-        matcher=data.matcher,
-        split=Split(data.config.training.seed, train=objects, validation=(), test=()),
-    )
 
 
 def _log_odds(parts: Iterable[ScoredTouches]) -> tuple[float, float]:
@@ -512,35 +448,45 @@ def install_projections(matcher: Matcher, projections: CcaProjections, scale: fl
     matcher.cosine_scale.fill_(scale)
 
 
-def _calibrated_fit(checkpoint: Checkpoint, data: AdaptationData, estimate: Estimate | None, quiet: bool) -> Checkpoint:
-    """Add the gel check and the calibrations to a fitted checkpoint.
+def _calibrated_fit(start: Checkpoint, data: AdaptationData, estimate: Estimate, quiet: bool) -> Checkpoint:
+    """Return a checkpoint with projections fitted to all objects, calibrations and a gel check.
 
     The calibrations are fitted on the touches of held-out objects (half of each kind at a time), because the
-    projections are overfitted to the fitted objects; without an estimate there are none.
+    projections are overfitted to the fitted objects.
     """
-    checkpoint = _with_gel_check(checkpoint, data.grasps, data.features, quiet)
-    if estimate is None:
-        return checkpoint
-    assert checkpoint.matcher.cosine_scale is not None
-    scale, offset = checkpoint.matcher.cosine_scale.item(), checkpoint.matcher.head.out.bias.item()
-    left_out = [
-        dataclasses.replace(part, logits=scale * part.logits + offset) for part in estimate.choice.held_out_touches
-    ]
+    held_out, matcher = estimate.choice.held_out_touches, data.matcher
+    with one_thread():
+        scale, offset = _log_odds(held_out)
+        install_projections(matcher, estimate.choice.projections, scale, offset)
+    assert matcher.cosine_scale is not None
+    scale, offset = matcher.cosine_scale.item(), matcher.head.out.bias.item()  # float32
+    left_out = [dataclasses.replace(part, logits=scale * part.logits + offset) for part in held_out]
     posterior, references = fit_calibrations(left_out)
-    verification = fit_verification(left_out, posterior)
-    return dataclasses.replace(checkpoint, posterior=posterior, references=references, verification=verification)
+    made = Checkpoint(
+        path=start.path,
+        digest="",
+        config=data.config,
+        provenance={"step": 0, **data.provenance, "metrics": estimate.to_dict()},
+        verification=fit_verification(left_out, posterior),
+        matcher=matcher,
+        split=Split(data.config.training.seed, tuple(sorted(set(data.features.object_ids))), (), ()),
+        posterior=posterior,
+        references=references,
+    )
+    return _with_gel_check(made, data.grasps, data.features, quiet)
 
 
 def _calibrated_baseline(start: Checkpoint, data: AdaptationData, estimate: Estimate, quiet: bool) -> Checkpoint:
     """Return the start model with a gel check and calibrations fitted to the recorded objects."""
-    checkpoint = _with_gel_check(start, data.grasps, estimate.baseline.features, quiet)
+    assert estimate.baseline is not None
+    checkpoint = _with_gel_check(start, data.grasps, estimate.baseline, quiet)
     about = {name: data.provenance[name] for name in ("source", "data_digest")}
     provenance = start.provenance | {
         "adapted_to": about,
         LICENCES: data.provenance[LICENCES],
         "metrics": estimate.to_dict(),
     }
-    touches = partial(estimate.baseline.touches, max_touches=MAX_CALIBRATION_TOUCHES)
+    touches = partial(_baseline_touches, start, estimate.baseline, max_touches=MAX_CALIBRATION_TOUCHES)
     posterior, references = fit_calibrations(touches(estimate.folds))
     # Nothing was fitted to the objects, so a verification compares all of them with each other.
     verification = fit_verification(touches([data.features.object_ids]), posterior)
