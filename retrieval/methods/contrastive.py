@@ -1,7 +1,5 @@
 """Two projections into one metric space, trained by a contrastive loss on fixed tower features."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -53,8 +51,7 @@ class ContrastiveEmbedding(Method):
     def _fit(self, train: "Features", validation: "Features") -> None:
         self._touch, self._photo = Standardiser.fit(train.touch), Standardiser.fit(train.photo)
         chosen = validation.select(validation_rows(validation))
-        steps = min(self.settings.config.training.iterations, MAX_STEPS)
-        fits = [self._train(train, chosen, steps, place) for place in range(len(REGULARISATIONS))]
+        fits = [self._train(train, chosen, place) for place in range(len(REGULARISATIONS))]
         aucs = [best.metrics["validation_auc"] for _, best in fits]
         place = aucs.index(max(aucs))
         self._module, best = fits[place]
@@ -67,12 +64,15 @@ class ContrastiveEmbedding(Method):
             "scale": self._scale,
         }
 
-    def _train(self, train: "Features", validation: "Features", steps: int, place: int) -> tuple[Projections, BestStep]:
+    def _train(self, train: "Features", validation: "Features", place: int) -> tuple[Projections, BestStep]:
         """Return projections trained with one regularisation, at their best step."""
-        dropout, weight_decay = REGULARISATIONS[place]
-        with seeded_generator(self.settings.seed) as generator:
-            dim = self.settings.config.matcher.embedding_dim
-            module = Projections(len(self._touch.columns), len(self._photo.columns), dim, dropout)
+        (dropout, weight_decay), config = REGULARISATIONS[place], self.settings.config
+        touch, photo = self._tensors(train)
+        touch_held_out, photo_held_out = self._tensors(validation)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.settings.seed)  # initial weights and dropout
+            draws = ObjectSampler(torch.from_numpy(train.owner), torch.Generator().manual_seed(self.settings.seed))
+            module = Projections(touch.shape[1], photo.shape[1], config.matcher.embedding_dim, dropout)
             optimizer = torch.optim.AdamW(  # biases and the temperature need not be small
                 [
                     {"params": [module.touch.bias, module.photo.bias, module.log_scale], "weight_decay": 0.0},
@@ -80,44 +80,34 @@ class ContrastiveEmbedding(Method):
                 ]
             )
             optimizer.register_step_post_hook(lambda *_: module.clamp_scale())
+
+            def loss(_: int, __: int) -> Tensor:
+                objects = draws.distinct_objects(OBJECTS_PER_BATCH).repeat(IMAGES_PER_OBJECT)
+                touches = module(touch[draws.rows(objects)], module.touch)
+                photos = module(photo[draws.rows(objects)], module.photo)
+                return contrastive_loss(touches, photos, objects, objects, module.log_scale)
+
+            @torch.inference_mode()
+            def validate() -> dict[str, float]:
+                module.eval()
+                scores = module(touch_held_out, module.touch) @ module(photo_held_out, module.photo).T
+                module.train()
+                return {"validation_auc": ranking_auc(scores.numpy(), validation.owner)}
+
             best = train_loop(
                 module,
                 optimizer,
-                Plan(steps, LEARNING_RATE, validate_every=VALIDATE_EVERY),
-                lambda left: left,
-                self._training_loss(module, train, generator),
+                Plan(min(config.training.iterations, MAX_STEPS), LEARNING_RATE, validate_every=VALIDATE_EVERY),
+                lambda steps: steps,
+                loss,
                 title=f"fit contrastive, {place + 1} of {len(REGULARISATIONS)}",
                 quiet=self.settings.quiet,
-                validate=self._validation(module, validation),
+                validate=validate,
             )
         return module.eval(), best
 
-    def _training_loss(
-        self, module: Projections, train: "Features", generator: torch.Generator
-    ) -> Callable[[int, int], Tensor]:
-        touch, photo = _tensor(self._touch, train.touch), _tensor(self._photo, train.photo)
-        draws = ObjectSampler(torch.from_numpy(train.owner), generator)
-
-        def loss(_: int, __: int) -> Tensor:
-            objects = draws.distinct_objects(OBJECTS_PER_BATCH).repeat(IMAGES_PER_OBJECT)
-            touches = module(touch[draws.rows(objects)], module.touch)
-            photos = module(photo[draws.rows(objects)], module.photo)
-            return contrastive_loss(touches, photos, objects, objects, module.log_scale)
-
-        return loss
-
-    def _validation(self, module: Projections, validation: "Features") -> Callable[[], dict[str, float]]:
-        touch = _tensor(self._touch, validation.touch)
-        photo = _tensor(self._photo, validation.photo)
-
-        @torch.inference_mode()
-        def validate() -> dict[str, float]:
-            module.eval()
-            scores = (module(touch, module.touch) @ module(photo, module.photo).T).numpy()
-            module.train()
-            return {"validation_auc": ranking_auc(scores, validation.owner)}
-
-        return validate
+    def _tensors(self, features: "Features") -> tuple[Tensor, Tensor]:
+        return _tensor(self._touch, features.touch), _tensor(self._photo, features.photo)
 
     @torch.inference_mode()
     def _encode_touch(self, touch: Array) -> Array:
@@ -137,27 +127,11 @@ def _tensor(standardise: Standardiser, features: NDArray[Any]) -> Tensor:
     return torch.from_numpy(standardise(features)).float()
 
 
-# Draws -----------------------------------------------------------------------------------------------
-
-
-@contextmanager
-def seeded_generator(seed: int) -> Iterator[torch.Generator]:
-    """Yield a seeded generator for draws; seed torch's own stream (initial weights, dropout), and restore it after."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        yield torch.Generator().manual_seed(seed)
-
-
 class ObjectSampler:
     """Samples grasps by object, without a loop over items."""
 
     def __init__(self, owner: Tensor, generator: torch.Generator) -> None:
-        """Index the rows.
-
-        Args:
-            owner: (n,) object of each row, from 0.
-            generator: Source of the draws.
-        """
+        """Index the rows by `owner` (n,), the object of each row, from 0."""
         self._rows = torch.argsort(owner, stable=True)
         self._counts = torch.bincount(owner)
         self._starts = self._counts.cumsum(0) - self._counts

@@ -36,7 +36,7 @@ class LateFusion(Method):
         if checkpoint.posterior is not None:  # the logit at which the likelihood ratio is 1
             method.best_params["pair_threshold"] = float(checkpoint.posterior.logit_of(np.zeros(1), 1)[0])
         fingers, touch, photo = _feature_counts(checkpoint.matcher)
-        method._shapes, method.fitted = ((fingers, touch), (photo,)), True
+        method._shapes = (fingers, touch), (photo,)
         return method
 
     def _fit(self, train: Features, validation: Features) -> None:

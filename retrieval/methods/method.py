@@ -48,8 +48,7 @@ class Method(ABC):
     """Scores touches with photos: a higher score is a better match.
 
     Scores are ranked, ties by expected rank; only calibration gives them a unit. After `fit`, `best_params` contains
-    the values chosen on validation objects, in JSON types. A method that is already fitted (from a checkpoint) sets
-    `fitted`.
+    the values chosen on validation objects, in JSON types.
 
     >>> import numpy as np
     >>> class Brightness(retrieval.Method):
@@ -62,8 +61,8 @@ class Method(ABC):
     ...     def _score(self, touch_encodings, photo_encodings):
     ...         return -abs(touch_encodings - photo_encodings.T)
     >>> method = Brightness(retrieval.MethodSettings(retrieval.load_config("tiny")))
-    >>> method.fitted
-    False
+    >>> method.best_params
+    {}
     """
 
     is_seeded: ClassVar[bool] = True
@@ -74,7 +73,6 @@ class Method(ABC):
     def __init__(self, settings: MethodSettings) -> None:
         self.settings = settings
         self.best_params: dict[str, Any] = {}
-        self.fitted = False
         self._shapes: tuple[tuple[int, ...], tuple[int, ...]] | None = None
 
     def fit(self, train: "Features", validation: "Features") -> None:
@@ -82,31 +80,34 @@ class Method(ABC):
 
         Raises:
             BadInput: One of the two has fewer than two objects, or they have a common object.
-            NumericalError: A feature is not finite.
         """
-        _require_fit(train, validation)
+        for name, part in (("training", train), ("validation", validation)):
+            if (count := len(set(part.object_ids))) < 2:
+                raise BadInput(f"a method is fitted on at least 2 {name} objects; got {count}; record more objects")
+        if shared := set(train.object_ids) & set(validation.object_ids):
+            raise BadInput(
+                f"training and validation objects must differ; {min(shared)!r} is in both; split the grasps by object"
+            )
         self._fit(train, validation)
         self._shapes = train.touch.shape[1:], train.photo.shape[1:]
-        self.fitted = True
 
     def encode_touch(self, touch: NDArray[Any]) -> Array:
         """Return encodings (T, ...) of touch features (T, fingers, F). Raises BadInput unless shaped as in the fit."""
-        self._require_fitted()
-        touch = _checked("touch features", touch, 3, self._shapes and self._shapes[0])
-        return _checked_encodings(self._encode_touch(touch), len(touch))
+        touch_shape, _ = self._fitted_shapes()
+        touch = _checked("touch features", touch, None, *touch_shape)
+        return _checked("encodings", self._encode_touch(touch), len(touch), ...)
 
     def encode_photo(self, photo: NDArray[Any]) -> Array:
         """Return encodings (N, ...) of photo features (N, F). Raises BadInput unless shaped as in the fit."""
-        self._require_fitted()
-        photo = _checked("photo features", photo, 2, self._shapes and self._shapes[1])
-        return _checked_encodings(self._encode_photo(photo), len(photo))
+        _, photo_shape = self._fitted_shapes()
+        photo = _checked("photo features", photo, None, *photo_shape)
+        return _checked("encodings", self._encode_photo(photo), len(photo), ...)
 
     def score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
         """Return scores (T, N) of every touch with every photo. Raises NumericalError for one that is not finite."""
-        self._require_fitted()
-        return _checked_scores(
-            self._score(touch_encodings, photo_encodings), len(touch_encodings), len(photo_encodings)
-        )
+        self._fitted_shapes()
+        scores = self._score(touch_encodings, photo_encodings)
+        return _checked("scores", scores, len(touch_encodings), len(photo_encodings))
 
     def score_sets(self, touch_encodings: Array, photo_encodings: Array, sets: NDArray[np.int64]) -> Array:
         """Return scores (S, N) of sets of grasps of one object with every photo.
@@ -119,10 +120,9 @@ class Method(ABC):
             photo_encodings: (N, ...) encodings.
             sets: (S, G) rows of `touch_encodings`.
         """
-        self._require_fitted()
-        return _checked_scores(
-            self._score_sets(touch_encodings, photo_encodings, sets), len(sets), len(photo_encodings)
-        )
+        self._fitted_shapes()
+        scores = self._score_sets(touch_encodings, photo_encodings, sets)
+        return _checked("scores", scores, len(sets), len(photo_encodings))
 
     @abstractmethod
     def _fit(self, train: "Features", validation: "Features") -> None: ...
@@ -140,9 +140,11 @@ class Method(ABC):
         used, place = np.unique(sets, return_inverse=True)
         return sum_over_sets(self._score(touch_encodings[used], photo_encodings), place.reshape(sets.shape))
 
-    def _require_fitted(self) -> None:
-        if not self.fitted:
+    def _fitted_shapes(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Return the shapes of a touch's and of a photo's features in the fit."""
+        if self._shapes is None:
             raise BadInput(f"a method must be fitted before use; call fit on this {type(self).__name__} first")
+        return self._shapes
 
 
 def sum_over_sets(scores: Array, sets: NDArray[np.int64]) -> Array:
@@ -153,46 +155,19 @@ def sum_over_sets(scores: Array, sets: NDArray[np.int64]) -> Array:
     return total.astype(np.float32)
 
 
-def _require_fit(train: "Features", validation: "Features") -> None:
-    for name, part in (("training", train), ("validation", validation)):
-        count = len(set(part.object_ids))
-        if count < 2:
-            raise BadInput(f"a method is fitted on at least 2 {name} objects; got {count}; record more objects")
-        _checked(f"touch features of {name} objects", part.touch, 3, train.touch.shape[1:])
-        _checked(f"photo features of {name} objects", part.photo, 2, train.photo.shape[1:])
-    if shared := set(train.object_ids) & set(validation.object_ids):
-        raise BadInput(
-            f"training and validation objects must differ; {min(shared)!r} is in both; split the grasps by object"
-        )
+def _checked(name: str, array: NDArray[Any], *shape: Any) -> Array:
+    """Return the array as float32 of a shape, in which None is any length, and a last `...` any further axes.
 
-
-def _checked(name: str, array: NDArray[Any], ndim: int, shape: tuple[int, ...] | None) -> Array:
+    A NaN or infinite value is an error: sorting would rank a NaN first.
+    """
     array = np.asarray(array, dtype=np.float32)
-    if array.ndim != ndim or (shape is not None and array.shape[1:] != shape):
-        expected = f"of shape (B, {', '.join(map(str, shape))})" if shape is not None else f"with {ndim} axes"
-        raise BadInput(f"{name} must be an array {expected}, as in the fit; got {array.shape}")
-    _require_finite(name, array)
-    return array
-
-
-def _checked_encodings(encodings: Array, count: int) -> Array:
-    encodings = np.asarray(encodings, dtype=np.float32)
-    if len(encodings) != count:
-        raise BadInput(f"a method must return one encoding per item; got {len(encodings)} for {count}")
-    _require_finite("encodings", encodings)
-    return encodings
-
-
-def _checked_scores(scores: Array, touches: int, photos: int) -> Array:
-    scores = np.asarray(scores, dtype=np.float32)
-    if scores.shape != (touches, photos):
-        raise BadInput(f"scores must be of shape {(touches, photos)}, touches by photos; got {scores.shape}")
-    _require_finite("scores", scores)
-    return scores
-
-
-def _require_finite(name: str, array: Array) -> None:
-    """Raise NumericalError for a NaN or infinite value: sorting would rank a NaN first."""
+    is_open = shape[-1] is ...
+    axes = shape[:-1] if is_open else shape
+    fits = array.ndim == len(axes) or (is_open and array.ndim > len(axes))
+    if not fits or any(wanted not in (None, got) for wanted, got in zip(axes, array.shape, strict=False)):
+        text = ", ".join("B" if wanted is None else "..." if wanted is ... else str(wanted) for wanted in shape)
+        raise BadInput(f"{name} must be an array of shape ({text}); got {array.shape}")
     if not np.isfinite(array).all():
         place = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise NumericalError(f"{name} must be finite; got {array[place]} at {place}")
+    return array

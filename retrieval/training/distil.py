@@ -234,11 +234,10 @@ def with_candidate_encoder(
     Raises:
         NumericalError: The loss is not finite.
     """
-    settings, matcher, metrics = config.training, checkpoint.matcher, checkpoint.provenance["metrics"]
-    width, linear, steps = config.matcher.candidate_width, config.matcher.candidate_linear, settings.distil_steps
-    seed = settings.seed
+    matcher, metrics, seed = checkpoint.matcher, checkpoint.provenance["metrics"], config.training.seed
+    width, linear, steps = config.matcher.candidate_width, config.matcher.candidate_linear, config.training.distil_steps
     distil(matcher, *train, width=width, linear=linear, steps=steps, seed=seed, quiet=quiet)
-    queries = None if validation is None else select_queries(validation[0], settings.seed)
+    queries = None if validation is None else select_queries(validation[0], seed)
     if validation is not None and queries is not None:
         touches = torch.from_numpy(queries).to(validation[1].device).float()
         photos = torch.cat([train[1], validation[1]])

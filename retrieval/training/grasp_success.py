@@ -17,8 +17,7 @@ A gate selects the touches that a matcher later trains on, so it makes them easi
 
 import dataclasses
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,7 +37,6 @@ from retrieval.data.dataset import (
     recording_source,
 )
 from retrieval.data.licences import LICENCES
-from retrieval.data.loading import worker_pool
 from retrieval.errors import DatasetError
 from retrieval.metrics.intervals import grouped_interval
 from retrieval.model.checkpoint import require_writable, write_tensors
@@ -53,6 +51,9 @@ LEARNING_RATE = 3e-3  # halved after each quarter of the steps, as the authors d
 VALIDATION = 0.25  # fraction of the objects, as the authors use
 BRIGHTNESS, CONTRAST = 20 / 255, 0.1  # largest change of the lamps between two frames
 _GREY_LEVEL = 1 / 255
+
+
+Differences = Callable[[Sequence[Attempt]], list[list[NDArray[np.float32]]]]
 
 
 @dataclass(frozen=True)
@@ -139,8 +140,16 @@ def train_gate(
         for objects in (split.train, split.validation)
     )
     _require_both_outcomes(train, f"the training objects of seed {seed} must have")
-    with worker_pool() as pool, one_thread():
-        differences = _DifferenceLoader(settings, pool)
+    load = ImageCache(settings.preprocessing().load_touch)
+
+    def differences(attempts: Sequence[Attempt]) -> list[list[NDArray[np.float32]]]:
+        """Return the differences of the fingers of each grasp."""
+        return [
+            [load(*pair) for pair in zip(_frames(attempt, settings.frame), attempt.grasp.backgrounds, strict=True)]
+            for attempt in attempts
+        ]
+
+    with one_thread():
         gate = GraspSuccessGate(_train_net(train, differences, iterations, seed, quiet), settings)
         with Bar("validate", len(validation), "grasps", quiet=quiet) as bar:
             logits: list[float] = []  # each grasp's highest logit
@@ -162,10 +171,14 @@ def train_gate(
     return report
 
 
+def _frames(attempt: Attempt, frame: str) -> tuple[Path, ...]:
+    return attempt.after if frame == "after" else attempt.grasp.touches
+
+
 def _require_frames(attempts: Sequence[Attempt], frame: str) -> None:
     for attempt in attempts:
-        grasp, frames = attempt.grasp, attempt.after if frame == "after" else attempt.grasp.touches
-        for moment, files in (("before", grasp.backgrounds), (frame, frames)):
+        grasp = attempt.grasp
+        for moment, files in (("before", grasp.backgrounds), (frame, _frames(attempt, frame))):
             if len(files) != len(grasp.touches):
                 raise DatasetError(
                     f"a gate compares the frames before and {frame} of each finger; {grasp.grasp_id} has "
@@ -182,26 +195,7 @@ def _require_both_outcomes(attempts: Sequence[Attempt], subject: str) -> None:
         )
 
 
-class _DifferenceLoader:
-    """Loader of the differences of grasps: a pool of workers decodes them, and a cache stores them in memory."""
-
-    def __init__(self, settings: GateSettings, pool: Executor) -> None:
-        self._frame, self._pool = settings.frame, pool
-        self._load = ImageCache(settings.preprocessing().load_touch)
-
-    def __call__(self, attempts: Sequence[Attempt]) -> list[list[NDArray[np.float32]]]:
-        distinct = {attempt.grasp.grasp_id: attempt for attempt in attempts}  # no two threads read one file
-        differences = dict(zip(distinct, self._pool.map(self._of, distinct.values()), strict=True))
-        return [differences[attempt.grasp.grasp_id] for attempt in attempts]
-
-    def _of(self, attempt: Attempt) -> list[NDArray[np.float32]]:
-        frames = attempt.after if self._frame == "after" else attempt.grasp.touches
-        return [self._load(*pair) for pair in zip(frames, attempt.grasp.backgrounds, strict=True)]
-
-
-def _train_net(
-    attempts: list[Attempt], differences: _DifferenceLoader, iterations: int, seed: int, quiet: bool
-) -> GraspNet:
+def _train_net(attempts: list[Attempt], differences: Differences, iterations: int, seed: int, quiet: bool) -> GraspNet:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         net = GraspNet()
@@ -254,26 +248,22 @@ def _report(
 ) -> GateReport:
     accepted = logits >= 0
     held = np.array([attempt.held for attempt in validation])
-    correct = _group_flags([attempt.grasp.object_id for attempt in validation], accepted == held)
+    by_object: dict[str, list[bool]] = defaultdict(list)
+    by_outcome: dict[str, list[bool]] = defaultdict(list)
+    for attempt, is_accepted, is_correct in zip(
+        validation, accepted.tolist(), (accepted == held).tolist(), strict=True
+    ):
+        by_object[attempt.grasp.object_id].append(is_correct)
+        by_outcome[attempt.outcome].append(is_accepted)
     return GateReport(
         path=str(out),
         frame=frame,
         train_grasps=len(train),
         train_held=sum(attempt.held for attempt in train),
         validation_grasps=len(validation),
-        validation_objects=len(correct),
+        validation_objects=len(by_object),
         accuracy=float((accepted == held).mean()),
-        interval=grouped_interval(list(correct.values())),
+        interval=grouped_interval([by_object[name] for name in sorted(by_object)]),
         chance=float(max(held.mean(), 1 - held.mean())),
-        accepted={
-            name: (sum(part), len(part))
-            for name, part in _group_flags([attempt.outcome for attempt in validation], accepted).items()
-        },
+        accepted={name: (sum(part), len(part)) for name, part in sorted(by_outcome.items())},
     )
-
-
-def _group_flags(names: Sequence[str], flags: NDArray[np.bool_]) -> dict[str, list[bool]]:
-    groups: dict[str, list[bool]] = defaultdict(list)
-    for name, flag in zip(names, flags.tolist(), strict=True):
-        groups[name].append(flag)
-    return dict(sorted(groups.items()))
