@@ -7,7 +7,7 @@ from retrieval.errors import BadInput
 from retrieval.methods.method import Array, Method
 from retrieval.training.calibration.posterior import fit_posterior
 from retrieval.training.cca import cosine, unit_rows
-from retrieval.training.cca_towers import fit_projections, select_settings, touch_rows, tower_widths
+from retrieval.training.cca_towers import fit_projections, select_settings, tower_widths
 from retrieval.training.selection import held_out_folds
 
 if TYPE_CHECKING:
@@ -31,8 +31,7 @@ class CcaTowers(Method):
         choice = select_settings(known, blocks, folds)
         self.best_params = {**choice.settings._asdict(), "validation_auc": choice.auc}
         if not self.settings.fit_on_validation:
-            fits = fit_projections(touch_rows(train), train.photo, train.owner, blocks, [choice.settings])
-            self._projections = dict(fits)[choice.settings]
+            self._projections = fit_projections(train, blocks, [choice.settings])[choice.settings]
             return
         self._projections = choice.projections
         with suppress(BadInput):  # too few held-out objects, or one photo of each

@@ -150,53 +150,52 @@ class CcaProjections(NamedTuple):
 
 
 def fit_projections(
-    touch: Rows, photo: Rows, owner: Numbers, blocks: TowerWidths, settings: Sequence[CcaSettings] = GRID
-) -> Iterator[tuple[CcaSettings, CcaProjections]]:
-    """Yield the projections of each of the settings.
-
-    Args:
-        touch: (n, F) touch features of grasps.
-        photo: (n, F') photo features.
-        owner: (n,) objects, from 0.
-        blocks: Feature widths of the concatenated towers, of touches and of photos.
-        settings: The settings to fit.
-    """
-    limit = max(one.directions for one in settings)
-    touch_view = ReducedFeatures.of(touch, blocks.touch, limit, towers=blocks.touch_towers)
-    photo_view = ReducedFeatures.of(photo, blocks.photo, limit)
-    for one, projections in _fit(touch_view, photo_view, np.arange(len(owner)), owner, settings):
-        yield one, _of_features(touch_view, photo_view, one, projections)
+    features: Features, widths: TowerWidths, settings: Sequence[CcaSettings] = GRID
+) -> dict[CcaSettings, CcaProjections]:
+    """Return the projections of grasps for each of the settings; `widths` are those of their towers."""
+    reduced, every = _Reduced.of(features, widths, settings), np.arange(len(features))
+    return {one: reduced.of_features(one, projections) for one, projections in reduced.fit(every, settings)}
 
 
-def _of_features(
-    touch: ReducedFeatures, photo: ReducedFeatures, settings: CcaSettings, projections: CcaProjections
-) -> CcaProjections:
-    """Return the projections of features, given those of reduced items."""
-    touch_map = touch.map(settings.directions, last_tower=settings.last_tower)
-    return CcaProjections(
-        touch_map.compose(projections.touch), photo.map(settings.directions).compose(projections.photo)
-    )
+@dataclass(frozen=True, eq=False)
+class _Reduced:
+    """Grasps in the widest directions of each tower's features, and their objects (n,)."""
 
+    touch: ReducedFeatures
+    photo: ReducedFeatures
+    owner: Numbers
 
-def _fit(
-    touch: ReducedFeatures, photo: ReducedFeatures, rows: Numbers, owner: Numbers, settings: Sequence[CcaSettings]
-) -> Iterator[tuple[CcaSettings, CcaProjections]]:
-    """Yield the projections of reduced items, fitted on the given rows."""
-    for (directions, last_tower), some in groupby(sorted(settings, key=_reduction), _reduction):
-        items = [touch.items(directions, last_tower=last_tower)[rows], photo.items(directions)[rows]]
-        means = [part.mean(0) for part in items]
-        touch_view, photo_view = (_centred_view(part - mean) for part, mean in zip(items, means, strict=True))
-        for (ridge, photo_ridge), alike in groupby(sorted(some), lambda one: one[:2]):
-            found = canonical_correlations(touch_view, photo_view, owner[rows], ridge, photo_ridge)
-            for one in alike:
-                weights = found.correlations[:COMPONENTS] ** one.power
-                variates = (each[:, :COMPONENTS] * weights for each in (found.touch_weights, found.photo_weights))
-                yield (
-                    one,
-                    CcaProjections(
-                        *(AffineMap(each, -mean @ each) for each, mean in zip(variates, means, strict=True))
-                    ),
-                )
+    @classmethod
+    def of(cls, features: Features, widths: TowerWidths, settings: Sequence[CcaSettings]) -> Self:
+        limit = max(one.directions for one in settings)
+        touch = ReducedFeatures.of(touch_rows(features), widths.touch, limit, towers=widths.touch_towers)
+        return cls(touch, ReducedFeatures.of(features.photo, widths.photo, limit), features.owner)
+
+    def items(self, settings: CcaSettings) -> tuple[Matrix, Matrix]:
+        """Return the reduced touches (n, k) and photos (n, k')."""
+        touch = self.touch.items(settings.directions, last_tower=settings.last_tower)
+        return touch, self.photo.items(settings.directions)
+
+    def fit(self, rows: Numbers, settings: Sequence[CcaSettings]) -> Iterator[tuple[CcaSettings, CcaProjections]]:
+        """Yield the projections of reduced items, fitted on the given rows, for each of the settings."""
+        for _, some in groupby(sorted(settings, key=_reduction), _reduction):
+            alike = sorted(some)
+            items = [part[rows] for part in self.items(alike[0])]
+            means = [part.mean(0) for part in items]
+            touch, photo = (_centred_view(part - mean) for part, mean in zip(items, means, strict=True))
+            for (ridge, photo_ridge), powers in groupby(alike, lambda one: one[:2]):
+                found = canonical_correlations(touch, photo, self.owner[rows], ridge, photo_ridge)
+                for one in powers:
+                    weights = found.correlations[:COMPONENTS] ** one.power
+                    variates = (each[:, :COMPONENTS] * weights for each in (found.touch_weights, found.photo_weights))
+                    maps = (AffineMap(each, -mean @ each) for each, mean in zip(variates, means, strict=True))
+                    yield one, CcaProjections(*maps)
+
+    def of_features(self, settings: CcaSettings, projections: CcaProjections) -> CcaProjections:
+        """Return the projections of features, given those of reduced items."""
+        touch = self.touch.map(settings.directions, last_tower=settings.last_tower)
+        photo = self.photo.map(settings.directions)
+        return CcaProjections(touch.compose(projections.touch), photo.compose(projections.photo))
 
 
 def _reduction(settings: CcaSettings) -> tuple[int, bool]:
@@ -229,7 +228,7 @@ class CcaSelection:
 
 def select_settings(
     features: Features,
-    blocks: TowerWidths,
+    widths: TowerWidths,
     folds: Sequence[Sequence[str]],
     settings: Sequence[CcaSettings] | None = None,
 ) -> CcaSelection:
@@ -239,19 +238,14 @@ def select_settings(
 
     Args:
         features: Features of grasps.
-        blocks: Feature widths of the concatenated towers, of touches and of photos.
+        widths: Feature widths of the concatenated towers.
         folds: Objects of `features` that are held out together; the fit uses the others.
         settings: The settings to choose from. Default: `GRID`, and with several touch towers the same for the last one.
     """
     if settings is None:
-        settings = GRID if blocks.touch_towers == 1 else (*GRID, *(one._replace(last_tower=True) for one in GRID))
-    limit = max(one.directions for one in settings)
-    touch_view = ReducedFeatures.of(touch_rows(features), blocks.touch, limit, towers=blocks.touch_towers)
-    photo_view = ReducedFeatures.of(features.photo, blocks.photo, limit)
-    items = {
-        one: (touch_view.items(one[0], last_tower=one[1]), photo_view.items(one[0]))
-        for one in set(map(_reduction, settings))
-    }
+        settings = GRID if widths.touch_towers == 1 else (*GRID, *(one._replace(last_tower=True) for one in GRID))
+    reduced = _Reduced.of(features, widths, settings)
+    items = {_reduction(one): reduced.items(one) for one in settings}
     found: dict[CcaSettings, list[tuple[float, CcaProjections]]] = {one: [] for one in settings}
     rows_of = [np.flatnonzero(np.isin(features.object_ids, fold)) for fold in folds]
     for rows in rows_of:
@@ -259,18 +253,18 @@ def select_settings(
         some = validation_rows(held_out, MAX_CHOICE_TOUCHES)
         owner, places = held_out.select(some).owner, rows[some]
         others = np.setdiff1d(np.arange(len(features)), rows)
-        for one, projections in _fit(touch_view, photo_view, others, features.owner, settings):
+        for one, projections in reduced.fit(others, settings):
             touch, photo = items[_reduction(one)]
             found[one].append((ranking_auc(projections.cosines(touch[places], photo[places]), owner), projections))
     aucs = {one: float(np.mean([auc for auc, _ in each])) for one, each in found.items()}
     best = max(aucs, key=lambda one: (aucs[one], one))
+    touch, photo = items[_reduction(best)]
     parts = [
-        held_out_touches(features.select(rows), projections, *(part[rows] for part in items[_reduction(best)]))
+        held_out_touches(features.select(rows), projections, touch[rows], photo[rows])
         for rows, (_, projections) in zip(rows_of, found[best], strict=True)
     ]
-    every = np.arange(len(features))
-    projections = dict(_fit(touch_view, photo_view, every, features.owner, [best]))[best]
-    return CcaSelection(best, aucs[best], _of_features(touch_view, photo_view, best, projections), parts)
+    projections = dict(reduced.fit(np.arange(len(features)), [best]))[best]
+    return CcaSelection(best, aucs[best], reduced.of_features(best, projections), parts)
 
 
 def held_out_touches(

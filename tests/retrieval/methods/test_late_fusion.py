@@ -139,7 +139,7 @@ def test_a_method_from_a_checkpoint_needs_no_fit_and_scores_the_same(method, fit
     np.testing.assert_array_equal(
         loaded.score(*encodings(loaded, parts[2])), expected.score(*encodings(expected, parts[2]))
     )
-    with pytest.raises(BadInput, match="as in the fit"):
+    with pytest.raises(BadInput, match="touch features must be an array of shape"):
         loaded.encode_touch(parts[2].touch[:, :1])
 
 

@@ -223,9 +223,7 @@ def test_concatenated_towers_are_also_fitted_on_validation_objects_after_the_set
     blocks = tower_widths(CONFIG, TRAIN)
     assert blocks == ([FEATURES, FEATURES], [FEATURES], 1)
     best_params = settings_of(method)
-    projections = dict(
-        fit_projections(both.touch.reshape(len(both), -1), both.photo, both.owner, blocks, [best_params])
-    )
+    projections = fit_projections(both, blocks, [best_params])
     expected = projections[best_params].cosines(TEST.touch.reshape(len(TEST), -1), TEST.photo)
     np.testing.assert_array_equal(method.score(*encodings(method)), expected)
 

@@ -45,6 +45,11 @@ def correlated_features(objects=30, grasps=6, seed=0):
     return touch.astype(np.float32), photo[:, :10].astype(np.float32), owner
 
 
+def as_features(touch, photo, owner):
+    names = tuple(f"object-{number:02}" for number in owner)
+    return Features(tuple(map(str, range(len(names)))), names, touch[:, None], photo)
+
+
 def top1_accuracy(projections, touch, photo, owner):
     best = owner[projections.cosines(touch, photo).argmax(1)]
     return float((best == owner).mean())
@@ -53,11 +58,13 @@ def top1_accuracy(projections, touch, photo, owner):
 def test_codes_distinguish_unseen_objects():
     touch, photo, owner = correlated_features()
     other = correlated_features(seed=1)
-    projections = dict(fit_projections(touch, photo, owner, TowerWidths([12], [10])))
+    projections = fit_projections(as_features(touch, photo, owner), TowerWidths([12], [10]))
     assert set(projections) == set(GRID)
     assert all(top1_accuracy(found, *other) > 0.9 for found in projections.values())  # chance 1 / 30
     permuted = np.random.default_rng(2).permutation(30)[owner]  # photos of other objects
-    control = dict(fit_projections(touch, photo[np.argsort(permuted, kind="stable")], owner, TowerWidths([12], [10])))
+    control = fit_projections(
+        as_features(touch, photo[np.argsort(permuted, kind="stable")], owner), TowerWidths([12], [10])
+    )
     assert all(top1_accuracy(found, *other) < 0.2 for found in control.values())
 
 
@@ -65,7 +72,7 @@ def test_combined_towers_have_equal_weight_at_any_scale():
     touch, photo, owner = correlated_features()
     scaled = touch * np.where(np.arange(12) < 4, 1000, 1).astype(np.float32)
     plain, rescaled = (
-        dict(fit_projections(x, photo, owner, TowerWidths([4, 8], [10])))[CcaSettings()] for x in (touch, scaled)
+        fit_projections(as_features(x, photo, owner), TowerWidths([4, 8], [10]))[CcaSettings()] for x in (touch, scaled)
     )
     assert np.allclose(plain.cosines(touch, photo), rescaled.cosines(scaled, photo), atol=1e-4)
 
@@ -97,8 +104,8 @@ def with_noise(features, names, seed):
 
 def test_a_held_out_fold_affects_neither_settings_nor_fit(monkeypatch):
     touch, photo, owner = correlated_features(objects=24)
-    names = tuple(f"object-{number:02}" for number in owner)
-    features = Features(tuple(map(str, range(len(names)))), names, touch[:, None], photo)
+    features = as_features(touch, photo, owner)
+    names = features.object_ids
     data = SimpleNamespace(grasps=[], kind_of={}, widths=TowerWidths([12], [10]), config=load_config("adapt"))
     drawn = [names[start : start + 8 * 6 : 6] for start in range(0, len(names), 8 * 6)]
     calls = []
@@ -123,14 +130,14 @@ def test_a_held_out_fold_affects_neither_settings_nor_fit(monkeypatch):
 def test_a_setting_that_is_best_only_on_the_held_out_fold_is_not_selected(monkeypatch):
     """Planted: one setting is perfect on the objects of one fold and useless on all others."""
     touch, photo, owner = correlated_features(objects=24)
-    names = tuple(f"object-{number:02}" for number in owner)
-    features = Features(tuple(map(str, range(len(names)))), names, touch[:, None], photo)
+    features = as_features(touch, photo, owner)
+    names = features.object_ids
     data = SimpleNamespace(grasps=[], kind_of={}, widths=TowerWidths([12], [10]), config=load_config("adapt"))
     drawn = [names[start : start + 8 * 6 : 6] for start in range(0, len(names), 8 * 6)]
     planted, plain = GRID[0], GRID[-1]
     current = []
-    fit = cca_towers._fit
-    monkeypatch.setattr(cca_towers, "_fit", lambda *args: (current.append(one[0]) or one for one in fit(*args)))
+    fit = cca_towers._Reduced.fit
+    monkeypatch.setattr(cca_towers._Reduced, "fit", lambda *args: (current.append(one[0]) or one for one in fit(*args)))
     held_out = []
     monkeypatch.setattr(
         cca_towers,
@@ -215,9 +222,8 @@ def test_the_adapted_checkpoint_is_an_ordinary_checkpoint(recording, model, cata
 def test_thresholds_of_verifications_come_from_objects_outside_the_fit():
     """A fit separates its own objects too well, so thresholds from them would accept other objects too often."""
     touch, photo, owner = correlated_features(objects=60)
-    names = tuple(f"object-{name:02d}" for name in owner)
-    ids = tuple(str(row) for row in range(len(owner)))
-    features, objects = Features(ids, names, touch[:, None], photo), sorted(set(names))
+    features = as_features(touch, photo, owner)
+    objects = sorted(set(features.object_ids))
     choice = select_settings(features, TowerWidths((12,), (10,)), [objects[::2], objects[1::2]])
     posterior = fit_posterior(*choice.held_out_touches)
     found = fit_verification(choice.held_out_touches, posterior)
