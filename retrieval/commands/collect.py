@@ -106,7 +106,7 @@ def _load_gate(path: Path | None) -> tuple[Any, str | None]:
     if path is None:
         return None, None
     from _touch_retrieval.files import file_digest
-    from retrieval.training.grasp_success import load_gate
+    from retrieval.training.gate import load_gate
 
     gate = load_gate(path)
     return gate, f"learned, sha256 {file_digest(path)}"

@@ -43,7 +43,6 @@ from retrieval.model.checkpoint import require_writable, write_tensors
 from retrieval.model.encode import batches, one_thread, touch_batch
 from retrieval.model.losses.loss import match_loss
 from retrieval.training.gate import TASK, GateSettings, GraspNet, GraspSuccessGate
-from retrieval.training.gate import load_gate as load_gate
 from retrieval.training.loop import Plan, train_loop
 
 BATCH = 32

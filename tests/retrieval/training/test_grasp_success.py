@@ -14,8 +14,8 @@ from retrieval.data.dataset import load_attempts, load_grasps
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import BadInput, CheckpointError, ConfigError, DatasetError, NumericalError
 from retrieval.model.checkpoint import load_checkpoint, read_tensors, write_tensors
-from retrieval.training.gate import GateSettings, GraspNet, GraspSuccessGate
-from retrieval.training.grasp_success import BATCH, augment, draw_batch, gate_loss, load_gate, train_gate
+from retrieval.training.gate import GateSettings, GraspNet, GraspSuccessGate, load_gate
+from retrieval.training.grasp_success import BATCH, augment, draw_batch, gate_loss, train_gate
 from robot.recording.folder import RecordingWriter
 
 OBJECTS = tuple("abcdefgh")
