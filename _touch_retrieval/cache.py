@@ -11,7 +11,7 @@ import hashlib
 import json
 import sqlite3
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -79,14 +79,19 @@ class Cache:
         self._connection.close()
 
     def get(self, key: str) -> bytes | None:
-        """Return an entry; None if it is missing or damaged. A damaged one is deleted."""
+        """Return an entry; None if it is missing or damaged."""
+        return self.get_all([key]).get(key)
+
+    def get_all(self, keys: Sequence[str]) -> dict[str, bytes]:
+        """Return those of some entries that are neither missing nor damaged. Damaged ones are deleted."""
+        select = "SELECT key, content, checksum FROM entries WHERE key IN (SELECT value FROM json_each(?))"
         with self._disk_errors():
-            row = self._connection.execute("SELECT content, checksum FROM entries WHERE key = ?", (key,)).fetchone()
-            if row is None or _checksum(key, row[0]) == row[1]:
-                return row and bytes(row[0])
-            with self._connection:
-                self._connection.execute("DELETE FROM entries WHERE key = ?", (key,))
-        return None
+            rows = self._connection.execute(select, (json.dumps(keys),)).fetchall()
+            damaged = [(key,) for key, content, checksum in rows if _checksum(key, content) != checksum]
+            if damaged:
+                with self._connection:
+                    self._connection.executemany("DELETE FROM entries WHERE key = ?", damaged)
+        return {key: content for key, content, _ in rows if (key,) not in damaged}
 
     def add(self, entries: Mapping[str, bytes]) -> None:
         """Store entries by key in one commit."""

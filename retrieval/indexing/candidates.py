@@ -29,8 +29,9 @@ EXHAUSTIVE_LIMIT = 500
 """Up to this number of photos, all are scored and nothing is measured."""
 TIMED_QUERIES = 15
 MIN_QUERIES = 50
-MEASUREMENT_FLOPS = 3e12
-"""Floating-point operations for exhaustive search: enough for 228 touches over 100,000 photos with `hidden` = 256."""
+MEASUREMENT_FLOPS = 1e12
+"""Floating-point operations for exhaustive search: one or two minutes of one core, 76 touches over 100,000 photos with
+`hidden` = 256."""
 MAX_CHANGED_FRACTION = 0.10
 """Fraction of a catalogue that may change before the number of candidates is measured again."""
 

@@ -291,10 +291,10 @@ def find_codes(
 
 def read_codes(cache: Cache, encoder: Encoder, keys: Sequence[str]) -> NDArray[Any]:
     """Return codes (n,) from the cache. Raises WriteFailed if one was damaged since it was stored."""
-    codes = [cache.get(key) for key in keys]
-    if None in codes:
+    codes = cache.get_all(keys)
+    if not codes.keys() >= set(keys):
         raise WriteFailed(f"{cache.path}: a code was damaged and is deleted; build again")
-    return np.frombuffer(b"".join(code for code in codes if code), encoder.layout)
+    return np.frombuffer(b"".join(codes[key] for key in keys), encoder.layout)
 
 
 def code_blocks(cache: Cache, encoder: Encoder, keys: Sequence[str]) -> Iterator[dict[str, NDArray[Any]]]:

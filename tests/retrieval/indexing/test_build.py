@@ -5,6 +5,7 @@ import os
 import random
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
@@ -14,14 +15,14 @@ import pytest
 import torch
 
 from _touch_retrieval.cache import Cache
-from indexes.errors import LockedIndex, ParameterError, VectorError
+from indexes.errors import LockedIndex, ParameterError, VectorError, WriteFailed
 from indexes.store.folder import IndexStore
 from retrieval.commands.main import main
 from retrieval.data import preprocessing
 from retrieval.data.catalogue import Catalogue, list_catalogue
 from retrieval.errors import DatasetError, NumericalError
 from retrieval.indexing import codes
-from retrieval.indexing.build import build_index
+from retrieval.indexing.build import CACHE, build_index
 from retrieval.indexing.codes import map_ahead
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
 from retrieval.model.encode import encode_photos
@@ -261,6 +262,16 @@ def test_without_the_cache_everything_is_read_and_embedded_again(catalogue_copy,
     read.clear()
     report = build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert (len(read), report.embedded, report.written) == (24, 24, False)
+
+
+def test_a_damaged_code_fails_the_build_and_the_next_one_makes_it_again(catalogue_copy, checkpoint, index):
+    build_index(catalogue_copy, checkpoint, index, quiet=True)
+    with sqlite3.connect(index / CACHE) as connection:
+        connection.execute("UPDATE entries SET checksum = checksum + 1 WHERE key NOT LIKE 'files/%'")
+    with pytest.raises(WriteFailed, match="build again"):
+        build_index(catalogue_copy, checkpoint, index, kind="HNSW8", quiet=True)
+    assert IndexStore(index).current() == "gen-000001"
+    assert build_index(catalogue_copy, checkpoint, index, kind="HNSW8", quiet=True).embedded == 24
 
 
 # Interrupted builds --------------------------------------------------------------------------------------------------
