@@ -34,7 +34,7 @@ class LateFusion(Method):
         method = cls(settings)
         method._use_checkpoint(checkpoint)
         if checkpoint.posterior is not None:  # the logit at which the likelihood ratio is 1
-            method.best_params["pair_threshold"] = float(checkpoint.posterior.logit_of(np.zeros(1), 1)[0])
+            method.best_params["pair_threshold"] = checkpoint.posterior.threshold
         fingers, touch, photo = _feature_counts(checkpoint.matcher)
         method._shapes = (fingers, touch), (photo,)
         return method

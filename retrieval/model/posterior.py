@@ -22,6 +22,9 @@ Objects that were not scored keep their part of the probability, estimated from 
 P(o | present) is the probability of o given that the catalogue has the object. p and offset cancel out. It is computed
 from the logits, never as P(o) / (1 - P(none)): that quotient is 0 / 0 if P(none) rounds to 1.
 
+A single pair of a touch and a photo is classified as a match above the logit with w * l + offset = 0
+(`Posterior.threshold`), the threshold of pair accuracy.
+
 A query passes through four files. `fusion_scorer.py` sums the match logits z of a photo over the grasps.
 `search/objects.py` computes l(o) of each object; reference touches change it (`references.py`).
 `search/shard.py` chooses the photos to score and samples the others. `EvidenceMass.merged` below sums the shards.
@@ -130,6 +133,11 @@ class Posterior:
     def logit_of(self, log_ratio: Floats, grasps: int) -> Floats:
         """Inverse of `log_ratio`."""
         return np.asarray((log_ratio - self.offset) / self.weight(grasps))
+
+    @property
+    def threshold(self) -> float:
+        """The match logit of one touch and one photo at which both hypotheses are equally likely."""
+        return -self.offset / self.slope
 
     def object_logits(self, logits: ArrayLike, owner: Numbers, counts: Numbers, grasps: int = 1) -> Floats:
         """Return the logit (J,) of each object from the summed match logits (N,) of its scored photos.

@@ -28,11 +28,9 @@ class GelImage:
 
     Attributes:
         touch: (px, px, 3) float32 RGB in 0..1 for a model whose `touch_px` is px.
-        file_bytes: Size of its file, for answers.
     """
 
     touch: RgbImage
-    file_bytes: int
 
 
 AnyImage: TypeAlias = str | os.PathLike[str] | bytes | bytearray | memoryview | Image.Image | NDArray[Any] | GelImage
@@ -120,7 +118,7 @@ def parse_grasps(touches: AnyTouches, fingers: int, *, noun: str = "touch", of: 
     if not grasps:
         raise BadInput(f"{of}give at least one {noun}: {_NESTING_HINT}")
     named = [
-        [InputImage(image, _name(image, f"{of}grasp {g}, finger", f)) for f, image in enumerate(grasp)]
+        [InputImage(image, _name(image, f"{of}grasp {g}", finger)) for finger, image in enumerate(grasp)]
         for g, grasp in enumerate(grasps, start=1)
     ]
     for grasp in named:
@@ -145,14 +143,7 @@ def _items(value: object, of: str) -> list[Any]:
     raise BadInput(f"{of}an image must be {_IMAGE_TYPES}, got {type(value).__name__}; {_NESTING_HINT}")
 
 
-def _name(image: AnyImage, place: str, finger: int) -> str:
+def _name(image: AnyImage, grasp: str, finger: int) -> str:
     if isinstance(image, str | os.PathLike):
         return os.fspath(image)
-    if isinstance(image, np.ndarray):
-        kind = f"array {' x '.join(map(str, image.shape))} {image.dtype}"
-    elif isinstance(image, Image.Image):
-        kind = f"Pillow image {image.width} x {image.height} {image.mode}"
-    else:
-        kind = f"{image.file_bytes if isinstance(image, GelImage) else len(bytes(image))} bytes"
-    letter = ascii_lowercase[finger] if finger < len(ascii_lowercase) else str(finger + 1)
-    return f"{place} {letter} ({kind})"
+    return f"{grasp}, finger {ascii_lowercase[finger : finger + 1] or finger + 1}"

@@ -224,8 +224,8 @@ def image_of(document: dict[str, Any], content: bytes) -> GelImage | PictureSize
             return PictureSize(*size)
         case {"error": str(reason), "name": str(name)}:
             raise ImageError(name, reason)
-        case {"px": int(px), "file_bytes": int(file_bytes)}:
-            return GelImage(np.frombuffer(content, np.float32).reshape(px, px, 3), file_bytes)
+        case {"px": int(px)}:
+            return GelImage(np.frombuffer(content, np.float32).reshape(px, px, 3))
         case _:
             raise MemoryError
 
@@ -240,7 +240,7 @@ def read_gel_image(data: bytes, name: str, px: int, max_pixels: int) -> GelImage
     if size.pixels > max_pixels:
         return size
     check_pixels(size, name)
-    return GelImage(resize_unchecked(decode(data, name), (px, px)), len(data))
+    return GelImage(resize_unchecked(decode(data, name), (px, px)))
 
 
 def _answer(requests: BinaryIO, text: int, content: int) -> bytes:
@@ -259,7 +259,7 @@ def _answer(requests: BinaryIO, text: int, content: int) -> bytes:
         return frame({"memory": DECODE_BYTES})
     if isinstance(found, PictureSize):
         return frame({"size": found})
-    return frame({"px": len(found.touch), "file_bytes": found.file_bytes}, found.touch.tobytes())
+    return frame({"px": len(found.touch)}, found.touch.tobytes())
 
 
 def _one_thread() -> None:

@@ -58,9 +58,7 @@ class ProblemDocument(BaseModel):
     type: str = Field(examples=[PREFIX + "bad-image"])
     title: str = Field(examples=["An image cannot be read"])
     status: int = Field(examples=[422])
-    detail: str = Field(
-        examples=["grasp 1, finger a (12 bytes): not a PNG, JPEG, BMP, TIFF, WebP, AVIF or HEIC picture"]
-    )
+    detail: str = Field(examples=["grasp 1, finger a: not a PNG, JPEG, BMP, TIFF, WebP, AVIF or HEIC picture"])
 
 
 class HttpProblem(HTTPException):

@@ -85,7 +85,7 @@ def test_the_bad_one_of_several_objects_is_reported_before_reading(searcher, gra
     with pytest.raises(BadInput, match=r"object 2, this model takes 2 gel image\(s\) for one touch; got 1"):
         searcher.query_many([["absent.png", "absent.png"], grasps[0][0][:1]])
     broken = [array(path) for path in grasps[0][0]]
-    with pytest.raises(ImageError, match=r"object 2, grasp 1, finger b \("):
+    with pytest.raises(ImageError, match=r"object 2, grasp 1, finger b: "):
         searcher.query_many([grasps[0], [broken[0], broken[1][..., 0]]])
 
 
