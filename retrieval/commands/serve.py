@@ -86,7 +86,7 @@ def serve(
     except ImportError as error:
         raise BadInput(f"{error.name} is missing; run: pip install 'touch-retrieval[serve]'") from error
     from retrieval.search.opening import find_index
-    from retrieval.serve.rig import load_live_rig, simulated_live_rig
+    from retrieval.serve.rig import load_live_rig
 
     if no_history:
         refuse_options("contradicts --no-history; give one of them", history=history)
@@ -110,9 +110,7 @@ def serve(
     with ExitStack() as stack:
         writer = _feedback_writer(settings.history, path, stack) if settings.history else None
         open_shards = _ray_shards(path, stack, cluster_options) if cluster else None
-        app = create_app(
-            settings, load_live_rig(rig, path) if rig else simulated_live_rig(path), writer, trials, open_shards
-        )
+        app = create_app(settings, load_live_rig(rig, path), writer, trials, open_shards)
 
         def on_start(bound_port: int) -> None:
             say(f"listening on http://{f'[{host}]' if ':' in host else host}:{bound_port}")

@@ -74,7 +74,8 @@ def _run(parts: Service, name: str) -> TrialRun:
     return found
 
 
-def _trial(parts: Service, run: TrialRun, number: int) -> Trial:
+def _trial(parts: Service, name: str, number: int) -> Trial:
+    run = _run(parts, name)
     if number > run.count:
         raise HttpProblem("unknown", f"This series has {run.count} trials, got number {number}.")
     return _require_trials(parts)[0].trial(parts.generations.current, run.seed, number)
@@ -112,8 +113,7 @@ def get_run(name: str, parts: Parts) -> dict[str, Any]:
 @router.get("/v1/trials/{name}/{number}")
 def trial(name: str, number: Number, parts: Parts) -> dict[str, Any]:
     """Return a trial. choice, truth, model: photo numbers counted from 1, null until the trial is done."""
-    run = _run(parts, name)
-    sampled_trial = _trial(parts, run, number)
+    sampled_trial = _trial(parts, name, number)
     done = next((one for one in _require_trials(parts)[1].choices(name) if one.number == number), None)
     where = f"/v1/trials/{name}/{number}"
     return {
@@ -130,7 +130,7 @@ def trial(name: str, number: Number, parts: Parts) -> dict[str, Any]:
 async def choose(body: ChoiceBody, request: Request, name: str, number: Number, parts: Parts) -> dict[str, Any]:
     """Store the choice of a trial, once; the response contains the right photo and the model's choice."""
     known, store = _require_trials(parts)
-    sampled_trial = await run_in_threadpool(lambda: _trial(parts, _run(parts, name), number))
+    sampled_trial = await run_in_threadpool(lambda: _trial(parts, name, number))
     model = await parts.queue.submit(lambda generation: known.model_choice(generation, sampled_trial), request)
     choice = TrialChoice(number, body.choice, sampled_trial.truth, model)
     if not await run_in_threadpool(store.choose, name, choice):
@@ -141,7 +141,7 @@ async def choose(body: ChoiceBody, request: Request, name: str, number: Number, 
 @router.get("/v1/trials/{name}/{number}/touches/{finger}", response_class=Response, responses=IMAGE_RESPONSES)
 def touch(name: str, number: Number, finger: str, parts: Parts) -> Response:
     """Return a gel image of the trial's grasp."""
-    files = _trial(parts, _run(parts, name), number).grasp.touches
+    files = _trial(parts, name, number).grasp.touches
     place = ascii_lowercase.find(finger) if len(finger) == 1 else -1
     if not 0 <= place < len(files):
         raise HttpProblem("unknown", f"The grasp has no finger {finger[:10]!r}.")
@@ -151,4 +151,4 @@ def touch(name: str, number: Number, finger: str, parts: Parts) -> Response:
 @router.get("/v1/trials/{name}/{number}/photos/{place}", response_class=Response, responses=IMAGE_RESPONSES)
 def photo(name: str, number: Number, place: Annotated[int, InPath(ge=1, le=CHOICES)], parts: Parts) -> Response:
     """Return one of the trial's photos, counted from 1."""
-    return image_response(read_bytes(_trial(parts, _run(parts, name), number).photos[place - 1]))
+    return image_response(read_bytes(_trial(parts, name, number).photos[place - 1]))

@@ -5,7 +5,6 @@ Of a real rig, only sensor pictures are available: no HTTP request moves it.
 
 import random
 import re
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from threading import Lock
@@ -34,19 +33,29 @@ _FIRST_UNRECORDED_ATTEMPT = 10_000
 _MAX_ATTEMPTS = 20
 
 
-def load_live_rig(spec: str, index: str | Path) -> LiveRig:
+def load_live_rig(spec: str | None, index: str | Path) -> LiveRig | None:
     """Return the sensors of a rig, and connect them.
 
     Args:
-        spec: Name or file of the rig, as for `--rig`.
+        spec: Name or file of the rig, as for `--rig`; None for the simulated rig if the index contains its objects and
+            the extra `sim` is installed, else no rig.
         index: Index folder; the simulated rig takes its seed from it.
 
     Raises:
         RobotError: The rig cannot be loaded or connected.
     """
-    rig = load_rig(spec, seed=_seed(index) or 0)
+    seed = _seed(index)
+    if spec is None and seed is None:
+        return None
+    try:
+        rig = load_rig(spec or "sim", seed=seed or 0)
+    except RobotConfigError:
+        if spec is None:
+            return None
+        raise
     if rig.info["rig"] == "sim":
-        return _simulated_rig(cast("SimRig", rig))
+        gripper = _SimulatedGripper(cast("SimRig", rig))
+        return LiveRig({finger: partial(gripper.picture, finger) for finger in rig.sensors}, gripper.grasp)
     for sensor in rig.sensors.values():
         sensor.connect()
 
@@ -55,17 +64,6 @@ def load_live_rig(spec: str, index: str | Path) -> LiveRig:
             return encode_image(sensor.read().pixels, ".jpg")
 
     return LiveRig({name: partial(picture, sensor, Lock()) for name, sensor in rig.sensors.items()})
-
-
-def simulated_live_rig(index: str | Path) -> LiveRig | None:
-    """Return the simulated rig if the index contains its objects and the extra `sim` is installed, else None."""
-    seed = _seed(index)
-    if seed is None:
-        return None
-    try:
-        return _simulated_rig(cast("SimRig", load_rig("sim", seed=seed)))
-    except RobotConfigError:
-        return None
 
 
 def _seed(index: str | Path) -> int | None:
@@ -108,9 +106,3 @@ class _SimulatedGripper:
                 self._rig.prepare(self._rig.object_ids(1)[0], 0)
                 self._gels[finger] = self._rig.sim_state.current_scene().image(f"touch_{finger}_before")
             return encode_image(self._gels[finger], ".jpg")
-
-
-def _simulated_rig(rig: "SimRig") -> LiveRig:
-    gripper = _SimulatedGripper(rig)
-    sensors: dict[str, Callable[[], bytes]] = {finger: partial(gripper.picture, finger) for finger in rig.sensors}
-    return LiveRig(sensors, gripper.grasp)

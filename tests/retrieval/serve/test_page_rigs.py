@@ -9,7 +9,7 @@ import pytest
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.indexing.build import build_index
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.serve.rig import load_live_rig, simulated_live_rig
+from retrieval.serve.rig import load_live_rig
 from retrieval.training.train import train
 from robot.sim.rig import SimRig
 from tests.browser import address, page
@@ -48,7 +48,7 @@ def live(opened):
 
 def test_simulated_grasps_include_their_no_contact_frames(browser, index, tmp_path):
     with (
-        with_history(index, tmp_path, rig=simulated_live_rig(index), serve=address) as url,
+        with_history(index, tmp_path, rig=load_live_rig(None, index), serve=address) as url,
         page(browser, url) as opened,
     ):
         assert live(opened).evaluate("one => one.naturalWidth") > 100
