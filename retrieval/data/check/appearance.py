@@ -6,7 +6,6 @@ concerns most touches). Small pictures are (n, 6, 8, 3).
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import combinations
 from string import ascii_lowercase
 
@@ -162,32 +161,16 @@ def check_moments(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Fi
 # Channels and mirrored images --------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class ChangedLayout:
-    """Images that fit the others better after a change.
-
-    Attributes:
-        change: The change, in words: "red and blue exchanged", for example.
-        rows: Rows of these images.
-    """
-
-    change: str
-    rows: Rows
-
-
-def changed_layout(images: SmallImages) -> ChangedLayout | None:
-    """Return the minority of images that have red and blue exchanged, or are mirrored; None if there is none.
+def changed_layout(images: SmallImages) -> tuple[str, Rows] | None:
+    """Return the change in words, and the minority of images that have red and blue exchanged, or are mirrored, if any.
 
     The lamps of a gel give each sensor a layout of colours, which contact changes little. An image minus its changed
     version is the same for all images of a sensor, up to contact; in a changed image it has the other sign, as in
     `swapped_fingers`. Grey or symmetric layouts cannot be checked, and neither can images that are all changed. Of
     several changes the one is returned that brings the minority nearest to the other images. If half of the images are
-    changed, they are the half without the first image.
-
-    Args:
-        images: (n, h, w, 3) of one sensor.
+    changed, they are the half without the first image. All images (n, h, w, 3) are of one sensor.
     """
-    found: dict[float, ChangedLayout] = {}
+    found: dict[float, tuple[str, Rows]] = {}
     for change, index in CHANGES.items() if len(images) >= _MIN_GRASPS else ():
         rows = swapped_fingers(images, images[index])
         if rows is None or not len(rows):
@@ -199,7 +182,7 @@ def changed_layout(images: SmallImages) -> ChangedLayout | None:
         centre = np.median(undone, axis=0)
         ratio = float(np.median(distance(undone[rows], centre) / distance(images[rows], centre)))
         if ratio <= _MAX_RATIO:
-            found[ratio] = ChangedLayout(change, rows)
+            found[ratio] = change, rows
     return found[min(found)] if found else None
 
 
@@ -214,7 +197,8 @@ def check_colour_layout(grasps: Sequence[Grasp], records: ImageRecords) -> Itera
         found = changed_layout(small_images(records, [path for _, _, path in frames]))
         if found is None:
             continue
+        change, rows = found
         for moment in ("touch", "no-contact frame"):
-            names = [frames[row][0].grasp_id for row in found.rows if frames[row][1] == moment]
-            text = f"{moment} of finger {ascii_lowercase[finger]} looks as if it had {found.change}, unlike the others,"
+            names = [frames[row][0].grasp_id for row in rows if frames[row][1] == moment]
+            text = f"{moment} of finger {ascii_lowercase[finger]} looks as if it had {change}, unlike the others,"
             yield from findings_for("warning", COLOUR_LAYOUT, text, names, grasps)

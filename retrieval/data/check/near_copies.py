@@ -21,7 +21,6 @@ every shift (`retrieval.data.check.shift_alignment`).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from hashlib import sha256
 
 import cv2
 import numpy as np
@@ -59,27 +58,21 @@ class Thumbnail:
     """One picture, reduced for the comparison.
 
     Attributes:
-        digest: SHA-256 (hex) of the file's bytes.
         grey: Grey levels (256,).
         distorted: Grey levels of the distorted copies (4, 256), in the order of `DISTORTIONS`.
         fine_grey_levels: Grey levels of the finer comparison.
     """
 
-    digest: str
     grey: Greys
     distorted: Greys
     fine_grey_levels: FineGreys
 
 
-def thumbnail(data: bytes, image: RgbImage) -> Thumbnail:
-    """Return the thumbnail of a picture, from the bytes of its file and the decoded image (H, W, 3)."""
+def thumbnail(image: RgbImage) -> Thumbnail:
+    """Return the thumbnail of a picture (H, W, 3)."""
     picture = np.rint(255 * image).astype(np.uint8)
-    return Thumbnail(
-        sha256(data).hexdigest(),
-        _small(picture),
-        np.stack([_small(distort(picture)) for distort in DISTORTIONS]),
-        fine_grey_levels(picture),
-    )
+    distorted = np.stack([_small(distort(picture)) for distort in DISTORTIONS])
+    return Thumbnail(_small(picture), distorted, fine_grey_levels(picture))
 
 
 def _small(picture: NDArray[np.uint8]) -> Greys:
@@ -140,12 +133,12 @@ def is_copy(one: Thumbnail, other: Thumbnail) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class NearestPictures:
-    """The nearest picture of another object for each of q queries, in arrays (q,).
+    """The nearest picture of another object for each picture, in arrays (n,).
 
     Attributes:
         row: Row of the nearest picture.
         distance: Its distance.
-        checked: Whether a copy of the query can be distinguished from other pictures.
+        checked: Whether a copy of the picture can be distinguished from other pictures.
         copy: Whether the nearest picture is a copy.
     """
 
@@ -175,39 +168,37 @@ class PictureSet:
         self.distortion_limits = SLACK * (1 - np.array(similarity, dtype=np.float64).reshape(-1, len(DISTORTIONS)))
         self._aligned = AlignedSet([one.fine_grey_levels for one in thumbnails])
 
-    def nearest(self, queries: NDArray[np.int64], among: NDArray[np.int64]) -> NearestPictures:
-        """Return the nearest picture in `among` of another object for each of `queries` (rows of this set)."""
-        if not len(queries) or not len(among):
-            nothing = np.zeros(len(queries), dtype=bool)
-            return NearestPictures(np.zeros(len(queries), np.int64), np.full(len(queries), np.inf), nothing, nothing)
-        among = among[np.argsort(self.objects[among], kind="stable")]
-        blocks = [queries[at : at + _BLOCK] for at in range(0, len(queries), _BLOCK)]
+    def nearest(self) -> NearestPictures:
+        """Return the nearest picture of another object for each picture."""
+        rows, among = np.arange(len(self.greys)), np.argsort(self.objects, kind="stable")
+        if not len(rows):
+            nothing = np.zeros(0, bool)
+            return NearestPictures(rows, np.zeros(0), nothing, nothing)
+        blocks = [rows[at : at + _BLOCK] for at in range(0, len(rows), _BLOCK)]
         parts = [self._nearest(block, among) for block in blocks]
         row, distance, third = (np.concatenate(part) for part in zip(*parts, strict=True))
         maximum = _RELATIVE_LIMIT * third
-        checked = self.distortion_limits[queries].max(axis=1) < maximum
+        checked = self.distortion_limits.max(axis=1) < maximum
         # Either picture may be the copy. A picture that was saved as JPEG hardly changes the second time.
-        distortion_limits = np.maximum(self.distortion_limits[queries], self.distortion_limits[row])
+        distortion_limits = np.maximum(self.distortion_limits, self.distortion_limits[row])
         farthest, nearest = distortion_limits.max(axis=1), distortion_limits.min(axis=1)
         limit = np.where(farthest < maximum, farthest, np.minimum(nearest, maximum))
         found = NearestPictures(row, distance, checked, np.asarray(distance <= limit))
-        self._add_shifted_copies(queries, [one for block in blocks for one in self._candidates(block, among)], found)
+        self._add_shifted_copies([one for block in blocks for one in self._candidates(block, among)], found)
         return found
 
-    def _add_shifted_copies(
-        self, queries: NDArray[np.int64], candidates: Sequence[list[int]], found: NearestPictures
-    ) -> None:
-        """Replace results in `found` by candidates that are shifted copies of their query."""
-        for at, (query, others) in enumerate(zip(queries.tolist(), candidates, strict=True)):
+    def _add_shifted_copies(self, candidates: Sequence[list[int]], found: NearestPictures) -> None:
+        """Replace results in `found` by candidates that are shifted copies of their picture."""
+        for at, others in enumerate(candidates):
             if not others or found.copy[at]:
                 continue
-            distances = self._aligned.distances(query, others)
+            distances = self._aligned.distances(at, others)
             objects = self.objects[others]
             by_object = np.sort([distances[objects == one].min() for one in np.unique(objects)])
             third = by_object[_NEIGHBOUR_RANK - 1] if len(by_object) >= _NEIGHBOUR_RANK else 1.0
             maximum = min(MAX_DISTANCE, RELATIVE_LIMIT * third)
             nearest = int(distances.argmin())
-            own, its = (SLACK * self._aligned.half_pixel_distance(one) for one in (query, others[nearest]))
+            own, its = (SLACK * self._aligned.half_pixel_distance(one) for one in (at, others[nearest]))
             found.checked[at] |= max(own, MIN_LIMIT) <= maximum
             if distances[nearest] <= min(max(own, its, MIN_LIMIT), maximum):  # either picture may be the copy
                 found.row[at], found.distance[at], found.copy[at] = others[nearest], distances[nearest], True

@@ -100,7 +100,7 @@ def read_pictures(
             image = decode_rgb(data, path)
         except ImageError as error:
             return error.reason
-        reduced = thumbnail(data, image) if path in copied else None
+        reduced = thumbnail(image) if path in copied else None
         is_flat = bool(np.ptp(image, axis=(0, 1)).max() <= _FLAT)
         return ImageRecord(sha256(data).hexdigest(), is_flat, resize(image, _SMALL), reduced)
 

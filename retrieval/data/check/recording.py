@@ -220,8 +220,7 @@ def _near_copies(grasps: Sequence[Grasp], records: ImageRecords, accepted: Seque
     for kind, every in _by_kind(accepted).items():
         items = list(_by_kind(grasps).get(kind, {}).items())
         pictures = PictureSet(thumbnails(records, [path for path, _ in items]), [one.object_id for _, one in items])
-        rows = np.arange(len(items))
-        found = pictures.nearest(rows, rows)
+        found = pictures.nearest()
         pairs: dict[tuple[int, ...], str] = {}
         for row in np.flatnonzero(found.copy).tolist():
             (path, grasp), (near, other) = items[row], items[found.row[row]]
