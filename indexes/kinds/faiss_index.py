@@ -111,7 +111,8 @@ class FaissIndex(VectorIndex):
                 scores, rows = self._structure.search(queries, k)
         return scores, rows
 
-    def _write(self, path: Path) -> bool:
+    def save(self, path: Path) -> bool:
+        """As `VectorIndex.save`."""
         if self._structure is None:
             return False
         with faiss_call(f"writing {path}", None):

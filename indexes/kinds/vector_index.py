@@ -30,7 +30,7 @@ class VectorIndex(ABC):
     * If k is N or more, all rows are scored exactly.
     * Vectors and queries are checked: finite, of unit norm within 1e-3, with d components.
 
-    A subclass implements `_search`; if it has a structure, also `_build`, `_write` and `_read`.
+    A subclass implements `_search`; if it has a structure, also `_build`, `save` and `_read`.
 
     >>> import numpy as np
     >>> index = indexes.build(np.eye(4, dtype=np.float32))
@@ -132,7 +132,7 @@ class VectorIndex(ABC):
 
     def save(self, path: Path) -> bool:
         """Write the structure to `path` and return True; return False if the vectors are the whole index."""
-        return self._write(path)
+        return False
 
     @abstractmethod
     def _search(self, queries: Floats, k: int) -> tuple[Floats, RowNumbers]:
@@ -140,10 +140,6 @@ class VectorIndex(ABC):
 
     def _build(self) -> None:  # noqa: B027 - nothing to do without a structure
         """Build the structure over `self.vectors`."""
-
-    def _write(self, path: Path) -> bool:
-        """Write the structure and return True; return False without a structure."""
-        return False
 
     def _read(self, path: Path) -> None:  # noqa: B027 - nothing to do without a structure
         """Read the structure and check that it fits `self.vectors`."""

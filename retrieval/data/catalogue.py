@@ -8,11 +8,10 @@
                                     value of a key takes precedence over its object's
 
 Names that start with a dot are skipped. A photo's path in the catalogue, with forward slashes, is its stable id.
-Listing opens no photo. `read_photo` reads one photo, and one broken file never stops the rest.
+Listing opens no photo.
 """
 
-import hashlib
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -20,11 +19,10 @@ from typing import Any
 from _touch_retrieval.files import parse_json, read_regular
 from retrieval.data.catalogue_touches import CatalogueTouch, group_touches, touch_name
 from retrieval.data.folder_walk import SkippedPhoto, list_files
-from retrieval.data.images import EXTENSIONS, decode_rgb, read_bytes
+from retrieval.data.images import EXTENSIONS, read_bytes
 from retrieval.data.naming import STEM, Naming
-from retrieval.data.resize import RgbImage
 from retrieval.data.text import require_utf8
-from retrieval.errors import BadInput, DatasetError, ImageError
+from retrieval.errors import BadInput, DatasetError
 
 METADATA_FILE = "metadata.jsonl"
 UNSUPPORTED_EXTENSIONS = frozenset(
@@ -105,15 +103,6 @@ def require_separate_folders(catalogue: str | Path, index: str | Path) -> None:
     has_photos = root in target.parents and any(path.suffix.lower() in EXTENSIONS for path in target.rglob("*"))
     if target == root or has_photos:
         raise BadInput(f"the index would be written among the photos in {index}; name another folder with --out")
-
-
-@dataclass(frozen=True)
-class PhotoBytes:
-    """The bytes of a photo's file, and their SHA-256 (hex)."""
-
-    photo: CataloguePhoto
-    data: bytes = field(repr=False)
-    digest: str
 
 
 def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogue:
@@ -221,31 +210,6 @@ def _no_photo_error(where: Path, found: _FileGroups, naming: Naming) -> DatasetE
     left_out = "".join(f"; {item.path}: {item.reason}" for item in found.skipped[:1])
     kinds = ", ".join(sorted(EXTENSIONS))
     return DatasetError(f"no photo ({kinds}) in the catalogue {where}{others}{left_out}: {_LAYOUT}")
-
-
-def read_photo(catalogue: Catalogue, photo: CataloguePhoto) -> PhotoBytes | SkippedPhoto:
-    """Read a photo's bytes; an unreadable photo gives a SkippedPhoto."""
-    try:
-        data = catalogue.read(photo.path)
-    except ImageError as error:
-        return SkippedPhoto(photo.path, error.reason)
-    return PhotoBytes(photo, data, hashlib.sha256(data).hexdigest())
-
-
-def decode_photo(file: PhotoBytes, decode: Callable[[bytes, str], RgbImage] = decode_rgb) -> RgbImage | SkippedPhoto:
-    """Decode a photo that `read_photo` returned.
-
-    Args:
-        file: The photo and its bytes.
-        decode: Function of (bytes, name in messages).
-
-    Returns:
-        The result of `decode`, by default (H, W, 3) float32 in 0..1; a SkippedPhoto if it raises ImageError.
-    """
-    try:
-        return decode(file.data, file.photo.path)
-    except ImageError as error:
-        return SkippedPhoto(file.photo.path, error.reason)
 
 
 # The user's own metadata -----------------------------------------------------------------------------------

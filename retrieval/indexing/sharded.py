@@ -42,9 +42,6 @@ from retrieval.model.fusion_scorer import CELLS
 from retrieval.model.references import REFERENCE_CALIBRATION, REFERENCE_ROWS
 from retrieval.version import __version__
 
-ADDITIVE_FIELDS = ("photos", "embedded", "reused", "seconds")
-"""Fields of a report that add up over the shards."""
-
 
 @dataclass(frozen=True)
 class ShardJob:
@@ -147,7 +144,7 @@ def build_sharded(
             for folder, part in _split_catalogue(catalogue, shards)
         ]
         built = sorted((run or build_in_process)(jobs, checkpoint), key=lambda one: one.folder)
-        report = _report(out, catalogue, naming, checkpoint, built)
+        report = _report(out, catalogue, naming, built)
         manifest = _manifest(before, built, shards, checkpoint, catalogue, report)
         written = before is None or manifest.generation != before.generation
         if written:
@@ -210,9 +207,7 @@ def _split_catalogue(catalogue: Catalogue, shards: int) -> list[tuple[str, Catal
     ]
 
 
-def _report(
-    out: str | Path, catalogue: Catalogue, naming: Naming, checkpoint: Checkpoint, built: Sequence[ShardBuild]
-) -> BuildReport:
+def _report(out: str | Path, catalogue: Catalogue, naming: Naming, built: Sequence[ShardBuild]) -> BuildReport:
     """Merge the reports of all shards. Raises NoReadablePhoto if no shard has a photo."""
     reports = [one.report for one in built if one.report is not None]
     skipped = [*catalogue.skipped, *(item for one in built for item in one.skipped)]
@@ -226,19 +221,16 @@ def _report(
     sums = {key: sum(one[key] for one in references) for key in ("touches", "objects", "touch_only", "encoded")}
     return replace(
         reports[0],
-        **{name: sum(getattr(report, name) for report in reports) for name in ADDITIVE_FIELDS},
+        **{
+            name: sum(getattr(report, name) for report in reports)
+            for name in ("photos", "objects", "embedded", "reused", "seconds")
+        },
         index=str(out),
-        generation="",
-        written=True,
-        model=str(checkpoint.path),
-        objects=sum(report.objects for report in reports),
-        objects_from=naming.text,
         warnings=naming_warnings(Counter(photo.object_id for photo in catalogue.photos), naming),
         skipped=skipped,
         ignored=list(catalogue.ignored),
         without_photo=sorted(lost),
         notes=list(catalogue.notes),
-        kind=", ".join(sorted({report.kind for report in reports})),
         reason=f"{len(reports)} shards; for {same} of them: {reason}",
         recall=min((report.recall for report in reports), key=lambda recall: recall["value"]),
         candidates=None,
