@@ -20,7 +20,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -101,6 +101,10 @@ class _Feature(msgspec.Struct):
     dtype: str
 
 
+class _Moments(msgspec.Struct):
+    moments: list[Literal["before", "during", "after"]] | None = None
+
+
 class _Info(msgspec.Struct):
     """The keys of info.json that are read; `recording` is of our own exports."""
 
@@ -117,6 +121,7 @@ def _read_info(path: Path) -> _Info:
     """Read info.json; raise ImporterError for another version of LeRobot or other paths."""
     try:
         info = msgspec.json.decode(read_content(path, ImporterError), type=_Info)
+        msgspec.convert(info.recording, _Moments)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise ImporterError(f"{path} must be that of a LeRobot data set: {error}") from error
     if not re.fullmatch(r"v3(\.\d+)*", info.codebase_version):
@@ -186,6 +191,9 @@ class _LeRobotSource:
         ):
             number = row.get("episode_index")
             name = safe_name(str(row.get("grasp_id") or f"episode-{number}"))
+            if not isinstance(row.get("length"), int):
+                yield Skip("its row in meta/episodes has no length", name)
+                continue
             fields = {key: row[key] for key in _FIELDS if row.get(key) is not None}
             sequence = row.get("sequence_id") or f"episode-{number}"
             moments = self._moments if row["length"] == len(self._moments or ()) else None

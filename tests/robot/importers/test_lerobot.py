@@ -118,6 +118,25 @@ def rewrite(path, change):
     pq.write_table(pa.Table.from_pylist([change(number, row) for number, row in enumerate(rows)]), path)
 
 
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ({"length": None}, "no length"),
+        ({"data/chunk_index": None, f"videos/{lerobot.LEFT}/chunk_index": None}, "does not name the file"),
+        ({f"videos/{lerobot.LEFT}/from_timestamp": None}, "its video is missing"),
+    ],
+)
+def test_a_damaged_row_costs_its_episode(source, tmp_path, row, message):
+    rewrite(
+        source / "meta/episodes/chunk-000/file-000.parquet",
+        lambda number, old: old | (row if number == 1 else {}),
+    )
+    recording = import_lerobot(source, tmp_path / "out")
+    assert len(recording.grasps) == 3
+    (reason,) = recording.info["skipped"]
+    assert message in reason
+
+
 def of_size(height, width):
     return lambda number: encoded(".png", number, (height + number % 2, width))
 
