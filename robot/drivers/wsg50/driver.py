@@ -388,8 +388,8 @@ class GripperReading:
         return _is_moving(self.system, self.grasping)
 
 
-IsDone = Callable[[GripperReading, Status | None], bool]
-"""Function from the gripper's state and its last answer (or None) to whether the motion was executed."""
+IsDone = Callable[[GripperReading], bool]
+"""Function from the gripper's state to whether a motion was executed."""
 
 
 class WSG50(Gripper):
@@ -499,7 +499,7 @@ class WSG50(Gripper):
             self._release(self._wider_opening(reading))
         self._set_force(force_n)
         packet = codec.command(CommandId.GRASP, self._options.grasp_width_mm, speed_mm_s)
-        return self._as_state(self._run_at(speed_mm_s, packet, lambda reading, _: reading.grasping in _CLOSED_STATES))
+        return self._as_state(self._run_at(speed_mm_s, packet, lambda reading: reading.grasping in _CLOSED_STATES))
 
     # Reading.
 
@@ -542,16 +542,6 @@ class WSG50(Gripper):
 
     # Motions.
 
-    def _home(self) -> GripperReading:
-        """Home the jaws. If the answer is lost, a reference that was missing and is now present proves success."""
-        before = self._query(CommandId.SYSTEM_STATE, codec.system_state)
-
-        def done(reading: GripperReading, status: Status | None) -> bool:
-            proven = status is Status.SUCCESS or not before & SystemState.REFERENCED
-            return proven and bool(reading.system & SystemState.REFERENCED)
-
-        return self._run(codec.home(), _HOMING_S, done)
-
     def _release(self, width_mm: float) -> GripperReading:
         speed = self._opening_speed()
         return self._run_at(speed, codec.command(CommandId.RELEASE, width_mm, speed), _is_at(width_mm))
@@ -581,7 +571,7 @@ class WSG50(Gripper):
         deadline = time.monotonic() + seconds
         status = self._watch(packet, deadline)
         reading = self._read_until_still(deadline)
-        if done(reading, status):
+        if done(reading):
             return reading
         answer = "nothing" if status is None else status.name
         stop = f", FAST STOP: {_fault_names(reading.system)}" if reading.system & SystemState.FAST_STOP else ""
@@ -715,7 +705,7 @@ class WSG50(Gripper):
             if not self.may_move:
                 raise DeviceError(f"{self.name} has lost its reference and must be homed, but motion is not allowed")
             _log.warning("%s has lost its reference: homing, the jaws move", self.name)
-            self._home()
+            self._run(codec.home(), _HOMING_S, lambda reading: bool(reading.system & SystemState.REFERENCED))
         if self._read().grasping is not GraspingState.HOLDING:  # with a smaller force, the held object would fall
             self._set_force(self.min_force_n)
         self.stroke_mm = limits.stroke_mm
@@ -773,7 +763,4 @@ def _fault_names(system: SystemState) -> str:
 
 
 def _is_at(width_mm: float) -> IsDone:
-    def done(reading: GripperReading, _: Status | None) -> bool:
-        return reading.grasping is GraspingState.IDLE and abs(reading.opening_mm - width_mm) <= _REACHED_MM
-
-    return done
+    return lambda reading: reading.grasping is GraspingState.IDLE and abs(reading.opening_mm - width_mm) <= _REACHED_MM
