@@ -56,26 +56,20 @@ MAX_QUERIES = 512
 
 
 def distil(
-    matcher: Matcher,
-    touch_partials: Tensor,
-    photo_partials: Tensor,
-    *,
-    width: int,
-    steps: int,
-    seed: int,
-    linear: int = 0,
-    quiet: bool = False,
+    matcher: Matcher, touch_partials: Tensor, photo_partials: Tensor, settings: Config, *, quiet: bool = False
 ) -> None:
     """Train a candidate encoder from `matcher.head`, and add it and its sizes (`matcher.config`) to `matcher`.
 
     The partial activations (N, P) and (M, P) are those of touches and photos of training objects; their cells are not
-    used. `width` and `linear` are `candidate_width` and `candidate_linear` of the configuration. The same seed gives
-    the same candidate encoder. The other weights do not change. The matcher is unchanged if an error is raised.
+    used. `settings` have the sizes of the candidate encoder, the steps and the seed. The other weights do not change.
+    The matcher is unchanged if an error is raised.
 
     Raises:
         NumericalError: The loss is not finite.
     """
-    config = dataclasses.replace(matcher.config, candidate_width=width, candidate_linear=linear)
+    seed, steps = settings.training.seed, settings.training.distil_steps
+    sizes = {name: getattr(settings.matcher, name) for name in ("candidate_width", "candidate_linear")}
+    config = dataclasses.replace(matcher.config, **sizes)
     touch_partials, photo_partials = (part[:, : config.pooled_width] for part in (touch_partials, photo_partials))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -235,8 +229,7 @@ def with_candidate_encoder(
         NumericalError: The loss is not finite.
     """
     matcher, metrics, seed = checkpoint.matcher, checkpoint.provenance["metrics"], config.training.seed
-    width, linear, steps = config.matcher.candidate_width, config.matcher.candidate_linear, config.training.distil_steps
-    distil(matcher, *train, width=width, linear=linear, steps=steps, seed=seed, quiet=quiet)
+    distil(matcher, *train, config, quiet=quiet)
     queries = None if validation is None else select_queries(validation[0], seed)
     if validation is not None and queries is not None:
         touches = torch.from_numpy(queries).to(validation[1].device).float()

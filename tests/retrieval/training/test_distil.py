@@ -55,8 +55,13 @@ def partials():
     return drawn(60, 5, sign=1), drawn(400, 6, sign=-1)
 
 
-def distilled(matcher, partials, steps=5, seed=0, **options):
-    distil.distil(matcher, *partials, width=32, steps=steps, seed=seed, quiet=True, **options)
+def config_with_encoder(steps=20, seed=0, **sizes):
+    matcher = dataclasses.replace(WITHOUT_CANDIDATE_ENCODER, candidate_width=32, **sizes)
+    return Config(matcher, TrainingConfig(distil_steps=steps, seed=seed))
+
+
+def distilled(matcher, partials, steps=5, seed=0):
+    distil.distil(matcher, *partials, config_with_encoder(steps, seed), quiet=True)
     return {name: tensor.clone() for name, tensor in matcher.candidate_encoder.state_dict().items()}
 
 
@@ -194,7 +199,8 @@ def test_with_a_cosine_in_the_logit_linear_values_rank_the_exhaustive_top1_highe
     )
     ranks = []
     for linear in (0, 2):
-        distil.distil(matcher, touches, photos, width=32, linear=linear, steps=3, seed=0, quiet=True)
+        sizes = config_with_encoder(3, candidate_linear=linear, cosine=True)
+        distil.distil(matcher, touches, photos, sizes, quiet=True)
         assert matcher.config == dataclasses.replace(config, candidate_width=32, candidate_linear=linear)
         ranks.append(distil.exhaustive_top1_ranks(matcher, touches, photos).mean())
     assert ranks[1] < ranks[0] / 2
@@ -215,12 +221,6 @@ def checkpoint(matcher, tmp_path):
         gel_check=None,
         verification=None,
         provenance=about,
-    )
-
-
-def config_with_encoder(steps=20):
-    return Config(
-        dataclasses.replace(WITHOUT_CANDIDATE_ENCODER, candidate_width=32), TrainingConfig(distil_steps=steps)
     )
 
 
