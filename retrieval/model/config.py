@@ -128,8 +128,8 @@ class TrainingConfig:
         freeze_stem: Keep the first layers of the towers (`Tower.stem_layers`) frozen if the towers are trained.
         augment: Change the images of each step at random (`retrieval.training.augmentation`), if towers are trained.
         distil_steps: Steps that distil the candidate encoder after training (`retrieval.training.distil`).
-        validation_fraction: FractionBelowOne of the objects that are validation objects.
-        test_fraction: FractionBelowOne of the objects that are test objects.
+        validation_fraction: Fraction of the objects that are validation objects.
+        test_fraction: Fraction of the objects that are test objects.
         validate_every: Steps between two validations.
         precision: "float32", "bfloat16" or "auto" (`retrieval.model.encode.autocast`).
         seed: Seed of all random choices.

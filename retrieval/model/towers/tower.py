@@ -106,7 +106,9 @@ class Tower(nn.Module):
         images = (images - self.mean) / self.std
         if not self.cells:
             return self._encode(images)
-        return self._with_cells(*self._encode_with_map(images))
+        features, maps = self._encode_with_map(images)
+        cells = _grid_means(maps.float(), self.cells)
+        return torch.cat([features, cells.flatten(2).transpose(1, 2).flatten(1)], dim=1)
 
     def stem_layers(self) -> nn.Module:
         """Return the first layers, which `freeze_stem` keeps frozen.
@@ -115,10 +117,6 @@ class Tower(nn.Module):
             ConfigError: This kind of tower has no stem.
         """
         raise ConfigError(f"{type(self).__name__} has no stem to freeze; set freeze_stem = false")
-
-    def _with_cells(self, features: Tensor, maps: Tensor) -> Tensor:
-        cells = _grid_means(maps.float(), self.cells)
-        return torch.cat([features, cells.flatten(2).transpose(1, 2).flatten(1)], dim=1)
 
     def _encode_with_map(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Return features (B, feature_count) and a map (B, cell_channels, H', W') that is averaged over each cell."""

@@ -23,20 +23,15 @@ class VerificationSequences(NamedTuple):
         owner: (S,) object of each sequence.
         ratios: (S, G) ratios of the right object after 1, 2, ... grasps.
         genuine: (G, S) the largest of them so far.
-        impostor_ratios: (S, O - 1, G) ratios of each other object.
+        impostor: (S, O - 1) largest ratio of each other object.
         similar: (S,) largest ratio of the most similar other object.
     """
 
     owner: NDArray[np.int64]
     ratios: Floats
     genuine: Floats
-    impostor_ratios: Floats
+    impostor: Floats
     similar: Floats
-
-    @property
-    def impostor(self) -> Floats:
-        """(S, O - 1) largest ratio of each other object."""
-        return np.asarray(self.impostor_ratios.max(axis=2))
 
 
 def verification_sequences(
@@ -63,7 +58,7 @@ def verification_sequences(
     owner, objects = scored.touch_owner[sets[:, 0]], np.unique(scored.photo_owner)
     if not len(sets):
         none = np.zeros((0, grasps))
-        return VerificationSequences(owner, none, none.T, np.zeros((0, len(objects) - 1, grasps)), none[:, 0])
+        return VerificationSequences(owner, none, none.T, np.zeros((0, len(objects) - 1)), none[:, 0])
     ratios = np.stack(
         [IdentificationTrials.of(scored, sets[:, :count], seed).log_ratios(posterior) for count in range(1, grasps + 1)]
     )
@@ -75,7 +70,7 @@ def verification_sequences(
         owner,
         ratios[:, rows, true].T,
         highest[:, rows, true],
-        ratios[:, is_impostor].T.reshape(len(sets), -1, grasps),
+        highest[-1][is_impostor].reshape(len(sets), -1),
         highest[-1][rows, similar],
     )
 
