@@ -3,7 +3,7 @@
 import json
 import logging
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -122,14 +122,32 @@ def touch_encoder_to_onnx(checkpoint: Checkpoint) -> bytes:
     """Return the touch encoder as an ONNX model with the checkpoint's digest, for any number of touches at once."""
     side, fingers = checkpoint.config.preprocessing.touch_px, checkpoint.config.matcher.fingers
     outputs = ["partial", "embedding"] + (["readings"] if checkpoint.matcher.gel_head else [])
-    return _trace(_TouchEncoder(checkpoint.matcher), (fingers, side, side, 3), outputs, checkpoint)
+    encoder = _Encoder(
+        for_inference(checkpoint.matcher, ["touch_tower"]),
+        lambda matcher, images: matcher.encode_touches(images.permute(0, 1, 4, 2, 3)),
+    )
+    return _trace(encoder, (fingers, side, side, 3), outputs, checkpoint)
 
 
 def photo_encoder_to_onnx(checkpoint: Checkpoint) -> bytes:
     """Return the photo encoder as ONNX: images (B, H, views * W, 3) to partial activations and embeddings."""
     side, views = checkpoint.config.preprocessing.photo_px, checkpoint.matcher.views
-    encoder = _PhotoEncoder(checkpoint.matcher)
+    encoder = _Encoder(
+        for_inference(checkpoint.matcher, ["photo_tower"]),
+        lambda matcher, images: matcher.photo_search_encoding(matcher.photo_features(images.permute(0, 3, 1, 2))),
+    )
     return _trace(encoder, (side, views * side, 3), ["partial", "embedding"], checkpoint)
+
+
+class _Encoder(nn.Module):
+    """A function of a matcher and of images with channels last."""
+
+    def __init__(self, matcher: Matcher, encode: Callable[[Matcher, Tensor], tuple[Tensor, ...]]) -> None:
+        super().__init__()
+        self.matcher, self.encode = matcher, encode
+
+    def forward(self, images: Tensor) -> tuple[Tensor, ...]:
+        return self.encode(self.matcher, images)
 
 
 def _trace(encoder: nn.Module, shape: tuple[int, ...], outputs: list[str], checkpoint: Checkpoint) -> bytes:
@@ -151,28 +169,6 @@ def _trace(encoder: nn.Module, shape: tuple[int, ...], outputs: list[str], check
     licences = json.dumps(checkpoint.provenance.get(LICENCES, []))
     onnx.helper.set_model_props(model, {CHECKPOINT_KEY: checkpoint.digest, LICENCES_KEY: licences})
     return bytes(model.SerializeToString())
-
-
-class _TouchEncoder(nn.Module):
-    """Images (B, fingers, H, W, 3) to partial activations, embeddings and, with a gel head, readings."""
-
-    def __init__(self, matcher: Matcher) -> None:
-        super().__init__()
-        self.matcher = for_inference(matcher, ["touch_tower"])
-
-    def forward(self, images: Tensor) -> tuple[Tensor, ...]:
-        return self.matcher.encode_touches(images.permute(0, 1, 4, 2, 3))
-
-
-class _PhotoEncoder(nn.Module):
-    """Images (B, H, views * W, 3) to partial activations and embeddings."""
-
-    def __init__(self, matcher: Matcher) -> None:
-        super().__init__()
-        self.matcher = for_inference(matcher, ["photo_tower"])
-
-    def forward(self, images: Tensor) -> tuple[Tensor, ...]:
-        return self.matcher.photo_search_encoding(self.matcher.photo_features(images.permute(0, 3, 1, 2)))
 
 
 def _difference(by_torch: TouchEncodings | EncodedTouches, by_onnx: TouchEncodings | EncodedTouches) -> float:
