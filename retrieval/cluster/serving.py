@@ -27,7 +27,7 @@ from indexes.store.sharded import ShardedManifest, ShardEntry, open_shard
 from retrieval.console.output import say
 from retrieval.errors import BadInput, IncompleteSearch, RetrievalError
 from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_checkpoint_info
-from retrieval.search.opening import folder_shard, sharded_index_info
+from retrieval.search.opening import folder_shard
 from retrieval.search.shard import IndexInfo, Shards
 
 OWNERS = "touch-retrieval"
@@ -182,7 +182,9 @@ class Deployments:
                 # Create its router now: concurrent first calls would create several, and only one could be shut down.
                 self._handles[name] = self._ray.serve.get_app_handle(name).options()
             handles = {folder: self._handles[name] for folder, name in names.items()}
-        opened = RayShards(sharded_index_info(manifest), manifest.shards, handles, self._settings)
+        opened = RayShards(
+            IndexInfo.of(manifest, manifest.calibration, len(manifest.shards)), manifest.shards, handles, self._settings
+        )
         weakref.finalize(opened, self._release, list(names.values()))
         return opened
 

@@ -146,7 +146,7 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
             for photo in catalogue.photos
             if (photo.path,) in photos.keys
         ]
-        about = {
+        about: dict[str, Any] = {
             "checkpoint": str(checkpoint.path.resolve()),
             "catalogue": catalogue.where,
             "objects_from": options.naming.text,
@@ -154,31 +154,29 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
             **references.about(checkpoint),
             **options.about,
         }
-        manifest, why = _current(store, checkpoint)
-        is_written = manifest is None or _differs(manifest, checkpoint, options, rows, about)
-        if manifest is not None and not is_written:
+        current, why = _current(store, checkpoint)
+        manifest = None if current is None or _differs(current, checkpoint, options, rows, about) else current
+        if manifest is not None:
             try:
                 store.open(name=manifest.generation)
             except CorruptIndex as error:
-                is_written, why = True, f"The existing index is not usable ({error})."
-        if is_written:
+                manifest, why = None, f"The existing index is not usable ({error})."
+        is_written = manifest is None
+        if manifest is None:
+            keys = [photos.keys[row.path,] for row in rows]
+            candidates = _measured_before(current, checkpoint, options, len(rows), photos.encoded)
             with store.draft() as draft:
                 draft.write_rows(rows)
-                keys = [photos.keys[row.path,] for row in rows]
                 arrays = draft.write_arrays(code_blocks(cache, encoder, keys))
                 calibration = {"calibration": checkpoint.posterior.to_dict()} if checkpoint.posterior else {}
                 draft.write_documents(calibration | references.documents)
                 touches = query_codes(checkpoint, RECALL_QUERIES)
                 index = draft.build_index(arrays[EMBEDDINGS], options.kind, queries=touches and touches[1])
-                candidates = _measured_before(manifest, checkpoint, options, len(rows), photos.encoded)
                 if candidates is None:
                     candidates = measure_candidates(checkpoint, index, StoredPartials(arrays), quiet=options.quiet)
-                measured = {"candidates": candidates, "partial_error": largest_rounding(arrays[PARTIALS])}
-                manifest = draft.finish(
-                    fingerprint=fingerprint(checkpoint), about=about | measured, software=__version__
-                )
+                about |= {"candidates": candidates, "partial_error": largest_rounding(arrays[PARTIALS])}
+                manifest = draft.finish(fingerprint=fingerprint(checkpoint), about=about, software=__version__)
             _forget_unused(cache, [*keys, *references.codes.keys.values()])
-    assert manifest is not None
     return _report(
         out,
         catalogue,
@@ -284,7 +282,7 @@ def _measured_before(
         return None
     if manifest.fingerprint != fingerprint(checkpoint):
         return None
-    return kept_measurement(manifest.about["candidates"], photos, encoded)
+    return kept_measurement(manifest.about.get("candidates"), photos, encoded)
 
 
 def _forget_unused(cache: Cache, keys: list[str]) -> None:

@@ -125,8 +125,9 @@ def open_index(
     if shards is not None:
         return shards(index, manifest, stored), stored
     check_fingerprint(index, manifest.fingerprint, fingerprint(stored))
+    info = IndexInfo.of(manifest, manifest.calibration, len(manifest.shards))
     opened = [open_shard(index, entry, manifest.fingerprint, threads=1) for entry in manifest.shards]
-    return Shards(sharded_index_info(manifest), [folder_shard(generation, stored) for generation in opened]), stored
+    return Shards(info, [folder_shard(generation, stored) for generation in opened]), stored
 
 
 def read_checkpoint_of(manifest: Manifest | ShardedManifest, model: str | Path | None) -> CheckpointInfo:
@@ -171,20 +172,6 @@ def scorer_for(stored: CheckpointInfo, about: Mapping[str, Any]) -> FusionScorer
     """
     scorer = read_scorer(stored)
     return replace(scorer, cell_dim=0) if about.get(CELLS) is False else scorer
-
-
-def sharded_index_info(manifest: ShardedManifest) -> IndexInfo:
-    """Return the information about a sharded index from its manifest."""
-    return IndexInfo(
-        manifest.generation,
-        manifest.kind,
-        manifest.photos,
-        manifest.objects,
-        manifest.fingerprint,
-        manifest.about,
-        manifest.calibration,
-        len(manifest.shards),
-    )
 
 
 def torch_encoder(stored: CheckpointInfo, threads: int | None = None) -> TouchEncoder:

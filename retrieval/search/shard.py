@@ -12,12 +12,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from threading import Lock
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from indexes.store.generation import Generation
+from indexes.store.manifest import Manifest
+from indexes.store.sharded import ShardedManifest
 from retrieval.model.fusion_scorer import FusionScorer, StoredPartials
 from retrieval.model.posterior import EvidenceMass, Posterior
 from retrieval.model.references import REFERENCE_ROWS
@@ -78,7 +80,6 @@ class IndexInfo:
         kind: Kind of index of candidate search.
         photos: Number of photos.
         objects: Number of objects.
-        fingerprint: Digests of the checkpoint and the preprocessing that the vectors come from.
         about: Further manifest entries, such as the catalogue and the checkpoint.
         calibration: The posterior as stored in the index; None without one.
         shards: Number of index folders.
@@ -88,10 +89,16 @@ class IndexInfo:
     kind: str
     photos: int
     objects: int
-    fingerprint: Mapping[str, str]
     about: Mapping[str, Any]
     calibration: Any | None
     shards: int = 1
+
+    @classmethod
+    def of(cls, manifest: Manifest | ShardedManifest, calibration: Any | None, shards: int = 1) -> Self:
+        """Return the information in a manifest."""
+        return cls(
+            manifest.generation, manifest.kind, manifest.photos, manifest.objects, manifest.about, calibration, shards
+        )
 
 
 class Page(NamedTuple):
@@ -123,20 +130,7 @@ class FolderShard:
         has_references = REFERENCE_ROWS in generation.documents
         self.references = References(generation, self.objects, scorer.cosine_columns) if has_references else None
         self._lock = Lock()
-
-    @property
-    def info(self) -> IndexInfo:
-        """Information that needs no search."""
-        manifest = self.generation.manifest
-        return IndexInfo(
-            manifest.generation,
-            manifest.kind,
-            self.generation.count,
-            self.objects.count,
-            manifest.fingerprint,
-            manifest.about,
-            self.generation.documents.get("calibration"),
-        )
+        self.info = IndexInfo.of(generation.manifest, generation.documents.get("calibration"))
 
     def search(self, query: ShardQuery, top: int, candidates: int | None, posterior: Posterior | None) -> ShardResult:
         """Return the best objects for the grasps of a query, and the evidence mass of all objects.
@@ -155,7 +149,8 @@ class FolderShard:
         """
         clock = Stopwatch()
         with clock("candidates"):
-            limit = self.limit(top, candidates)
+            measured = self.generation.manifest.about.get("candidates") or {"k": DEFAULT_CANDIDATES}
+            limit = max(top, int(measured["k"]) if candidates is None else candidates)
             similarities = None if self.references is None else self.references.similarities_to_objects(query.partials)
             rows = self._candidates(query.embeddings, similarities, limit)
         with clock("rerank"):
@@ -170,7 +165,7 @@ class FolderShard:
         """Return the logit of an object for grasps, by all its photos and reference touches.
 
         Args:
-            number: Number of the object (`Objects.numbers_of`).
+            number: Number of the object (`Rows.find_object`).
             partials: (G, touch_partial_width) partial activations of the grasps.
             posterior: The posterior of the model.
         """
@@ -216,16 +211,6 @@ class FolderShard:
             " ".join(map(str, (row.object_id, row.path, *row.metadata.values()))).casefold()
             for row in self.generation.rows
         ]
-
-    def limit(self, top: int, candidates: int | None) -> int:
-        """Return the number of photos to rerank: `candidates`, else the measured number, else `DEFAULT_CANDIDATES`.
-
-        Args:
-            top: Number of objects to return, the minimum number of photos to rerank.
-            candidates: The user's number; None for the number that was measured for the index.
-        """
-        measured = self.generation.manifest.about.get("candidates") or {"k": DEFAULT_CANDIDATES}
-        return max(top, int(measured["k"]) if candidates is None else candidates)
 
     def _candidates(self, embeddings: Floats, similarities: Similarities | None, k: int) -> Rows:
         """Return the rows to score.
