@@ -237,7 +237,7 @@ def presses(surface: RandomSurface, sensor: GelSensor, rng: Rng, tries: int) -> 
         rng: Draws places and forces.
         tries: Number of presses.
     """
-    pixel_mm = PIXELS * sensor.pixel_mm
+    pixel_mm = PIXELS * sensor.field.pixel_mm
     elastic: dict[str, Any] = {}
     if math.isfinite(surface.modulus_mpa):
         elastic = {"object_modulus_mpa": surface.modulus_mpa, "object_poisson": 0.4}

@@ -49,9 +49,10 @@ def test_held_out_touches_evaluate_the_number_of_candidates_that_others_chose(cr
             manifest=None,
             arrays={"partials": np.zeros((9, crowd.photos.shape[1]), np.float16)},
             index=SimpleNamespace(
-                kind="flat", candidates=lambda query, k: [np.array([top1_of(numbers.get(query[0].tobytes()))])]
+                kind="flat",
+                candidates=lambda query, k: [np.array([top1_of(numbers.get(query[0].tobytes()))])],
+                search=lambda query, k: (None, np.array([[top1_of(numbers.get(query[0].tobytes()))]])),
             ),
-            search=lambda query, k: (None, np.array([[top1_of(numbers.get(query[0].tobytes()))]])),
         )
         touches = np.concatenate([crowd.touches, crowd.held_out])
         exhaustive_top1 = np.concatenate([np.arange(12), np.full(7, 8)]) % 9

@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("rosbags")
 
-from retrieval.model import fusion_scorer, verification
+from retrieval.model import gel_check, verification
 from retrieval.search import answer
 from retrieval.version import __version__
 from tests.documents import table_rows
@@ -40,7 +40,7 @@ def test_the_constants_of_the_messages_are_those_of_the_answers():
         return {value for _, _, value in DEFINED[f"touch_retrieval_msgs/msg/{name}"][0]}
 
     assert constants("Answer") == set(answer.EXIT_CODES)
-    undecided = {fusion_scorer.NO_CONTACT, fusion_scorer.NOT_A_GEL}
+    undecided = {gel_check.NO_CONTACT, gel_check.NOT_A_GEL}
     decisions = {verification.ACCEPT, verification.REJECT, verification.ANOTHER_GRASP}
     assert constants("Verify_Response") == decisions | undecided
 

@@ -626,8 +626,8 @@ def test_a_lost_log_is_refused(tmp_path):
         ({"names": []}, "at least one object"),
         ({"names": ["a", "a"]}, "different names"),
         ({"jobs": 0}, "jobs must be a whole number >= 1"),
-        ({"grasps": 0}, "must be at least 1"),
-        ({"limit": 0}, "must be at least 1"),
+        ({"grasps": 0}, ">= 1"),
+        ({"limit": 0}, ">= 1"),
         ({"attempt": AttemptSettings(grasp=GraspSettings(force_n=(1.0, 2.0)))}, "force_n must be within 5 to 80 N"),
     ],
 )
