@@ -1,20 +1,13 @@
 """`retrieve identify`: grasp an object with a rig until its identity is clear."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from retrieval.commands.options import (
-    COUNT,
-    FRACTION,
-    SEED,
-    Index,
-    IndexModel,
-    Json,
-    resolve_index,
-)
+from retrieval.commands.options import COUNT, FRACTION, SEED, Index, IndexModel, Json, resolve_index
 from retrieval.console.interruption import resumable
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput, RetrievalError
@@ -119,6 +112,7 @@ def identify(
     return EXIT_CODES[run.answer.verdict]
 
 
+@dataclass
 class _Run:
     """The grasps of one run, and the answer after the last of them.
 
@@ -127,13 +121,14 @@ class _Run:
         answer: `QueryResult`, or `Verification` with an expected object; None before the first grasp.
     """
 
-    def __init__(
-        self, searcher: "Searcher", folder: Path, expect: str | None, far: float, confidence: float, grasps: int
-    ) -> None:
-        self.searcher, self.folder, self.expect, self.far = searcher, folder, expect, far
-        self.confidence, self.grasps = confidence, grasps
-        self.heights_mm: list[float] = []
-        self.answer: Any = None
+    searcher: "Searcher"
+    folder: Path
+    expect: str | None
+    far: float
+    confidence: float
+    grasps: int
+    heights_mm: list[float] = field(default_factory=list)
+    answer: Any = None
 
     def is_enough(self, grasps: Sequence["RecordedGrasp"]) -> bool:
         """Answer from all grasps so far, print the answer, and return whether it is final."""
@@ -145,7 +140,9 @@ class _Run:
         background = self._files(grasps[-1].touches_before) if self.searcher.reader.takes_background else None
         if self.expect is None:
             self.answer = self.searcher.query(touches, background=background)
-            is_final, now = self._is_clear(self.answer), _first_object(self.answer)
+            none, results = self.answer.none_probability, self.answer.results
+            is_final = none is not None and max(none, results[0].probability or 0.0) >= self.confidence
+            now = _first_object(self.answer)
         else:
             self.answer = self.searcher.verify(touches, self.expect, far=self.far, background=background)
             is_final, now = self.answer.decision in (ACCEPT, REJECT), self.answer.decision
@@ -161,12 +158,6 @@ class _Run:
 
     def _files(self, images: Mapping[str, str]) -> list[Path]:
         return [self.folder / images[finger] for finger in sorted(images)]
-
-    def _is_clear(self, answer: "QueryResult") -> bool:
-        """Return whether the first object, or the answer "none of these", has at least the required probability."""
-        if answer.none_probability is None:
-            return False
-        return max(answer.none_probability, answer.results[0].probability or 0.0) >= self.confidence
 
 
 def _first_object(answer: "QueryResult") -> str:

@@ -5,16 +5,7 @@ from typing import Annotated
 
 import typer
 
-from retrieval.commands.options import (
-    COUNT,
-    FRACTION,
-    Background,
-    GelSight,
-    Index,
-    IndexModel,
-    Json,
-    resolve_index,
-)
+from retrieval.commands.options import COUNT, FRACTION, Background, GelSight, Index, IndexModel, Json, resolve_index
 from retrieval.console.files import require_output, text_bytes, write_output
 from retrieval.console.output import print_json, say
 

@@ -1,22 +1,14 @@
 """`retrieve serve`: answer queries over HTTP, with a page."""
 
 import os
-from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from msgspec import Meta
 
-from retrieval.commands.options import (
-    SECONDS,
-    WORKERS,
-    Index,
-    IndexModel,
-    NumberParser,
-    refuse_options,
-)
+from retrieval.commands.options import SECONDS, WORKERS, Index, IndexModel, NumberParser, refuse_options, resolve_index
 from retrieval.console.output import say
 from retrieval.errors import BadInput, ConfigError
 
@@ -85,17 +77,13 @@ def serve(
         from retrieval.serve.settings import ServiceSettings
     except ImportError as error:
         raise BadInput(f"{error.name} is missing; run: pip install 'touch-retrieval[serve]'") from error
-    from retrieval.search.opening import find_index
     from retrieval.serve.rig import load_live_rig
 
     if no_history:
         refuse_options("contradicts --no-history; give one of them", history=history)
-    cluster_options = {"replicas": replicas, "shard_timeout": shard_timeout}
     if not cluster:
-        refuse_options("needs --cluster", **cluster_options)
-    path, reason = find_index(index)
-    if index is None:
-        say(f"index: {path} ({reason})")
+        refuse_options("needs --cluster", replicas=replicas, shard_timeout=shard_timeout)
+    path = resolve_index(index)
     local = path.resolve()
     settings = ServiceSettings(
         index=path,
@@ -109,7 +97,7 @@ def serve(
     )
     with ExitStack() as stack:
         writer = _feedback_writer(settings.history, path, stack) if settings.history else None
-        open_shards = _ray_shards(path, stack, cluster_options) if cluster else None
+        open_shards = _ray_shards(path, stack, replicas or 1, shard_timeout or 5.0) if cluster else None
         app = create_app(settings, load_live_rig(rig, path), writer, trials, open_shards)
 
         def on_start(bound_port: int) -> None:
@@ -118,13 +106,14 @@ def serve(
         run(app, on_start)
 
 
-def _ray_shards(index: str | Path, stack: ExitStack, options: Mapping[str, Any]) -> "OpenShards":
+def _ray_shards(index: Path, stack: ExitStack, replicas: int, wait_s: float) -> "OpenShards":
     """Return the function that opens shards on Ray; join or start Ray first.
 
     Args:
         index: Folder of the index.
         stack: Closes the session and the deployments.
-        options: Values of the options of `--cluster`; None for those left out.
+        replicas: Processes for each shard.
+        wait_s: Longest wait for a shard in seconds.
 
     Raises:
         BadInput: The index is not sharded.
@@ -133,10 +122,9 @@ def _ray_shards(index: str | Path, stack: ExitStack, options: Mapping[str, Any])
     from retrieval.cluster.serving import Deployments, ReplicaSettings
     from retrieval.cluster.session import ray_session
 
-    if not is_sharded(Path(index)):
+    if not is_sharded(index):
         raise BadInput(f"{index} has no shards; build a sharded index with `retrieve build-index --shards`")
-    values = {name.replace("shard_timeout", "wait_s"): value for name, value in options.items() if value is not None}
-    settings = ReplicaSettings(**values)
+    settings = ReplicaSettings(replicas=replicas, wait_s=wait_s)
     deployments = Deployments(stack.enter_context(ray_session()), settings)
     stack.callback(deployments.close)
     return deployments.open

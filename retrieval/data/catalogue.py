@@ -2,7 +2,8 @@
 
     catalog/<object_id>/<photo>     the first folder names the object; the photo may be at any depth below it
     catalog/<object_id>.<ext>       or one photo per object, named like the object; other rules: retrieval.data.naming
-    catalog/<object_id>/touch_*     a gel image: a touch of the object (retrieval.data.catalogue_touches)
+    catalog/<object_id>/touch_<name>.png                         a touch of the object, of a sensor with one finger
+    catalog/<object_id>/touch_<name>_a.png, touch_<name>_b.png   or of two fingers, in this order
     catalog/metadata.jsonl          optional: one JSON object per line, with `file_name` (a photo's path in the
                                     catalogue) or `object_id` (all its photos) and any other keys; a photo's
                                     value of a key takes precedence over its object's
@@ -11,13 +12,13 @@ Names that start with a dot are skipped. A photo's path in the catalogue, with f
 Listing opens no photo.
 """
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from _touch_retrieval.files import parse_json, read_regular
-from retrieval.data.catalogue_touches import CatalogueTouch, group_touches, touch_name
 from retrieval.data.folder_walk import SkippedPhoto, list_files
 from retrieval.data.images import EXTENSIONS, read_bytes
 from retrieval.data.naming import STEM, Naming
@@ -29,6 +30,7 @@ UNSUPPORTED_EXTENSIONS = frozenset(
     {".arw", ".cr2", ".cr3", ".dng", ".gif", ".jfif", ".jp2", ".jxl", ".nef", ".orf", ".raf", ".rw2", ".svg", ".tga"}
 )
 """Extensions of picture formats that are not read. An object with only such files has no photo."""
+_TOUCH = re.compile(r"(touch_.*?)(?:_([a-z]))?", re.DOTALL)
 _LAYOUT = "put photos in <object_id>/<photo> or <object_id>.<ext>"
 
 
@@ -44,6 +46,21 @@ class CataloguePhoto:
 
     path: str
     object_id: str
+    metadata: dict[str, Any] = field(default_factory=dict, hash=False)
+
+
+@dataclass(frozen=True, slots=True)
+class CatalogueTouch:
+    """One touch of a catalogue.
+
+    Attributes:
+        object_id: The touched object.
+        paths: Paths of the gel images relative to the catalogue, in finger order.
+        metadata: The user's own keys and values.
+    """
+
+    object_id: str
+    paths: tuple[str, ...]
     metadata: dict[str, Any] = field(default_factory=dict, hash=False)
 
 
@@ -195,6 +212,31 @@ def _classify_files(names: Iterable[str], naming: Naming) -> _FileGroups:
         else:
             found.gels.append((path, name))
     return found
+
+
+def touch_name(path: str, naming: Naming) -> tuple[str, str] | None:
+    """Return a gel image's touch name (with its folder) and finger ("" for one finger), or None for a photo.
+
+    A picture outside every folder is a photo, and so is every picture if the file stem names the object.
+    """
+    if "/touch_" not in path or naming.text == STEM:
+        return None
+    place = PurePosixPath(path)
+    found = _TOUCH.fullmatch(place.stem)
+    return None if found is None else (f"{place.parent}/{found[1]}", found[2] or "")
+
+
+def group_touches(images: Iterable[tuple[str, str]], naming: Naming) -> tuple[CatalogueTouch, ...]:
+    """Group gel images, (path, object) each, into touches, sorted by name."""
+    groups: dict[tuple[str, str], list[tuple[str, str]]] = {}
+    for path, object_id in images:
+        name = touch_name(path, naming)
+        assert name is not None
+        groups.setdefault((name[0], object_id), []).append((name[1], path))
+    return tuple(
+        CatalogueTouch(owner, tuple(path for _, path in sorted(fingers)))
+        for (_, owner), fingers in sorted(groups.items())
+    )
 
 
 def _no_photo_error(where: Path, found: _FileGroups, naming: Naming) -> DatasetError:

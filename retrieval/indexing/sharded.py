@@ -28,8 +28,7 @@ from indexes.store.sharded import (
     shard_number,
     write_sharded_manifest,
 )
-from retrieval.data.catalogue import Catalogue, CataloguePhoto, list_catalogue
-from retrieval.data.catalogue_touches import CatalogueTouch
+from retrieval.data.catalogue import Catalogue, CataloguePhoto, CatalogueTouch, list_catalogue
 from retrieval.data.folder_walk import SkippedPhoto
 from retrieval.data.naming import Naming, naming_warnings
 from retrieval.errors import BadInput, NoReadablePhoto

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from _touch_retrieval.cache import Cache
-from retrieval.data.catalogue import Catalogue, CataloguePhoto
-from retrieval.data.catalogue_touches import CatalogueTouch
+from retrieval.data.catalogue import Catalogue, CataloguePhoto, CatalogueTouch
 from retrieval.data.folder_walk import SkippedPhoto
 from retrieval.errors import BadInput
 from retrieval.indexing.codes import SHOWS, Codes, find_codes, read_codes, touch_encoder

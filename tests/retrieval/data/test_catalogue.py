@@ -1,4 +1,4 @@
-"""Listing a catalogue folder, its metadata, and reading its photos one at a time."""
+"""Listing a catalogue folder and its metadata."""
 
 import io
 import json

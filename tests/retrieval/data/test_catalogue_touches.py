@@ -4,8 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from retrieval.data.catalogue import list_catalogue
-from retrieval.data.catalogue_touches import CatalogueTouch, group_touches, touch_name
+from retrieval.data.catalogue import CatalogueTouch, group_touches, list_catalogue, touch_name
 from retrieval.data.naming import Naming
 from retrieval.errors import DatasetError
 
