@@ -273,7 +273,7 @@ class Estimate:
                 f"difference {gain['difference']:+.3f} [{gain['low']:+.3f}, {gain['high']:+.3f}]"
             )
         lines.append(f"  {self.verdict}")
-        if self.baseline:
+        if self.baseline is not None:
             found = [f"{label} {interval(self.measures[f'baseline_{name}'])}" for name, label in _LABELS.items()]
             lines.append(f"unadapted model: {', '.join(found)}")
         if self.is_baseline_better:
