@@ -121,12 +121,7 @@ class Encoder(NamedTuple):
 
     def key(self, digests: Iterable[str]) -> str:
         """Return the key in the cache of an item whose files have these digests."""
-        return code_key(self.model, digests)
-
-
-def code_key(model: str, digests: Iterable[str]) -> str:
-    """Return the key of a code in the cache from the group of its model and the digests of its files."""
-    return f"{model}/{'-'.join(digests)}"
+        return f"{self.model}/{'-'.join(digests)}"
 
 
 def photo_encoder(checkpoint: Checkpoint) -> Encoder:
