@@ -159,7 +159,7 @@ def candidate_sample(sample):
 
 def test_touches_are_encoded_by_the_default_of_the_towers(sample):
     matcher = sample.checkpoint.matcher
-    images = [BatchImages(sample.checkpoint.config).touch(sample.grasps[sample.touch_rows[0]])]
+    images = [BatchImages(sample.checkpoint.config.preprocessing).touch(sample.grasps[sample.touch_rows[0]])]
     default = next(encode for _, encode, is_default in encoders(sample.checkpoint) if is_default)
     assert np.array_equal(default(images), encode_touches(matcher, images).partial.numpy())
 
