@@ -39,6 +39,9 @@ class Registry(Collection[str], Generic[T]):
         self.noun, self.group, self.table = noun, f"touch_retrieval.{kind}", table
         self._error, self._base = error, base
 
+    def __repr__(self) -> str:
+        return f"<registry of {self.group.rpartition('.')[2]}>"
+
     def __iter__(self) -> Iterator[str]:
         return iter(self.table)
 
