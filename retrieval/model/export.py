@@ -83,7 +83,7 @@ def export_to_cache(checkpoint: Checkpoint) -> Path | None:
     if path is None or path.is_file() or checkpoint.path.with_suffix(EXPORT_SUFFIX).is_file():
         return None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         return export(checkpoint, path)
     except (OSError, RetrievalError) as error:
         log.info("no export for queries: %s", error)

@@ -4,6 +4,7 @@ As in the authors' collection code, one network serves all fingers, and its inpu
 frame. A grasp succeeds if ANY finger's probability is at least 1/2. This network is smaller than theirs.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from torch import Tensor, nn
 
 from retrieval.data.images import to_float
 from retrieval.data.preprocessing import Preprocessing
-from retrieval.errors import BadInput, CheckpointError, ConfigError
+from retrieval.errors import BadInput, CheckpointError, ConfigError, NumericalError
 from retrieval.model.checkpoint import load_weights, read_tensors
 from retrieval.model.encode import one_thread, touch_batch
 
@@ -120,9 +121,15 @@ class GraspSuccessGate:
 
     @torch.inference_mode()
     def score(self, differences: Sequence[Sequence[NDArray[np.float32]]]) -> list[list[float]]:
-        """Return the logits of grasps, each given by its fingers' differences."""
+        """Return the logits of grasps, each given by its fingers' differences.
+
+        Raises:
+            NumericalError: A logit is not finite. A NaN is not above 0, so the grasp would be classified as failed.
+        """
         with one_thread():
             logits: list[list[float]] = self.net(touch_batch(differences)).tolist()
+        if bad := [number for number, each in enumerate(logits) if not all(map(math.isfinite, each))]:
+            raise NumericalError(f"logits of a gate must be finite, got {logits[bad[0]]}; train the gate again")
         return logits
 
     def _difference(self, finger: str, frames: FingerFrames) -> NDArray[np.float32]:

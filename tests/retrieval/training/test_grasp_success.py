@@ -338,6 +338,15 @@ def test_the_threshold_is_a_probability_of_exactly_one_half(monkeypatch, logits,
     assert gate(fingers(0)) is accepted
 
 
+def test_a_logit_that_is_not_finite_is_an_error_and_not_a_failed_grasp():
+    """Finite weights can overflow; NaN >= 0 is False, so every grasp would be rejected silently."""
+    net = GraspNet()
+    torch.nn.init.constant_(net.last.weight, 3e38)
+    torch.nn.init.constant_(net.layers[0].bias, 3e38)
+    with pytest.raises(NumericalError, match="train the gate again"):
+        GraspSuccessGate(net, DURING)(fingers(0))
+
+
 def test_a_change_of_one_grey_level_does_not_wrap(trained):
     """In uint8 arithmetic, one level darker becomes 255 brighter."""
     gate, darker = load_gate(trained[0]), Frames(LEAN, LEAN - np.uint8(1))
