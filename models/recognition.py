@@ -13,7 +13,7 @@ queries. It writes FOLDER/recognition.json, and reuses the features of RECORDING
 import argparse
 import json
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -73,7 +73,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     first = next(iter(found.values()))
     rows: dict[str, dict[str, Any]] = {
         name: {
-            key: {**summarise([value], seed=0), "against_first": compare([value], [first[key]], seed=0)}
+            key: {
+                **asdict(summarise([value])),
+                "against_first": asdict(compare([value], [first[key]])),
+            }
             for key, value in each.items()
         }
         for name, each in found.items()
@@ -185,7 +188,7 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
         for name, each in rows.items():
             cells.append(summary_cell(each[key]))
             if name != first:
-                cells.append(interval(*(each[key]["against_first"][part] for part in ("difference", "low", "high"))))
+                cells.append(interval(*(each[key]["against_first"][part] for part in ("value", "low", "high"))))
         lines.append(f"| {key} | {' | '.join(cells)} |")
     return "\n".join(lines)
 

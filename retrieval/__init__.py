@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from retrieval.errors import BadInput as BadInput
     from retrieval.errors import RetrievalError as RetrievalError
     from retrieval.evaluation.evaluate import evaluate as evaluate
-    from retrieval.evaluation.real.benchmark import benchmark as benchmark
-    from retrieval.evaluation.real.protocol import Protocol as Protocol
+    from retrieval.evaluation.protocol import Protocol as Protocol
     from retrieval.frontier.measure import measure_frontier as measure_frontier
     from retrieval.indexing.build import build_index as build_index
     from retrieval.indexing.report import BuildReport as BuildReport
@@ -64,7 +63,7 @@ _MODULES = {
     "Loss": "model.losses.loss:Loss",
     "Match": "search.answer:Match",
     "Method": "methods.method:Method",
-    "Protocol": "evaluation.real.protocol:Protocol",
+    "Protocol": "evaluation.protocol:Protocol",
     "QueryResult": "search.answer:QueryResult",
     "RetrievalError": "errors:RetrievalError",
     "Searcher": "search.searcher:Searcher",
@@ -72,7 +71,6 @@ _MODULES = {
     "Tower": "model.towers.tower:Tower",
     "Verification": "search.answer:Verification",
     "adapt": "training.adapt:adapt",
-    "benchmark": "evaluation.real.benchmark:benchmark",
     "build_index": "indexing.build:build_index",
     "check_recording": "data.check.recording:check_recording",
     "embed_photos": "search.embeddings:embed_photos",

@@ -1,4 +1,4 @@
-"""Miniatures for `retrieve benchmark real`: small data sets with as many objects as the protocols need."""
+"""Miniatures for `retrieve evaluate --protocol`: small data sets with as many objects as the protocols need."""
 
 from pathlib import Path
 

@@ -3,12 +3,12 @@
 The numbers are random and mean nothing; their shapes and ranges are realistic.
 """
 
-import json
-
+import msgspec
 import numpy as np
 
 from retrieval.data.dataset import load_grasps, make_split
-from retrieval.evaluation import SCHEMA_VERSION
+from retrieval.evaluation.results import Results, Timings, write_results
+from retrieval.metrics.registry import METRICS
 from retrieval.model.posterior import Posterior
 
 SKILL = {
@@ -21,9 +21,7 @@ SKILL = {
 RANKS = ("recall_1", "recall_5", "recall_10", "map")
 
 
-def summary(
-    rng, value, chance, *, queries=792, objects=18, gallery="18 unseen objects, 792 photos; own photo left out"
-):
+def summary(rng, value, chance):
     """Return a summary of results.json around the values (m,)."""
     value, width = np.atleast_1d(value), rng.uniform(0.02, 0.06)
     by_seed = np.clip(value + rng.normal(0, 0.01, (3, len(value))), 0, 1)
@@ -34,8 +32,9 @@ def summary(
         "chance": np.atleast_1d(chance).tolist(),
         "queries": 792,
         "objects": 18,
+        "few_objects": False,
         "gallery": "18 unseen objects, 792 photos; own photo left out",
-        "by_seed": by_seed.tolist(),
+        "repeats": by_seed.tolist(),
     }
 
 
@@ -90,34 +89,39 @@ def risk_coverage(skill):
     return [[float(x), float((1 - 0.5 * curve(skill, 5)[0]) * x ** (0.5 * skill))] for x in coverage]
 
 
-def method(rng, name, split):
-    """Return the entry of one method in results.json."""
+def row(rng, name, split):
+    """Return the row of one method in results.json."""
     skill = SKILL.get(name, 0.9)
     test, everyone = split["test"], [*split["train"], *split["validation"], *split["test"]]
     accuracy = float(curve(skill, 5)[0])
     by_object = {item: float(np.clip(rng.normal(accuracy, 0.2), 0, 1)) for item in everyone}
     pairs = [rng.choice(test, 2, replace=False).tolist() for _ in range(min(12, len(test)))]
     fractions = sorted(rng.uniform(0.1, 0.8, len(pairs)), reverse=True)
+    found = measures(rng, skill)
     return {
-        "best_params": [{"components": 64, "ridge": 0.1, "p": 2, "seed": seed} for seed in range(3)]
-        if skill
-        else [{}] * 3,
-        "measures": measures(rng, skill),
-        "per_object": {"test_candidates": {item: by_object[item] for item in test}, "all_candidates": by_object},
-        "confusions": [
-            {"object_id": a, "mistaken_for": b, "share": float(fraction)}
-            for (a, b), fraction in zip(pairs, fractions, strict=True)
-        ],
-        "reliability": {kind: reliability(rng) for kind in ("pairs", "k5", "k10", "k5_g5")},
-        "calibration": {
-            "pairs": {"1": {"slope": 0.9, "intercept": -0.1}},
-            "posteriors": {str(count): Posterior(slope=0.9 / count).to_dict() for count in (1, 3)},
-        },
-        "reject": {
-            **decision(rng, skill),
-            "balanced_accuracy": summary(rng, 0.5 + 0.12 * skill, 0.5),
-            "roc": roc(skill),
-            "risk_coverage": risk_coverage(skill),
+        "method": name,
+        "model": None,
+        "measures": found,
+        "best_params": [[{"components": 64, "ridge": 0.1, "seed": seed} if skill else {}] for seed in range(3)],
+        "details": {
+            "pair_threshold": {"at": 0.1, "source": "validation objects"},
+            "per_object": {"test_candidates": {item: by_object[item] for item in test}, "all_candidates": by_object},
+            "confusions": [
+                {"object_id": a, "mistaken_for": b, "share": float(fraction)}
+                for (a, b), fraction in zip(pairs, fractions, strict=True)
+            ],
+            "reliability": {kind: reliability(rng) for kind in ("pairs", "k5", "k10", "k5_g5")},
+            "calibration": {
+                "pairs": {"1": {"slope": 0.9, "intercept": -0.1}},
+                "posteriors": {str(count): Posterior(slope=0.9 / count).to_dict() for count in (1, 3)},
+            },
+            "reject": {
+                **decision(rng, skill),
+                "balanced_accuracy": summary(rng, 0.5 + 0.12 * skill, 0.5),
+                "roc": roc(skill),
+                "risk_coverage": risk_coverage(skill),
+            },
+            "verification": verification(np.random.default_rng(1)) if name == "late_fusion" else None,
         },
     }
 
@@ -146,98 +150,91 @@ def verification(rng):
 
 CEILINGS = {"touch_to_touch": "two touches of one object", "photo_to_photo": "two photos of one object"}
 CONTROLS = {
+    "permuted": "touches are permuted among training objects before fitting, so there is nothing to learn",
     "no_contact": "the no-contact frame replaces the touch in fitting and in scoring",
     "low_pass": "each gel image is reduced to 8 x 6 pixels in fitting and in scoring",
-    "shuffled": "touches are permuted among training objects before fitting, so there is nothing to learn",
 }
+PROTOCOL = "unseen-objects"
 
 
-def synthetic_results(recording, methods=tuple(SKILL), seed=0):
-    """Return (results, timings) of an evaluation of the recording."""
+def control(rng, text, method, skill):
+    """Return the entry of a control or a ceiling."""
+    found = {"pair_accuracy": summary(rng, 0.5 + 0.2 * skill, 0.5)}
+    found["topn_k5"] = summary(rng, curve(skill, 5), np.arange(1, 6) / 5)
+    return {"description": text, "method": method, "measures": found}
+
+
+def synthetic_protocol(recording, methods=tuple(SKILL), seed=0):
+    """Return the results of one protocol of results.json, as JSON types."""
     rng, grasps = np.random.default_rng(seed), load_grasps(recording)
-    split = make_split(grasps, validation=0.16, test=0.2, seed=seed)
-    entries = {name: method(rng, name, split.to_dict()) for name in methods}
-    results = {
-        "schema_version": SCHEMA_VERSION,
-        "software": "0.1.0",
+    split = make_split(grasps, validation=0.16, test=0.2, seed=seed).to_dict()
+    difference = {"value": 0.12, "low": 0.06, "high": 0.18, "few_objects": False, "p": 0.0021}
+    return {
+        "title": "Unseen objects",
+        "rule": "Methods are fitted on the training objects.",
+        "published_results": ["The paper reports 64.3 % on other objects."],
+        "main": "pair_accuracy",
+        "labels": [[key, metric.label] for key, metric in METRICS.items()],
+        "unit": "object",
         "recording": {
-            "path_name": recording.name,
+            "name": recording.name,
             "source": "simulated rig",
             "digest": "ab" * 32,
             "objects": len({grasp.object_id for grasp in grasps}),
             "grasps": len(grasps),
         },
-        "split": split.to_dict(),
-        "setting": {
-            "preset": "mobilenet",
-            "config": {"matcher": {"tower": "mobilenet"}, "training": {"iterations": 2000}},
-            "seeds": [0, 1, 2],
-            "draws": 10000,
-            "features": {"touch": 1280, "photo": 1280, "fingers": 2, "digest": "cd" * 32},
-        },
-        "methods": entries,
+        "features": {"touch": 1280, "photo": 1280, "fingers": 2, "digest": "cd" * 32},
+        "folds": [[split]],
+        "rows": {name: row(rng, name, split) for name in methods},
         "controls": {
-            name: {
-                "description": text,
-                "measures": {
-                    "pair_accuracy": summary(rng, 0.5 + 0.05 * (name == "low_pass"), 0.5),
-                    "topn_k5": summary(rng, curve(0.3 * (name == "low_pass"), 5), np.arange(1, 6) / 5),
-                },
-            }
-            for name, text in CONTROLS.items()
+            name: control(rng, text, "late_fusion", 0.2 * (name == "low_pass")) for name, text in CONTROLS.items()
         },
-        "ceilings": {
-            name: {
-                "description": text,
-                "measures": {
-                    "pair_accuracy": summary(rng, 0.9, 0.5),
-                    "topn_k5": summary(rng, curve(0.8, 5), np.arange(1, 6) / 5),
-                },
-            }
-            for name, text in CEILINGS.items()
-        },
-        "verification": verification(np.random.default_rng([seed, 1])),
+        "ceilings": {name: control(rng, text, "cca", 0.8) for name, text in CEILINGS.items()},
         "comparisons": [
-            {
-                "a": methods[0],
-                "b": other,
-                "measure": key,
-                "difference": 0.12,
-                "low": 0.06,
-                "high": 0.18,
-                "p": 0.0021,
-            }
+            {"a": methods[0], "b": other, "measure": key, "difference": difference}
             for other in methods[1:]
             for key in ("pair_accuracy", "topn_k5")
         ],
     }
-    return results, timings(rng, methods)
 
 
-def timings(rng, methods):
-    """Return times between a microsecond and a minute."""
+def synthetic_results(protocols):
+    """Return results.json of these protocols by name, as JSON types."""
+    config = {"matcher": {"tower": "mobilenet"}, "training": {"iterations": 2000}}
+    setting = {
+        "preset": "mobilenet",
+        "config": config,
+        "model": None,
+        "compared": {},
+        "seeds": [0, 1, 2],
+    }
+    return {"setting": setting, "protocols": protocols, "skipped": {}, "software": "0.1.0"}
+
+
+def synthetic_timings(methods, seed=0):
+    """Return timings.json with times between a microsecond and a minute, as JSON types."""
+    rng = np.random.default_rng(seed)
+    rows = {
+        name: {
+            "fit_s": 60.0 * SKILL.get(name, 0.9),
+            "encode_touch_ms": 0.21,
+            "encode_photo_ms": 0.14,
+            "score_us_per_photo": 1.3,
+            "query_ms": float(10 ** rng.uniform(-1.5, 1.5)),
+        }
+        for name in methods
+    }
     return {
-        "machine": {"cpus": 2, "threads": 1},
-        "encode": {"touch_ms": 14.2, "photo_ms": 21.8, "where": "towers"},
-        "methods": {
-            name: {
-                "fit_s": 60.0 * SKILL.get(name, 0.9),
-                "encode_touch_ms": 0.21,
-                "encode_photo_ms": 0.14,
-                "score_us_per_photo": 1.3,
-                "query_ms": float(10 ** rng.uniform(-1.5, 1.5)),
-            }
-            for name in methods
-        },
+        "cpus": 2,
+        "threads": 1,
+        "protocols": {PROTOCOL: {"tower_touch_ms": 14.2, "tower_photo_ms": 21.8, "rows": rows}},
     }
 
 
-def write_synthetic_results(recording, out, methods=tuple(SKILL), change=None):
-    """Write the evaluation to `out`, after `change(results)` if given; return `out`."""
-    results, times = synthetic_results(recording, methods)
-    if change:
-        change(results)
+def write_synthetic_results(recording, out, methods=tuple(SKILL)):
+    """Write the evaluation to `out`; return `out`."""
     out.mkdir(parents=True, exist_ok=True)
-    (out / "results.json").write_text(json.dumps(results, sort_keys=True))
-    (out / "timings.json").write_text(json.dumps(times, sort_keys=True))
+    results = synthetic_results({PROTOCOL: synthetic_protocol(recording, methods)})
+    write_results(out / "results.json", msgspec.convert(results, Results))
+    write_results(out / "timings.json", msgspec.convert(synthetic_timings(methods), Timings))
     return out

@@ -27,10 +27,9 @@ def adapt(
 ) -> None:
     """Fit a model to a new sensor and your own objects. Takes minutes on two cores."""
     from retrieval.data.check.recording import check_gel_layout
+    from retrieval.report.adaptation import print_adaptation
     from retrieval.training.adapt import adapt as fit
 
     for finding in check_gel_layout(recording):
         say(f"{finding.severity}: {finding.message}")
-    result = fit(recording, out, model, init=init, split=read_split(split))
-    for line in result.lines():
-        say(line)
+    print_adaptation(fit(recording, out, model, init=init, split=read_split(split)))

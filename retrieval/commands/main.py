@@ -31,12 +31,12 @@ _BAD_PATH_ERRNOS = {
     *(errno.EINVAL, errno.ENAMETOOLONG, errno.ELOOP, errno.EEXIST),
 }
 
-GROUPS = ("benchmark", "rig")
+GROUPS = ("rig",)
 COMMANDS = (
     *("demo", "collect", "import", "export-recording", "check", "train", "adapt", "build-index", "query", "verify"),
     *("identify", "export", "evaluate", "frontier", "serve", *GROUPS),
 )
-KEEP_FREED_MEMORY = {"train", "adapt", "build-index", "evaluate", "benchmark"}
+KEEP_FREED_MEMORY = {"train", "adapt", "build-index", "evaluate"}
 """Commands that compute with large tensors until they end."""
 
 

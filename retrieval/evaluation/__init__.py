@@ -1,4 +1,31 @@
-"""Ranking metrics with confidence intervals and chance levels."""
+"""Evaluate methods by protocols: the split of a recording or a real data set, the queries, controls and measures."""
 
-SCHEMA_VERSION = 3
-"""Schema version of results.json."""
+from typing import TYPE_CHECKING
+
+from _touch_retrieval.registry import Registry
+from retrieval.errors import ConfigError
+
+if TYPE_CHECKING:
+    from retrieval.evaluation.protocol import Protocol
+
+UNSEEN_OBJECTS = "unseen-objects"
+"""Name of the protocol of any recording: a split into training, validation and test objects."""
+PROTOCOLS: "Registry[Protocol]" = Registry(
+    "protocol",
+    "protocols",
+    {
+        UNSEEN_OBJECTS: "retrieval.evaluation.protocols.recording:UNSEEN_OBJECTS",
+        "vt60-choices": "retrieval.evaluation.protocols.vt60:CHOICES",
+        "vt60-seen-classes": "retrieval.evaluation.protocols.vt60:SEEN_CLASSES",
+        "vt60-random": "retrieval.evaluation.protocols.vt60:RANDOM",
+        "vt60-classes": "retrieval.evaluation.protocols.vt60:CLASSES",
+        "billets-unseen": "retrieval.evaluation.protocols.billets:UNSEEN",
+        "billets-places": "retrieval.evaluation.protocols.billets:PLACES",
+        "objectfolder": "retrieval.evaluation.protocols.objectfolder:PUBLISHED",
+        "rct": "retrieval.evaluation.protocols.rct:MATERIALS",
+        "physiclear": "retrieval.evaluation.protocols.physiclear:LEAVE_ONE_VIDEO_OUT",
+        "feeling-of-success": "retrieval.evaluation.protocols.feeling_of_success:PAPER",
+    },
+    error=ConfigError,
+    base="retrieval.evaluation.protocol:Protocol",
+)

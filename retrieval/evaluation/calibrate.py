@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.errors import BadInput
+from retrieval.evaluation.results import PairThreshold
 from retrieval.metrics.pairs import Calibration, fit_calibration, reliability_bins
 from retrieval.metrics.table import ScoreTable, object_scores
 from retrieval.model.posterior import Posterior
@@ -85,18 +86,6 @@ def calibrate(validation: Mapping[int, ScoreTable], *, seed: int = 0) -> Calibra
 def calibrate_pairs(validation: ScoreTable, *, seed: int = 0) -> Calibration:
     """Fit the log-odds of a row with a photo on drawn pairs."""
     return fit_calibration(*draw_pairs(validation, seed))
-
-
-class PairThreshold(NamedTuple):
-    """The score above which a pair is classified as a match, with its source; or why there is none."""
-
-    at: float | None
-    source: str | None = None
-    reason: str | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return "pair_threshold" of results.json."""
-        return {"at": self.at, "from": self.source, "reason": self.reason}
 
 
 def pair_threshold(best_params: Mapping[str, Any], validation: ScoreTable, *, seed: int = 0) -> PairThreshold:

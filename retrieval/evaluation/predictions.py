@@ -1,19 +1,15 @@
-"""Prediction files: the scores of a method, with a digest of all inputs that determine them."""
+"""Predictions: the scores of a fitted method for all queries, with the times."""
 
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from retrieval.evaluation.cache import CacheKey, read_cached, write_cached
 from retrieval.evaluation.queries import Queries
 from retrieval.methods.method import Method, sum_over_sets
 from retrieval.model.encode import one_thread
-from retrieval.training.calibration.touches import ScoredTouches
 from retrieval.training.features import Features
 
 Scores = NDArray[np.float32]
@@ -34,17 +30,6 @@ class Predictions:
     set_scores: dict[int, Scores]
     best_params: dict[str, Any]
     seconds: dict[str, float]
-
-
-def scored_touches(queries: Queries, predictions: Predictions, part: str) -> ScoredTouches:
-    """Return the scores of the touches with the photos of one part ("train", "validation" or "test")."""
-    touches, photos = queries.of_part(queries.touch_owner, part), queries.of_part(queries.photo_owner, part)
-    return ScoredTouches(
-        predictions.scores[np.ix_(touches, photos)],
-        queries.touch_owner[touches],
-        queries.photo_owner[photos],
-        queries.own_photo[touches][:, None] == photos,
-    )
 
 
 @one_thread()
@@ -87,19 +72,3 @@ def _query_s(method: Method, touch: Scores, photo_encodings: Scores, repeats: in
         method.score(method.encode_touch(touch), photo_encodings)
         times.append(time.perf_counter() - start)
     return float(np.median(times))
-
-
-def write_predictions(path: Path, predictions: Predictions, cache_key: CacheKey) -> None:
-    """Write scores with the digest of their inputs (method, seed, features, queries, ...)."""
-    tensors = {"scores": torch.from_numpy(predictions.scores)}
-    tensors |= {f"sets_{size}": torch.from_numpy(scores) for size, scores in predictions.set_scores.items()}
-    write_cached(path, cache_key, tensors, {"best_params": predictions.best_params, "seconds": predictions.seconds})
-
-
-def read_predictions(path: Path, cache_key: CacheKey) -> Predictions | None:
-    """Return the predictions in a file; None if it is missing, damaged, or has another key."""
-    if (stored := read_cached(path, cache_key)) is None:
-        return None
-    tensors, header = stored
-    sets = {int(name.removeprefix("sets_")): tensors[name].numpy() for name in tensors if name != "scores"}
-    return Predictions(tensors["scores"].numpy(), dict(sorted(sets.items())), header["best_params"], header["seconds"])

@@ -14,8 +14,6 @@ from retrieval.errors import DatasetError
 from retrieval.metrics.registry import PHOTOS_PER_CANDIDATE, SET_SIZES
 
 PARTS = ("train", "validation", "test")
-MAX_GRASPS = {"train": 8, "validation": 12}
-"""Maximum number of scored grasps of one object, by part; test objects have no limit."""
 SETS_OF_AN_OBJECT = 20
 
 Rows = NDArray[np.int64]
@@ -59,9 +57,7 @@ class Queries:
         return digest.hexdigest()
 
 
-def draw_queries(
-    grasps: Sequence[Grasp], split: Split, seed: int, max_grasps: Mapping[str, int] = MAX_GRASPS
-) -> Queries:
+def draw_queries(grasps: Sequence[Grasp], split: Split, seed: int, max_grasps: Mapping[str, int]) -> Queries:
     """Draw the queries: all grasps of test objects and some of the others.
 
     Sets of each size in `SET_SIZES` are drawn for test and validation objects, without replacement within a set, if

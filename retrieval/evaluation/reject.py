@@ -27,8 +27,8 @@ Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
-class Rejection:
-    """Rejection performance of a posterior on objects that it was not fitted on.
+class RejectionMeasures:
+    """Rejection performance of a posterior on objects that it was not fitted on, for one training seed.
 
     Attributes:
         auroc: Area under the ROC curve.
@@ -80,7 +80,7 @@ def statistic(gallery: Floats) -> Floats:
     return np.asarray(logsumexp(gallery, axis=1) - np.log(np.isfinite(gallery).sum(1)))
 
 
-def reject(posterior: Posterior, table: ScoreTable, *, seed: int = 0) -> Rejection:
+def reject(posterior: Posterior, table: ScoreTable, *, seed: int = 0) -> RejectionMeasures:
     """Measure the rejection performance of a posterior on objects that it was not fitted on.
 
     The prior of "none of these" is even. Objects have equal weight.
@@ -109,7 +109,7 @@ def reject(posterior: Posterior, table: ScoreTable, *, seed: int = 0) -> Rejecti
     def measure(values: Floats, chance: float) -> Measure:
         return Measure(values[:, None], targets.touch_owner, np.array([chance]), words)
 
-    return Rejection(
+    return RejectionMeasures(
         auroc=measure(_areas(present, absent, weights), 0.5),
         balanced_accuracy=measure(((present >= 0) + 1.0 - (absent >= 0)) / 2, 0.5),
         false_accepts_at_95=measure(_false_accepts(present, absent, targets.touch_owner), TRUE_ACCEPTS),

@@ -9,21 +9,19 @@ to 100 % of cases; a bootstrap over objects did so in 76 to 97 %, least for smal
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, replace
-from typing import Any
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from retrieval.evaluation.experiment import Experiment
-from retrieval.evaluation.predictions import Predictions, scored_touches
+from retrieval.evaluation.results import Rate, VerificationRates
+from retrieval.evaluation.scoring import MethodScores
 from retrieval.model.checkpoint import Checkpoint
-from retrieval.model.posterior import Posterior
 from retrieval.model.verification import ERRORS_NEEDED, error_rate, objects_needed
 from retrieval.training.calibration.posterior import MIN_OBJECTS, fit_posterior
-from retrieval.training.calibration.touches import ScoredTouches
 from retrieval.training.calibration.verification import verification_sequences
+from retrieval.training.features import Features
 
 GRASPS = (1, 2, 3, 5)
 """Numbers of grasps of the sequences."""
@@ -33,72 +31,96 @@ FARS = (0.1, 0.01, 0.001)
 Floats = NDArray[np.float64]
 
 
-def score_verification(
-    experiment: Experiment, predictions: Sequence[Predictions], seeds: Sequence[int], seed: int
-) -> dict[str, Any] | None:
-    """Return "verification" of results.json: error rates by kind of impostor, then by number of grasps.
+@dataclass(frozen=True)
+class Errors:
+    """Error rates of the sequences of one number of grasps, for one training seed.
+
+    Attributes:
+        objects: Touched objects.
+        sequences: Sequences of grasps.
+        eer: Equal error rate.
+        frr: False-reject rates at `FARS`.
+    """
+
+    objects: int
+    sequences: int
+    eer: float
+    frr: tuple[float, ...]
+
+
+ErrorsByImpostors = dict[str, dict[str, Errors]]
+"""Kind of impostors ("random", "similar") -> number of grasps -> errors."""
+
+
+def verification_errors(scores: MethodScores, features: Features, checkpoint: Checkpoint) -> ErrorsByImpostors | None:
+    """Return the errors of late fusion on test objects.
+
+    A head that was trained on features has no posterior; one is fitted on validation objects, as in training.
 
     Args:
-        experiment: The experiment with late fusion.
-        predictions: Scores of late fusion for each training seed.
-        seeds: The training seeds.
-        seed: Seed of the sequences.
+        scores: The scores of late fusion.
+        features: Tower features of all grasps.
+        checkpoint: The model.
 
     Returns:
-        The rates, averaged over training seeds. None for fewer than
-        three test objects, or for a model without posterior and fewer than three validation objects.
+        The errors; None for fewer than three test objects, or for a model without posterior and fewer than three
+        validation objects.
     """
-    touches = [
-        _test_touches(experiment, scores, experiment.late_fusion_checkpoint(each), seed)
-        for scores, each in zip(predictions, seeds, strict=True)
-    ]
-    found: dict[str, Any] = {"random": {}, "similar": {}}
+    queries, posterior = scores.queries, checkpoint.posterior
+    test = scores.scored_touches("test")
+    if posterior is None:
+        validation = scores.scored_touches("validation")
+        if len(np.unique(validation.photo_owner)) >= MIN_OBJECTS:
+            posterior = fit_posterior(validation, seed=scores.seed)
+    if posterior is None or len(np.unique(test.photo_owner)) < MIN_OBJECTS:
+        return None
+    photos = torch.from_numpy(features.photo[queries.photos[queries.of_part(queries.photo_owner, "test")]])
+    with torch.inference_mode():
+        embeddings = checkpoint.matcher.photo_encoding(photos).embedding.numpy()
+    test = replace(test, photo_embeddings=embeddings)
+    found: ErrorsByImpostors = {"random": {}, "similar": {}}
     for grasps in GRASPS:
-        by_seed = [verification_sequences(*one, seed, grasps) for one in touches if one is not None]
-        if not by_seed or (objects := len(np.unique(by_seed[0].owner))) < MIN_OBJECTS:
+        sequences = verification_sequences(test, posterior, scores.seed, grasps)
+        objects, genuine = len(np.unique(sequences.owner)), sequences.genuine[-1]
+        if objects < MIN_OBJECTS:
             continue
-        genuine = [one.genuine[-1] for one in by_seed]
-        for kind, impostors, needed in (
-            ("random", [one.impostor.ravel() for one in by_seed], objects_needed),
-            ("similar", [one.similar for one in by_seed], lambda far: math.ceil(ERRORS_NEEDED / far)),
-        ):
-            pairs = list(zip(genuine, impostors, strict=True))
-            eer = float(np.mean([equal_error_rate(*pair) for pair in pairs]))
-            rates = {f"{far:g}": (far, float(np.mean([false_rejects(far, *pair) for pair in pairs]))) for far in FARS}
-            found[kind][str(grasps)] = {
-                "objects": objects,
-                "sequences": len(genuine[0]),
-                "eer": _rate(eer, objects, needed(eer) if eer else None),
-                "frr": {name: _rate(frr, objects, needed(far)) for name, (far, frr) in rates.items()},
-            }
+        for kind, impostors in (("random", sequences.impostor.ravel()), ("similar", sequences.similar)):
+            frr = tuple(false_rejects(far, genuine, impostors) for far in FARS)
+            found[kind][str(grasps)] = Errors(objects, len(genuine), equal_error_rate(genuine, impostors), frr)
     return found if found["random"] else None
 
 
-def _rate(value: float, objects: int, needed: int | None) -> dict[str, float | None]:
-    """Return a rate and its interval, None for too few objects; `needed` is None if there are no errors."""
-    if needed is None or objects < needed:
-        return {"value": None, "low": None, "high": None, "objects_needed": needed}
-    return {**asdict(error_rate(value, objects)), "objects_needed": needed}
+def verification_rates(by_seed: Sequence[ErrorsByImpostors]) -> dict[str, dict[str, VerificationRates]]:
+    """Return the rates with intervals, averaged over the training seeds."""
+    return {
+        kind: {grasps: _rates(kind, [one[kind][grasps] for one in by_seed]) for grasps in by_grasps}
+        for kind, by_grasps in by_seed[0].items()
+    }
 
 
-def _test_touches(
-    experiment: Experiment, predictions: Predictions, checkpoint: Checkpoint, seed: int
-) -> tuple[ScoredTouches, Posterior] | None:
-    """Return the scored touches of test objects, and the posterior; None for too few objects.
+def _rates(kind: str, by_seed: Sequence[Errors]) -> VerificationRates:
+    objects = by_seed[0].objects
 
-    A head that was trained on features has no posterior; a posterior is fitted on validation objects, as in training.
-    """
-    queries, posterior = experiment.queries, checkpoint.posterior
-    validation, test = (scored_touches(queries, predictions, part) for part in ("validation", "test"))
-    if posterior is None and len(np.unique(validation.photo_owner)) >= MIN_OBJECTS:
-        posterior = fit_posterior(validation, seed=seed)
-    if posterior is None or len(np.unique(test.photo_owner)) < MIN_OBJECTS:
-        return None
-    photos = queries.photos[queries.of_part(queries.photo_owner, "test")]
-    features = torch.from_numpy(experiment.features_for("late_fusion").photo[photos])
-    with torch.inference_mode():
-        embeddings = checkpoint.matcher.photo_encoding(features).embedding.numpy()
-    return replace(test, photo_embeddings=embeddings), posterior
+    def rate(values: Sequence[float], far: float) -> Rate:
+        value = float(np.mean(values))
+        needed = objects_needed(far) if kind == "random" else math.ceil(ERRORS_NEEDED / far)
+        return _rate(value, objects, needed)
+
+    eer = float(np.mean([one.eer for one in by_seed]))
+    return VerificationRates(
+        objects,
+        by_seed[0].sequences,
+        rate([eer], eer) if eer else Rate(None, None, None, None),
+        {f"{far:g}": rate([one.frr[place] for one in by_seed], far) for place, far in enumerate(FARS)},
+    )
+
+
+def _rate(value: float, objects: int, needed: int) -> Rate:
+    return (
+        Rate(None, None, None, needed)
+        if objects < needed
+        else Rate(**asdict(error_rate(value, objects)), objects_needed=needed)
+    )
 
 
 def false_rejects(far: float, genuine: Floats, impostors: Floats) -> float:

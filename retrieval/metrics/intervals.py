@@ -23,7 +23,7 @@ collection lacks.
 """
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,43 +33,78 @@ from retrieval.errors import BadInput
 from retrieval.metrics.measure import Measure
 
 LEVEL = 0.95
+DRAWS = 10_000
+"""Resamples of an interval, and random sign flips of a p-value."""
 FEW_OBJECTS = 5
 """With fewer objects, the coverage of an interval is far below LEVEL."""
 
 _EXACT_UP_TO = 18  # objects: 2 ** 17 sign flips; the other half mirrors them
 
 
-def summarise(measures: Sequence[Measure], *, draws: int = 10_000, seed: int = 0) -> dict[str, Any]:
-    """Return the "summary" of results.json.
+@dataclass(frozen=True)
+class Summary:
+    """A measure of all queries; lists have one number for each n of a top-n curve, else one number.
+
+    Attributes:
+        value: Mean over objects, then over seeds or splits.
+        low: Lower end of the 95 % interval.
+        high: Upper end.
+        chance: Value of a constant scorer.
+        queries: Number of queries of a seed; with splits, of all splits.
+        objects: Number of objects, or of the units that intervals resample.
+        few_objects: Whether the interval is too narrow because of few objects.
+        gallery: Description of the gallery.
+        repeats: The value of each seed, or of each split.
+    """
+
+    value: list[float]
+    low: list[float]
+    high: list[float]
+    chance: list[float]
+    queries: int
+    objects: int
+    few_objects: bool
+    gallery: str
+    repeats: list[list[float]]
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A paired difference on the same queries, with its 95 % interval and two-sided p-value."""
+
+    value: float
+    low: float
+    high: float
+    few_objects: bool
+    p: float
+
+
+def summarise(measures: Sequence[Measure], *, seed: int = 0) -> Summary:
+    """Return the summary of a measure; intervals resample objects.
 
     Args:
         measures: One measure per training seed, in the order of the seeds.
-        draws: Bootstrap resamples.
         seed: Seed of the resamples.
-
-    Returns:
-        {"value": [m], "low": [m], "high": [m], "chance": [m], "queries", "objects", "few_objects": whether the interval
-        is too narrow because of few objects, "gallery", "by_seed": [[m], ...]}.
 
     Raises:
         BadInput: There are no measures, or they have different queries.
     """
     means = _object_means(measures)
     every = means.mean(0)
-    low, high = bootstrap_interval(every, draws=draws, seed=seed)
+    low, high = bootstrap_interval(every, seed=seed)
     first, value = measures[0], every.mean(0)
-    return {
-        "value": value.tolist(),
+    return Summary(
+        value=value.tolist(),
         # The mean of equal numbers may differ from them in the last digit.
-        "low": np.minimum(np.clip(low, 0, 1), value).tolist(),
-        "high": np.maximum(np.clip(high, 0, 1), value).tolist(),
-        "chance": first.chance.tolist(),
-        "queries": len(first.owner),
-        "objects": int(means.shape[1]),
-        "few_objects": means.shape[1] < FEW_OBJECTS,
-        "gallery": first.gallery,
-        "by_seed": means.mean(1).tolist(),
-    }
+        low=np.minimum(np.clip(low, 0, 1), value).tolist(),
+        high=np.maximum(np.clip(high, 0, 1), value).tolist(),
+        chance=first.chance.tolist(),
+        queries=len(first.owner),
+        objects=int(means.shape[1]),
+        few_objects=means.shape[1] < FEW_OBJECTS,
+        gallery=first.gallery,
+        repeats=means.mean(1).tolist(),
+    )
 
 
 def _object_means(measures: Sequence[Measure]) -> NDArray[np.float64]:
@@ -85,7 +120,7 @@ def _object_means(measures: Sequence[Measure]) -> NDArray[np.float64]:
 
 
 def bootstrap_interval(
-    means: NDArray[np.float64], *, draws: int = 10_000, seed: int = 0
+    means: NDArray[np.float64], *, draws: int = DRAWS, seed: int = 0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the ends (m,) of the interval of the mean of object means: the expanded percentile bootstrap.
 
@@ -108,42 +143,35 @@ def bootstrap_interval(
     return np.where(same, means[0], low), np.where(same, means[0], high)
 
 
-def compare(
-    a: Sequence[Measure], b: Sequence[Measure], *, column: int = 0, draws: int = 10_000, seed: int = 0
-) -> dict[str, float | bool]:
-    """Compare two methods on the same queries, with objects as the units.
+def compare(a: Sequence[Measure], b: Sequence[Measure], *, seed: int = 0) -> Difference:
+    """Return the first value of `a` minus that of `b` on the same queries, with objects as the units.
 
     The p-value is that of a two-sided sign-flip permutation test on the objects' differences. Up to 18 objects it uses
-    all flips, else `draws` random ones (Phipson and Smyth 2010: p is never 0). The p-value is 1 for one
-    object or no difference.
+    all flips, else random ones (Phipson and Smyth 2010: p is never 0). The p-value is 1 for one object or no
+    difference.
 
     Args:
         a: Measures of the first method, one per training seed.
         b: Measures of the second.
-        column: Column of the values; of a top-n curve, 0 is the top-1 accuracy.
-        draws: Resamples and random flips.
-        seed: Seed of both.
-
-    Returns:
-        {"difference": a - b, "low", "high", "few_objects", "p"}.
+        seed: Seed of resamples and random flips.
 
     Raises:
         BadInput: The methods were scored on different queries.
     """
     if not a or not b or not np.array_equal(a[0].owner, b[0].owner):
         raise BadInput("compared methods must have the same queries; score both on the same queries")
-    differences = _object_means(a).mean(0)[:, column] - _object_means(b).mean(0)[:, column]
-    low, high = bootstrap_interval(differences[:, None], draws=draws, seed=seed)
-    return {
-        "difference": float(differences.mean()),
-        "low": float(np.clip(low[0], -1, 1)),
-        "high": float(np.clip(high[0], -1, 1)),
-        "few_objects": len(differences) < FEW_OBJECTS,
-        "p": sign_flip_p(differences, draws=draws, seed=seed),
-    }
+    differences = _object_means(a).mean(0)[:, 0] - _object_means(b).mean(0)[:, 0]
+    low, high = bootstrap_interval(differences[:, None], seed=seed)
+    return Difference(
+        value=float(differences.mean()),
+        low=float(np.clip(low[0], -1, 1)),
+        high=float(np.clip(high[0], -1, 1)),
+        few_objects=len(differences) < FEW_OBJECTS,
+        p=sign_flip_p(differences, seed=seed),
+    )
 
 
-def sign_flip_p(differences: NDArray[np.float64], *, draws: int = 10_000, seed: int = 0) -> float:
+def sign_flip_p(differences: NDArray[np.float64], *, draws: int = DRAWS, seed: int = 0) -> float:
     """Return the fraction of sign flips of the differences (R,) whose mean is at least as far from 0 as observed."""
     observed = abs(differences.sum())
     # Sums of the same numbers in another order differ by rounding; they are treated as equal.
@@ -165,65 +193,47 @@ def _flipped_sums(differences: NDArray[np.float64]) -> NDArray[np.float64]:
 # Splits ----------------------------------------------------------------------------------------------------
 
 
-def summarise_splits(splits: Sequence[Measure], ratio: float) -> dict[str, Any]:
-    """Return the "summary" of results.json over splits.
+def summarise_splits(splits: Sequence[Measure], ratio: float) -> Summary:
+    """Return the summary of a measure over splits.
 
     Args:
         splits: One measure per split.
         ratio: Test objects per training object of a split.
-
-    Returns:
-        The keys of `summarise`, with "by_split" [[m], ...], "min" and "max" [m] in place of "by_seed".
 
     Raises:
         BadInput: There are fewer than two splits.
     """
     means = _means(splits)
     value, margin = means.mean(0), _margin(means, ratio)
-    return {
-        "value": value.tolist(),
-        "low": np.clip(value - margin, 0, 1).tolist(),
-        "high": np.clip(value + margin, 0, 1).tolist(),
-        "min": means.min(0).tolist(),
-        "max": means.max(0).tolist(),
-        "chance": np.mean([one.chance for one in splits], axis=0).tolist(),
-        "queries": sum(len(one.owner) for one in splits),
-        "objects": len(np.unique(np.concatenate([one.owner for one in splits]))),
-        "few_objects": len(splits) < FEW_OBJECTS,
-        "gallery": splits[0].gallery,
-        "by_split": means.tolist(),
-    }
+    return Summary(
+        value=value.tolist(),
+        low=np.clip(value - margin, 0, 1).tolist(),
+        high=np.clip(value + margin, 0, 1).tolist(),
+        chance=np.mean([one.chance for one in splits], axis=0).tolist(),
+        queries=sum(len(one.owner) for one in splits),
+        objects=len(np.unique(np.concatenate([one.owner for one in splits]))),
+        few_objects=len(splits) < FEW_OBJECTS,
+        gallery=splits[0].gallery,
+        repeats=means.tolist(),
+    )
 
 
-def compare_splits(a: Sequence[Measure], b: Sequence[Measure], ratio: float, *, column: int = 0) -> dict[str, Any]:
-    """Compare two methods on the same splits, paired by split.
+def compare_splits(a: Sequence[Measure], b: Sequence[Measure], ratio: float) -> Difference:
+    """Return the first value of `a` minus that of `b`, paired by split; p is that of the corrected t-test.
 
     Args:
         a: Measures of the first method, one per split.
         b: Measures of the second.
         ratio: Test objects per training object of a split.
-        column: Column of the values; of a top-n curve, 0 is the top-1 accuracy.
-
-    Returns:
-        {"difference": a - b, "low", "high", "min", "max", "few_objects", "p"}; p is that of the corrected t-test,
-        two-sided.
 
     Raises:
         BadInput: There are fewer than two splits.
     """
-    differences = (_means(a) - _means(b))[:, [column]]
+    differences = (_means(a) - _means(b))[:, [0]]
     value, margin = float(differences.mean()), float(_margin(differences, ratio)[0])
     scale = margin / stdtrit(len(differences) - 1, (1 + LEVEL) / 2)
     p = float(2 * stdtr(len(differences) - 1, -abs(value) / scale)) if scale else float(value == 0)
-    return {
-        "difference": value,
-        "low": max(value - margin, -1.0),
-        "high": min(value + margin, 1.0),
-        "min": float(differences.min()),
-        "max": float(differences.max()),
-        "few_objects": len(differences) < FEW_OBJECTS,
-        "p": p,
-    }
+    return Difference(value, max(value - margin, -1.0), min(value + margin, 1.0), len(differences) < FEW_OBJECTS, p)
 
 
 def _means(splits: Sequence[Measure]) -> NDArray[np.float64]:

@@ -60,11 +60,14 @@ def pooled(parts: Sequence[Measure], units: Sequence[Mapping[int, int]] | None =
         owners = [np.array([unit[name] for name in own.tolist()]) for own, unit in zip(owners, units, strict=True)]
     owner = np.concatenate(owners)
     order = np.argsort(owner, kind="stable")
-    chances = np.concatenate([np.tile(part.chance, (len(part.owner), 1)) for part in parts])
+    chance = parts[0].chance
+    if not all(np.array_equal(part.chance, chance) for part in parts):  # the mean of equal numbers may be rounded
+        chances = np.concatenate([np.tile(part.chance, (len(part.owner), 1)) for part in parts])
+        chance = object_means(chances, owner)[1].mean(0)
     return Measure(
         np.concatenate([part.values for part in parts])[order],
         owner[order].astype(np.int64),
-        object_means(chances, owner)[1].mean(0),
+        chance,
         parts[0].gallery,
     )
 

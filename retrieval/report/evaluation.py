@@ -1,18 +1,29 @@
 """The report of an evaluation: Markdown, one HTML page and figures, from results.json.
 
-Every number comes from results.json or timings.json; the report measures nothing.
+Every number comes from results.json or timings.json; the report measures nothing. A report of one protocol has a
+section for each part; a report of several has a section for each protocol, with folded parts. A part without results is
+left out.
 """
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-from retrieval.report import error_analysis, method_comparison, tables
-from retrieval.report.builder import Builder
+import msgspec
+
+from retrieval.console.output import show
+from retrieval.evaluation.aggregate import RULE
+from retrieval.evaluation.results import Results, Timings, read_results
+from retrieval.metrics.registry import SET_SIZES, grasps_metric_name
+from retrieval.model.verification import ERRORS_NEEDED
+from retrieval.report import plots, tables
 from retrieval.report.document import (
     Block,
     Details,
     Document,
     Listing,
+    Picture,
     Section,
     Table,
     Text,
@@ -20,19 +31,28 @@ from retrieval.report.document import (
     write_document,
 )
 from retrieval.report.numbers import FEW_OBJECTS_MARK, FEW_OBJECTS_NOTE, percent, with_interval
-from retrieval.report.results import measure_label, method_label, read_results
+from retrieval.report.results import ProtocolView, views
+from retrieval.report.terminal import print_columns
 
-PAPER = (
-    "For orientation only: on its own data (98 real objects, real GelSight fingers) the paper reports a pair accuracy "
-    "of 64.3 % (chance 50 %) on its 18 unseen objects (Lin, Calandra, Levine: Learning to Identify Object Instances by "
-    "Touch, ICRA 2019). Its objects and pictures differ, so the numbers are not comparable."
-)
 SIMULATION = (
     "This recording is simulated. It can show that the code works, how methods compare on the same data, and how "
     "accuracy depends on objects, grasps and time. It cannot show the accuracy on real sensors and real objects: a "
     "program generates relief, material and light; photo and touch come from one geometry without wear, dirt or "
     "calibration errors; and objects differ only in the properties that the program varies."
 )
+INTERVALS_OF_UNITS = (
+    "Brackets contain 95 % intervals of a bootstrap that resamples {unit}s, because queries of one {unit} are "
+    "correlated. Every value is the mean over {unit}s of each {unit}'s mean, averaged over seeds. The interval covers "
+    "other {unit}s of this kind; it does not cover another recording, split or rig. {ties}"
+)
+INTERVALS_OF_CHOICES = (
+    "Every value is the mean over choices of test objects. Brackets contain 95 % intervals that cover the choice of "
+    "test and training objects (corrected resampled t-test, because choices share objects). {ties}"
+)
+TIES = "Ties get their expected rank, so a constant scorer gets exactly chance."
+TOO_FEW = "Not evaluated: the open-set decision requires at least three validation objects and three test objects."
+
+Blocks = Iterator[Block | None]
 
 
 def write_report(out: Path) -> list[Path]:
@@ -56,76 +76,312 @@ def write_report(out: Path) -> list[Path]:
     >>> [path.name for path in retrieval.write_report(Path("summaries"))][:2]
     ['report.md', 'report.html']
     """
-    results = read_results(out)
-    builder = Builder(results)
-    sections = [Section(title, tuple(block for block in build(builder) if block)) for title, build in SECTIONS.items()]
-    document = Document(
-        f"Which object was touched? Evaluation on {results.data['recording']['path_name']}",
-        tuple(_lead(builder)),
-        tuple(section for section in sections if section.blocks),
-    )
-    return write_document(document, out)
+    results, timings = read_results(out / "results.json", Results), None
+    if (out / "timings.json").exists():
+        timings = read_results(out / "timings.json", Timings)
+    found = views(results, timings)
+    lead = [Text(RULE)] if any(row.verdict for view in found for row in view.result.rows.values()) else []
+    lead += [Text(f"{name} was skipped: {why}.") for name, why in results.skipped.items()]
+    sections = [Section("Settings", tuple(_settings(results)))]
+    if len(found) == 1:
+        names = [f"{found[0].result.recording.name}: {found[0].result.title}"]
+        lead += _lead(found[0])
+        sections = [Section(title, blocks) for title, blocks in _parts(found[0])] + sections
+    else:
+        names = [view.result.title for view in found]
+        sections = [Section(view.result.title, tuple(_folded(view))) for view in found] + sections
+    title = f"Which object was touched? Evaluation on {', '.join(names)}"
+    return write_document(Document(title, tuple(lead), tuple(sections)), out)
 
 
-def _lead(builder: Builder) -> Iterator[Block]:
-    data = builder.results.data
-    parts, recording = data["split"], data["recording"]
+def print_results(results: Results) -> None:
+    """Print a table of each protocol, with its queries, objects and gallery, and the verdicts."""
+    for view in views(results, None):
+        if table := tables.measures(view, {key: view.measure_label(key) for key in view.headlines}):
+            print_columns(view.result.title, table.header, table.rows, words=(0,))
+            for note in table.notes:
+                show(note)
+        for line in tables.verdicts(view):
+            show(line)
+
+
+def _parts(view: ProtocolView) -> list[tuple[str, tuple[Block, ...]]]:
+    """Return titles and blocks of all parts that have results."""
+    parts = [(title, tuple(block for block in build(view) if block)) for title, build in PARTS.items()]
+    return [part for part in parts if part[1]]
+
+
+def _folded(view: ProtocolView) -> Iterator[Block]:
+    """Yield the blocks of a protocol; all parts but the first are folded."""
+    (_, first), *others = _parts(view)
+    yield from _lead(view)
+    yield from first
+    yield from (Details(title, blocks) for title, blocks in others)
+
+
+def _lead(view: ProtocolView) -> Iterator[Text]:
+    recording, splits = view.result.recording, view.result.folds[0]
+    counts = f"{len(splits)} {'choices' if view.result.unit == 'choice' else 'folds'}"
+    if len(splits) == 1:
+        counts = ", ".join(f"{len(splits[0][part])} {label} objects" for part, label in tables.PARTS.items())
     yield Text(
-        f"{recording['objects']} objects, {recording['grasps']:,} grasps, source: {recording['source']}. "
-        f"The methods were trained on {len(parts['train'])} objects. Settings were selected and probabilities "
-        f"calibrated on {len(parts['validation'])} others. The results below are from {len(parts['test'])} unseen "
-        f"objects. Seeds: {', '.join(map(str, data['setting']['seeds']))}."
+        f"{view.result.rule} {recording.objects} objects, {recording.grasps:,} grasps, source: {recording.source}; "
+        f"{counts}."
     )
-    keys = ("pair_accuracy", "topn_k5", "topn_k5_g5_p3")
-    found = [(key, summary) for key in keys if (summary := builder.results.summary(builder.main, key))]
-    summaries = [
-        f"{measure_label(key)}: {with_interval(summary)} (chance {percent(summary['chance'][0])})"
-        for key, summary in found
-    ]
-    text = (
-        f"{capitalized(method_label(builder.main))} on unseen objects, in percent. {capitalized('; '.join(summaries))}."
-    )
-    yield Text(f"{text} {FEW_OBJECTS_NOTE}" if FEW_OBJECTS_MARK in text else text)
-    if builder.results.simulated:
+    if verdicts := tables.verdicts(view):
+        yield from (Text(line, warn="does not count" in line) for line in verdicts)
+    else:
+        values = [
+            f"{view.measure_label(key)} {with_interval(summary)} (chance {percent(summary.chance[0])})"
+            for key in view.headlines
+            if (summary := view.summary(view.main_row, key))
+        ]
+        text = f"{capitalized(view.label(view.main_row))}, in percent: {'; '.join(values)}."
+        yield Text(f"{text} {FEW_OBJECTS_NOTE}" if FEW_OBJECTS_MARK in text else text)
+    if "simulat" in recording.source.lower():
         yield Text(SIMULATION)
-    yield Text(PAPER)
+    yield from (Text(sentence) for sentence in view.result.published_results)
 
 
-def _setting(builder: Builder) -> Iterator[Block | None]:
-    data = builder.results.data
-    setting, features, recording = data["setting"], data["setting"]["features"], data["recording"]
-    plain = {key: value for key, value in sorted(setting.items()) if isinstance(value, str | int | float)}
-    rows = (
-        ("recording", f"{recording['path_name']} ({recording['source']})"),
-        ("digest of the recording", recording["digest"]),
-        ("features", f"touch {features['touch']} x {features['fingers']} finger(s), photo {features['photo']}"),
-        ("digest of the features", features["digest"]),
-        ("seed of the split", str(data["split"]["seed"])),
-        *((key, f"{value:,}" if isinstance(value, int) else str(value)) for key, value in plain.items()),
-        ("software", f"touch-retrieval {data['software']}"),
+# Methods ---------------------------------------------------------------------------------------------
+
+
+def _methods(view: ProtocolView) -> Blocks:
+    if keys := view.headlines[:5]:
+        yield Picture(
+            view.figure_name("overview"),
+            f"Dots with intervals. {_values(view, keys)}.",
+            "Value and 95 % interval of each method; dashed: chance in closed form.",
+            lambda: plots.overview(view, keys),
+        )
+    yield tables.section(view, "main")
+    of_choices = view.result.unit == "choice"
+    yield Text((INTERVALS_OF_CHOICES if of_choices else INTERVALS_OF_UNITS).format(unit=view.result.unit, ties=TIES))
+    yield tables.choices(view)
+
+
+def _values(view: ProtocolView, keys: list[str]) -> str:
+    """Return measures of all rows as text, for the text alternative of a figure."""
+    lines = []
+    for key in keys:
+        found = view.summaries(key)
+        values = [f"{view.label(name)} {percent(summary.value[0])} %" for name, summary in found.items()]
+        chance = percent(next(iter(found.values())).chance[0])
+        lines.append(f"{view.measure_label(key)}: {', '.join(values)}; chance {chance} %")
+    return ". ".join(lines)
+
+
+def _topn(view: ProtocolView) -> Blocks:
+    keys = [key for key in ("topn_k5", "topn_k10") if view.any(key)]
+    if keys:
+        yield Picture(
+            view.figure_name("guess-curves"),
+            f"Rising curves. {_values(view, keys)}.",
+            "How often the object is among the first N answers, with K − 1 other objects as candidates. Bands: 95 % "
+            "intervals.",
+            lambda: plots.topn_curves(view, keys),
+        )
+
+
+def _grasps(view: ProtocolView) -> Blocks:
+    if keys := [key for key in map(grasps_metric_name, SET_SIZES) if view.any(key)]:
+        yield Picture(
+            view.figure_name("grasps"),
+            f"Top-1 accuracy against grasps in a query. {_values(view, keys)}.",
+            "A query of several grasps of one object against three photos of each of five objects. Dashed: chance.",
+            lambda: plots.grasps(view),
+        )
+        yield tables.section(view, "grasps")
+
+
+def _time(view: ProtocolView) -> Blocks:
+    if view.timings and view.times:
+        if key := next((key for key in ("topn_k5", view.result.main) if view.any(key)), None):
+            yield Picture(
+                view.figure_name("time"),
+                f"Accuracy against time on a logarithmic scale. {_values(view, [key])}. Times in the table.",
+                "Upper left is better. The grey steps join the methods on the Pareto front; dashed: chance.",
+                lambda: plots.accuracy_and_time(view, key),
+            )
+        yield tables.times(view, view.timings, view.times)
+
+
+def _gallery(view: ProtocolView) -> Blocks:
+    if table := tables.section(view, "gallery"):
+        yield Text("From a touch to all photos of the unseen objects; any photo of the object is right.")
+        yield table
+
+
+def _comparisons(view: ProtocolView) -> Blocks:
+    yield tables.comparisons(view)
+
+
+# Validity ------------------------------------------------------------------------------------------
+
+
+def _controls(view: ProtocolView) -> Blocks:
+    if view.result.controls:
+        yield Text(
+            "The same method on inputs without the information of interest. Permuted touches, no-contact frames and "
+            "the order of capture should be at chance. Low-pass touches contain light and coarse shape, so they may be "
+            "above chance."
+        )
+        yield tables.controls(view)
+    if table := tables.differences(view):
+        yield Details("Against the controls, all measures", (table,))
+
+
+def _ceilings(view: ProtocolView) -> Blocks:
+    if table := tables.ceilings(view):
+        yield Text(
+            "CCA trained and tested within one modality. Matching between touch and photo can hardly be better than "
+            "the worse of the two. The difference between that ceiling and the result is due to the change of modality."
+        )
+        yield table
+
+
+# Objects -------------------------------------------------------------------------------------------
+
+
+def _each(view: ProtocolView, entry: str, show_row: Callable[[ProtocolView, str, Any], Iterator[Block]]) -> Blocks:
+    """Yield the blocks of the main row, then, folded, of the other learned rows whose details have this entry."""
+    for name, details in view.details().items():
+        if name in view.learned and (found := getattr(details, entry)):
+            blocks = tuple(show_row(view, name, found))
+            folded = (Details(capitalized(view.label(name)), blocks),) if blocks else ()
+            yield from blocks if name == view.main_row else folded
+
+
+def _objects(view: ProtocolView) -> Blocks:
+    yield from _each(view, "per_object", _objects_of_row)
+
+
+def _objects_of_row(view: ProtocolView, name: str, per_object: dict[str, dict[str, float]]) -> Iterator[Block]:
+    label = view.label(name)
+    for key, measure, words in (
+        ("test", "topn_k5", "(a) candidates: test objects only"),
+        ("all", "topn_k5_all_objects", "(b) candidates: all objects (red: test, grey: validation, blue: training)"),
+    ):
+        if accuracy := per_object.get(f"{key}_candidates"):
+            best, worst = max(accuracy, key=accuracy.__getitem__), min(accuracy, key=accuracy.__getitem__)
+            low, high = percent(accuracy[worst]), percent(accuracy[best])
+            yield Picture(
+                view.figure_name(f"objects-{key}-{name}"),
+                f"Bars, {label}, {words}: {high} % ({best}) to {low} % ({worst}).",
+                f"Top-1 accuracy among five objects for each object, {label}; {words}.",
+                partial(plots.objects, view, name, f"{key}_candidates", measure),
+            )
+
+
+def _confusions(view: ProtocolView) -> Blocks:
+    yield from _each(view, "confusions", tables.confusions)
+
+
+# Decisions -----------------------------------------------------------------------------------------
+
+
+def _calibration(view: ProtocolView) -> Blocks:
+    yield from _each(view, "reliability", _reliability)
+    if fitted := {name: details.calibration for name, details in view.details().items() if details.calibration}:
+        yield Details("Calibration fitted on validation objects", (Listing.of_json(fitted),))
+
+
+def _reliability(view: ProtocolView, name: str, diagrams: dict[str, Any]) -> Iterator[Block]:
+    label = view.label(name)
+    descriptions = [
+        f"{text}: ECE {percent(diagrams[key]['ece'])} %" for key, text in plots.RELIABILITIES.items() if key in diagrams
+    ]
+    yield Picture(
+        view.figure_name(f"reliability-{name}"),
+        f"Reliability diagrams, {label}. {'; '.join(descriptions)}.",
+        f"Fraction of right answers against the probability that {label} stated; a calibrated method is on the "
+        "diagonal. Below: number of answers (logarithmic).",
+        partial(plots.reliability, view, name),
     )
-    yield Table(("setting", "value"), rows, words=frozenset({1}))
-    yield Details("Objects of each part", (tables.split(builder.results),))
-    yield Details("Configuration", (Listing.of_json(setting["config"]),))
-    if selected := {
-        name: one["best_params"] for name, one in data["methods"].items() if any(one.get("best_params") or ())
-    }:
-        yield Details("Parameters selected on validation objects, for each seed", (Listing.of_json(selected),))
 
 
-SECTIONS: dict[str, Callable[[Builder], Iterator[Block | None]]] = {
-    "Comparison of methods": method_comparison.method_overview,
-    "Top-N accuracy": method_comparison.topn_curves,
-    "Several grasps": method_comparison.grasps,
-    "Accuracy and time": method_comparison.time,
-    "Full gallery": method_comparison.gallery,
-    "Differences between methods": method_comparison.comparisons,
-    "Controls": method_comparison.controls,
-    "Ceilings": method_comparison.ceilings,
-    "Accuracy by object": error_analysis.objects,
-    "Confusions": error_analysis.confusions,
-    "Calibration": error_analysis.calibration,
-    "Is the object in the catalogue?": error_analysis.reject,
-    "Is it the expected object?": error_analysis.verification,
-    "Settings": _setting,
+def _reject(view: ProtocolView) -> Blocks:
+    found = {name: details.reject for name, details in view.details().items() if details.reject}
+    if found:
+        descriptions = [
+            f"{view.label(name)} {percent(one.auroc.value[0])} % "
+            f"({percent(one.risk_coverage[-1][1])} % wrong if all queries are answered)"
+            for name, one in found.items()
+        ]
+        yield Picture(
+            view.figure_name("reject"),
+            f"ROC curves, and risk against coverage; areas under the ROC curves: {', '.join(descriptions)}.",
+            "Each query is used twice: with its object in the gallery, and without it. Left: ROC curve of the decision "
+            "that the gallery contains the object; the grey line marks 95 % true accepts. Right: fraction of wrong "
+            "top-1 answers; half of the queries have no right answer, so a method that answers all of them ends on or "
+            "above the grey line.",
+            lambda: plots.reject(view),
+        )
+        yield tables.rejects(view, found)
+    elif view.details():
+        yield Text(TOO_FEW)
+
+
+def _verification(view: ProtocolView) -> Blocks:
+    for found in (details.verification for details in view.details().values() if details.verification):
+        one = next(iter(found["random"].values()))
+        yield tables.verification(found)
+        yield Text(
+            f"{one.sequences:,} sequences of grasps of {one.objects} unseen objects. A sequence is accepted if "
+            "its largest log likelihood ratio so far reaches the threshold. Impostors: every other unseen object, or "
+            "the one whose photos have the most similar embeddings. A FAR is refused if the trials would contain fewer "
+            f"than {ERRORS_NEEDED} errors (rule of 30)."
+        )
+
+
+# Settings ------------------------------------------------------------------------------------------
+
+
+def _recording(view: ProtocolView) -> Blocks:
+    recording, features = view.result.recording, view.result.features
+    rows = [
+        ("recording", f"{recording.name} ({recording.source})"),
+        ("digest of the recording", recording.digest),
+    ]
+    if features:
+        words = f"touch {features.touch} x {features.fingers} finger(s), photo {features.photo}"
+        rows += [("features", words), ("digest of the features", features.digest)]
+    yield Table(("property", "value"), tuple(rows), words=frozenset({1}))
+    if len(view.result.folds[0]) == 1:
+        yield Details("Objects of each part", (tables.split(view.result.folds[0][0]),))
+    if selected := {name: row.best_params for name, row in view.result.rows.items() if any(map(any, row.best_params))}:
+        words = "Parameters selected on validation objects, for each seed and fold"
+        yield Details(words, (Listing.of_json(selected),))
+
+
+def _settings(results: Results) -> Iterator[Block]:
+    setting = results.setting
+    rows = [
+        ("preset", setting.preset),
+        ("seeds", ", ".join(map(str, setting.seeds))),
+        ("software", f"touch-retrieval {results.software}"),
+    ]
+    if setting.model:
+        rows.insert(1, ("digest of the model", setting.model))
+    yield Table(("setting", "value"), tuple(rows), words=frozenset({1}))
+    yield Details("Configuration", (Listing.of_json(setting.config),))
+    if setting.compared:
+        yield Details("Compared towers", (Listing.of_json(msgspec.to_builtins(setting.compared)),))
+
+
+PARTS: dict[str, Callable[[ProtocolView], Blocks]] = {
+    "Comparison of methods": _methods,
+    "Top-N accuracy": _topn,
+    "Several grasps": _grasps,
+    "Accuracy and time": _time,
+    "Full gallery": _gallery,
+    "Differences between methods": _comparisons,
+    "Controls": _controls,
+    "Ceilings": _ceilings,
+    "Accuracy by object": _objects,
+    "Confusions": _confusions,
+    "Calibration": _calibration,
+    "Is the object in the catalogue?": _reject,
+    "Is it the expected object?": _verification,
+    "Recording": _recording,
 }

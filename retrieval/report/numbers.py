@@ -1,9 +1,8 @@
 """How reports write numbers: one form for numbers, percentages, intervals and p-values."""
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
 
-from retrieval.metrics.intervals import FEW_OBJECTS
+from retrieval.metrics.intervals import FEW_OBJECTS, Difference, Summary
 
 MISSING_VALUE = "–"
 FEW_OBJECTS_MARK = " †"
@@ -11,8 +10,6 @@ FEW_OBJECTS_NOTE = (
     f"† Fewer than {FEW_OBJECTS} objects: the interval is too narrow. In simulated samples it contained the true value "
     "in 50 % of cases for 2 objects, 74 % for 3 and 87 % for 4, instead of 95 %."
 )
-Summary = Mapping[str, Any]
-"""A measure in results.json: value, interval, chance, queries, objects and gallery (`retrieval.metrics.intervals`)."""
 
 
 def format_number(value: float | None) -> str:
@@ -39,19 +36,18 @@ def with_interval(summary: Summary | None) -> str:
 
     Of a top-n curve, this is the top-1 accuracy.
     """
-    if summary is None or summary["value"][0] is None:
+    if summary is None:
         return MISSING_VALUE
-    return interval(*(summary[key][0] for key in ("value", "low", "high"))) + _mark(summary)
+    return interval(summary.value[0], summary.low[0], summary.high[0]) + _mark(summary)
 
 
-def points(comparison: Mapping[str, Any]) -> str:
+def difference(found: Difference) -> str:
     """Return a difference and its interval in percent points, with a mark if there are too few objects."""
-    value, low, high = (comparison[key] for key in ("difference", "low", "high"))
-    return interval(value, low, high, lambda fraction: f"{100 * fraction:+.1f}") + _mark(comparison)
+    return interval(found.value, found.low, found.high, lambda fraction: f"{100 * fraction:+.1f}") + _mark(found)
 
 
-def _mark(found: Mapping[str, Any]) -> str:
-    return FEW_OBJECTS_MARK if found.get("few_objects") else ""
+def _mark(found: Summary | Difference) -> str:
+    return FEW_OBJECTS_MARK if found.few_objects else ""
 
 
 def probability(value: float) -> str:

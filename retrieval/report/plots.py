@@ -1,13 +1,12 @@
-"""Plots of an evaluation: each function returns a matplotlib figure of the results."""
+"""Plots of an evaluation: each function returns a matplotlib figure of one protocol."""
 
-import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.methods import CHANCE
+from retrieval.metrics.intervals import Summary
 from retrieval.metrics.registry import SET_SIZES, grasps_metric_name
 from retrieval.report.canvas import (
     MUTED_COLOUR,
@@ -20,55 +19,47 @@ from retrieval.report.canvas import (
     style_of,
 )
 from retrieval.report.numbers import percent
-from retrieval.report.results import Results, measure_label, method_label, shortened
+from retrieval.report.results import ProtocolView
 
-OVERVIEW = ("pair_accuracy", "topn_k5", "topn_k10", grasps_metric_name(5), "map")
 _LABELLED_OBJECTS = 130
+_LABEL_LENGTH = 24
 
 
-def overview(results: Results) -> Figure:
-    """Plot value, interval and chance: a row for each method, a panel for each main measure."""
-    keys = [key for key in OVERVIEW if any(results.summary(name, key) for name in results.methods)]
-    figure = canvas(10.5, 0.9 + 0.32 * len(results.methods))
+def overview(view: ProtocolView, keys: Sequence[str]) -> Figure:
+    """Plot value, interval and chance: a line for each row, a panel for each measure."""
+    figure = canvas(10.5, 0.9 + 0.32 * len(view.rows))
     panels = figure.subplots(1, len(keys), sharey=True, squeeze=False)[0]
     for panel, key in zip(panels, keys, strict=True):
-        for row, name in enumerate(results.methods):
-            if summary := results.summary(name, key):
+        for place, name in enumerate(view.rows):
+            if summary := view.summary(name, key):
                 value, low, high = _first(summary)
-                panel.plot([low, high], [row, row], color=style_of(name).colour, lw=2.2, solid_capstyle="butt")
-                panel.plot(value, row, style_of(name).marker, color=style_of(name).colour, ms=6.5)
-                panel.axvline(100 * summary["chance"][0], color=MUTED_COLOUR, ls="--", lw=1, zorder=0)
-        panel.set_title(measure_label(key).replace(", ", "\n", 1), fontsize=9)
+                panel.plot([low, high], [place, place], color=style_of(name).colour, lw=2.2, solid_capstyle="butt")
+                panel.plot(value, place, style_of(name).marker, color=style_of(name).colour, ms=6.5)
+                panel.axvline(100 * summary.chance[0], color=MUTED_COLOUR, ls="--", lw=1, zorder=0)
+        panel.set_title(view.measure_label(key).replace(", ", "\n", 1), fontsize=9)
         panel.set_xlabel("%")
         panel.tick_params(axis="y", length=0)
         panel.grid(axis="y", visible=False)
-    panels[0].set_yticks(range(len(results.methods)), [method_label(name) for name in results.methods])
+    panels[0].set_yticks(range(len(view.rows)), list(map(view.label, view.rows)))
     panels[0].invert_yaxis()
     return figure
 
 
-def _first(summary: Any) -> tuple[float, float, float]:
+def _first(summary: Summary) -> tuple[float, float, float]:
     """Return the first value of a measure and its interval, in percent."""
-    value, low, high = (_percents(summary[key])[0] for key in ("value", "low", "high"))
-    return float(value), float(low), float(high)
+    return 100 * summary.value[0], 100 * summary.low[0], 100 * summary.high[0]
 
 
-def _percents(fractions: Sequence[float | None]) -> NDArray[np.float64]:
-    return 100 * np.array([math.nan if fraction is None else fraction for fraction in fractions])
-
-
-def topn_curves(results: Results) -> Figure:
-    """Plot the top-N accuracy for 5 candidates and, if there are enough objects, for 10."""
-    all_keys = ("topn_k5", "topn_k10")
-    keys = [key for key in all_keys if any(results.summary(name, key) for name in results.methods)] or all_keys
+def topn_curves(view: ProtocolView, keys: Sequence[str]) -> Figure:
+    """Plot the top-N accuracy: a panel for each number of candidates."""
     figure = canvas(2.5 + 4 * len(keys), 4.6)
     for panel, key in zip(figure.subplots(1, len(keys), squeeze=False)[0], keys, strict=True):
-        for name in reversed(results.methods):
-            if (summary := results.summary(name, key)) is None:
-                continue
-            value, low, high = (_percents(summary[part]) for part in ("value", "low", "high"))
+        for name, summary in reversed(view.summaries(key).items()):
+            value, low, high, chance = (
+                100 * np.array(part) for part in (summary.value, summary.low, summary.high, summary.chance)
+            )
             ranks, style = np.arange(1, len(value) + 1), style_of(name)
-            panel.plot(ranks, _percents(summary["chance"]), color=MUTED_COLOUR, ls="--", lw=1.2, zorder=1)
+            panel.plot(ranks, chance, color=MUTED_COLOUR, ls="--", lw=1.2, zorder=1)
             panel.plot(ranks, value, color=style.colour, marker=style.marker, ls=style.line)
             if name != CHANCE:
                 panel.fill_between(ranks, low, high, color=style.colour, alpha=0.13, lw=0)
@@ -76,66 +67,64 @@ def topn_curves(results: Results) -> Figure:
         panel.set_xlabel("N")
         panel.xaxis.get_major_locator().set_params(integer=True)
         percent_axis(panel, "object among the first N answers, %")
-    _legend(figure, results.methods)
+    _legend(figure, view, view.rows)
     return figure
 
 
-def _legend(figure: Figure, names: Sequence[str]) -> None:
+def _legend(figure: Figure, view: ProtocolView, names: Sequence[str]) -> None:
     """Add one legend on the right, in the order of the tables."""
     from matplotlib.lines import Line2D
 
     handles = [
-        Line2D([], [], color=style.colour, marker=style.marker, ls=style.line, label=method_label(name))
+        Line2D([], [], color=style.colour, marker=style.marker, ls=style.line, label=view.label(name))
         for name, style in ((name, style_of(name)) for name in names)
     ]
     handles.append(Line2D([], [], color=MUTED_COLOUR, ls="--", lw=1.2, label="chance, closed form"))
     figure.legend(handles=handles, loc="outside right center", frameon=False)
 
 
-def grasps(results: Results) -> Figure:
+def grasps(view: ProtocolView) -> Figure:
     """Plot top-1 accuracy of five against the number of grasps, with 3 photos of each candidate."""
     figure = canvas(8, 4.4)
     panel = figure.subplots()
-    keys = {grasps_metric_name(count): count for count in SET_SIZES}
-    keys = {key: count for key, count in keys.items() if any(results.summary(name, key) for name in results.methods)}
-    for place, name in enumerate(results.methods):
-        shift, style = 0.055 * (place - (len(results.methods) - 1) / 2), style_of(name)
-        found = [(at, summary) for at, key in enumerate(keys) if (summary := results.summary(name, key))]
+    keys = {key: count for count in SET_SIZES if view.any(key := grasps_metric_name(count))}
+    for place, name in enumerate(view.rows):
+        shift, style = 0.055 * (place - (len(view.rows) - 1) / 2), style_of(name)
+        found = [(at, summary) for at, key in enumerate(keys) if (summary := view.summary(name, key))]
         points = np.array([(at + shift, *_first(summary)) for at, summary in found]).reshape(-1, 4)
         panel.plot(points[:, 0], points[:, 1], color=style.colour, marker=style.marker, ls=style.line, ms=5)
         panel.vlines(points[:, 0], points[:, 2], points[:, 3], color=style.colour, lw=1.4, alpha=0.7)
         for at, summary in found:
-            panel.hlines(100 * summary["chance"][0], at - 0.4, at + 0.4, color=MUTED_COLOUR, ls="--", lw=1.2, zorder=1)
+            panel.hlines(100 * summary.chance[0], at - 0.4, at + 0.4, color=MUTED_COLOUR, ls="--", lw=1.2, zorder=1)
     panel.set_xticks(range(len(keys)), list(map(str, keys.values())))
     panel.set_xlabel("grasps of the same object in one query")
     percent_axis(panel, "top-1 accuracy among 5 objects, %")
-    _legend(figure, results.methods)
+    _legend(figure, view, view.rows)
     return figure
 
 
-# Objects ---------------------------------------------------------------------------------------------
+def objects(view: ProtocolView, row: str, candidates: str, measure: str) -> Figure:
+    """Plot the top-1 accuracy of five for each object, coloured by part.
 
-
-def objects(results: Results, method: str, which: str) -> Figure:
-    """Plot the top-1 accuracy of five for each object, coloured by part; `which` is "test" or "all" (candidates)."""
-    accuracies = results.data["methods"][method]["per_object"][f"{which}_candidates"]
+    Args:
+        view: The protocol.
+        row: The row.
+        candidates: "test_candidates" or "all_candidates".
+        measure: The measure whose chance is drawn.
+    """
+    accuracies, split = view.details()[row].per_object[candidates], view.result.folds[0][0]
     ranked = sorted(accuracies, key=lambda name: (-accuracies[name], name))
-    bars = [
-        (name, accuracies[name], colour)
-        for part, colour in PART_COLOURS.items()
-        for name in ranked
-        if name in results.data["split"][part]
-    ]
+    bars = [(name, colour) for part, colour in PART_COLOURS.items() for name in ranked if name in split[part]]
     figure = canvas(13, 3.8)
     panel = figure.subplots()
-    values, colours = [100 * accuracy for _, accuracy, _ in bars], [colour for *_, colour in bars]
-    panel.bar(range(len(bars)), values, 0.78, color=colours)
-    if summary := results.summary(method, "topn_k5" if which == "test" else "topn_k5_all_objects"):
-        panel.axhline(100 * summary["chance"][0], color="#333333", ls="--", lw=1.2)
-        panel.text(len(bars) - 0.4, 100 * summary["chance"][0], " chance", va="center", fontsize=8)
+    heights, colours = [100 * accuracies[name] for name, _ in bars], [colour for _, colour in bars]
+    panel.bar(range(len(bars)), heights, 0.78, color=colours)
+    if summary := view.summary(row, measure):
+        panel.axhline(100 * summary.chance[0], color="#333333", ls="--", lw=1.2)
+        panel.text(len(bars) - 0.4, 100 * summary.chance[0], " chance", va="center", fontsize=8)
     if len(bars) <= _LABELLED_OBJECTS:
         size = float(np.clip(700 / len(bars), 5.5, 8))
-        panel.set_xticks(range(len(bars)), [shortened(name, 24) for name, *_ in bars], rotation=90, fontsize=size)
+        panel.set_xticks(range(len(bars)), [_shortened(name) for name, _ in bars], rotation=90, fontsize=size)
     else:
         panel.set_xticks([])
         panel.set_xlabel(f"{len(bars)} objects")
@@ -143,6 +132,12 @@ def objects(results: Results, method: str, which: str) -> Figure:
     panel.grid(axis="x", visible=False)
     percent_axis(panel, "top-1 accuracy, %")
     return figure
+
+
+def _shortened(name: str) -> str:
+    """Return the name, shortened in its middle, because the ends distinguish objects."""
+    head = (_LABEL_LENGTH - 1) // 2
+    return name if len(name) <= _LABEL_LENGTH else f"{name[:head]}…{name[len(name) - (_LABEL_LENGTH - 1 - head) :]}"
 
 
 # Decisions -------------------------------------------------------------------------------------------
@@ -155,16 +150,16 @@ RELIABILITIES = {
 }
 
 
-def reliability(results: Results, method: str) -> Figure:
+def reliability(view: ProtocolView, row: str) -> Figure:
     """Plot the fraction of right answers against the stated probability, on test objects, with counts below."""
-    diagrams = results.data["methods"][method]["reliability"]
+    diagrams = view.details()[row].reliability
     kinds = [kind for kind in RELIABILITIES if kind in diagrams]
     figure = canvas(0.6 + 2.7 * len(kinds), 4.1)
     grid = figure.subplots(2, len(kinds), sharex=True, sharey="row", squeeze=False, height_ratios=[4, 1])
-    colour = style_of(method).colour
+    colour = style_of(row).colour
     for panel, counts, kind in zip(*grid, kinds, strict=True):
         bins = [found for found in diagrams[kind]["bins"] if found["count"]]
-        stated, right = _percents([one["probability"] for one in bins]), _percents([one["frequency"] for one in bins])
+        stated, right = (100 * np.array([one[key] for one in bins]) for key in ("probability", "frequency"))
         panel.plot([0, 100], [0, 100], color=MUTED_COLOUR, ls="--", lw=1.2)
         panel.vlines(stated, stated, right, color=colour, lw=1, alpha=0.5)
         panel.plot(stated, right, "o-", color=colour, ms=5)
@@ -179,15 +174,14 @@ def reliability(results: Results, method: str) -> Figure:
     return figure
 
 
-def reject(results: Results) -> Figure:
+def reject(view: ProtocolView) -> Figure:
     """Plot the ROC curve of "the catalogue contains the object", and the top-1 risk against coverage."""
     figure = canvas(10.5, 4.4)
     accepts, risk = figure.subplots(1, 2)
-    names = [name for name in results.methods if results.data["methods"][name].get("reject")]
-    for name in reversed(names):
-        found = results.data["methods"][name]["reject"]
-        _decisions(accepts, name, found["roc"])
-        _decisions(risk, name, found["risk_coverage"])
+    rejections = {name: details.reject for name, details in view.details().items() if details.reject}
+    for name, rejection in reversed(rejections.items()):
+        _curve(accepts, name, 100 * np.array(rejection.roc))
+        _curve(risk, name, 100 * np.array(rejection.risk_coverage))
     accepts.plot([0, 100], [0, 100], color=MUTED_COLOUR, ls="--", lw=1.2)
     accepts.axhline(95, color=MUTED_COLOUR, lw=0.8)
     accepts.set(xlabel="accepted, object absent (false accepts), %", ylabel="accepted, object present, %")
@@ -196,43 +190,40 @@ def reject(results: Results) -> Figure:
     for panel in (accepts, risk):
         panel.set(xlim=(-1, 101), ylim=(-1, 101))
         panel.set_aspect("equal", adjustable="box")
-    _legend(figure, names)
+    _legend(figure, view, list(rejections))
     return figure
 
 
-def _decisions(panel: Axes, name: str, corners: Sequence[Sequence[float]]) -> None:
-    """Plot a curve of many corners with a few markers."""
-    points, style = 100 * np.array(corners), style_of(name)
-    panel.plot(points[:, 0], points[:, 1], color=style.colour, ls=style.line)
-    step = max(1, len(points) // 6)
-    panel.plot(points[step:-1:step, 0], points[step:-1:step, 1], style.marker, color=style.colour, ms=5)
+def _curve(panel: Axes, row: str, points: NDArray[np.float64]) -> None:
+    """Plot a curve of many corners (n, 2) with a few markers."""
+    style, step = style_of(row), max(1, len(points) // 6)
+    panel.plot(*points.T, color=style.colour, ls=style.line)
+    panel.plot(*points[step:-1:step].T, style.marker, color=style.colour, ms=5)
 
 
 # Time ------------------------------------------------------------------------------------------------
 
 
-def accuracy_and_time(results: Results) -> Figure:
-    """Plot top-1 accuracy of five against the time of a query, and against the time of fitting."""
+def accuracy_and_time(view: ProtocolView, key: str) -> Figure:
+    """Plot a measure against the time of a query, and against the time of fitting."""
     figure = canvas(10.5, 4.4)
     panels = figure.subplots(1, 2, sharey=True)
     titles = {"query_ms": "one query against the whole gallery, ms", "fit_s": "fitting, s"}
-    for panel, (key, title) in zip(panels, titles.items(), strict=True):
-        front: list[tuple[float, float]] = []
-        for name in results.methods:
-            time, summary = results.time(name, key), results.summary(name, "topn_k5")
-            if not (time and summary):
+    for panel, (kind, title) in zip(panels, titles.items(), strict=True):
+        points: list[tuple[float, float]] = []
+        for name, summary in view.summaries(key).items():
+            times, style = view.time_of(name), style_of(name)
+            if not (times and (time := getattr(times, kind))):
                 continue
             value, low, high = _first(summary)
-            front.append((time, value))
-            panel.errorbar(
-                time, value, [[value - low], [high - value]], fmt=style_of(name).marker, color=style_of(name).colour
-            )
-            panel.axhline(100 * summary["chance"][0], color=MUTED_COLOUR, ls="--", lw=1.2, zorder=0)
+            points.append((time, value))
+            panel.errorbar(time, value, [[value - low], [high - value]], fmt=style.marker, color=style.colour)
+            panel.axhline(100 * summary.chance[0], color=MUTED_COLOUR, ls="--", lw=1.2, zorder=0)
         # The Pareto front of time and accuracy.
         front = [
             (time, value)
-            for time, value in sorted(front)
-            if not any(other != (time, value) and other[0] <= time and other[1] >= value for other in front)
+            for time, value in sorted(points)
+            if not any(other != (time, value) and other[0] <= time and other[1] >= value for other in points)
         ]
         if front:
             panel.step(*zip(*front, strict=True), where="post", color="#222222", lw=1, alpha=0.45, zorder=0)
@@ -240,6 +231,6 @@ def accuracy_and_time(results: Results) -> Figure:
         low, high = panel.get_xlim()
         logarithmic(panel.xaxis, (1, 2, 5) if high < 1000 * low else (1,))
         panel.set_xlabel(title)
-    percent_axis(panels[0], "top-1 accuracy among 5 objects, %")
-    _legend(figure, results.methods)
+    percent_axis(panels[0], f"{view.measure_label(key)}, %")
+    _legend(figure, view, view.rows)
     return figure

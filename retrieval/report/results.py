@@ -1,19 +1,13 @@
-"""Reader of results.json and timings.json, and the report's labels of methods and measures."""
+"""One protocol of results.json as the report shows it: its measures, and labels of rows and measures."""
 
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
-from _touch_retrieval.files import read_json
-from retrieval.errors import BadInput
-from retrieval.evaluation import SCHEMA_VERSION
+from retrieval.evaluation.results import Details, MethodTimes, ProtocolResult, ProtocolTimes, Results, Timings
 from retrieval.methods import CHANCE
-from retrieval.metrics.registry import METRICS
-from retrieval.report.numbers import Summary
+from retrieval.metrics.intervals import Summary
+from retrieval.metrics.registry import METRICS, grasps_metric_name
 
-# Order of every table and figure. Other methods come last, under their own names.
 METHOD_LABELS = {
     "late_fusion": "late fusion",
     "retrieve_rerank": "retrieve + rerank",
@@ -22,81 +16,8 @@ METHOD_LABELS = {
     "cca": "CCA",
     "chance": "random scores",
 }
-IMPOSTORS = {"random": "random", "similar": "most similar object"}
-"""Labels of the impostors of verification."""
-
-
-@dataclass(frozen=True)
-class Results:
-    """Results and timings of an evaluation, as in the files."""
-
-    data: Mapping[str, Any]
-    timings: Mapping[str, Any]
-
-    @property
-    def methods(self) -> list[str]:
-        """The evaluated methods, in the order of `METHOD_LABELS`."""
-        known = list(METHOD_LABELS)
-        return sorted(self.data["methods"], key=lambda name: (known.index(name) if name in known else 99, name))
-
-    @property
-    def learned(self) -> list[str]:
-        """The methods without chance."""
-        return [name for name in self.methods if name != CHANCE]
-
-    def summary(self, method: str, measure: str) -> Summary | None:
-        """Return value, interval, chance and basis of a measure; None if the method lacks it."""
-        found: Summary | None = self.data["methods"].get(method, {}).get("measures", {}).get(measure)
-        return found
-
-    def time(self, method: str, key: str) -> float | None:
-        """Return a time of timings.json; None if the method lacks it."""
-        found: float | None = self.timings.get("methods", {}).get(method, {}).get(key)
-        return found
-
-    @property
-    def simulated(self) -> bool:
-        """Whether the recording comes from a simulated rig."""
-        return "simulat" in self.data["recording"]["source"].lower()
-
-
-def read_results(out: Path) -> Results:
-    """Read `out`/results.json, and `out`/timings.json if it exists.
-
-    Raises:
-        BadInput: A file cannot be read.
-    """
-    timings = out / "timings.json"
-    data = read_results_file(out / "results.json", SCHEMA_VERSION, "evaluate")
-    return Results(data, read_results_file(timings, None, "evaluate") if timings.exists() else {})
-
-
-def read_results_file(path: Path, version: int | None, command: str) -> dict[str, Any]:
-    """Read a JSON object that a command wrote.
-
-    Args:
-        path: The file.
-        version: Required schema version; None for any.
-        command: Command that writes the file, for messages.
-
-    Returns:
-        The object.
-
-    Raises:
-        BadInput: The file cannot be read or has another schema version.
-    """
-    try:
-        data = read_json(path)
-    except (OSError, ValueError) as error:
-        raise BadInput(f"{path} must contain results in JSON ({error}). Run `retrieve {command}`.") from error
-    if not isinstance(data, dict):
-        raise BadInput(f"{path} must contain a JSON object, got {type(data).__name__}. Run `retrieve {command}`.")
-    if version is not None and (found := data.get("schema_version")) != version:
-        raise BadInput(f"{path} must have schema version {version}, got {found!r}. Run `retrieve {command}`.")
-    return data
-
-
-# Labels ----------------------------------------------------------------------------------------------
+HEADLINES = ("pair_accuracy", "topn_k5", "topn_k10", grasps_metric_name(5), "map")
+"""Measures of the overview of a protocol with many measures."""
 
 
 def method_label(name: str) -> str:
@@ -104,19 +25,89 @@ def method_label(name: str) -> str:
     return METHOD_LABELS.get(name, name.rpartition(":")[2].replace("_", " "))
 
 
-def measure_label(name: str) -> str:
-    """Return the report's label of a measure."""
-    return METRICS[name].label if name in METRICS else name.replace("_", " ")
+@dataclass(frozen=True)
+class ProtocolView:
+    """Results of one protocol, with labels.
+
+    Attributes:
+        name: Name of the protocol.
+        result: Its results.
+        timings: Run times of all protocols, if they were measured.
+        is_only: Whether the report has no other protocol.
+    """
+
+    name: str
+    result: ProtocolResult
+    timings: Timings | None
+    is_only: bool
+
+    @property
+    def rows(self) -> list[str]:
+        """Names of the rows."""
+        return list(self.result.rows)
+
+    @property
+    def learned(self) -> list[str]:
+        """The rows without random scores."""
+        return [name for name in self.rows if name != CHANCE]
+
+    @property
+    def main_row(self) -> str:
+        """The row that is shown in detail."""
+        return (self.learned or self.rows)[0]
+
+    @property
+    def is_in_depth(self) -> bool:
+        """Whether single objects and decisions are reported, and so many measures that each section has a table."""
+        return any(row.details for row in self.result.rows.values())
+
+    @property
+    def headlines(self) -> list[str]:
+        """The measures of the overview, the deciding one among them."""
+        names = HEADLINES if self.is_in_depth else [key for key, _ in self.result.labels]
+        return [key for key in names if self.any(key)]
+
+    def label(self, row: str) -> str:
+        """Return the label of a row: that of its method, or the name of a checkpoint that scores as it is."""
+        found = self.result.rows.get(row)
+        is_method = found is None or found.method == row or found.model is None
+        return method_label(row) if is_method else f"{row} (unadapted)"
+
+    def measure_label(self, key: str) -> str:
+        """Return the label of a measure."""
+        return dict(self.result.labels).get(key) or (METRICS[key].label if key in METRICS else key.replace("_", " "))
+
+    def summary(self, row: str, key: str) -> Summary | None:
+        """Return a measure of a row; None if the row lacks it."""
+        return self.result.rows[row].measures.get(key)
+
+    def summaries(self, key: str) -> dict[str, Summary]:
+        """Return a measure of all rows that have it."""
+        return {row: found.measures[key] for row, found in self.result.rows.items() if key in found.measures}
+
+    def any(self, *keys: str) -> bool:
+        """Return whether any row has one of these measures."""
+        return any(self.summaries(key) for key in keys)
+
+    def details(self) -> dict[str, Details]:
+        """Return the details of all rows that have them."""
+        return {name: row.details for name, row in self.result.rows.items() if row.details}
+
+    @property
+    def times(self) -> ProtocolTimes | None:
+        """The run times; None if they were not measured."""
+        return self.timings.protocols.get(self.name) if self.timings else None
+
+    def time_of(self, row: str) -> MethodTimes | None:
+        """Return the run times of a row; None if they were not measured."""
+        return self.times.rows.get(row) if self.times else None
+
+    def figure_name(self, name: str) -> str:
+        """Return a name of a figure's file that no other protocol of the report has."""
+        return re.sub(r"[^A-Za-z0-9_-]+", "-", name if self.is_only else f"{self.name}-{name}")
 
 
-def file_name(name: str) -> str:
-    """Return the name with all characters that are unsafe in paths replaced by "-"."""
-    return re.sub(r"[^A-Za-z0-9_-]+", "-", name)
-
-
-def shortened(name: str, length: int) -> str:
-    """Return the name, shortened in its middle to `length` characters, because the ends distinguish objects."""
-    if len(name) <= length:
-        return name
-    head = (length - 1) // 2
-    return f"{name[:head]}…{name[len(name) - (length - 1 - head) :]}"
+def views(results: Results, timings: Timings | None) -> list[ProtocolView]:
+    """Return a view of each protocol, in the order of the file."""
+    is_only = len(results.protocols) == 1
+    return [ProtocolView(name, result, timings, is_only) for name, result in results.protocols.items()]

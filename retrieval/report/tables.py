@@ -1,87 +1,101 @@
-"""Tables of an evaluation: each function returns a table block of the document."""
+"""Tables of an evaluation: each function returns a table block of one protocol, or None if there are no numbers."""
 
-import dataclasses
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
+from retrieval.evaluation.aggregate import CONTROL_NAMES
+from retrieval.evaluation.results import (
+    Confusion,
+    ControlResult,
+    ProtocolTimes,
+    Rate,
+    Rejection,
+    Summaries,
+    Timings,
+    VerificationRates,
+)
+from retrieval.metrics.intervals import Summary
 from retrieval.metrics.registry import METRICS
 from retrieval.model.posterior import FORMULA
-from retrieval.report.document import Table
+from retrieval.report.document import Block, Table
 from retrieval.report.numbers import (
     FEW_OBJECTS_MARK,
     FEW_OBJECTS_NOTE,
     MISSING_VALUE,
-    Summary,
+    difference,
     format_number,
     interval,
     percent,
-    points,
     probability,
     with_interval,
 )
-from retrieval.report.results import IMPOSTORS, Results, measure_label, method_label
+from retrieval.report.results import ProtocolView
 
-Column = tuple[str, str]
-"""Heading and measure."""
-
-
-def section(results: Results, name: str) -> Table | None:
-    """Return a row for each method and a column for each measured metric of a section; None if there is none."""
-    return _table(results, [(metric.column, key) for key, metric in METRICS.items() if metric.section == name])
+Row = tuple[str, ...]
+LOW_PASS_LABEL = "low-pass control (8 x 6)"
+IMPOSTORS = {"random": "random", "similar": "most similar object"}
+PARTS = {"train": "training", "validation": "validation", "test": "test"}
+"""Parts of a split."""
 
 
-def measures(results: Results, keys: Sequence[str]) -> Table | None:
-    """Return a row for each method and a column for each of these measures; None if there is none."""
-    return _table(results, [(measure_label(key), key) for key in keys])
+def _marked(header: Row, rows: Iterable[Row], notes: Sequence[str] = (), words: Sequence[int] = ()) -> Table | None:
+    """Return the table, with the explanation of its marks below; None without rows."""
+    rows = tuple(rows)
+    if any(FEW_OBJECTS_MARK in cell for row in rows for cell in row):
+        notes = (*notes, FEW_OBJECTS_NOTE)
+    return Table(header, rows, tuple(notes), frozenset(words)) if rows else None
 
 
-def _with_notes(table: Table) -> Table:
-    """Return the table, with the explanation of its marks below."""
-    if any(FEW_OBJECTS_MARK in cell for row in table.rows for cell in row):
-        return dataclasses.replace(table, notes=(*table.notes, FEW_OBJECTS_NOTE))
-    return table
+# Measures --------------------------------------------------------------------------------------------
 
 
-def _table(results: Results, columns: Sequence[Column]) -> Table | None:
-    notes = _without_threshold(results) if any(key == "pair_accuracy" for _, key in columns) else []
-    columns = [column for column in columns if any(results.summary(name, column[1]) for name in results.methods)]
-    if not columns:
+def section(view: ProtocolView, name: str) -> Table | None:
+    """Return the measures of a section; a protocol with few measures has all of them in the section "main"."""
+    if view.is_in_depth:
+        return measures(view, {key: metric.column for key, metric in METRICS.items() if metric.section == name})
+    return measures(view, dict(view.result.labels)) if name == "main" else None
+
+
+def measures(view: ProtocolView, headings: Mapping[str, str]) -> Table | None:
+    """Return a line for each row, its low-pass control and chance, and a column for each of these measures."""
+    keys = [key for key in headings if view.any(key)]
+    if not keys:
         return None
-    rows = [
-        (method_label(name), *(with_interval(results.summary(name, key)) for _, key in columns))
-        for name in results.methods
-    ]
-    chance = ["chance, closed form"]
-    for _, key in columns:
-        found = [summary for name in results.methods if (summary := results.summary(name, key))]
-        chance.append(" or ".join(sorted({percent(summary["chance"][0]) for summary in found})) or MISSING_VALUE)
-    return _with_notes(
-        Table(
-            ("method, %", *(heading for heading, _ in columns)),
-            (*rows, tuple(chance)),
-            (*_basis(results, list(dict.fromkeys(key for _, key in columns))), *notes),
-        )
-    )
+    rows: list[Row] = []
+    for name, row in view.result.rows.items():
+        counts = "" if row.verdict is None else "yes" if row.verdict.counts_as_touch else "no"
+        rows.append((view.label(name), *_values(row.measures, keys), counts))
+        if row.low_pass:
+            rows.append((LOW_PASS_LABEL, *_values(row.low_pass, keys), ""))
+    chances = ({percent(summary.chance[0]) for summary in view.summaries(key).values()} for key in keys)
+    rows.append(("chance, closed form", *(" or ".join(sorted(values)) for values in chances), ""))
+    header: Row = ("method, %", *(headings[key] for key in keys), "counts as touch")
+    if not any(row.verdict for row in view.result.rows.values()):
+        header, rows = header[:-1], [row[:-1] for row in rows]
+    notes = _without_threshold(view) if "pair_accuracy" in headings else []
+    return _marked(header, rows, _basis(view, keys) + notes)
 
 
-def _without_threshold(results: Results) -> list[str]:
+def _values(measures: Summaries | None, keys: Sequence[str]) -> Iterator[str]:
+    return (with_interval((measures or {}).get(key)) for key in keys)
+
+
+def _without_threshold(view: ProtocolView) -> list[str]:
     """Return the reasons why methods have no pair accuracy."""
     reasons: dict[str, list[str]] = {}
-    for name in results.methods:
-        if why := (results.data["methods"][name].get("pair_threshold") or {}).get("reason"):
-            reasons.setdefault(why, []).append(method_label(name))
+    for name, details in view.details().items():
+        if why := details.pair_threshold.reason:
+            reasons.setdefault(why, []).append(view.label(name))
     return [f"No pair accuracy of {', '.join(names)}: {why}." for why, names in reasons.items()]
 
 
-def _basis(results: Results, keys: Sequence[str]) -> list[str]:
+def _basis(view: ProtocolView, keys: Sequence[str]) -> list[str]:
     """Return queries, objects and gallery of the columns; measures with the same basis are grouped."""
     bases: dict[str, list[str]] = {}
     for key in keys:
-        for name in results.methods:
-            if found := results.summary(name, key):
-                labels = bases.setdefault(basis(found), [])
-                if measure_label(key) not in labels:
-                    labels.append(measure_label(key))
+        for summary in view.summaries(key).values():
+            labels = bases.setdefault(basis(summary), [])
+            if view.measure_label(key) not in labels:
+                labels.append(view.measure_label(key))
     if len(bases) == 1:
         return list(bases)
     return [f"{'; '.join(labels)}: {text}" for text, labels in bases.items()]
@@ -89,82 +103,146 @@ def _basis(results: Results, keys: Sequence[str]) -> list[str]:
 
 def basis(summary: Summary) -> str:
     """Return queries, objects and gallery of a measure as a sentence."""
-    return f"{summary['queries']:,} queries of {summary['objects']} objects. Gallery: {summary['gallery']}."
+    return f"{summary.queries:,} queries of {summary.objects} objects. Gallery: {summary.gallery}."
 
 
-def comparisons(results: Results) -> Table:
-    """Return the paired differences between methods on the same queries."""
+def choices(view: ProtocolView) -> Table | None:
+    """Return the spread of the main measure over choices of test objects."""
+    if view.result.unit != "choice":
+        return None
+    main = view.result.main
+    rows = []
+    for name, row in view.result.rows.items():
+        for label, found in ((view.label(name), row.measures), (LOW_PASS_LABEL, row.low_pass)):
+            if found:
+                values = [one[0] for one in found[main].repeats]
+                spread = (percent(value) for value in (found[main].value[0], min(values), max(values)))
+                rows.append((label, *spread, str(len(values))))
+    header = (f"{view.measure_label(main)}, over choices", "mean, %", "minimum, %", "maximum, %", "choices")
+    return _marked(header, rows)
+
+
+# Differences and controls ----------------------------------------------------------------------------
+
+
+def comparisons(view: ProtocolView) -> Table | None:
+    """Return the paired differences between rows on the same queries."""
     rows = [
         (
-            f"{method_label(one['a'])} − {method_label(one['b'])}",
-            measure_label(one["measure"]),
-            points(one),
-            probability(one["p"]),
+            f"{view.label(one.a)} − {view.label(one.b)}",
+            view.measure_label(one.measure),
+            difference(one.difference),
+            probability(one.difference.p),
         )
-        for one in results.data["comparisons"]
+        for one in view.result.comparisons
     ]
     note = "Same queries for both. Interval: bootstrap over objects; p: two-sided sign-flip test over objects."
-    return _with_notes(Table(("methods", "measure", "difference, points", "p"), tuple(rows), (note,), frozenset({1})))
+    return _marked(("methods", "measure", "difference, points", "p"), rows, (note,), words=(1,))
 
 
-def controls(results: Results) -> Table:
-    """Return the measures of the controls of late fusion, and whether they equal chance."""
-    keys = ("pair_accuracy", "topn_k5")
-    real = (with_interval(results.summary("late_fusion", key)) for key in keys)
-    rows = [("the result", "late fusion without a control", *real, "")]
-    for name, control in results.data["controls"].items():
-        values, at_chance = (control["measures"].get(key) for key in keys), MISSING_VALUE
-        if found := next((control["measures"][key] for key in keys if key in control["measures"]), None):
-            at_chance = "yes" if found["low"][0] <= found["chance"][0] <= found["high"][0] else "no"
-        rows.append((name, control["description"], *map(with_interval, values), at_chance))
-    header = ("control", "description", *(f"{measure_label(key)}, %" for key in keys), "chance in the interval")
-    return _with_notes(Table(header, tuple(rows), tuple(_without_threshold(results)), words=frozenset({1})))
-
-
-def ceilings(results: Results) -> Table:
-    """Return the measures of CCA between touch and photo, and between two touches or two photos of an object."""
-    keys = ("pair_accuracy", "topn_k5", "topn_k10")
+def differences(view: ProtocolView) -> Table | None:
+    """Return the paired differences between each row and its controls."""
     rows = [
-        (name.replace("_", " "), one["description"], *(with_interval(one["measures"].get(key)) for key in keys))
-        for name, one in results.data["ceilings"].items()
+        (view.label(name), view.measure_label(key), CONTROL_NAMES[control], difference(one), probability(one.p))
+        for name, row in view.result.rows.items()
+        for control, found in row.differences.items()
+        for key, one in found.items()
     ]
-    if "cca" in results.methods:
-        real = (with_interval(results.summary("cca", key)) for key in keys)
-        rows.insert(0, ("touch to photo", "the result of CCA", *real))
-    header = ("ceiling", "description", *(f"{measure_label(key)}, %" for key in keys))
-    return _with_notes(Table(header, tuple(rows), words=frozenset({1})))
+    return _marked(("method", "measure", "control", "touch minus control, points", "p"), rows, words=(1, 2))
 
 
-def rejects(results: Results) -> Table:
-    """Return the measures of the decision that the object is in the catalogue."""
-    found = {
-        name: results.data["methods"][name]["reject"] for name in results.methods if _has_entry(results, name, "reject")
-    }
+def verdicts(view: ProtocolView) -> list[str]:
+    """Return a sentence for each row with a verdict: the main measure, and its differences from the controls."""
+    main, sentences = view.result.main, []
+    for name, row in view.result.rows.items():
+        if row.verdict:
+            reasons = []
+            for control, found in row.differences.items():
+                where = "over" if found[main].low > 0 else "below" if found[main].high < 0 else "against"
+                reasons.append(f"{difference(found[main])} points {where} {CONTROL_NAMES[control]}")
+            sentences.append(
+                f"{view.label(name)}, {view.measure_label(main)}: {with_interval(row.measures[main])}, "
+                f"{'above' if row.verdict.above_chance else 'not significantly different from'} chance "
+                f"({percent(row.measures[main].chance[0])}); "
+                f"{'counts' if row.verdict.counts_as_touch else 'does not count'} as touch: {'; '.join(reasons)}."
+            )
+    return sentences
+
+
+def controls(view: ProtocolView) -> Table | None:
+    """Return the main measures of each control, and whether they equal chance."""
+    keys = _measured(view, view.result.controls)
+    rows = []
+    for name, control in view.result.controls.items():
+        at_chance = MISSING_VALUE
+        if found := next(iter((control.measures or {}).values()), None):
+            at_chance = "yes" if found.low[0] <= found.chance[0] <= found.high[0] else "no"
+        description = f"{control.description} ({control.reason})" if control.reason else control.description
+        rows.append((name, description, *_values(control.measures, keys), at_chance))
+    for method in _methods(view, view.result.controls):
+        real = _values(view.result.rows[method].measures, keys)
+        rows.insert(0, ("the result", f"{view.label(method)} without a control", *real, ""))
+    header = ("control", "description", *(f"{view.measure_label(key)}, %" for key in keys), "chance in the interval")
+    return _marked(header, rows, _without_threshold(view), words=(1,))
+
+
+def ceilings(view: ProtocolView) -> Table | None:
+    """Return the measures between touch and photo, and between two touches or two photos of an object."""
+    keys = _measured(view, view.result.ceilings)
     rows = [
-        (
-            method_label(name),
-            with_interval(one["auroc"]),
-            with_interval(one["false_accepts_at_95"]),
-            with_interval(one["balanced_accuracy"]),
-        )
+        ("touch to photo", f"the result of {view.label(method)}", *_values(view.result.rows[method].measures, keys))
+        for method in _methods(view, view.result.ceilings)
+    ]
+    for name, one in view.result.ceilings.items():
+        rows.append((name.replace("_", " "), one.description, *_values(one.measures, keys)))
+    header = ("ceiling", "description", *(f"{view.measure_label(key)}, %" for key in keys))
+    return _marked(header, rows, words=(1,))
+
+
+def _measured(view: ProtocolView, controls: Mapping[str, ControlResult]) -> list[str]:
+    """Return the main measures that the controls have, at most three."""
+    keys = dict.fromkeys([view.result.main, *view.headlines])
+    return [key for key in keys if any(key in (control.measures or {}) for control in controls.values())][:3]
+
+
+def _methods(view: ProtocolView, controls: Mapping[str, ControlResult]) -> Iterable[str]:
+    """Return the rows of the methods that the controls use."""
+    return dict.fromkeys(control.method for control in controls.values() if control.method in view.result.rows)
+
+
+# Objects and decisions -------------------------------------------------------------------------------
+
+
+def confusions(view: ProtocolView, name: str, pairs: Sequence[Confusion]) -> Iterator[Block]:
+    """Yield the most frequent confusions of a row."""
+    rows = tuple((one.object_id, one.mistaken_for, percent(one.share, 0)) for one in pairs)
+    note = (
+        f"The fraction of the touches of an object for which {view.label(name)} ranked another one first in the full "
+        "gallery of unseen objects."
+    )
+    yield Table(("object", "mistaken for", "of its touches, %"), rows, (note,), words=frozenset({1}))
+
+
+def rejects(view: ProtocolView, found: Mapping[str, Rejection]) -> Table | None:
+    """Return the measures of the decision whether the catalogue contains the object."""
+    rows = [
+        (view.label(name), *map(with_interval, (one.auroc, one.false_accepts_at_95, one.balanced_accuracy)))
         for name, one in found.items()
     ]
-    first = next(iter(found.values()))["auroc"]
     header = ("method", "AUROC, %", "false accepts at 95 % true accepts, %", "balanced accuracy, %")
     notes = (
-        f"{basis(first)} Chance is 50, 95 and 50 %.",
+        f"{basis(next(iter(found.values())).auroc)} Chance is 50, 95 and 50 %.",
         "Balanced accuracy: a query is accepted if the posterior, fitted on validation objects, is at least as high "
         f"for the gallery as for none of its objects: {FORMULA}.",
     )
-    return _with_notes(Table(header, tuple(rows), notes))
+    return _marked(header, rows, notes)
 
 
-def verification(results: Results) -> Table:
+def verification(found: Mapping[str, Mapping[str, VerificationRates]]) -> Table:
     """Return the equal error rate, and the false-reject rate at each false-accept rate, by impostors and grasps."""
-    found = results.data["verification"]
-    fars = sorted(next(iter(found["random"].values()))["frr"], key=float, reverse=True)
+    fars = sorted(next(iter(found["random"].values())).frr, key=float, reverse=True)
     rows = [
-        (label, grasps, *map(_supported_rate, (one["eer"], *(one["frr"][far] for far in fars))))
+        (label, grasps, *map(_supported_rate, (one.eer, *(one.frr[far] for far in fars))))
         for kind, label in IMPOSTORS.items()
         for grasps, one in sorted(found[kind].items(), key=lambda item: int(item[0]))
     ]
@@ -173,20 +251,19 @@ def verification(results: Results) -> Table:
     return Table(header, tuple(rows), (note,), words=frozenset({0}))
 
 
-def _supported_rate(rate: Mapping[str, Any]) -> str:
+def _supported_rate(rate: Rate) -> str:
     """Return a rate with its interval in percent, or the number of objects that it needs."""
-    if rate["value"] is not None:
-        return interval(rate["value"], rate["low"], rate["high"])
-    needed = rate["objects_needed"]
+    if rate.value is not None and rate.low is not None and rate.high is not None:
+        return interval(rate.value, rate.low, rate.high)
+    needed = rate.objects_needed
     return "refused: no errors" if needed is None else f"refused: needs {needed:,} objects"
 
 
-def _has_entry(results: Results, name: str, entry: str) -> bool:
-    return bool(results.data["methods"][name].get(entry))
+# Times and objects -----------------------------------------------------------------------------------
 
 
-def times(results: Results) -> Table:
-    """Return the run times of each method."""
+def times(view: ProtocolView, timings: Timings, found: ProtocolTimes) -> Table:
+    """Return the run times of each row."""
     columns = {
         "fit_s": "fit, s",
         "encode_touch_ms": "encode a touch, ms",
@@ -194,26 +271,19 @@ def times(results: Results) -> Table:
         "score_us_per_photo": "score a photo, µs",
         "query_ms": "a query, ms",
     }
-    rows = [
-        (method_label(name), *(format_number(results.time(name, key)) for key in columns))
-        for name in results.methods
-        if name in results.timings.get("methods", {})
-    ]
-    towers, machine = results.timings.get("encode", {}), results.timings.get("machine", {})
-    cpus, threads = (machine.get(key, MISSING_VALUE) for key in ("cpus", "threads"))
-    touch_ms, photo_ms = (format_number(towers.get(key)) for key in ("touch_ms", "photo_ms"))
-    note = (
-        f"On {cpus} CPU(s) with {threads} thread(s). Times of the methods without the towers: one query is one touch "
-        "against the whole gallery, with precomputed features. The towers, shared by all methods, take "
-        f"{touch_ms} ms for a touch and {photo_ms} ms for a photo."
-    )
-    return Table(("method", *columns.values()), tuple(rows), (note,))
-
-
-def split(results: Results) -> Table:
-    """Return the objects of each part of the split."""
-    found = results.data["split"]
     rows = tuple(
-        (part, str(len(found[part])), ", ".join(sorted(found[part]))) for part in ("train", "validation", "test")
+        (view.label(name), *(format_number(getattr(row, key)) for key in columns)) for name, row in found.rows.items()
     )
+    note = (
+        f"On {timings.cpus} CPU(s) with {timings.threads} thread(s). Times of the methods without the towers: one "
+        "query is one touch against the whole gallery, with precomputed features. The towers, shared by all methods, "
+        f"take {format_number(found.tower_touch_ms)} ms for a touch and {format_number(found.tower_photo_ms)} ms for a "
+        "photo."
+    )
+    return Table(("method", *columns.values()), rows, (note,))
+
+
+def split(parts: Mapping[str, Sequence[str]]) -> Table:
+    """Return the objects of each part of a split."""
+    rows = tuple((label, str(len(parts[part])), ", ".join(sorted(parts[part]))) for part, label in PARTS.items())
     return Table(("part", "objects", "ids"), rows, words=frozenset({2}))

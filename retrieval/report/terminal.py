@@ -3,16 +3,9 @@
 import sys
 from collections.abc import Collection, Sequence
 from itertools import chain, repeat
-from typing import TYPE_CHECKING
 
 from retrieval.console.output import printable, show
 from retrieval.search.answer import NearestReference, QueryResult
-
-if TYPE_CHECKING:
-    from retrieval.report.results import Results
-
-MEASURES = ("pair_accuracy", "topn_k5", "topn_k10", "map")
-"""Measures of an evaluation's table; the report contains all measures."""
 
 
 def print_table(result: QueryResult) -> None:
@@ -45,17 +38,6 @@ def _reference(nearest: NearestReference | None) -> tuple[str, str, str]:
     if nearest is None:
         return "", "", ""
     return nearest.touch[0], f"{nearest.cosine:.2f}", "no photo" if nearest.adds is None else f"{nearest.adds:+.2f}"
-
-
-def print_measures(results: "Results") -> None:
-    """Print the main measures of every method, with their queries, objects and gallery."""
-    from retrieval.report import tables  # imported here, because the table of a query does not need it
-
-    table = tables.measures(results, MEASURES)
-    if table is not None:
-        print_columns("On unseen objects", table.header, table.rows, words=(0,))
-        for note in table.notes:
-            show(note)
 
 
 def print_columns(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], words: Collection[int]) -> None:

@@ -36,7 +36,6 @@ from retrieval.data.dataset import (
 )
 from retrieval.data.licences import LICENCES
 from retrieval.errors import BadInput
-from retrieval.metrics.intervals import compare, summarise
 from retrieval.metrics.measure import Measure, pooled
 from retrieval.metrics.pairs import fit_calibration
 from retrieval.metrics.ranking import k_way_accuracies
@@ -106,8 +105,8 @@ def adapt(
 
     >>> from pathlib import Path
     >>> made = retrieval.adapt("lab", Path("mine.safetensors"), "model.safetensors", init="none", quiet=True)
-    >>> made.lines()[-1]
-    'mine.safetensors: fitted to 12 objects, 24 touches'
+    >>> made.checkpoint.path.name, len(made.features)
+    ('mine.safetensors', 24)
     """
     require_writable(out)
     recording = folder_of(recording)
@@ -136,8 +135,6 @@ class Adaptation:
 
     >>> from pathlib import Path
     >>> made = retrieval.adapt("lab", Path("own.safetensors"), "model.safetensors", init="none", quiet=True)
-    >>> made.checkpoint.path.name
-    'own.safetensors'
     >>> 0 <= made.estimate.to_dict()["held_out_top1"] <= 1
     True
     """
@@ -145,11 +142,6 @@ class Adaptation:
     checkpoint: Checkpoint
     features: Features
     estimate: "Estimate"
-
-    def lines(self) -> list[str]:
-        """Return the result as lines of text."""
-        objects, touches = len(set(self.features.object_ids)), len(self.features)
-        return [*self.estimate.lines(), f"{self.checkpoint.path}: fitted to {objects} objects, {touches} touches"]
 
 
 # Features of the combined towers ---------------------------------------------------------------------------
@@ -261,51 +253,10 @@ class Estimate:
         means = self.to_dict()
         return means.get("baseline_pair_accuracy", 0.0) >= means["held_out_pair_accuracy"]
 
-    def lines(self) -> list[str]:
-        """Return the estimate as lines of text."""
-        lines = [f"each object held out once, one touch, {self.measures['held_out_top1'].gallery}:"]
-        for name in ("top1", "pair_accuracy"):
-            touched, control = self.measures[f"held_out_{name}"], self.measures[f"held_out_{name}_low_pass"]
-            gain = compare([touched], [control])
-            lines.append(
-                f"  {_LABELS[name]} {interval(touched)}; low-pass touch {interval(control)}; "
-                f"chance {touched.chance[0]:.3f}; "
-                f"difference {gain['difference']:+.3f} [{gain['low']:+.3f}, {gain['high']:+.3f}]"
-            )
-        lines.append(f"  {self.verdict}")
-        if self.baseline is not None:
-            found = [f"{label} {interval(self.measures[f'baseline_{name}'])}" for name, label in _LABELS.items()]
-            lines.append(f"unadapted model: {', '.join(found)}")
-        if self.is_baseline_better:
-            lines.append(
-                "  The unadapted model is used: its pair accuracy is at least that of the fit. "
-                "Only its calibrations and its check of gel images are fitted."
-            )
-        return lines
-
-    @property
-    def verdict(self) -> str:
-        """A sentence on whether the fit is better than its low-pass control."""
-        gain = compare([self.measures["held_out_top1"]], [self.measures["held_out_top1_low_pass"]])
-        if gain["low"] > 0:
-            return "Better than the low-pass control: the fit uses more than light and coarse shape."
-        return (
-            "Not better than the low-pass control: there is no evidence that the fit uses touch. Record more objects."
-        )
-
     def to_dict(self) -> dict[str, float]:
         """Return the metrics that the checkpoint stores: means over objects."""
         means = {name: float(measure.by_object()[1].mean()) for name, measure in self.measures.items()}
         return means | {"held_out_top1_chance": float(self.measures["held_out_top1"].chance[0])}
-
-
-_LABELS = {"top1": "top-1 accuracy", "pair_accuracy": "pair accuracy"}
-
-
-def interval(measure: Measure) -> str:
-    """Format a measure with its interval."""
-    summary = summarise([measure])
-    return f"{summary['value'][0]:.3f} [{summary['low'][0]:.3f}, {summary['high'][0]:.3f}]"
 
 
 @one_thread()

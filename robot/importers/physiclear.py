@@ -5,8 +5,8 @@
 The videos can also be in `dataset/`. A part is an object, a video a sequence. A video provides `frames` grasps
 (default 5): the frames that differ most from the first one, in order of time. The first frame is their no-contact
 frame. There are no photos: the gel image itself replaces the photo, so the recording is for touch-to-touch search only
-(`retrieve benchmark real`), and `retrieve check` reports each of its grasps as an error. The recording has the order of
-the file names, part by part.
+(`retrieve evaluate --protocol`), and `retrieve check` reports each of its grasps as an error. The recording has the
+order of the file names, part by part.
 """
 
 import heapq

@@ -48,7 +48,6 @@ SHORTER = {
     "evaluate": ["--preset", "tiny", "--iterations", "2", "--seeds", "1", "--methods", "late_fusion,chance"],
     "frontier": ["--only", "partials", "--recording", "recording"],
     "serve": ["--port", "0"],
-    "benchmark": ["--preset", "tiny", "--iterations", "2", "--seeds", "1", "--methods", "cca"],
 }
 """Options that make each command fast."""
 

@@ -10,13 +10,12 @@ import pytest
 
 from retrieval.commands.main import main
 from retrieval.data.dataset import load_grasps, make_split
+from retrieval.evaluation.results import Comparison
 from retrieval.model.checkpoint_info import read_header
 from retrieval.search.answer import EXIT_CODES
 from retrieval.serve.store import HistoryStore
 from robot.recording.folder import RecordingWriter, read_recording
-from tests import real_data_sets
 from tests.documents import ROOT, text_of
-from tests.miniatures import physiclear
 
 PAGE = ROOT / "docs" / "formats.md"
 
@@ -85,35 +84,25 @@ def test_the_results_of_an_evaluation(tmp_path, recording):
     assert main(["evaluate", str(recording), "--out", str(tmp_path / "out"), *quick]) == 0
     results = json.loads((tmp_path / "out" / "results.json").read_text())
     check(7, results)
-    method = results["methods"]["late_fusion"]
-    check(8, method)
-    assert set(results["verification"]) == {"random", "similar"}
-    verification = results["verification"]["random"]["1"]
-    check(9, verification)
-    row = re.search(r"^\| `eer` .*$", text_of(PAGE), re.M)[0]
-    assert set(re.findall(r"`(\w+)`", row)) - {"eer"} == set(verification["eer"])
-    row = re.search(r"^\| `measures` .*$", text_of(PAGE), re.M)[0]
-    assert set(re.findall(r"`(\w+)`", row)) - {"measures"} == set(method["measures"]["pair_auc"])
+    protocol = results["protocols"]["unseen-objects"]
+    check(8, protocol)
+    row = protocol["rows"]["late_fusion"]
+    check(9, row)
+    verification = row["details"]["verification"]["random"]["1"]
+    check(10, verification)
+    for key, nested in (("eer", verification["eer"]), ("verdict", ("counts_as_touch", "above_chance"))):
+        assert set(nested) == nested_keys(key)
+    assert set(row["measures"]["pair_auc"]) == nested_keys("measures") - {"low_pass"}
+    assert set(row["details"]) == nested_keys("details")
+    assert set(protocol["controls"]["low_pass"]) == nested_keys("controls") - {"ceilings"}
+    assert set(Comparison.__annotations__) == nested_keys("comparisons")
 
 
-@pytest.mark.slow
-def test_the_results_of_the_benchmark_of_real_data(tmp_path):
-    real_data_sets.write_billets(tmp_path / "billets")
-    physiclear.write(tmp_path / "physiclear")
-    quick = ["--preset", "tiny", "--seeds", "1", "--methods", "cca", "--protocols", "billets-places,physiclear,rct"]
-    assert main(["benchmark", "real", str(tmp_path), "--out", str(tmp_path / "out"), *quick]) == 0
-    results = json.loads((tmp_path / "out" / "results.json").read_text())
-    check(10, results)
-    assert set(results["skipped"]) == {"rct"}
-    entry = results["protocols"]["billets-places"]
-    check(11, entry)
-    row, control = entry["rows"]["cca"], entry["controls"]["permuted"]
-    page = text_of(PAGE).partition("### `results.json` of the benchmark")[2]
-    documented = {key: re.search(rf"^\| `{key}` .*$", page, re.M)[0] for key in ("rows", "controls")}
-    touch_to_touch = next(iter(results["protocols"]["physiclear"]["rows"].values()))
-    keys = {*row, *row["verdict"], *row["low_pass_differences"]["pair_auc"], *touch_to_touch}
-    assert keys == set(re.findall(r"`(\w+)`", documented["rows"])) - {"rows"}
-    assert set(control) == set(re.findall(r"`(\w+)`", documented["controls"])) - {"controls"}
+def nested_keys(key):
+    """Return the keys that the line of a key names, without the key."""
+    page = text_of(PAGE).partition("## `results.json`")[2]
+    line = re.search(rf"^\| `{key}`.*$", page, re.M)[0]
+    return set(re.findall(r"`(\w+)`", line)) - {key}
 
 
 def test_the_history_of_a_service(tmp_path):

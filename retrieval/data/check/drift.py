@@ -137,5 +137,5 @@ def nearest_grasp_accuracy(
     chance = object_means(others[rows, None] / (len(objects) - 1), objects[rows])[1].mean(axis=0)
     found = summarise([Measure(correct[rows, None], objects[rows], chance, "other grasps")])
     return NearestGraspAccuracy(
-        found["value"][0], found["low"][0], found["high"][0], float(chance[0]), found["queries"], found["objects"]
+        found.value[0], found.low[0], found.high[0], float(chance[0]), found.queries, found.objects
     )

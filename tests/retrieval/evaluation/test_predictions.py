@@ -1,4 +1,4 @@
-"""Queries, and the prediction files between prediction and scoring."""
+"""Queries, and the scores of a method for them."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,11 +8,10 @@ import pytest
 
 from retrieval.data.dataset import Grasp, Split
 from retrieval.errors import DatasetError
-from retrieval.evaluation.predictions import Predictions, predict, read_predictions, write_predictions
-from retrieval.evaluation.queries import MAX_GRASPS, SET_SIZES, SETS_OF_AN_OBJECT, draw_queries
+from retrieval.evaluation.predictions import predict
+from retrieval.evaluation.queries import SET_SIZES, SETS_OF_AN_OBJECT, draw_queries
 from retrieval.methods.chance import Chance
 from retrieval.methods.method import MethodSettings
-from retrieval.model.checkpoint import write_tensors
 from retrieval.training.features import Features
 from tests.conftest import TINY
 
@@ -30,7 +29,8 @@ def recorded(counts):
 
 
 GRASPS = recorded({"a": 20, "b": 3, "c": 20, "d": 6, "e": 24, "f": 2, "left out": 5})
-QUERIES = draw_queries(GRASPS, SPLIT, 0)
+MAX_GRASPS = {"train": 8, "validation": 12}
+QUERIES = draw_queries(GRASPS, SPLIT, 0, MAX_GRASPS)
 
 
 def test_queries_hold_all_test_grasps_and_some_of_the_others():
@@ -69,8 +69,8 @@ def test_sets_have_different_grasps_of_one_object_and_leave_three_photos():
 
 
 def test_queries_depend_on_the_seed():
-    assert draw_queries(GRASPS, SPLIT, 0).digest == QUERIES.digest
-    assert draw_queries(GRASPS, SPLIT, 1).digest != QUERIES.digest
+    assert draw_queries(GRASPS, SPLIT, 0, MAX_GRASPS).digest == QUERIES.digest
+    assert draw_queries(GRASPS, SPLIT, 1, MAX_GRASPS).digest != QUERIES.digest
     assert replace(QUERIES, sets={1: QUERIES.sets[1]}).digest != QUERIES.digest
 
 
@@ -78,7 +78,7 @@ def test_queries_depend_on_the_seed():
 def test_two_objects_of_each_part_must_be_recorded(part):
     lacking = [grasp for grasp in GRASPS if grasp.object_id != getattr(SPLIT, part)[0]]
     with pytest.raises(DatasetError, match=f"at least 2 {part} objects, but the recording has 1"):
-        draw_queries(lacking, SPLIT, 0)
+        draw_queries(lacking, SPLIT, 0, MAX_GRASPS)
 
 
 @pytest.fixture(scope="module")
@@ -126,36 +126,3 @@ def test_scores_of_sets_are_those_of_the_method(features, predictions):
     for size, sets in QUERIES.sets.items():
         expected = np.array([predictions.scores[list(row)].max(0) for row in sets])
         np.testing.assert_array_equal(fused.set_scores[size], expected)
-
-
-CACHE_KEY = {"method": "chance", "seed": 0, "features": "ab" * 32, "queries": QUERIES.digest}
-
-
-def test_written_predictions_are_read_back(predictions, tmp_path):
-    write_predictions(tmp_path / "p.safetensors", predictions, CACHE_KEY)
-    found = read_predictions(tmp_path / "p.safetensors", CACHE_KEY)
-    np.testing.assert_array_equal(found.scores, predictions.scores)
-    assert list(found.set_scores) == list(predictions.set_scores) == sorted(SET_SIZES)
-    for size, scores in predictions.set_scores.items():
-        np.testing.assert_array_equal(found.set_scores[size], scores)
-    assert (found.best_params, found.seconds) == (predictions.best_params, predictions.seconds)
-
-
-@pytest.mark.parametrize("key", [*CACHE_KEY, "model"])
-def test_scores_with_another_key_are_not_read(key, predictions, tmp_path):
-    write_predictions(tmp_path / "p.safetensors", predictions, CACHE_KEY)
-    assert read_predictions(tmp_path / "p.safetensors", {**CACHE_KEY, key: "other"}) is None
-
-
-def test_a_flipped_bit_a_missing_file_and_a_nan_are_not_read(predictions, tmp_path):
-    path = tmp_path / "p.safetensors"
-    assert read_predictions(path, CACHE_KEY) is None
-    write_predictions(path, predictions, CACHE_KEY)
-    data = bytearray(path.read_bytes())
-    data[-3] ^= 4
-    path.write_bytes(data)
-    assert read_predictions(path, CACHE_KEY) is None
-    write_predictions(path, Predictions(np.full((1, 1), np.nan, np.float32), {}, {}, {}), CACHE_KEY)
-    assert read_predictions(path, CACHE_KEY) is None
-    write_tensors(path, {}, {})
-    assert read_predictions(path, CACHE_KEY) is None

@@ -8,12 +8,13 @@ import pytest
 
 from retrieval.data.dataset import Grasp, Split
 from retrieval.errors import BadInput, ConfigError, DatasetError
-from retrieval.evaluation.real import PROTOCOLS
-from retrieval.evaluation.real.conditions import clock_features, missing_no_contact_reason
-from retrieval.evaluation.real.protocol import RecordingFacts
-from retrieval.evaluation.real.touch_to_touch import TouchToTouch
-from retrieval.evaluation.real.verdict import verdict
-from retrieval.metrics.intervals import compare_splits, summarise_splits
+from retrieval.evaluation import PROTOCOLS, UNSEEN_OBJECTS
+from retrieval.evaluation.aggregate import verdict
+from retrieval.evaluation.inputs import clock_features, missing_no_contact_reason
+from retrieval.evaluation.protocol import RecordingFacts
+from retrieval.evaluation.results import Verdict
+from retrieval.evaluation.touch_to_touch import TouchToTouch
+from retrieval.metrics.intervals import Difference, Summary, compare_splits, summarise_splits
 from retrieval.metrics.measure import Measure, pooled
 
 
@@ -23,7 +24,7 @@ def facts(sequence_of, about=None, splits=None):
         for name, sequence in sequence_of.items()
         for turn in range(2)
     ]
-    return RecordingFacts("drawn", grasps, about or {}, splits or {})
+    return RecordingFacts("drawn", "drawn", grasps, about or {}, splits or {})
 
 
 def vt60(instances=4):
@@ -59,7 +60,7 @@ def folds(name, seed=0):
 
 
 def test_every_protocol_has_a_recording_here():
-    assert set(RECORDINGS) | WITHOUT_SPLIT == set(PROTOCOLS)
+    assert set(RECORDINGS) | WITHOUT_SPLIT | {UNSEEN_OBJECTS} == set(PROTOCOLS)
     assert all(isinstance(PROTOCOLS.load(name), TouchToTouch) == (name in WITHOUT_SPLIT) for name in PROTOCOLS)
 
 
@@ -190,28 +191,15 @@ def test_no_contact_control_needs_one_frame_per_grasp():
     assert missing_no_contact_reason(with_frames("xxxy")) is None
 
 
-ABOVE = {"difference": 0.1, "low": 0.01, "high": 0.2}
+ABOVE = Difference(0.1, 0.01, 0.2, False, 0.01)
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "counts", "words"),
-    [
-        (0.01, 0.2, True, "+10.0 points [+1.0, +20.0] over"),
-        (-0.01, 0.2, False, "+10.0 points [-1.0, +20.0] against the {}, an interval that contains 0"),
-        (0.0, 0.2, False, "+10.0 points [+0.0, +20.0] against the {}"),
-        (-0.2, -0.01, False, "+10.0 points [-20.0, -1.0] below the {}"),
-    ],
-)
-def test_a_result_counts_as_touch_only_if_both_intervals_are_above_0(low, high, counts, words):
-    summary, tried = {"low": [0.3], "chance": [0.2]}, {"difference": 0.1, "low": low, "high": high}
-    for control, found in (
-        ("low-pass control", verdict(summary, tried, ABOVE)),
-        ("order of capture", verdict(summary, ABOVE, tried)),
-    ):
-        assert found["counts_as_touch"] is counts
-        assert found["words"].startswith("counts as touch: +10" if counts else "does not count as touch: ")
-        assert words.format(control) in found["words"]
-        assert found["above_chance"]
+@pytest.mark.parametrize(("low", "high", "counts"), [(0.01, 0.2, True), (-0.01, 0.2, False), (0.0, 0.2, False)])
+@pytest.mark.parametrize("control", ["low_pass", "order"])
+def test_a_result_counts_as_touch_only_if_both_intervals_are_above_0(low, high, counts, control):
+    summary = Summary([0.4], [0.3], [0.5], [0.2], 10, 10, False, "ten", [[0.4]])
+    found = verdict(summary, {"low_pass": ABOVE, "order": ABOVE, control: Difference(0.1, low, high, False, 0.1)})
+    assert found == Verdict(counts_as_touch=counts, above_chance=True)
 
 
 def of_choices(*values):
@@ -227,17 +215,16 @@ def test_an_interval_over_choices_is_the_corrected_resampled_t_interval():
     found = summarise_splits(of_choices(0.5, 0.6, 0.7), ratio=1.0)
     # s^2 = .01; (1 / 3 + 1) s^2 = .01333; t of 2 degrees of freedom at .975: 4.30265
     half = 4.30265 * np.sqrt((1 / 3 + 1) * 0.01)
-    assert found["value"] == [pytest.approx(0.6)]
-    assert found["low"] == [pytest.approx(0.6 - half, abs=1e-5)]
-    assert found["high"] == [1.0]  # .6 + .4968, limited to 1
-    assert (found["min"], found["max"]) == ([pytest.approx(0.5)], [pytest.approx(0.7)])
-    assert (found["objects"], found["queries"], found["few_objects"]) == (3, 9, True)
+    assert found.value == [pytest.approx(0.6)]
+    assert found.low == [pytest.approx(0.6 - half, abs=1e-5)]
+    assert found.high == [1.0]  # .6 + .4968, limited to 1
+    assert np.ravel(found.repeats) == pytest.approx([0.5, 0.6, 0.7])
+    assert (found.objects, found.queries, found.few_objects) == (3, 9, True)
     difference = compare_splits(of_choices(0.5, 0.6, 0.7), of_choices(0.4, 0.4, 0.4), ratio=1.0)
-    assert difference["difference"] == pytest.approx(0.2)
-    assert difference["low"] == pytest.approx(0.2 - half, abs=1e-5)
-    assert (difference["min"], difference["max"]) == (pytest.approx(0.1), pytest.approx(0.3))
+    assert difference.value == pytest.approx(0.2)
+    assert difference.low == pytest.approx(0.2 - half, abs=1e-5)
     # t = .2 / sqrt(.01333) = 1.7321; of 2 degrees of freedom both tails beyond it have 1 - t / sqrt(t^2 + 2)
-    assert difference["p"] == pytest.approx(1 - 1.7320508 / np.sqrt(5))
+    assert difference.p == pytest.approx(1 - 1.7320508 / np.sqrt(5))
     with pytest.raises(BadInput, match="needs at least two splits; got 1"):
         summarise_splits(of_choices(0.5, 0.6, 0.7)[:1], ratio=1.0)
 

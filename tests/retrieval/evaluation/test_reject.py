@@ -41,7 +41,7 @@ def statistics(ratios, true):
 
 
 def value(measure):
-    return summarise([measure])["value"][0]
+    return summarise([measure]).value[0]
 
 
 def test_a_perfect_scorer_is_always_right_and_an_uninformative_one_is_at_chance():

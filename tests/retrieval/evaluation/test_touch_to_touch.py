@@ -1,6 +1,5 @@
 """Touch to touch: nothing uses the left-out sequence, the common frame removes the leak, controls are measured."""
 
-import json
 from importlib import resources
 from pathlib import Path
 
@@ -12,7 +11,8 @@ from retrieval.commands.main import main
 from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.data.images import read_rgb
 from retrieval.errors import DatasetError
-from retrieval.evaluation.real.touch_to_touch import (
+from retrieval.evaluation.results import Results, read_results
+from retrieval.evaluation.touch_to_touch import (
     Sequences,
     leave_one_out_scores,
     with_common_frame,
@@ -134,41 +134,43 @@ def test_drift_that_identifies_the_object_is_removed_on_the_common_frame(tmp_pat
 # The protocol ----------------------------------------------------------------------------------------------
 
 
-def benchmark(recording, out, *more):
-    options = ["--preset", "tiny", "--protocols", "physiclear", "--seeds", "2", "--methods", "chance", *more]
-    return main(["benchmark", "real", str(recording / "data"), "--out", str(out), *options])
+def evaluate(recording, out, *more):
+    options = ["--preset", "tiny", "--protocol", "physiclear", "--seeds", "2", "--methods", "chance", *more]
+    return main(["evaluate", str(recording / "data"), "--out", str(out), *options])
+
+
+def read(out):
+    return read_results(out / "results.json", Results).protocols["physiclear"]
 
 
 @pytest.fixture(scope="module")
 def out(recording, tmp_path_factory):
     folder = tmp_path_factory.mktemp("made") / "report"
-    assert benchmark(recording, folder) == 0
+    assert evaluate(recording, folder) == 0
     return folder
 
 
 def test_each_representation_is_compared_with_three_controls(out):
-    entry = json.loads((out / "results.json").read_text())["protocols"]["physiclear"]
-    assert set(entry["rows"]) == {"frozen-difference", "frozen-common-frame"}
-    for row in entry["rows"].values():
-        assert (row["measures"]["recall_1"]["queries"], row["measures"]["recall_1"]["objects"]) == (6, 2)
-        assert row["measures"]["recall_1"]["chance"][0] == pytest.approx(2 / 5)  # two of five other videos
-        lows = [
-            row[key]["recall_1"]["low"]
-            for key in ("low_pass_differences", "order_differences", "no_contact_differences")
-        ]
-        assert row["verdict"]["counts_as_touch"] == all(low > 0 for low in lows)
-        assert "the no-contact frame as input" in row["verdict"]["words"]
-        assert row["tower_differences"] is None
-    assert set(entry["controls"]) == {"no_contact", "order", "permuted"}
-    assert len(entry["controls"]["permuted"]["measures"]["recall_1"]["by_seed"]) == 2
+    entry = read(out)
+    assert set(entry.rows) == {"frozen-difference", "frozen-common-frame"}
+    for row in entry.rows.values():
+        summary = row.measures["recall_1"]
+        assert (summary.queries, summary.objects) == (6, 2)
+        assert summary.chance[0] == pytest.approx(2 / 5)  # two of five other videos
+        assert set(row.differences) == {"low_pass", "order", "no_contact"}
+        lows = [found["recall_1"].low for found in row.differences.values()]
+        assert row.verdict.counts_as_touch == all(low > 0 for low in lows)
+    assert entry.comparisons == []
+    assert set(entry.controls) == {"no_contact", "order", "permuted"}
+    assert len(entry.controls["permuted"].measures["recall_1"].repeats) == 2
     # The gels have a colour for each part: the no-contact frame identifies the part, and so does the order.
-    assert entry["controls"]["no_contact"]["measures"]["recall_1"]["value"][0] == 1.0
-    assert entry["controls"]["order"]["measures"]["recall_1"]["value"][0] >= 2 / 3
+    assert entry.controls["no_contact"].measures["recall_1"].value[0] == 1.0
+    assert entry.controls["order"].measures["recall_1"].value[0] >= 2 / 3
 
 
 def test_the_report_shows_touch_to_touch_results(out):
     text = (out / "report.md").read_text().replace("\\", "")
-    for words in ("one video left out", "control: permuted", "frozen-common-frame"):
+    for words in ("one video left out", "| permuted |", "frozen-common-frame", "the no-contact frame as input"):
         assert words in text
 
 
@@ -176,26 +178,27 @@ def test_the_towers_of_other_configurations_are_rows_compared_with_the_first(rec
     larger = tmp_path / "larger.toml"
     tiny = (resources.files("retrieval") / "configs" / "tiny.toml").read_text()
     larger.write_text(tiny.replace("touch_px = 32", "touch_px = 48"))
-    assert benchmark(recording, tmp_path / "report", "--towers", "same=tiny", f"larger={larger}") == 0
-    rows = json.loads((tmp_path / "report" / "results.json").read_text())["protocols"]["physiclear"]["rows"]
-    assert set(rows) == {
+    assert evaluate(recording, tmp_path / "report", "--compare", "same=tiny", f"larger={larger}") == 0
+    found = read(tmp_path / "report")
+    assert set(found.rows) == {
         f"{name}-{representation}"
         for name in ("frozen", "same", "larger")
         for representation in ("difference", "common-frame")
     }
-    same, first = rows["same-difference"], rows["frozen-difference"]
-    assert same["measures"] == first["measures"]
-    assert [same["tower_differences"]["map"][key] for key in ("low", "difference", "high")] == [0, 0, 0]
-    assert rows["larger-difference"]["tower_differences"] is not None
+    assert found.rows["same-difference"].measures == found.rows["frozen-difference"].measures
+    differences = {(one.a, one.b): one.difference for one in found.comparisons if one.measure == "map"}
+    same = differences["same-difference", "frozen-difference"]
+    assert (same.low, same.value, same.high) == (0, 0, 0)
+    assert ("larger-difference", "frozen-difference") in differences
 
 
 @pytest.mark.parametrize(
     ("choice", "message"),
     [
-        ("tiny", "--towers must have the form NAME=CONFIG, got 'tiny'"),
+        ("tiny", "--compare must have the form NAME=CHOICE, got 'tiny'"),
         ("frozen=tiny", "Another row is already named frozen"),
     ],
 )
 def test_a_tower_without_a_name_of_its_own_is_refused(recording, tmp_path, capsys, choice, message):
-    assert benchmark(recording, tmp_path / "report", "--towers", choice) == 2
+    assert evaluate(recording, tmp_path / "report", "--compare", choice) == 2
     assert message in capsys.readouterr().err

@@ -5,11 +5,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from retrieval.data.dataset import Split
-from retrieval.evaluation.experiment import Experiment
 from retrieval.evaluation.predictions import Predictions
 from retrieval.evaluation.queries import Queries
-from retrieval.evaluation.verification import equal_error_rate, false_rejects, score_verification
+from retrieval.evaluation.results import Rate
+from retrieval.evaluation.scoring import MethodScores
+from retrieval.evaluation.verification import (
+    equal_error_rate,
+    false_rejects,
+    verification_errors,
+    verification_rates,
+)
 from retrieval.model.posterior import Posterior
 
 GENUINE = np.array([1.0, 2.0, 3.0, 4.0, 5.0])
@@ -58,8 +63,9 @@ def evaluated(objects, grasps=7, gap=0.0, posterior=POSTERIOR, validation=0):
     features = SimpleNamespace(photo=np.eye(objects // 2, dtype=np.float32)[owner // 2])
     matcher = SimpleNamespace(photo_encoding=lambda photo: SimpleNamespace(embedding=photo))
     checkpoint = SimpleNamespace(matcher=matcher, posterior=posterior)
-    experiment = Experiment("", None, Split(0, (), (), names), features, queries, checkpoint, False, True)
-    return score_verification(experiment, [Predictions(logits.astype(np.float32), {}, {}, {})], [0], 0)
+    scores = MethodScores(queries, Predictions(logits.astype(np.float32), {}, {}, {}), 0)
+    errors = verification_errors(scores, features, checkpoint)
+    return errors and verification_rates([errors])
 
 
 @pytest.fixture(scope="module")
@@ -73,26 +79,26 @@ def test_each_kind_of_impostor_and_number_of_grasps_has_its_rates(found):
     for by_grasps in found.values():
         assert list(by_grasps) == ["1", "2", "3", "5"]
         for one in by_grasps.values():
-            assert (one["objects"], one["sequences"]) == (50, 400)
-            assert list(one["frr"]) == ["0.1", "0.01", "0.001"]
+            assert (one.objects, one.sequences) == (50, 400)
+            assert list(one.frr) == ["0.1", "0.01", "0.001"]
 
 
 def test_a_rate_is_refused_with_the_number_of_objects_that_would_be_enough(found):
     for by_grasps in found["random"].values():
-        rates = by_grasps["frr"]
-        assert rates["0.1"]["value"] is not None
-        assert rates["0.1"]["objects_needed"] == 25  # 300 pairs, 30 errors
-        assert rates["0.01"] == {"value": None, "low": None, "high": None, "objects_needed": 78}  # 3,003 pairs
-        assert rates["0.001"]["objects_needed"] == 246  # 30,135 pairs
-    similar = found["similar"]["1"]["frr"]  # each object has one most similar object
-    assert [rate["objects_needed"] for rate in similar.values()] == [300, 3000, 30000]
-    assert {rate["value"] for rate in similar.values()} == {None}
+        rates = by_grasps.frr
+        assert rates["0.1"].value is not None
+        assert rates["0.1"].objects_needed == 25  # 300 pairs, 30 errors
+        assert rates["0.01"] == Rate(None, None, None, 78)  # 3,003 pairs
+        assert rates["0.001"].objects_needed == 246  # 30,135 pairs
+    similar = found["similar"]["1"].frr  # each object has one most similar object
+    assert [rate.objects_needed for rate in similar.values()] == [300, 3000, 30000]
+    assert {rate.value for rate in similar.values()} == {None}
 
 
 def test_a_rate_has_the_binomial_interval_with_each_object_as_one_trial():
-    rate = evaluated(30, gap=20.0)["random"]["1"]["frr"]["0.1"]
-    assert rate["value"] == 0
-    assert (rate["low"], rate["high"]) == (0, pytest.approx(1 - 0.025 ** (1 / 30)))
+    rate = evaluated(30, gap=20.0)["random"]["1"].frr["0.1"]
+    assert rate.value == 0
+    assert (rate.low, rate.high) == (0, pytest.approx(1 - 0.025 ** (1 / 30)))
 
 
 def test_numbers_of_grasps_that_the_objects_lack_are_left_out():
@@ -104,5 +110,5 @@ def test_numbers_of_grasps_that_the_objects_lack_are_left_out():
 def test_a_head_without_posterior_gets_that_of_the_validation_objects():
     assert evaluated(30, gap=4.0, posterior=None, validation=2) is None  # a posterior needs three
     found = evaluated(40, gap=4.0, posterior=None, validation=10)["random"]["1"]
-    assert found["objects"] == 30
-    assert found["frr"]["0.1"]["value"] < 0.1
+    assert found.objects == 30
+    assert found.frr["0.1"].value < 0.1

@@ -28,20 +28,20 @@ def some_objects(count=12, queries=7, seed=0):
 
 def test_a_value_is_the_mean_of_the_objects_means_so_an_object_with_many_queries_counts_no_more():
     found = summarise([measure_of([[1, 1, 1, 1, 1, 1, 1, 1], [0, 0], [0]])])
-    assert found["value"] == [pytest.approx(1 / 3)]  # naively, over queries, 8 / 11
-    assert (found["queries"], found["objects"], found["chance"], found["gallery"]) == (11, 3, [0.5], "18 objects")
+    assert found.value == [pytest.approx(1 / 3)]  # naively, over queries, 8 / 11
+    assert (found.queries, found.objects, found.chance, found.gallery) == (11, 3, [0.5], "18 objects")
 
 
 def test_seeds_are_averaged_by_object_and_listed_one_by_one():
     parts = [measure_of(some_objects(seed=seed)) for seed in range(3)]
     found = summarise(parts)
     each = [np.mean([np.mean(part.values[part.owner == name]) for name in range(12)]) for part in parts]
-    np.testing.assert_allclose(np.ravel(found["by_seed"]), each)
-    assert found["value"][0] == pytest.approx(np.mean(each))
+    np.testing.assert_allclose(np.ravel(found.repeats), each)
+    assert found.value[0] == pytest.approx(np.mean(each))
     one_seed = summarise(parts[:1])
     # Naively, three seeds would count as three times as many objects.
-    assert found["high"][0] - found["low"][0] > 0.4 * (one_seed["high"][0] - one_seed["low"][0])
-    assert summarise([parts[0]] * 3)["low"] == pytest.approx(one_seed["low"])
+    assert found.high[0] - found.low[0] > 0.4 * (one_seed.high[0] - one_seed.low[0])
+    assert summarise([parts[0]] * 3).low == pytest.approx(one_seed.low)
 
 
 def test_measures_of_different_queries_are_not_combined():
@@ -69,12 +69,12 @@ def test_the_interval_equals_that_of_a_loop_over_resamples():
 @pytest.mark.parametrize("value", [0.0, 1.0, 1 / 3])
 def test_objects_with_equal_values_have_an_interval_without_width(value):
     found = summarise([measure_of([[value] * 4] * 7)])
-    assert found["low"] == found["high"] == [value]
+    assert found.low == found.high == [value]
 
 
 def test_one_object_gives_the_widest_interval():
     found = summarise([measure_of([[0.5, 0.7, 0.9]])])
-    assert (found["low"], found["value"], found["high"]) == ([0.0], [pytest.approx(0.7)], [1.0])
+    assert (found.low, found.value, found.high) == ([0.0], [pytest.approx(0.7)], [1.0])
 
 
 def coverage(interval_of, trials=400, objects=18, queries=20):
@@ -127,8 +127,8 @@ def test_the_coverage_for_few_objects_is_as_documented(objects, stated):
 def test_results_of_fewer_than_five_objects_are_marked():
     for objects, few in ((1, True), (2, True), (4, True), (5, False), (12, False)):
         measure = measure_of(some_objects(objects))
-        assert summarise([measure])["few_objects"] is few
-        assert compare([measure], [measure])["few_objects"] is few
+        assert summarise([measure]).few_objects is few
+        assert compare([measure], [measure]).few_objects is few
 
 
 # Comparisons -----------------------------------------------------------------------------------------------
@@ -164,12 +164,12 @@ def test_a_small_difference_on_every_object_is_significant_although_the_interval
     better = [[value + 0.02 for value in part] for part in parts]
     a, b = measure_of(better), measure_of(parts)
     found = compare([a], [b])
-    assert found["difference"] == pytest.approx(0.02)
-    assert 0.019 < found["low"] <= found["high"] < 0.021
-    assert found["p"] == pytest.approx(2 / 2**18)
-    assert summarise([a])["low"][0] < summarise([b])["high"][0] - 0.1
+    assert found.value == pytest.approx(0.02)
+    assert 0.019 < found.low <= found.high < 0.021
+    assert found.p == pytest.approx(2 / 2**18)
+    assert summarise([a]).low[0] < summarise([b]).high[0] - 0.1
     back = compare([b], [a])
-    assert (back["difference"], back["p"]) == (pytest.approx(-0.02), found["p"])
+    assert (back.value, back.p) == (pytest.approx(-0.02), found.p)
 
 
 def test_rounding_never_puts_a_value_outside_its_interval():
@@ -177,4 +177,4 @@ def test_rounding_never_puts_a_value_outside_its_interval():
     for count in (3, 7, 9):
         measure = Measure(values[:count], np.arange(count), np.array([0.5]), "objects")
         summary = summarise([measure, measure, measure])
-        assert summary["low"][0] <= summary["value"][0] <= summary["high"][0]
+        assert summary.low[0] <= summary.value[0] <= summary.high[0]

@@ -4,6 +4,7 @@ names break nothing."""
 import json
 import re
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -11,10 +12,10 @@ from retrieval.errors import BadInput
 from retrieval.model.posterior import FORMULA
 from retrieval.report.document import Details, Document, Listing, Picture, Section, Table, Text, to_html, to_markdown
 from retrieval.report.evaluation import write_report
-from retrieval.report.numbers import format_number, percent, probability, with_interval
+from retrieval.report.numbers import format_number, interval, percent, probability, with_interval
 from tests import synthetic
 from tests.pages import HtmlPage
-from tests.synthetic_evaluation import write_synthetic_results
+from tests.synthetic_evaluation import PROTOCOL, verification, write_synthetic_results
 
 METHODS = ("late_fusion", "cca", "chance")
 
@@ -43,10 +44,10 @@ def text_only(monkeypatch):
 
 
 def remake(report, tmp_path, change=None):
-    """Write the report again after `change(results)`."""
+    """Write the report again after `change(protocol)`."""
     results = json.loads((report[1] / "results.json").read_text())
     if change:
-        change(results)
+        change(results["protocols"][PROTOCOL])
     (tmp_path / "results.json").write_text(json.dumps(results))
     files = write_report(tmp_path)
     return (tmp_path / "report.html").read_text("utf-8"), (tmp_path / "report.md").read_text("utf-8"), files
@@ -84,8 +85,8 @@ def test_every_measure_of_every_method_is_printed_with_its_interval_and_basis(re
     _, out = report
     results = json.loads((out / "results.json").read_text())
     page, text = HtmlPage((out / "report.html").read_text("utf-8")).text, (out / "report.md").read_text("utf-8")
-    for method in results["methods"].values():
-        for summary in method["measures"].values():
+    for row in results["protocols"][PROTOCOL]["rows"].values():
+        for summary in row["measures"].values():
             cell = f"{100 * summary['value'][0]:.1f} [{100 * summary['low'][0]:.1f}, {100 * summary['high'][0]:.1f}]"
             assert cell in page
             assert cell.replace("[", r"\[").replace("]", r"\]") in text
@@ -97,8 +98,8 @@ def test_every_measure_of_every_method_is_printed_with_its_interval_and_basis(re
 def test_numbers_are_printed_without_recomputation(report, tmp_path):
     """A value that contradicts all others is printed unchanged."""
 
-    def change(results):
-        results["methods"]["cca"]["measures"]["pair_accuracy"] |= {"value": [0.12345], "low": [0.9], "high": [0.1]}
+    def change(protocol):
+        protocol["rows"]["cca"]["measures"]["pair_accuracy"] |= {"value": [0.12345], "low": [0.9], "high": [0.1]}
 
     page, text, _ = remake(report, tmp_path, change=change)
     assert "12.3 [90.0, 10.0]" in page
@@ -106,37 +107,32 @@ def test_numbers_are_printed_without_recomputation(report, tmp_path):
 
 
 @pytest.mark.usefixtures("text_only")
-def test_the_report_cites_the_papers_number_and_names_simulation(report, tmp_path):
+def test_the_report_cites_published_results_and_names_simulation(report, tmp_path):
     page, _, _ = remake(report, tmp_path)
     assert "64.3 %" in page
-    assert "the numbers are not comparable" in page
     assert "This recording is simulated." in page
 
-    def real(results):
-        results["recording"]["source"] = "billets"
+    def real(protocol):
+        protocol["recording"]["source"] = "billets"
 
     assert "This recording is simulated." not in remake(report, tmp_path, change=real)[0]
 
 
 @pytest.mark.usefixtures("text_only")
 def test_a_control_states_whether_chance_lies_in_its_interval(report, tmp_path):
-    def change(results):
-        results["controls"]["no_contact"]["measures"]["pair_accuracy"] |= {
-            "low": [0.51],
-            "chance": [0.5],
-            "high": [0.6],
-        }
-        results["controls"]["shuffled"]["measures"]["pair_accuracy"] |= {"low": [0.49], "chance": [0.5], "high": [0.6]}
+    def change(protocol):
+        for name, low in (("no_contact", 0.51), ("permuted", 0.49)):
+            protocol["controls"][name]["measures"]["pair_accuracy"] |= {"low": [low], "chance": [0.5], "high": [0.6]}
 
     rows = remake(report, tmp_path, change=change)[1].splitlines()
     assert next(row for row in rows if row.startswith(r"| no\_contact |")).endswith("| no |")
-    assert next(row for row in rows if row.startswith("| shuffled |")).endswith("| yes |")
+    assert next(row for row in rows if row.startswith("| permuted |")).endswith("| yes |")
 
 
 @pytest.mark.usefixtures("text_only")
 def test_the_decision_is_shown_with_the_formula(report, tmp_path):
-    def change(results):
-        found = results["methods"]["cca"]["reject"]
+    def change(protocol):
+        found = protocol["rows"]["cca"]["details"]["reject"]
         found["false_accepts_at_95"] |= {"value": [0.8123], "low": [0.7], "high": [0.9]}
 
     page, text, _ = remake(report, tmp_path, change=change)
@@ -148,11 +144,11 @@ def test_the_decision_is_shown_with_the_formula(report, tmp_path):
 
 
 def test_too_few_objects_for_a_posterior_are_reported(report, tmp_path):
-    def change(results):
-        for method in results["methods"].values():
-            method["reject"] = None
-            method["calibration"]["posteriors"] = {}
-            method["reliability"] = {"pairs": method["reliability"]["pairs"]}
+    def change(protocol):
+        for details in (row["details"] for row in protocol["rows"].values()):
+            details["reject"] = None
+            details["calibration"]["posteriors"] = {}
+            details["reliability"] = {"pairs": details["reliability"]["pairs"]}
 
     _, text, files = remake(report, tmp_path, change=change)
     assert "at least three validation objects" in text
@@ -161,10 +157,10 @@ def test_too_few_objects_for_a_posterior_are_reported(report, tmp_path):
 
 @pytest.mark.usefixtures("text_only")
 def test_intervals_of_too_few_objects_are_marked_and_explained_in_every_table(report, tmp_path):
-    def change(results):
-        for method in results["methods"].values():
-            method["measures"]["pair_accuracy"]["few_objects"] = True
-        results["comparisons"][0]["few_objects"] = True
+    def change(protocol):
+        for row in protocol["rows"].values():
+            row["measures"]["pair_accuracy"]["few_objects"] = True
+        protocol["comparisons"][0]["difference"]["few_objects"] = True
 
     assert "† Fewer than 5 objects" not in remake(report, tmp_path)[1]
     page, text, _ = remake(report, tmp_path, change=change)
@@ -177,12 +173,10 @@ def test_intervals_of_too_few_objects_are_marked_and_explained_in_every_table(re
 
 
 def test_missing_measures_are_left_out(report, tmp_path):
-    def change(results):
-        for method in results["methods"].values():
-            for key in ("per_object", "confusions", "reliability", "calibration", "reject", "best_params"):
-                method.pop(key)
-            method["measures"] = {"pair_accuracy": method["measures"]["pair_accuracy"]}
-        results |= {"controls": {}, "ceilings": {}, "comparisons": [], "verification": None}
+    def change(protocol):
+        for row in protocol["rows"].values():
+            row |= {"details": None, "measures": {"pair_accuracy": row["measures"]["pair_accuracy"]}}
+        protocol |= {"controls": {}, "ceilings": {}, "comparisons": []}
 
     _, text, files = remake(report, tmp_path, change=change)
     assert [path.name for path in files[2:]] == ["overview.png"]
@@ -199,25 +193,24 @@ def test_missing_measures_are_left_out(report, tmp_path):
 
 
 def test_unknown_methods_are_shown_under_their_names(report, tmp_path):
-    def change(results):
-        results["methods"]["brand/new_method"] = results["methods"]["cca"]
+    def change(protocol):
+        protocol["rows"]["brand/new_method"] = protocol["rows"]["cca"]
 
     page, _, files = remake(report, tmp_path, change=change)
     assert "brand/new method" in page
     assert "objects-test-brand-new_method.png" in {path.name for path in files}
 
 
-def rename(results, old, new):
-    return json.loads(json.dumps(results).replace(json.dumps(old)[1:-1], json.dumps(new)[1:-1]))
-
-
 @pytest.mark.parametrize(
     "name", ["<script>alert(1)</script>", "$\\frac{1}$ | *x* [y](z)", "x" * 400, "mug 茶碗 🍵 100 %d {} a&b"]
 )
 def test_any_name_of_an_object_is_harmless(report, tmp_path, name):
-    results = json.loads((report[1] / "results.json").read_text())
-    changed = rename(results, results["split"]["test"][0], name)
-    page, text, _ = remake(report, tmp_path, change=lambda results: (results.clear(), results.update(changed)))
+    def change(protocol):
+        old = protocol["folds"][0][0]["test"][0]
+        renamed = json.dumps(protocol).replace(json.dumps(old)[1:-1], json.dumps(name)[1:-1])
+        protocol |= json.loads(renamed)
+
+    page, text, _ = remake(report, tmp_path, change=change)
     assert HtmlPage(page).all("script") == [{}]
     assert name in HtmlPage(page).text
     for line in text.splitlines():
@@ -231,6 +224,58 @@ def test_unreadable_results_are_one_clear_error(tmp_path, text):
         write_report(tmp_path)
 
 
+@pytest.mark.usefixtures("text_only")
+def test_rates_of_verification_fall_with_the_false_accept_rate_and_refusals_name_the_objects_that_they_need(
+    report, tmp_path
+):
+    found = verification(np.random.default_rng(0))
+    one = found["random"]["3"]
+    one["eer"] = {"value": 0.0512, "low": 0.02, "high": 0.11, "objects_needed": 35}
+    one["frr"] = {
+        "0.001": {"value": None, "low": None, "high": None, "objects_needed": 1246},
+        "0.01": {"value": 0.2345, "low": 0.1, "high": 0.4, "objects_needed": 78},
+        "0.1": {"value": 0.01, "low": 0.0, "high": 0.06, "objects_needed": 25},
+    }
+    found["similar"]["1"]["eer"] = dict.fromkeys(("value", "low", "high", "objects_needed"))
+
+    def change(protocol):
+        protocol["rows"]["late_fusion"]["details"]["verification"] = found
+
+    text = remake(report, tmp_path, change)[1].replace("\\", "")
+    assert (
+        "| impostors | grasps | EER, % | FRR at a FAR of 10 %, % | FRR at a FAR of 1 %, % | FRR at a FAR of 0.1 %, % |"
+    ) in text
+    assert (
+        "| random | 3 | 5.1 [2.0, 11.0] | 1.0 [0.0, 6.0] | 23.4 [10.0, 40.0] | refused: needs 1,246 objects |" in text
+    )
+    assert "| most similar object | 1 | refused: no errors |" in text
+    assert len(re.findall(r"^\| (random|most similar object) \| [1235] \|", text, re.MULTILINE)) == 8
+
+
+@pytest.mark.usefixtures("text_only")
+def test_protocols_of_real_data_have_low_pass_controls_verdicts_and_a_section_each(report, tmp_path):
+    results = json.loads((report[1] / "results.json").read_text())
+    protocol = results["protocols"][PROTOCOL]
+    low = {"value": 0.1, "low": -0.02, "high": 0.2, "few_objects": False, "p": 0.2}
+    for row in protocol["rows"].values():
+        row |= {"details": None, "low_pass": row["measures"]}
+        row["differences"] = {"low_pass": {"topn_k5": low}}
+        row["verdict"] = {"counts_as_touch": False, "above_chance": True}
+    protocol |= {"labels": [["topn_k5", "top-1 of 5"]], "main": "topn_k5", "unit": "choice"}
+    results |= {"protocols": {"first": protocol, "second": protocol}, "skipped": {"rct": "no folder"}}
+    (tmp_path / "results.json").write_text(json.dumps(results))
+    write_report(tmp_path)
+    text = (tmp_path / "report.md").read_text("utf-8").replace("\\", "")
+    assert "rct was skipped: no folder." in text
+    assert text.count("\n## Unseen objects\n") == 2
+    assert text.count("> Late fusion, top-1 of 5: ".lower()) == 2
+    assert "does not count as touch: +10.0 [-2.0, +20.0] points against the low-pass control" in text
+    assert "| low-pass control (8 x 6) |" in text
+    assert "| late fusion | top-1 of 5 | the low-pass control | +10.0 [-2.0, +20.0] | 0.20 |" in text
+    assert "| top-1 of 5, over choices | mean, % | minimum, % | maximum, % | choices |" in text
+    assert {path.name for path in (tmp_path / "figures").iterdir()} >= {"first-overview.png", "second-overview.png"}
+
+
 # Labels ----------------------------------------------------------------------------------------------
 
 
@@ -239,7 +284,7 @@ def test_numbers_are_written_for_readers():
         *("–", "0", "3", "4.00", "0.0361", "100", "123", "12,346")
     ]
     assert [percent(0.71249), percent(None), percent(0.5, 0)] == ["71.2", "–", "50"]
-    assert with_interval({"value": [0.5], "low": [0.4], "high": [0.625]}) == "50.0 [40.0, 62.5]"
+    assert interval(0.5, 0.4, 0.625) == "50.0 [40.0, 62.5]"
     assert with_interval(None) == "–"
     assert [probability(p) for p in (0.0, 0.00012, 0.0512, 0.5)] == ["< 0.0001", "0.00012", "0.051", "0.50"]
 

@@ -25,14 +25,10 @@ from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, Split, data_digest
 from retrieval.data.images import encode_image, read_rgb
 from retrieval.errors import DatasetError
-from retrieval.evaluation.real.conditions import (
-    CONTROLS,
-    TowerEncoder,
-    clock_features,
-    missing_no_contact_reason,
-)
-from retrieval.evaluation.real.protocol import Protocol, RecordingFacts
-from retrieval.evaluation.real.verdict import Aggregation, control_entry, row_entry
+from retrieval.evaluation.aggregate import Aggregation, MeasuredControl, MeasuredRow, protocol_result
+from retrieval.evaluation.inputs import TowerEncoder, clock_features, missing_no_contact_reason, with_fingers
+from retrieval.evaluation.protocol import Protocol, RecordingFacts
+from retrieval.evaluation.results import ProtocolResult
 from retrieval.metrics import protocols
 from retrieval.metrics.measure import Measure, pooled
 from retrieval.metrics.registry import MethodScoreTables, Metric
@@ -43,7 +39,8 @@ COMPONENTS = 60
 REPRESENTATIONS = ("difference", "common-frame")
 FROZEN = "frozen"
 """Row name of the configuration's own towers."""
-PERMUTED = "the objects of the sequences are permuted: the level of chance"
+METHOD = "nearest"
+"""Method of the rows and controls: the nearest sequence."""
 
 Vectors = NDArray[np.float64]
 
@@ -219,12 +216,7 @@ class _SequenceEncoder:
 
     def _features(self, grasps: Sequence[Grasp], touch_variant: str) -> NDArray[np.float32]:
         """Return the features (G, fingers * F) of these touches without cells, whose place in the image would count."""
-        fingers = self.towers.config.matcher.fingers
-        if fingers > 1 and len(grasps[0].touches) == 1:  # both fingers of the model get the same touch
-            grasps = [
-                dataclasses.replace(one, touches=one.touches * fingers, backgrounds=one.backgrounds * fingers)
-                for one in grasps
-            ]
+        grasps = with_fingers(grasps, self.towers.config.matcher.fingers)
         ids = tuple(grasp.grasp_id for grasp in grasps)
         no_photos = Features(ids, ids, np.zeros((len(ids), 1, 1), np.float32), np.zeros((len(ids), 1), np.float32))
         towers = self.towers
@@ -240,24 +232,22 @@ class _SequenceEncoder:
         return found.pooled(towers.matcher).touch.reshape(len(ids), -1)
 
 
-def touch_to_touch_entry(
+def run_touch_to_touch(
     protocol: TouchToTouch,
     facts: RecordingFacts,
     towers_of: Mapping[str, TowerEncoder],
     seeds: Sequence[int],
-    cache: Path,
-    draws: int,
+    folder: Path,
     quiet: bool,
-) -> dict[str, Any]:
-    """Return the protocol's entry of results.json.
+) -> ProtocolResult:
+    """Return the results of the protocol.
 
     Args:
         protocol: The protocol.
         facts: The recording. Each touch must have a no-contact frame, and each object two sequences.
         towers_of: Towers by name of their row; the others are compared with the first.
         seeds: Seeds of the permutations of the objects.
-        cache: Folder of features and of images on the common frame.
-        draws: Resamples of an interval.
+        folder: Folder of images on the common frame.
         quiet: No progress on stderr.
 
     Raises:
@@ -266,56 +256,35 @@ def touch_to_touch_entry(
     sequences = Sequences.of(facts.grasps)
     if reason := missing_no_contact_reason(facts.grasps):
         raise DatasetError(f"Touch to touch needs the no-contact frame of each sequence: {reason}.")
-    digest = data_digest(facts.grasps)
-    common = with_common_frame(facts.grasps, cache / "common-frame" / digest[:32], quiet=quiet)
-    aggregation = Aggregation(draws, seeds[0])
+    common = with_common_frame(facts.grasps, folder / data_digest(facts.grasps)[:32], quiet=quiet)
     order = _measures(protocol, sequences, clock_features(len(sequences.names)).astype(np.float64))
-    entries: dict[str, Any] = {}
+    rows: dict[str, MeasuredRow] = {}
     controls: dict[str, list[dict[str, Measure]]] = {"order": [order]}
-    frozen: dict[str, dict[str, Measure]] = {}
     for label, towers in towers_of.items():
         encoder = _SequenceEncoder(sequences, towers, common)
         no_contact = _measures(protocol, sequences, encoder.no_contact())
         controls.setdefault("no_contact", [no_contact])
         for representation in REPRESENTATIONS:
-            name = f"{label}-{representation}"
             table = sequences.table(leave_one_out_scores(encoder.vectors(representation, "touch")))
             low_pass = _measures(protocol, sequences, encoder.vectors(representation, "low_pass"))
-            measured = _measure_table(protocol, table)
-            model = towers.checkpoint
-            first = frozen.setdefault(representation, measured)
-            entries[name] = {
-                "method": "nearest",
-                "model": model.digest if model else None,
-                **row_entry(protocol, [measured], [low_pass], [order], aggregation, [no_contact]),
-                "tower_differences": None if first is measured else aggregation.differences([measured], [first]),
-                "best_params": [],
-            }
-            controls.setdefault("permuted", list(_permuted_measures(protocol, sequences, table.scores, seeds)))
-    objects = sorted(set(sequences.objects))
-    return {
-        "title": protocol.title,
-        "rule": protocol.rule,
-        "published_results": list(protocol.published_results),
-        "main": protocol.main,
-        "labels": [[name, metric.label] for name, metric in protocol.measures.items()],
-        "unit": "object",
-        "recording": {
-            "data_set": protocol.data_set,
-            "source": facts.source,
-            "digest": digest,
-            "objects": len(objects),
-            "grasps": len(facts.grasps),
-        },
-        "folds": [[{"test": [name]} for name in sequences.names]],
-        "rows": entries,
-        "controls": {
-            name: control_entry(
-                protocol, PERMUTED if name == "permuted" else CONTROLS[name], None, by_seed, aggregation
+            rows[f"{label}-{representation}"] = MeasuredRow(
+                METHOD,
+                towers.checkpoint.digest if towers.checkpoint else None,
+                [_measure_table(protocol, table)],
+                [low_pass],
+                [no_contact],
             )
-            for name, by_seed in controls.items()
-        },
-    }
+            controls.setdefault("permuted", list(_permuted_measures(protocol, sequences, table.scores, seeds)))
+    first, *others = towers_of
+    return protocol_result(
+        protocol,
+        facts,
+        [[Split(seeds[0], (), (), (name,)) for name in sequences.names]],
+        rows,
+        [MeasuredControl(kind, METHOD, by_seed) for kind, by_seed in controls.items()],
+        [(f"{other}-{each}", f"{first}-{each}") for other in others for each in REPRESENTATIONS],
+        Aggregation(seeds[0]),
+    )
 
 
 def _measures(protocol: Protocol, sequences: Sequences, vectors: Vectors) -> dict[str, Measure]:

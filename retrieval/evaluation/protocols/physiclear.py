@@ -1,6 +1,6 @@
 """PhysiCLeAR: identify the pressed object part from other press videos of it."""
 
-from retrieval.evaluation.real.touch_to_touch import TouchToTouch
+from retrieval.evaluation.touch_to_touch import TouchToTouch
 
 LEAVE_ONE_VIDEO_OUT = TouchToTouch(
     "physiclear",

@@ -10,7 +10,7 @@ import numpy as np
 
 from retrieval.data.dataset import Split
 from retrieval.errors import DatasetError
-from retrieval.evaluation.real.protocol import Protocol, RecordingFacts, registered_metrics, topn_accuracy
+from retrieval.evaluation.protocol import Protocol, RecordingFacts, registered_metrics, topn_accuracy
 
 _PARTS = 4
 

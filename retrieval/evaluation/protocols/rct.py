@@ -3,7 +3,7 @@
 import numpy as np
 
 from retrieval.data.dataset import Split
-from retrieval.evaluation.real.protocol import Protocol, RecordingFacts, folds, registered_metrics, topn_accuracy
+from retrieval.evaluation.protocol import Protocol, RecordingFacts, folds, registered_metrics, topn_accuracy
 
 _FOLDS = 5
 

@@ -1,7 +1,7 @@
-"""Benchmark protocols: the split of a data set, the galleries, and the measures."""
+"""Protocols: the split of a recording or data set, the galleries, the controls and the measures."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +10,15 @@ import numpy as np
 from _touch_retrieval.files import read_json
 from retrieval.data.dataset import Grasp, Split, load_grasps
 from retrieval.errors import DatasetError
+from retrieval.evaluation.inputs import CONTROL_CCA
 from retrieval.metrics.registry import METRICS, Metric, k_way_measure
 
 VALIDATION_OBJECTS = 5
 """Default number of validation objects, on which methods select their settings."""
+MAX_GRASPS = {"train": 1, "validation": 12, "test": 40}
+"""Default number of scored grasps of one object at most, by part."""
+CONTROLS = ("permuted", "no_contact", "order", "background")
+"""Default inputs of the controls that are measured once for all rows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,12 +26,14 @@ class RecordingFacts:
     """A recording with the facts that protocols need.
 
     Attributes:
+        name: Name of its folder.
         source: Source of the recording.
         grasps: The grasps.
         objects: object_id -> metadata of the data set.
         splits: Name -> published split.
     """
 
+    name: str
     source: str
     grasps: list[Grasp]
     objects: Mapping[str, Mapping[str, Any]]
@@ -69,20 +76,24 @@ def read_recording_facts(folder: Path) -> RecordingFacts:
             splits[path.stem] = Split.from_dict(read_json(path))
         except ValueError as error:
             raise DatasetError(f"{path} is not a JSON file: {error}") from error
-    return RecordingFacts(str(info["source"]), grasps, objects, splits)
+    return RecordingFacts(folder.resolve().name, str(info["source"]), grasps, objects, splits)
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """One benchmark protocol of a data set.
+    """One protocol: the objects of each part, the queries and galleries, the controls and the measures.
 
     Attributes:
-        data_set: The importer of the data set.
+        data_set: The importer of the data set; None for any recording.
         title: Title in the report.
         rule: The split, described in sentences.
         folds: Function from recording and seed to splits. The test objects of all folds together are the same for every
             seed.
-        measures: Measures by name. The first one decides whether a result is evidence of touch (`verdict.RULE`).
+        measures: Measures by name. The first one decides whether a result is evidence of touch (`aggregate.RULE`).
+        controls: Inputs (`inputs.INPUTS`) -> the method that is fitted and scored on them, once for all rows.
+        ceilings: The same for inputs of one modality.
+        control_measures: Measures of controls, ceilings and comparisons; empty for all.
+        max_grasps: Maximum number of scored grasps of one object, by part; a part without an entry has no limit.
         allows_own_photos: Whether a touch is compared with the photo of its own grasp, because the data set pairs them
             at random or has one photo of each object.
         is_by_sequence: Whether a gallery contains the objects of one sequence; intervals then resample sequences.
@@ -90,8 +101,11 @@ class Protocol:
         galleries: Function from recording and split to the gallery of each test object, if there are several galleries.
         choices: Whether the folds are different, overlapping choices of test objects. Values are then means over the
             folds, and intervals cover the choice.
+        in_depth: Whether single objects, calibrated probabilities and decisions of each row are reported. Then one
+            split serves all seeds, which only repeat the training; no method is fitted on validation objects, and rows
+            have no low-pass control of their own and no verdict.
 
-    >>> from retrieval.evaluation.real.protocol import topn_accuracy, folds
+    >>> from retrieval.evaluation.protocol import topn_accuracy, folds
     >>> def halves(facts, seed):
     ...     return folds(facts.names, [facts.names[::2], facts.names[1::2]], seed)
     >>> protocol = retrieval.Protocol("vt60", "Halves", "Objects are halved by name.", halves, topn_accuracy(10))
@@ -99,16 +113,21 @@ class Protocol:
     'topn_k10'
     """
 
-    data_set: str
+    data_set: str | None
     title: str
     rule: str
     folds: Callable[[RecordingFacts, int], list[Split]]
     measures: Mapping[str, Metric]
+    controls: Mapping[str, str] = field(default_factory=lambda: dict.fromkeys(CONTROLS, CONTROL_CCA))
+    ceilings: Mapping[str, str] = field(default_factory=dict)
+    control_measures: tuple[str, ...] = ()
+    max_grasps: Mapping[str, int] = field(default_factory=lambda: MAX_GRASPS)
     allows_own_photos: bool = False
     is_by_sequence: bool = False
     published_results: tuple[str, ...] = ()
     galleries: Callable[[RecordingFacts, Split], Mapping[str, str]] | None = None
     choices: bool = False
+    in_depth: bool = False
 
     def gallery_of(self, facts: RecordingFacts, split: Split) -> Mapping[str, str]:
         """Return the name of the gallery of each test object."""

@@ -2,7 +2,7 @@
 
 from retrieval.data.dataset import Split
 from retrieval.errors import DatasetError
-from retrieval.evaluation.real.protocol import Protocol, RecordingFacts, registered_metrics
+from retrieval.evaluation.protocol import Protocol, RecordingFacts, registered_metrics
 from retrieval.metrics import protocols
 from retrieval.metrics.registry import Metric
 

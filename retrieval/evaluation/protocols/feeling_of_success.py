@@ -4,7 +4,7 @@ import numpy as np
 
 from retrieval.data.dataset import Split
 from retrieval.evaluation.calibrate import MIN_THRESHOLD_OBJECTS
-from retrieval.evaluation.real.protocol import Protocol, RecordingFacts, fold, registered_metrics
+from retrieval.evaluation.protocol import Protocol, RecordingFacts, fold, registered_metrics
 
 _OBJECTS, _TEST = 98, 18
 

@@ -1,0 +1,201 @@
+"""From measures to results: values with intervals, paired differences from the controls, and the verdict."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from retrieval.data.dataset import Split, data_digest
+from retrieval.evaluation.inputs import INPUTS
+from retrieval.evaluation.protocol import Protocol, RecordingFacts
+from retrieval.evaluation.results import (
+    Comparison,
+    ControlResult,
+    Details,
+    FeatureCounts,
+    ProtocolResult,
+    RecordingResult,
+    RowResult,
+    Summaries,
+    Verdict,
+)
+from retrieval.metrics.intervals import Difference, Summary, compare, compare_splits, summarise, summarise_splits
+from retrieval.metrics.measure import Measure
+
+RULE = (
+    "A result counts as touch only if it is evidence that the relief in the gel identifies the object: its main "
+    "measure must be higher than that of each control, with the whole interval of the paired difference above 0. Two "
+    "controls always apply: the same method on low-pass touches, and the order of capture as input instead of the "
+    "touch. If touches are compared with touches, a third one applies: the no-contact frame as input."
+)
+CONTROL_NAMES = {
+    "low_pass": "the low-pass control",
+    "order": "the order of capture",
+    "no_contact": "the no-contact frame as input",
+}
+"""Control of a verdict -> its name."""
+
+MeasuresBySeed = Sequence[Mapping[str, Measure]]
+
+
+@dataclass(frozen=True)
+class Aggregation:
+    """Aggregates measures over seeds, with intervals that resample objects, or over choices of test objects.
+
+    Attributes:
+        seed: Seed of the resamples.
+        ratio: Number of test objects divided by the number of training objects, if the measures are from random
+            choices of test objects; None if they are from training seeds.
+    """
+
+    seed: int
+    ratio: float | None = None
+
+    def summaries(self, by_seed: MeasuresBySeed) -> Summaries:
+        """Return values with intervals, for measures that all seeds have."""
+        found = {name: [one[name] for one in by_seed] for name in _shared(by_seed)}
+        if self.ratio is not None:
+            return {name: summarise_splits(each, self.ratio) for name, each in found.items()}
+        return {name: summarise(each, seed=self.seed) for name, each in found.items()}
+
+    def differences(self, a: MeasuresBySeed, b: MeasuresBySeed) -> dict[str, Difference]:
+        """Return paired differences `a` - `b`, by name."""
+        names = [name for name in _shared(a) if name in _shared(b)]
+        pairs = {name: ([one[name] for one in a], [one[name] for one in b]) for name in names}
+        if self.ratio is not None:
+            return {name: compare_splits(*pair, self.ratio) for name, pair in pairs.items()}
+        return {name: compare(*pair, seed=self.seed) for name, pair in pairs.items()}
+
+
+def _shared(by_seed: MeasuresBySeed) -> list[str]:
+    return [name for name in by_seed[0] if all(name in one for one in by_seed)]
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredRow:
+    """Measures of a row, by seed or choice.
+
+    Attributes:
+        method: Name of the method.
+        model: Digest of the checkpoint of its towers, if there is one.
+        touch: Measures of the touches.
+        low_pass: Measures of low-pass touches; empty for a row without a verdict.
+        no_contact: Measures with no-contact frames as input, if the verdict uses this control.
+        best_params: Selected parameters, by seed and fold.
+        details: The details of a protocol in depth.
+    """
+
+    method: str
+    model: str | None
+    touch: MeasuresBySeed
+    low_pass: MeasuresBySeed = ()
+    no_contact: MeasuresBySeed = ()
+    best_params: Sequence[list[dict[str, Any]]] = ()
+    details: Details | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredControl:
+    """A control or a ceiling: kind of inputs, method, and measures by seed or choice; or why there are none."""
+
+    kind: str
+    method: str
+    measures: MeasuresBySeed = ()
+    reason: str | None = None
+
+
+def protocol_result(
+    protocol: Protocol,
+    facts: RecordingFacts,
+    folds: Iterable[Sequence[Split]],
+    rows: Mapping[str, MeasuredRow],
+    controls: Sequence[MeasuredControl],
+    compared: Iterable[tuple[str, str]],
+    aggregation: Aggregation,
+    features: FeatureCounts | None = None,
+) -> ProtocolResult:
+    """Return the results of a protocol.
+
+    Args:
+        protocol: The protocol.
+        facts: The recording.
+        folds: The splits of each seed.
+        rows: Measures of the rows.
+        controls: Measures of controls and ceilings.
+        compared: Pairs of rows whose paired differences are stated.
+        aggregation: How measures are aggregated.
+        features: Counts of the features.
+    """
+    order = next((one.measures for one in controls if one.kind == "order"), ())
+    results = {
+        one.kind: ControlResult(
+            INPUTS[one.kind],
+            one.method,
+            aggregation.summaries(one.measures) if one.measures else None,
+            one.reason,
+        )
+        for one in controls
+    }
+    return ProtocolResult(
+        title=protocol.title,
+        rule=protocol.rule,
+        published_results=list(protocol.published_results),
+        main=protocol.main,
+        labels=[(name, metric.label) for name, metric in protocol.measures.items()],
+        unit="choice" if protocol.choices else "sequence" if protocol.is_by_sequence else "object",
+        recording=RecordingResult(
+            protocol.data_set or facts.name,
+            facts.source,
+            data_digest(facts.grasps),
+            len(facts.names),
+            len(facts.grasps),
+        ),
+        features=features,
+        folds=[[asdict(split) for split in splits] for splits in folds],
+        rows={name: _row_result(protocol, row, order, aggregation) for name, row in rows.items()},
+        controls={kind: one for kind, one in results.items() if kind not in protocol.ceilings},
+        ceilings={kind: one for kind, one in results.items() if kind in protocol.ceilings},
+        comparisons=_comparisons(protocol, rows, compared, aggregation),
+    )
+
+
+def _row_result(protocol: Protocol, row: MeasuredRow, order: MeasuresBySeed, aggregation: Aggregation) -> RowResult:
+    measures = aggregation.summaries(row.touch)
+    controls = {"low_pass": row.low_pass, "order": order, "no_contact": row.no_contact} if row.low_pass else {}
+    differences = {kind: aggregation.differences(row.touch, one) for kind, one in controls.items() if one}
+    main = protocol.main
+    return RowResult(
+        row.method,
+        row.model,
+        measures,
+        list(row.best_params),
+        aggregation.summaries(row.low_pass) if row.low_pass else None,
+        differences,
+        verdict(measures[main], {kind: one[main] for kind, one in differences.items()}) if differences else None,
+        row.details,
+    )
+
+
+def _comparisons(
+    protocol: Protocol,
+    rows: Mapping[str, MeasuredRow],
+    compared: Iterable[tuple[str, str]],
+    aggregation: Aggregation,
+) -> list[Comparison]:
+    differences = {(a, b): aggregation.differences(rows[a].touch, rows[b].touch) for a, b in compared}
+    return [
+        Comparison(a, b, name, found[name])
+        for name in protocol.control_measures or protocol.measures
+        for (a, b), found in differences.items()
+        if name in found
+    ]
+
+
+def verdict(main: Summary, differences: Mapping[str, Difference]) -> Verdict:
+    """Return whether a row's main measure counts as touch (see `RULE`).
+
+    Args:
+        main: The main measure.
+        differences: Its paired differences from the controls, by their names in `CONTROL_NAMES`; the whole interval of
+            each must be above 0.
+    """
+    return Verdict(all(one.low > 0 for one in differences.values()), main.low[0] > main.chance[0])

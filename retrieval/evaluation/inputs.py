@@ -1,0 +1,213 @@
+"""Inputs of methods: features of touches and photos by frozen towers, and the inputs of controls and ceilings.
+
+A control runs a method on inputs that lack information that the method should use. A ceiling measures how well one
+modality alone identifies the object, and so which modality limits the result.
+"""
+
+import dataclasses
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.data.dataset import Grasp, finger_count
+from retrieval.errors import DatasetError
+from retrieval.methods import METHODS
+from retrieval.methods.cca import Cca
+from retrieval.methods.late_fusion import frozen_matcher
+from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.config import Config
+from retrieval.model.fusion import Matcher
+from retrieval.training.features import Features, encode_recording
+
+INPUTS = {
+    "touch": "the touches and photos",
+    "permuted": "touches are randomly assigned to other objects before fitting, so there is nothing to learn",
+    "no_contact": "no-contact frames replace the touches, in fitting and in scoring",
+    "low_pass": "each gel image is reduced to 8 x 6 pixels, in fitting and in scoring",
+    "order": "the input is the position of the touch in the order of capture, not its image: an upper bound on the "
+    "information in sensor drift",
+    "background": "only the margin of each photo is used, an eighth of each side, in fitting and in scoring",
+    "touch_to_touch": "the touch of another grasp replaces the photo: how repeatable touches are",
+    "photo_to_photo": "the photo of another grasp replaces the touch: how repeatable photos are",
+}
+"""Kind of inputs -> description. "touch" is the result, the last two are ceilings, the others are controls."""
+_BUMPS = (4, 16, 64)
+
+
+class ControlCca(Cca):
+    """Method of the controls of real data: it takes features of any width, and principal components make it fast."""
+
+    max_directions = 96
+
+
+CONTROL_CCA = METHODS.name_of(ControlCca)
+
+
+@dataclass(frozen=True, eq=False)
+class TowerEncoder:
+    """Towers that encode a recording; each kind of inputs is encoded once.
+
+    Attributes:
+        grasps: The grasps of the recording.
+        config: Configuration of the towers, and of heads that are fitted on them.
+        matcher: Matcher with the towers.
+        checkpoint: The model of the towers, with which late fusion scores as it is; None if heads are fitted.
+        cache: Folder of encoded features.
+        quiet: No progress on stderr.
+    """
+
+    grasps: list[Grasp]
+    config: Config
+    matcher: Matcher
+    checkpoint: Checkpoint | None
+    cache: Path
+    quiet: bool
+    _encoded: dict[tuple[str, bool, int | None], Features] = field(default_factory=dict)
+
+    @classmethod
+    def of_config(cls, grasps: list[Grasp], config: Config, cache: Path, quiet: bool) -> Self:
+        """Return the frozen towers of a configuration."""
+        matcher = dataclasses.replace(config.matcher, fingers=finger_count(grasps))
+        config = dataclasses.replace(config, matcher=matcher)
+        return cls(grasps, config, frozen_matcher(config), None, cache, quiet)
+
+    @classmethod
+    def of_checkpoint(
+        cls, grasps: list[Grasp], checkpoint: Checkpoint, iterations: int, cache: Path, quiet: bool
+    ) -> Self:
+        """Return the towers of a checkpoint.
+
+        If the model has two fingers and the recording one, both fingers get the same touch.
+
+        Args:
+            grasps: The grasps of the recording.
+            checkpoint: The checkpoint.
+            iterations: Optimiser steps of heads that are fitted on its towers.
+            cache: Folder of encoded features.
+            quiet: No progress on stderr.
+
+        Raises:
+            DatasetError: The recording has more fingers than the model.
+        """
+        fingers, recorded = checkpoint.config.matcher.fingers, finger_count(grasps)
+        if recorded not in (1, fingers):
+            raise DatasetError(
+                f"{checkpoint.path} needs {fingers} finger(s), but the recording has {recorded}. Evaluate a model for "
+                f"{recorded} finger(s)."
+            )
+        grasps = with_fingers(grasps, fingers)
+        training = dataclasses.replace(
+            checkpoint.config.training,
+            init="random",
+            init_photo="",
+            start="",
+            init_touch="",
+            iterations=iterations,
+            freeze_towers=True,
+        )
+        config = dataclasses.replace(checkpoint.config, training=training)
+        return cls(grasps, config, checkpoint.matcher, checkpoint, cache, quiet)
+
+    def inputs(self, kind: str, with_cells: bool = True, max_grasps: int | None = None) -> Features:
+        """Return the features on which a method is fitted and scored.
+
+        Args:
+            kind: One of `INPUTS`.
+            with_cells: Whether features end with the cells of the towers, if these have cells.
+            max_grasps: Maximum number of grasps of an object (`thin_grasps`); None for all.
+        """
+        key = kind, with_cells, max_grasps
+        if key not in self._encoded:
+            self._encoded[key] = self._inputs(*key)
+        return self._encoded[key]
+
+    def missing_reason(self, kind: str) -> str | None:
+        """Return why the recording cannot give this kind of inputs; None if it can."""
+        if kind == "no_contact":
+            return missing_no_contact_reason(self.grasps)
+        if kind == "photo_to_photo":
+            features = self.inputs("touch")
+            photos = {
+                (owner, row.tobytes()) for owner, row in zip(features.owner.tolist(), features.photo, strict=True)
+            }
+            return None if len(photos) > len(set(features.object_ids)) else "no object has two different photos"
+        return None
+
+    def _inputs(self, kind: str, with_cells: bool, max_grasps: int | None) -> Features:
+        if kind in ("permuted", "order", "touch_to_touch", "photo_to_photo"):
+            touches = self.inputs("touch", with_cells, max_grasps)
+            if kind == "permuted":  # the experiment permutes the touches of each part
+                return touches
+            if kind == "order":
+                return dataclasses.replace(touches, touch=clock_features(len(touches))[:, None])
+            if kind == "touch_to_touch":
+                return dataclasses.replace(touches, photo=touches.touch.reshape(len(touches), -1))
+            return dataclasses.replace(touches, touch=touches.photo[:, None])
+        if not with_cells:
+            return self.inputs(kind, max_grasps=max_grasps).pooled(self.matcher)
+        is_touch, is_background = kind == "touch", kind == "background"
+        return encode_recording(
+            thin_grasps(self.grasps, max_grasps) if max_grasps else self.grasps,
+            self.matcher,
+            self.config,
+            self.cache,
+            touch_variant="touch" if is_touch or is_background else kind,
+            photo_variant="margin" if is_background else "photo",
+            photo_features_from=None if is_touch or is_background else self.inputs("touch"),
+            quiet=self.quiet,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """A row of the result table: its name, a method, and the towers under it."""
+
+    name: str
+    method: str
+    towers: TowerEncoder
+
+
+def with_fingers(grasps: Sequence[Grasp], fingers: int) -> list[Grasp]:
+    """Return the grasps for a model of this many fingers: each finger gets the touch of a grasp that has only one."""
+    copies = fingers if len(grasps[0].touches) == 1 else 1
+    return [
+        dataclasses.replace(one, touches=one.touches * copies, backgrounds=one.backgrounds * copies) for one in grasps
+    ]
+
+
+def missing_no_contact_reason(grasps: Sequence[Grasp]) -> str | None:
+    """Return why no-contact frames cannot replace touches; None if they can."""
+    if not all(len(grasp.backgrounds) == len(grasp.touches) for grasp in grasps):
+        return "the recording lacks no-contact frames"
+    if len({grasp.backgrounds for grasp in grasps}) == 1:
+        return "all touches share one no-contact frame, so it contains no information about the object"
+    return None
+
+
+def thin_grasps(grasps: Sequence[Grasp], max_grasps: int) -> list[Grasp]:
+    """Return at most `max_grasps` grasps of each object, evenly spaced in the order of its grasps."""
+    rows_of: dict[str, list[int]] = defaultdict(list)
+    for row, grasp in enumerate(grasps):
+        rows_of[grasp.object_id].append(row)
+    selected: set[int] = set()
+    for rows in rows_of.values():
+        selected |= {rows[place] for place in np.linspace(0, len(rows) - 1, min(max_grasps, len(rows))).astype(int)}
+    return [grasps[row] for row in sorted(selected)]
+
+
+def clock_features(count: int) -> NDArray[np.float32]:
+    """Encode the places 0..count-1 of an order as Gaussian bumps of three widths.
+
+    Near places have similar features, and a linear method can distinguish distant ones.
+
+    Returns:
+        (count, F) float32.
+    """
+    place = np.linspace(0, 1, count)[:, None]
+    bumps = [np.exp(-0.5 * ((place - np.linspace(0, 1, number)) * number) ** 2) for number in _BUMPS]
+    return np.concatenate(bumps, axis=1).astype(np.float32)

@@ -1,0 +1,1 @@
+"""Benchmark protocols: a file for each data set."""

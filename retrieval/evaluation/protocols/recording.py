@@ -1,0 +1,74 @@
+"""Any recording: unseen objects of one split, each method described in depth."""
+
+import dataclasses
+from collections.abc import Sequence
+
+from retrieval.data.check.split import require_fit
+from retrieval.data.dataset import Grasp, Split, make_split
+from retrieval.errors import DatasetError
+from retrieval.evaluation.protocol import Protocol, RecordingFacts
+from retrieval.metrics.registry import METRICS
+from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.config import TrainingConfig
+
+_RULE = (
+    "Methods are fitted on the training objects; settings are selected and probabilities calibrated on the validation "
+    "objects; the results are from the test objects. A touch is never compared with the photo of its own grasp. "
+)
+
+
+def _drawn(facts: RecordingFacts, seed: int) -> list[Split]:
+    return [make_split(facts.grasps, validation=0.15, test=0.15, seed=seed)]
+
+
+UNSEEN_OBJECTS = Protocol(
+    None,
+    "Unseen objects",
+    f"{_RULE}The split is drawn.",
+    _drawn,
+    METRICS,
+    controls=dict.fromkeys(("permuted", "no_contact", "low_pass"), "late_fusion"),
+    ceilings=dict.fromkeys(("touch_to_touch", "photo_to_photo"), "cca"),
+    control_measures=("pair_accuracy", "topn_k5", "topn_k10"),
+    max_grasps={"train": 8, "validation": 12},
+    in_depth=True,
+)
+
+
+def with_split(
+    facts: RecordingFacts, settings: TrainingConfig, model: Checkpoint | None, requested: Split | None
+) -> Protocol:
+    """Return the protocol with the requested split, else the model's own, else a new one.
+
+    Args:
+        facts: The recording.
+        settings: Seed and fractions of a new split.
+        model: The evaluated model.
+        requested: The requested split.
+
+    Raises:
+        DatasetError: The requested split does not fit the recording, or the recording has some, but not all training
+            objects of the model.
+    """
+    split, origin = _split(facts.grasps, settings, model, requested)
+    return dataclasses.replace(UNSEEN_OBJECTS, rule=f"{_RULE}The split is {origin}.", folds=lambda *_: [split])
+
+
+def _split(
+    grasps: Sequence[Grasp], settings: TrainingConfig, model: Checkpoint | None, requested: Split | None
+) -> tuple[Split, str]:
+    if requested is not None:
+        require_fit(requested, grasps)
+        return requested, "given"
+    own = model.split if model else None
+    trained = {*own.train, *own.validation} if own else set()
+    recorded = {grasp.object_id for grasp in grasps}
+    if own and trained and trained <= recorded:
+        return dataclasses.replace(own, test=own.test or tuple(sorted(recorded - trained))), "the model's own"
+    if shared := trained & recorded:
+        raise DatasetError(
+            f"The recording must contain all training objects of the model or none of them, but contains {len(shared)} "
+            f"of {len(trained)}, such as {min(shared)}. Give a split with --split."
+        )
+    drawn = make_split(grasps, validation=settings.validation_fraction, test=settings.test_fraction, seed=settings.seed)
+    return drawn, "drawn; the model was trained on none of its objects" if model else "drawn"

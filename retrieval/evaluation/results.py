@@ -1,0 +1,309 @@
+"""Results of an evaluation as data: results.json and timings.json, written by `evaluate` and read by the report."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from _touch_retrieval.files import write_atomically
+from retrieval.errors import BadInput
+from retrieval.metrics.intervals import Difference, Summary
+
+SCHEMA_VERSION = 4
+"""Schema version of results.json."""
+T = TypeVar("T")
+
+
+Summaries = dict[str, Summary]
+"""Summaries by name of the measure."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether the main measure of a row counts as touch (`retrieval.evaluation.aggregate.RULE`), with the reason."""
+
+    counts_as_touch: bool
+    above_chance: bool
+
+
+@dataclass(frozen=True)
+class PairThreshold:
+    """The score above which a pair is classified as a match, with its source; or why there is none."""
+
+    at: float | None
+    source: str | None = None
+    reason: str | None = None
+
+
+@dataclass(frozen=True)
+class Confusion:
+    """An object, another one that ranked first for its touches, and the fraction of these touches."""
+
+    object_id: str
+    mistaken_for: str
+    share: float
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """Decisions that an object is not in the catalogue; curves are those of the first seed.
+
+    Attributes:
+        auroc: Area under the ROC curve.
+        false_accepts_at_95: False accept rate at a true accept rate of 95 %.
+        balanced_accuracy: Mean of true accept rate and true reject rate, at even prior.
+        roc: [false accept rate, true accept rate].
+        risk_coverage: [fraction answered, error rate of these answers].
+    """
+
+    auroc: Summary
+    false_accepts_at_95: Summary
+    balanced_accuracy: Summary
+    roc: list[list[float]]
+    risk_coverage: list[list[float]]
+
+
+@dataclass(frozen=True)
+class Rate:
+    """An error rate with its interval: null unless there are `objects_needed` objects, which is null without errors."""
+
+    value: float | None
+    low: float | None
+    high: float | None
+    objects_needed: int | None
+
+
+@dataclass(frozen=True)
+class VerificationRates:
+    """Error rates of verification by sequences of one number of grasps.
+
+    Attributes:
+        objects: Touched objects.
+        sequences: Sequences of grasps.
+        eer: Equal error rate.
+        frr: False-reject rate by false-accept rate ("0.01").
+    """
+
+    objects: int
+    sequences: int
+    eer: Rate
+    frr: dict[str, Rate]
+
+
+@dataclass(frozen=True)
+class Details:
+    """Single objects and decisions of a method on one split.
+
+    Attributes:
+        pair_threshold: The threshold of pair accuracy.
+        per_object: Mean top-1 accuracy of 5 of each object: "test_candidates" among test objects, "all_candidates".
+        confusions: The most frequent ones.
+        calibration: Calibrations of the first seed: "pairs" and "posteriors" by number of grasps.
+        reliability: "pairs", "k5", "k10", "k5_g5" -> {"ece", "bins"}.
+        reject: None with too few objects.
+        verification: Impostors ("random", "similar") -> number of grasps -> rates; None with too few objects, and for
+            methods other than late fusion.
+    """
+
+    pair_threshold: PairThreshold
+    per_object: dict[str, dict[str, float]]
+    confusions: list[Confusion]
+    calibration: dict[str, Any]
+    reliability: dict[str, Any]
+    reject: Rejection | None
+    verification: dict[str, dict[str, VerificationRates]] | None
+
+
+@dataclass(frozen=True)
+class RowResult:
+    """A row of the table: a method on towers, or a checkpoint.
+
+    Attributes:
+        method: Name of the method.
+        model: Digest of the checkpoint that scores as it is, or whose towers are used; None for other towers.
+        measures: Measures of the touches.
+        best_params: Parameters that the method selected, by seed and fold.
+        low_pass: Measures with low-pass touches; None without this control of the row.
+        differences: Control ("low_pass", "order", "no_contact") -> measure -> touch minus control.
+        verdict: None for rows without controls of their own.
+        details: None for protocols of several folds.
+    """
+
+    method: str
+    model: str | None
+    measures: Summaries
+    best_params: list[list[dict[str, Any]]]
+    low_pass: Summaries | None = None
+    differences: dict[str, dict[str, Difference]] = field(default_factory=dict)
+    verdict: Verdict | None = None
+    details: Details | None = None
+
+
+@dataclass(frozen=True)
+class ControlResult:
+    """A control or a ceiling: one method on other inputs; or the reason why it was not measured."""
+
+    description: str
+    method: str
+    measures: Summaries | None
+    reason: str | None = None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A paired difference between two rows: `a` minus `b`."""
+
+    a: str
+    b: str
+    measure: str
+    difference: Difference
+
+
+@dataclass(frozen=True)
+class RecordingResult:
+    """The evaluated recording: folder name, source, digest of the grasps, and counts."""
+
+    name: str
+    source: str
+    digest: str
+    objects: int
+    grasps: int
+
+
+@dataclass(frozen=True)
+class FeatureCounts:
+    """Features of the towers of the first row: of one finger, of a photo; number of fingers; their digest."""
+
+    touch: int
+    photo: int
+    fingers: int
+    digest: str
+
+
+@dataclass(frozen=True)
+class ProtocolResult:
+    """Results of one protocol.
+
+    Attributes:
+        title: Title.
+        rule: The split, in sentences.
+        published_results: Results of others, in sentences.
+        main: The measure that decides.
+        labels: Measure and label, in the order of tables.
+        unit: What intervals resample: "object" or "sequence"; or "choice", if they cover choices of test objects.
+        recording: The recording.
+        features: None for touch to touch.
+        folds: The splits of each seed; one list if all seeds have the same splits.
+        rows: Rows by name, in the order of tables.
+        controls: Controls by name.
+        ceilings: Methods within one modality.
+        comparisons: Paired differences between rows.
+    """
+
+    title: str
+    rule: str
+    published_results: list[str]
+    main: str
+    labels: list[tuple[str, str]]
+    unit: str
+    recording: RecordingResult
+    features: FeatureCounts | None
+    folds: list[list[dict[str, Any]]]
+    rows: dict[str, RowResult]
+    controls: dict[str, ControlResult]
+    ceilings: dict[str, ControlResult]
+    comparisons: list[Comparison]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Settings of an evaluation.
+
+    Attributes:
+        preset: Name of the configuration.
+        config: The configuration.
+        model: Digest of the evaluated checkpoint, if one was given.
+        compared: Name -> configuration of towers that are compared.
+        seeds: Training seeds.
+    """
+
+    preset: str
+    config: dict[str, Any]
+    model: str | None
+    compared: dict[str, Any]
+    seeds: list[int]
+
+
+@dataclass(frozen=True)
+class Results:
+    """All results of an evaluation: the content of results.json, which has no times and no paths.
+
+    Attributes:
+        setting: The settings.
+        protocols: Protocols by name.
+        skipped: Protocol -> the reason why it was not run.
+        software: Version of the writer.
+        schema_version: `SCHEMA_VERSION`.
+    """
+
+    setting: Setting
+    protocols: dict[str, ProtocolResult]
+    skipped: dict[str, str]
+    software: str
+    schema_version: int = SCHEMA_VERSION
+
+
+@dataclass(frozen=True)
+class MethodTimes:
+    """Median run times of a row over seeds and folds; `fit_s` is None for a checkpoint, which is not fitted."""
+
+    fit_s: float | None
+    encode_touch_ms: float
+    encode_photo_ms: float
+    score_us_per_photo: float
+    query_ms: float
+
+
+@dataclass(frozen=True)
+class ProtocolTimes:
+    """Run times of one protocol: the towers for one touch and one photo, and each row."""
+
+    tower_touch_ms: float
+    tower_photo_ms: float
+    rows: dict[str, MethodTimes]
+
+
+@dataclass(frozen=True)
+class Timings:
+    """Content of timings.json: CPUs of the machine, threads of a measurement, and times by protocol."""
+
+    cpus: int
+    threads: int
+    protocols: dict[str, ProtocolTimes]
+
+
+def write_results(path: Path, results: Results | Timings) -> None:
+    """Write results.json or timings.json. Equal results give equal bytes."""
+    write_atomically(path, msgspec.json.format(msgspec.json.encode(results), indent=1) + b"\n")
+
+
+def read_results(path: Path, kind: type[T]) -> T:
+    """Read a file that `write_results` wrote.
+
+    Args:
+        path: The file.
+        kind: `Results` or `Timings`.
+
+    Raises:
+        BadInput: The file cannot be read, or another version wrote it.
+    """
+    try:
+        found = msgspec.json.decode(path.read_bytes(), type=kind)
+    except (OSError, msgspec.MsgspecError) as error:
+        raise BadInput(
+            f"{path} must contain the results of an evaluation ({error}). Run `retrieve evaluate`."
+        ) from error
+    if getattr(found, "schema_version", SCHEMA_VERSION) != SCHEMA_VERSION:
+        raise BadInput(f"{path} must have schema version {SCHEMA_VERSION}. Run `retrieve evaluate` again.")
+    return found

@@ -1,0 +1,42 @@
+"""The accuracy of a model that `retrieve adapt` fitted, on held-out objects."""
+
+from retrieval.console.output import say, show
+from retrieval.metrics.intervals import compare, summarise
+from retrieval.report.numbers import difference, percent, with_interval
+from retrieval.report.terminal import print_columns
+from retrieval.training.adapt import Adaptation
+
+MEASURES = {"top1": "top-1 accuracy, %", "pair_accuracy": "pair accuracy, %"}
+ROWS = {
+    "fitted model": "held_out_{}",
+    "the same with low-pass touches": "held_out_{}_low_pass",
+    "unadapted model": "baseline_{}",
+}
+"""Label -> name of a measure in `Estimate.measures`."""
+
+
+def print_adaptation(result: Adaptation) -> None:
+    """Print a table of the accuracies, two sentences on them, and what was fitted."""
+    estimate, measures = result.estimate, result.estimate.measures
+    rows = [
+        [label, *(with_interval(summarise([measures[name.format(key)]])) for key in MEASURES)]
+        for label, name in ROWS.items()
+        if name.format("top1") in measures
+    ]
+    gains = {key: compare([measures[f"held_out_{key}"]], [measures[f"held_out_{key}_low_pass"]]) for key in MEASURES}
+    rows.insert(2, ["fitted minus low-pass, points", *map(difference, gains.values())])
+    rows.append(["chance", *(percent(measures[f"held_out_{key}"].chance[0]) for key in MEASURES)])
+    gallery = measures["held_out_top1"].gallery
+    print_columns(f"On held-out objects, {gallery}", ("one touch", *MEASURES.values()), rows, words=(0,))
+    show(f"Each object was held out once; {gallery}.")
+    if gains["top1"].low > 0:
+        show("Better than the low-pass control: the fit uses more than light and coarse shape.")
+    else:
+        show("Not better than the low-pass control: no evidence that the fit uses touch. Record more objects.")
+    if estimate.is_baseline_better:
+        show(
+            "The unadapted model is used: its pair accuracy is at least that of the fit. Only its calibrations and its "
+            "check of gel images are fitted."
+        )
+    objects, touches = len(set(result.features.object_ids)), len(result.features)
+    say(f"{result.checkpoint.path}: fitted to {objects} objects, {touches} touches")
