@@ -57,11 +57,12 @@ class Standardise(nn.BatchNorm1d):
 
     def forward(self, features: Tensor) -> Tensor:
         """Return standardised features (B, F)."""
-        if not self.training:  # plain arithmetic, also for the exporter to ONNX
-            mean, variance = self.get_buffer("running_mean"), self.get_buffer("running_var")
+        mean, variance = self.get_buffer("running_mean"), self.get_buffer("running_var")
+        if torch.onnx.is_in_onnx_export():  # batch normalisation requires a width that the exporter does not know
             return (features - mean) * torch.rsqrt(self._floored_variance(mean, variance))
         scaled: Tensor = super().forward(features)
-        variance, mean = torch.var_mean(features.detach(), dim=0, correction=0)
+        if self.training:
+            variance, mean = torch.var_mean(features.detach(), dim=0, correction=0)
         return scaled * ((variance + self.eps) / self._floored_variance(mean, variance)).sqrt()
 
     def _floored_variance(self, mean: Tensor, variance: Tensor) -> Tensor:
