@@ -45,6 +45,6 @@ def test_a_model_does_not_differ_from_itself(recording, model, tmp_path, capsys)
     assert rows["one"].keys() == rows["other"].keys() >= {"K = 5, 1 grasp, 1 photo", "K = 5, 2 grasps, 1 photo"}
     measured = rows["other"]["K = 5, 1 grasp, 1 photo"]
     assert measured["chance"] == [0.2]
-    assert measured["against_first"]["difference"] == 0
+    assert measured["against_first"]["value"] == 0
     assert measured["queries"] == len(load_grasps(recording))
     assert "| K = 5, 1 grasp, 1 photo | 0.200 |" in capsys.readouterr().out
