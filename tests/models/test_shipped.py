@@ -1,6 +1,7 @@
 """The making of the shipped checkpoints on a few objects, and a small evaluation of them."""
 
 import argparse
+import dataclasses
 import json
 
 import numpy as np
@@ -11,6 +12,7 @@ from models import shipped
 from models.labels import LabelHead
 from models.pictures import METADATA, ObjectLabels, collect_pictures
 from retrieval.data.images import to_float
+from retrieval.evaluation.protocols import recording
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import touch_features
 from retrieval.model.gel_check import NOT_A_GEL
@@ -68,9 +70,11 @@ def test_an_untrained_head_guesses_alike_and_ignores_the_sizes_of_smooth_objects
 @pytest.mark.slow
 def test_the_shipped_checkpoint_is_far_above_chance_on_unseen_objects(tmp_path, monkeypatch):
     monkeypatch.setattr(shipped, "FITTED", 3)
-    monkeypatch.setattr("retrieval.evaluation.evaluate.control_experiments", lambda *_: {})  # each trains a head
+    without_controls = dataclasses.replace(recording.UNSEEN_OBJECTS, controls={})  # each trains a head
+    monkeypatch.setattr(recording, "UNSEEN_OBJECTS", without_controls)
     assert shipped.main(["score", str(tmp_path), "--objects", "13", "--grasps", "2", "--jobs", "1"]) == 0
-    measures = json.loads((tmp_path / "report" / "results.json").read_text())["methods"]["late_fusion"]["measures"]
+    results = json.loads((tmp_path / "report" / "results.json").read_text())
+    measures = results["protocols"]["unseen-objects"]["rows"]["late_fusion"]["measures"]
     assert measures["topn_k5"]["objects"] == 7
     assert measures["topn_k5"]["value"][0] > 0.4  # chance 0.2
 

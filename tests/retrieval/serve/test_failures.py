@@ -133,7 +133,7 @@ index, folder, where = sys.argv[1:]
 hang = lambda *args, **keywords: time.sleep(10_000)
 rig = LiveRig({"a": hang if where == "sensor" else lambda: b"picture"}, hang)
 with RecordingWriter(Path(folder) / "recording", {"source": "s", "sensor": "t"}) as recorder:
-    app = create_app(ServiceSettings(index=index, port=0, history=Path(folder)), rig, recorder)
+    app = create_app(ServiceSettings(index=Path(index), port=0, history=Path(folder)), rig, recorder)
     parts = app.state.service
     def on_started(port):
         generation = parts.generations.current
