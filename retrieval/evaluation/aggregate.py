@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from retrieval.data.dataset import Split, data_digest
+from retrieval.data.dataset import Split
 from retrieval.evaluation.inputs import INPUTS
 from retrieval.evaluation.protocol import Protocol, RecordingFacts
 from retrieval.evaluation.results import (
@@ -145,7 +145,7 @@ def protocol_result(
         recording=RecordingResult(
             protocol.data_set or facts.name,
             facts.source,
-            data_digest(facts.grasps),
+            facts.digest,
             len(facts.names),
             len(facts.grasps),
         ),

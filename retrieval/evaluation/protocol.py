@@ -2,13 +2,14 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from _touch_retrieval.files import read_json
-from retrieval.data.dataset import Grasp, Split, load_grasps
+from retrieval.data.dataset import Grasp, Split, data_digest, load_grasps
 from retrieval.errors import DatasetError
 from retrieval.evaluation.inputs import CONTROL_CCA
 from retrieval.metrics.registry import METRICS, Metric, k_way_measure
@@ -39,18 +40,23 @@ class RecordingFacts:
     objects: Mapping[str, Mapping[str, Any]]
     splits: Mapping[str, Split]
 
-    @property
+    @cached_property
+    def digest(self) -> str:
+        """Digest of the ids and images of the grasps."""
+        return data_digest(self.grasps)
+
+    @cached_property
     def names(self) -> list[str]:
         """The touched objects, sorted."""
         return sorted({grasp.object_id for grasp in self.grasps})
 
-    @property
+    @cached_property
     def kind_of(self) -> dict[str, str] | None:
         """The class of every object; None if the recording lacks the class of one."""
         found = {name: str(self.objects[name]["class"]) for name in self.names if "class" in self.objects.get(name, {})}
         return found if len(found) == len(self.names) else None
 
-    @property
+    @cached_property
     def sequence_of(self) -> dict[str, str]:
         """The sequence of each object's first grasp; the object itself if it has none."""
         found: dict[str, str] = {}

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from _touch_retrieval.files import write_atomically
 from retrieval.console.progress import Bar
-from retrieval.data.dataset import Grasp, Split, data_digest
+from retrieval.data.dataset import Grasp, Split
 from retrieval.data.images import encode_image, read_rgb
 from retrieval.errors import DatasetError
 from retrieval.evaluation.aggregate import Aggregation, MeasuredControl, MeasuredRow, protocol_result
@@ -256,7 +256,7 @@ def run_touch_to_touch(
     sequences = Sequences.of(facts.grasps)
     if reason := missing_no_contact_reason(facts.grasps):
         raise DatasetError(f"Touch to touch needs the no-contact frame of each sequence: {reason}.")
-    common = with_common_frame(facts.grasps, folder / data_digest(facts.grasps)[:32], quiet=quiet)
+    common = with_common_frame(facts.grasps, folder / facts.digest[:32], quiet=quiet)
     order = _measures(protocol, sequences, clock_features(len(sequences.names)).astype(np.float64))
     rows: dict[str, MeasuredRow] = {}
     controls: dict[str, list[dict[str, Measure]]] = {"order": [order]}

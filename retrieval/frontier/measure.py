@@ -5,7 +5,7 @@ Each finished row is stored, so a stopped run continues with the missing rows.
 
 import dataclasses
 import json
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -78,16 +78,16 @@ def measure_frontier(
     scale = Scale(min(photos, 2000), min(queries, 12), 2, quick) if quick else Scale(photos, queries, repeats)
     grasps = recording if callable(recording) else lambda: folder_of(recording)
     sample = Sample(Path(model or shipped_model()), grasps, out, scale, quiet)
-    rows = {}
+    rows, model_digest = {}, file_digest(sample.model)
     for name, work in works.items():
-        rows[name] = _row(sample, out, name, work, name in model_free)
+        rows[name] = _row(sample, name, work, [] if name in model_free else [model_digest, sample.digest])
         if not quiet:
             for line in rows[name].lines():
                 say(f"{name}: {line}")
     document = {
         "software": __version__,
         "machine": machine(),
-        "model": file_digest(sample.model),
+        "model": model_digest,
         "scale": dataclasses.asdict(scale),
         "rows": {name: row.to_dict() for name, row in rows.items()},
     }
@@ -97,16 +97,21 @@ def measure_frontier(
 
 
 def _row(
-    sample: Sample, out: Path, name: str, work: Callable[[Sample], ApproximationResult], is_model_free: bool
+    sample: Sample, name: str, work: Callable[[Sample], ApproximationResult], digests: Sequence[str]
 ) -> ApproximationResult:
-    """Return the stored result of an approximation, or measure and store it."""
-    inputs: list[Any] = [name, FORMAT, __version__, machine(), dataclasses.asdict(sample.scale)]
-    if not is_model_free:
-        inputs += [file_digest(sample.model), sample.digest]
+    """Return the stored result of an approximation, or measure and store it.
+
+    Args:
+        sample: What is measured on.
+        name: Name of the row.
+        work: Measures it.
+        digests: Digests of the model and the grasps, if the row depends on them.
+    """
 
     def make() -> dict[str, Any]:
         if not sample.quiet:
             say(f"frontier: measuring {name}")
         return work(sample).to_dict()
 
-    return msgspec.convert(sample.stored(cache_key("frontier", *inputs), make), ApproximationResult)
+    key = cache_key("frontier", name, FORMAT, __version__, machine(), dataclasses.asdict(sample.scale), *digests)
+    return msgspec.convert(sample.stored(key, make), ApproximationResult)

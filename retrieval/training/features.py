@@ -260,7 +260,8 @@ def _encoded(
         Cache(cache / "cache.sqlite") if cache else nullcontext() as store,
     ):
         keys = [_cache_key(made_by, files(item)) for item in items] if store else []
-        found = {row: content for row, key in enumerate(keys) if store and (content := store.get(key)) is not None}
+        stored = store.get_all(keys) if store else {}
+        found = {row: stored[key] for row, key in enumerate(keys) if key in stored}
         missing = [row for row in range(len(items)) if row not in found]
         bar.advance(len(found))
         images = map_in_order(pool, load, [items[row] for row in missing], _BATCH)
