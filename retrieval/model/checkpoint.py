@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from tempfile import NamedTemporaryFile
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -58,25 +58,14 @@ class Checkpoint(CheckpointInfo):
     split: Split | None = None
     queries: NDArray[np.float16] | None = None
 
-    def without_cells(self) -> "Checkpoint":
-        """Return the model without late interaction, with the calibration of its logits, for an index without cells.
-
-        It has the same digest. A model without cells is returned as it is.
-        """
-        if not self.config.matcher.cell_dim:
+    def without_cells(self) -> Self:
+        """Return the model without late interaction; its partial activations are the pooled ones."""
+        info = super().without_cells()
+        if info is self:
             return self
         matcher = self.matcher.without_cells()
-        return replace(
-            self,
-            config=replace(self.config, matcher=matcher.config),
-            matcher=matcher,
-            posterior=self.pooled_posterior,
-            queries=None if self.queries is None else self.queries[:, : matcher.config.pooled_width],
-            references=self.pooled_references,
-            verification=None,
-            pooled_posterior=None,
-            pooled_references=None,
-        )
+        queries = None if self.queries is None else self.queries[:, : matcher.config.pooled_width]
+        return replace(info, matcher=matcher, queries=queries)
 
 
 def store_checkpoint(checkpoint: Checkpoint, path: Path) -> None:
@@ -121,13 +110,12 @@ def sibling_file(path: Path, ending: str) -> Path:
     return path.with_name(path.name.removesuffix(".safetensors") + ending)
 
 
-def load_checkpoint(path: str | Path, *, info: CheckpointInfo | None = None) -> Checkpoint:
+def load_checkpoint(path: str | Path, *, digest: str | None = None) -> Checkpoint:
     """Read a checkpoint.
 
     Args:
         path: The .safetensors file.
-        info: Result of `read_checkpoint_info` for this file, if its digest was already verified. Digest and checksum
-            are then not computed again.
+        digest: SHA-256 (hex) of the file, if it was already verified. Digest and checksum are then not computed again.
 
     Raises:
         CheckpointError: The file is missing, damaged or unusable. The message names the remedy.
@@ -139,8 +127,8 @@ def load_checkpoint(path: str | Path, *, info: CheckpointInfo | None = None) -> 
     retrieval.errors.CheckpointError: there is no checkpoint at none.safetensors; `retrieve train` makes one
     """
     path = Path(path)
-    state, header = read_tensors(path, check=info is None)
-    info = info or checkpoint_info(path, header)
+    state, header = read_tensors(path, check=digest is None)
+    info = checkpoint_info(path, header, digest)
     queries = state.pop(_QUERIES, None)
     try:
         split = None if header["split"] is None else Split.from_dict(header["split"])

@@ -1,8 +1,8 @@
 """The header of a checkpoint's file, read without PyTorch: enough for a query whose towers run elsewhere."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -51,6 +51,23 @@ class CheckpointInfo:
     pooled_posterior: Posterior | None = None
     pooled_references: ReferenceCalibration | None = None
 
+    def without_cells(self) -> Self:
+        """Return the model without late interaction, with the calibration of its logits, for an index without cells.
+
+        It has the same digest. A model without cells is returned as it is.
+        """
+        if not self.config.matcher.cell_dim:
+            return self
+        return replace(
+            self,
+            config=replace(self.config, matcher=replace(self.config.matcher, cell_dim=0)),
+            posterior=self.pooled_posterior,
+            references=self.pooled_references,
+            verification=None,
+            pooled_posterior=None,
+            pooled_references=None,
+        )
+
 
 PARTS: dict[str, type[Any]] = {
     "posterior": Posterior,
@@ -79,8 +96,8 @@ def read_checkpoint_info(path: Path) -> CheckpointInfo:
     return checkpoint_info(path, read_header(path))
 
 
-def checkpoint_info(path: Path, header: dict[str, Any]) -> CheckpointInfo:
-    """Parse the header of a matcher's file. Raises CheckpointError for the header of another file."""
+def checkpoint_info(path: Path, header: dict[str, Any], digest: str | None = None) -> CheckpointInfo:
+    """Parse the header of a matcher's file with this SHA-256. Raises CheckpointError for the header of another file."""
     if "task" in header:
         raise CheckpointError(
             f"{path} is a {header['task']} classifier, not a matcher; use it with `retrieve collect --gate`, "
@@ -102,7 +119,7 @@ def checkpoint_info(path: Path, header: dict[str, Any]) -> CheckpointInfo:
         }
     except BadInput as error:
         raise unusable(path, error) from error
-    return CheckpointInfo(path, file_digest(path), config, header["provenance"], **parts)
+    return CheckpointInfo(path, digest or file_digest(path), config, header["provenance"], **parts)
 
 
 def read_scorer(info: CheckpointInfo) -> FusionScorer:

@@ -179,4 +179,4 @@ def torch_encoder(stored: CheckpointInfo, threads: int | None = None) -> TouchEn
     from retrieval.model.checkpoint import load_checkpoint
     from retrieval.model.encode import TorchEncoder
 
-    return TorchEncoder(load_checkpoint(stored.path, info=stored).matcher, threads)
+    return TorchEncoder(load_checkpoint(stored.path, digest=stored.digest).matcher, threads)

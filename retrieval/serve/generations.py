@@ -35,7 +35,7 @@ class ServedGeneration:
     @cached_property
     def checkpoint(self) -> Checkpoint:
         """The whole model, including the photo tower, which queries do not need."""
-        return load_checkpoint(self.searcher.checkpoint.path, info=self.searcher.checkpoint)
+        return load_checkpoint(self.searcher.checkpoint.path, digest=self.searcher.checkpoint.digest)
 
 
 class Generations:
