@@ -93,7 +93,7 @@ def write_page(out: Path, document: Mapping[str, Any]) -> Path:
     )
     packages = dict.fromkeys(case["package"] for case in cases)
     sections = tuple(_section(name, [case for case in cases if case["package"] == name]) for name in packages)
-    return write_document(Document("Hard cases of every numerical kernel", lead, sections), out, "stability")[1]
+    return write_document(Document("Hard cases of every numerical kernel", (*lead, *sections)), out, "stability")[1]
 
 
 def _section(package: str, cases: Sequence[Mapping[str, Any]]) -> Section:
@@ -120,7 +120,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     print("\n".join(lines(document)))
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-        write_output(out / "stability.json", (json.dumps(document, indent=1) + "\n").encode())
+        write_output(out / "stability.json", json.dumps(document, indent=1) + "\n")
         print(f"page: {write_page(out, document)}")
     return int(document["failed"] > 0)
 

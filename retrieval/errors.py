@@ -1,7 +1,7 @@
 """Every error that `retrieval` raises on purpose.
 
-A message states the problem, the value and the remedy. The command line prints it on one line and
-exits with `exit_code`; any other error is a bug.
+A message states the problem, the value and the remedy. The command line prints it on one line and exits with
+`exit_code`; any other error is a bug.
 
     RetrievalError             the job ran and failed (exit code 1)
     +-- NumericalError         a value is NaN or infinite

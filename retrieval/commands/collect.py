@@ -8,7 +8,7 @@ import typer
 from retrieval.commands.options import COUNT, SEED, Jobs, Objects, refuse_options
 from retrieval.console.interruption import resumable
 from retrieval.console.output import say, show
-from retrieval.console.progress import CountedBar
+from retrieval.console.progress import Bar
 from retrieval.errors import RetrievalError
 
 
@@ -59,7 +59,7 @@ def collect(
             f"{grasps} rounds through {objects} objects, one accepted grasp of each in a round; where a person changes "
             "the objects, the rig requests another object after each accepted grasp"
         )
-    with resumable(out), CountedBar("collect", "grasps") as bar:
+    with resumable(out), Bar("collect", 0, "grasps") as bar:
         tallies = collect_grasps(
             partial(load_rig, rig, seed=seed),
             out,
@@ -69,7 +69,7 @@ def collect(
             gate=decide,
             gate_name=gate_name,
             jobs=jobs,
-            progress=lambda now: bar(now.grasps_done, now.grasps_target, str(now)),
+            progress=lambda now: bar.show(now.grasps_done, now.grasps_target, str(now)),
         )
     for line in acceptance_table(tallies, grasps_target=settings.grasps).splitlines():
         say(line)

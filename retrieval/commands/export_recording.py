@@ -7,7 +7,7 @@ import typer
 
 from retrieval.commands.options import Recording
 from retrieval.console.output import say
-from retrieval.console.progress import CountedBar
+from retrieval.console.progress import Bar
 
 
 def export_recording(
@@ -20,8 +20,8 @@ def export_recording(
     from robot.recording.folder import read_recording
 
     source = read_recording(recording)
-    with CountedBar("export", "grasps") as bar:
-        notes = export_lerobot(source, out, bar)
+    with Bar("export", 0, "grasps") as bar:
+        notes = export_lerobot(source, out, bar.show)
     for note in (*source.notes, *notes):
         say(note)
     say(f"{out}: {len(source.grasps)} grasps as a LeRobot data set")

@@ -49,14 +49,14 @@ def recording_of(recording: Path | None, out: Path, quick: bool = False) -> Path
     """Return the folder of the recording, after a small one is collected under `out` if it is None."""
     if recording is not None:
         return recording
-    from retrieval.console.progress import CountedBar
+    from retrieval.console.progress import Bar
     from robot.collection import CollectSettings, collect
     from robot.rig import load_rig
 
     objects, grasps = (6, 2) if quick else (30, 4)
     folder = out / "recording"
     say(f"collecting {grasps} grasps of each of {objects} simulated objects in {folder}")
-    with CountedBar("collect", "grasps") as bar:
+    with Bar("collect", 0, "grasps") as bar:
         collect(
             partial(load_rig, "sim", seed=SEED),
             folder,
@@ -64,6 +64,6 @@ def recording_of(recording: Path | None, out: Path, quick: bool = False) -> Path
             seed=SEED,
             settings=CollectSettings(grasps=grasps),
             jobs=os.cpu_count() or 1,
-            progress=lambda now: bar(now.grasps_done, now.grasps_target, str(now)),
+            progress=lambda now: bar.show(now.grasps_done, now.grasps_target, str(now)),
         )
     return folder

@@ -8,7 +8,7 @@ import typer
 
 from retrieval.commands.options import OptionValues
 from retrieval.console.output import say, show
-from retrieval.console.progress import CountedBar
+from retrieval.console.progress import Bar
 from retrieval.errors import BadInput
 
 if TYPE_CHECKING:
@@ -67,8 +67,8 @@ def run_importer(name: str, source: Path, out: Path, **options: Any) -> "Recordi
     """
     from robot.importers import load_importer
 
-    with CountedBar(f"import {name}", "grasps") as bar:
-        return load_importer(name)(source, out, bar, **options)
+    with Bar(f"import {name}", 0, "grasps") as bar:
+        return load_importer(name)(source, out, bar.show, **options)
 
 
 def _list_importers() -> list[str]:

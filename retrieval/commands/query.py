@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from retrieval.commands.options import COUNT, FRACTION, Background, GelSight, Index, IndexModel, Json, resolve_index
-from retrieval.console.files import require_output, text_bytes, write_output
+from retrieval.console.files import require_output, write_output
 from retrieval.console.output import print_json, say
 
 
@@ -39,9 +39,9 @@ def query(
         none_prior=none_prior,
     )
     if html:
-        from retrieval.report.query import query_html
+        from retrieval.report.query import query_page
 
-        write_output(html, text_bytes(query_html(result, searcher.catalogue)))
+        write_output(html, query_page(result, searcher.catalogue))
         say(f"page: {html}")
     say(f"model: {result.index['model']} (trained on: {result.index['trained_on']})")
     if json:

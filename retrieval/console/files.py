@@ -28,20 +28,14 @@ def require_output(path: Path, suffix: str) -> None:
         )
 
 
-def write_output(path: Path, data: bytes) -> None:
+def write_output(path: Path, content: str | bytes) -> None:
     """Write an output file of a command atomically, and create its folder.
+
+    Text is written in UTF-8; surrogates, from file names in unknown encodings, become character references of HTML.
 
     Raises:
         OSError: The file cannot be written. The error contains `path`.
     """
     with named_write_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, data)
-
-
-def text_bytes(text: str) -> bytes:
-    """Return the text of a page in UTF-8.
-
-    Surrogates, from file names in unknown encodings, become numeric character references of HTML.
-    """
-    return text.encode("utf-8", "xmlcharrefreplace")
+    write_atomically(path, content if isinstance(content, bytes) else content.encode("utf-8", "xmlcharrefreplace"))

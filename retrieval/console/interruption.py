@@ -2,9 +2,10 @@
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from retrieval.errors import JobInterrupted
 
@@ -13,37 +14,13 @@ from retrieval.errors import JobInterrupted
 def interruption() -> Iterator[threading.Event]:
     """Yield an event that the first Ctrl-C sets; the second one raises KeyboardInterrupt as usual."""
     stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
 
     def on_interrupt(number: int, frame: object) -> None:
         stop.set()
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    before = signal.signal(signal.SIGINT, on_interrupt)
-    try:
+    with _handled([signal.SIGINT], on_interrupt):
         yield stop
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-@contextmanager
-def resumable(folder: Path) -> Iterator[None]:
-    """Say after Ctrl-C that the same command continues the job, which stores each finished part (`Cache`, recordings).
-
-    Args:
-        folder: Folder of the finished parts.
-
-    Raises:
-        JobInterrupted: After Ctrl-C.
-    """
-    try:
-        yield
-    except (KeyboardInterrupt, JobInterrupted) as error:
-        raise JobInterrupted(
-            f"Stopped. Finished parts are stored in {folder}; run the same command to continue."
-        ) from error
 
 
 @contextmanager
@@ -54,17 +31,35 @@ def record_interrupts() -> Iterator[list[int]]:
     signal during an import may surface as another error: a partly loaded numpy.linalg raises RecursionError.
     """
     signals: list[int] = []
-    if threading.current_thread() is not threading.main_thread():
-        yield signals
-        return
 
     def on_interrupt(number: int, frame: object) -> None:
         signals.append(number)
         raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, on_interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
+    with _handled([signal.SIGINT, signal.SIGTERM], on_interrupt):
         yield signals
+
+
+@contextmanager
+def _handled(numbers: Sequence[int], handler: Callable[[int, Any], None]) -> Iterator[None]:
+    """Handle signals within the block; only the main thread of a process can."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, earlier in before.items():
+            signal.signal(number, earlier)
+
+
+@contextmanager
+def resumable(folder: Path) -> Iterator[None]:
+    """Turn Ctrl-C into a JobInterrupted which says that the same command continues from the parts in `folder`."""
+    try:
+        yield
+    except (KeyboardInterrupt, JobInterrupted) as error:
+        raise JobInterrupted(
+            f"Stopped. Finished parts are stored in {folder}; run the same command to continue."
+        ) from error

@@ -30,11 +30,7 @@ def show(text: str) -> None:
 
 @contextlib.contextmanager
 def checked_stdout() -> Iterator[None]:
-    """Convert write errors of stdout, such as a full disk; BrokenPipeError passes unchanged.
-
-    Raises:
-        RetrievalError: Standard output cannot be written.
-    """
+    """Raise RetrievalError if stdout cannot be written, such as on a full disk; BrokenPipeError passes unchanged."""
     try:
         yield
     except BrokenPipeError:
@@ -71,11 +67,8 @@ def abbreviate_list(names: Sequence[str], shown: int = 5) -> str:
     return ", ".join(names[:shown]) + more
 
 
-class PrintableFormatter(logging.Formatter):
-    """Formatter that escapes unprintable characters of log messages."""
-
+class _PrintableFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
-        """Return the record's message on one line."""
         return printable(super().format(record))
 
 
@@ -85,5 +78,5 @@ def prepare_streams() -> None:
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(PrintableFormatter("%(message)s"))
+    handler.setFormatter(_PrintableFormatter("%(message)s"))
     logging.basicConfig(handlers=[handler], level=logging.WARNING)

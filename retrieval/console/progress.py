@@ -6,19 +6,19 @@ from typing import Any
 
 from retrieval.console.output import printable, say
 
+_LINE_EVERY_S = 15.0
+
 
 class Bar:
     """A progress bar, used as a context manager.
 
     Args:
         title: Name of the work.
-        total: Number of units of work.
+        total: Number of units of work; 0 if the first `show` states it.
         unit: Name of the units.
         done: Number of finished units; above 0 if work resumes.
         quiet: Whether to print nothing.
     """
-
-    _LINE_EVERY_S = 15.0
 
     def __init__(self, title: str, total: int, unit: str, *, done: int = 0, quiet: bool = False) -> None:
         self.title, self.total, self.unit, self.done = title, total, unit, done
@@ -27,14 +27,13 @@ class Bar:
         self._quiet = quiet
 
     def __enter__(self) -> "Bar":
-        if sys.stderr.isatty() and not self._quiet:
+        if self.total and not self._quiet and sys.stderr.isatty():
             from rich.console import Console
-            from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-            from rich.progress import Progress as RichProgress
+            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
             from rich.table import Column
 
             # On a narrow terminal, shorten the bar; by default rich cuts the numbers first.
-            self._rich = RichProgress(
+            self._rich = Progress(
                 TextColumn("{task.description}", markup=False),
                 BarColumn(),
                 MofNCompleteColumn(table_column=Column(no_wrap=True)),
@@ -51,39 +50,20 @@ class Bar:
         self.done += count
         if self._rich:
             self._rich.update(self._task, advance=count, note=printable(note))
-        elif not self._quiet and (time.monotonic() - self._last_line > self._LINE_EVERY_S or self.done == self.total):
+        elif not self._quiet and (time.monotonic() - self._last_line > _LINE_EVERY_S or self.done == self.total):
             self._last_line = time.monotonic()
             rate = (self.done - self._first) / max(time.monotonic() - self._start, 1e-9)
             left_s = (self.total - self.done) / rate if rate else float("nan")
             text = f"{self.title}: {self.done}/{self.total} {self.unit}, {rate:.1f} per second, {left_s:.0f} s left"
             say(f"{text}  {note}".rstrip())
 
+    def show(self, done: int, total: int, note: str = "") -> None:
+        """Show `done` of `total` units; the bar begins at the first call."""
+        if not self.total:
+            self.total, self.done, self._first = total, done, done
+            self.__enter__()
+        self.advance(done - self.done, note)
+
     def __exit__(self, *error: object) -> None:
         if self._rich:
             self._rich.stop()
-
-
-class CountedBar:
-    """A progress bar that is created at its first call.
-
-    Args:
-        title: Name of the work.
-        unit: Name of the units.
-    """
-
-    def __init__(self, title: str, unit: str) -> None:
-        self.title, self.unit = title, unit
-        self._bar: Bar | None = None
-
-    def __call__(self, done: int, total: int, note: str = "") -> None:
-        """Show `done` of `total` units; `note` shows the latest figures."""
-        if self._bar is None:
-            self._bar = Bar(self.title, total, self.unit, done=done).__enter__()
-        self._bar.advance(done - self._bar.done, note)
-
-    def __enter__(self) -> "CountedBar":
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        if self._bar is not None:
-            self._bar.__exit__(*error)

@@ -11,7 +11,6 @@ from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, form
 from retrieval.report.canvas import MUTED_COLOUR, Axes, Figure, canvas, logarithmic
 from retrieval.report.document import (
     Block,
-    Details,
     Document,
     Picture,
     Section,
@@ -53,7 +52,7 @@ def write_frontier(out: Path, document: Mapping[str, Any]) -> list[Path]:
     """
     rows = msgspec.convert(document["rows"], dict[str, ApproximationResult])
     sections = tuple(Section(row.title, tuple(_section(name, row))) for name, row in rows.items())
-    page = Document("Error against run time", tuple(_lead(document, rows)), sections)
+    page = Document("Error against run time", (*_lead(document, rows), *sections))
     return write_document(page, out, "frontier")
 
 
@@ -88,7 +87,7 @@ def _section(name: str, row: ApproximationResult) -> Iterator[Block]:
         lines = row.lines()
         caption = " ".join(f"{capitalized(line)}." for line in lines)
         yield Picture(name, ". ".join(lines), caption, lambda: figure(row.panels))
-        yield Details("Every point", tuple(_points(panel) for panel in row.panels))
+        yield Section("Every point", tuple(_points(panel) for panel in row.panels))
 
 
 def _points(panel: Panel) -> Table:
@@ -128,9 +127,8 @@ def _draw(axes: Axes, panel: Panel) -> None:
     axes.set_title(f"{capitalized(panel.title)}, against {panel.reference}", fontsize=9.5, loc="left")
     axes.set_xlabel(f"{panel.time}, ms")
     axes.set_ylabel(panel.unit)
-    for axis in (axes.xaxis, axes.yaxis):
-        low, high = axis.get_view_interval()
-        logarithmic(axis, (1, 2, 5) if high < 300 * low else (1,))
+    logarithmic(axes.xaxis)
+    logarithmic(axes.yaxis)
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)
 
 

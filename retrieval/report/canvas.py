@@ -69,16 +69,15 @@ def canvas(width_in: float, height_in: float) -> Figure:
 
 def percent_axis(panel: Axes, label: str) -> None:
     """Set a vertical axis from 0 to 100 %."""
-    panel.set_ylim(0, 102)
-    panel.set_yticks(range(0, 101, 20))
-    panel.set_ylabel(label)
+    panel.set(ylim=(0, 102), yticks=range(0, 101, 20), ylabel=label)
 
 
-def logarithmic(axis: Any, steps: tuple[int, ...]) -> None:
-    """Label a logarithmic axis with plain numbers, at `steps` times powers of ten; matplotlib's labels are formulas."""
+def logarithmic(axis: Any) -> None:
+    """Label a logarithmic axis with plain numbers, because matplotlib's labels are formulas."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    axis.set_major_locator(LogLocator(subs=steps, numticks=16))
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 300 * low else (1,), numticks=16))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
     axis.set_minor_formatter(NullFormatter())
 

@@ -1,21 +1,22 @@
-"""Documents of headings, paragraphs, tables and figures, written as Markdown and as one HTML page.
+"""Documents of headings, paragraphs, tables and pictures, written as Markdown and as one HTML page.
 
-Both are made from the same blocks, so their contents agree. Every report is such a document: of an evaluation, of error
-against run time, of hard cases.
+Both are made from the same blocks, so their contents agree. Every report and the page of a query is such a document.
 """
 
-import json
 import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
+import jinja2
+from markupsafe import Markup
 from PIL import Image
 
-from retrieval.console.files import text_bytes, write_output
+from retrieval.console.files import write_output
 from retrieval.report.canvas import FIGURE_DPI, Figure, draw
-from retrieval.report.pages import data_uri, render, script
+from retrieval.report.pages import data_uri
 
 _PAGE_DPI = 96
 
@@ -30,28 +31,8 @@ class Text:
 
 
 @dataclass(frozen=True)
-class Listing:
-    """Preformatted text."""
-
-    kind: ClassVar[str] = "listing"
-    text: str
-
-    @classmethod
-    def of_json(cls, data: Any) -> "Listing":
-        """Return data of JSON types as text, one item per line."""
-        return cls(json.dumps(data, indent=2, sort_keys=True, ensure_ascii=False))
-
-
-@dataclass(frozen=True)
 class Table:
-    """A table of plain text cells.
-
-    Attributes:
-        header: Column headings.
-        rows: Cells of each row.
-        notes: Paragraphs below the table.
-        words: Columns of text, which are left-aligned.
-    """
+    """A table of plain text cells, with paragraphs below it; the columns `words` contain text and are left-aligned."""
 
     kind: ClassVar[str] = "table"
     header: tuple[str, ...]
@@ -62,14 +43,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure, written to figures/NAME.png next to the document.
-
-    Attributes:
-        name: Name of the file.
-        alt: Text alternative.
-        caption: Text below the figure.
-        figure: Function that draws it.
-    """
+    """A figure, written to figures/NAME.png next to the document, with a text alternative and a caption."""
 
     kind: ClassVar[str] = "picture"
     name: str
@@ -84,74 +58,78 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Details:
-    """Blocks that a page shows folded."""
+class Card:
+    """A frame with pictures, a title and lines of text.
 
-    kind: ClassVar[str] = "details"
+    Attributes:
+        pictures: Data URI and text alternative of each picture; an empty URI leaves a blank.
+        title: Title, in bold.
+        lines: Lines below the title.
+        is_marked: Whether the frame is highlighted.
+    """
+
+    pictures: tuple[tuple[str, str], ...]
     title: str
-    blocks: tuple["Block", ...]
+    lines: tuple[str, ...]
+    is_marked: bool = False
 
 
-Block = Text | Listing | Table | Picture | Details
+@dataclass(frozen=True)
+class Cards:
+    """Cards next to each other; Markdown has their text only."""
+
+    kind: ClassVar[str] = "cards"
+    cards: tuple[Card, ...]
 
 
 @dataclass(frozen=True)
 class Section:
-    """A heading and its blocks."""
+    """A heading and blocks; a page shows a section within another one folded."""
+
+    kind: ClassVar[str] = "section"
+    title: str
+    blocks: tuple["Block", ...]
+
+
+Block = Text | Table | Picture | Cards | Section
+
+
+@dataclass(frozen=True)
+class Document:
+    """A title and blocks."""
 
     title: str
     blocks: tuple[Block, ...]
 
 
-@dataclass(frozen=True)
-class Document:
-    """A title, leading blocks, and sections."""
+def write_document(document: Document, out: Path, name: str = "report") -> list[Path]:
+    """Write a document as NAME.md, NAME.html and figures/ in the folder `out`; return the paths in this order.
 
-    title: str
-    lead: tuple[Block, ...]
-    sections: tuple[Section, ...]
-
-    def pictures(self) -> list[Picture]:
-        """Return all pictures, also those in folded blocks."""
-        return list(_pictures([*self.lead, *(block for section in self.sections for block in section.blocks)]))
+    Raises:
+        RetrievalError: The document has figures, and matplotlib is not installed.
+    """
+    figures = {out / picture.file: picture for picture in _pictures(document.blocks)}
+    for path, picture in figures.items():
+        draw(path, picture.figure)
+    text, page = out / f"{name}.md", out / f"{name}.html"
+    write_output(text, to_markdown(document))
+    write_output(page, to_html(document, out))
+    return [text, page, *figures]
 
 
 def _pictures(blocks: Iterable[Block]) -> Iterator[Picture]:
     for block in blocks:
         if isinstance(block, Picture):
             yield block
-        elif isinstance(block, Details):
+        elif isinstance(block, Section):
             yield from _pictures(block.blocks)
-
-
-def write_document(document: Document, out: Path, name: str = "report") -> list[Path]:
-    """Write a document as NAME.md, NAME.html and figures/.
-
-    Args:
-        document: The document.
-        out: Folder to write to.
-        name: Name of the files.
-
-    Returns:
-        The paths: Markdown, page, figures.
-
-    Raises:
-        RetrievalError: The document has pictures, and matplotlib is not installed.
-    """
-    figures = {out / picture.file: picture for picture in document.pictures()}
-    for path, picture in figures.items():
-        draw(path, picture.figure)
-    text, page = out / f"{name}.md", out / f"{name}.html"
-    write_output(text, text_bytes(to_markdown(document)))
-    write_output(page, text_bytes(to_html(document, out)))
-    return [text, page, *figures]
 
 
 # HTML ------------------------------------------------------------------------------------------------
 
 
 def to_html(document: Document, folder: Path) -> str:
-    """Return one HTML page that embeds the figures under `folder`."""
+    """Return one HTML page that embeds the figures under `folder`; all text is escaped."""
 
     def uri(picture: Picture) -> str:
         return data_uri((folder / picture.file).read_bytes(), "png")
@@ -164,32 +142,34 @@ def to_html(document: Document, folder: Path) -> str:
     def anchor(title: str) -> str:
         return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
 
-    return render("document.html", document=document, uri=uri, width=width, anchor=anchor, script=script("tables.js"))
+    templates = resources.files("retrieval") / "templates"
+    template, script = ((templates / name).read_text("utf-8") for name in ("document.html", "tables.js"))
+    environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    return environment.from_string(template).render(
+        document=document, uri=uri, width=width, anchor=anchor, script=Markup(script)
+    )
 
 
 # Markdown --------------------------------------------------------------------------------------------
 
 
 def to_markdown(document: Document) -> str:
-    """Return the document as GitHub Markdown; pictures are links to their files."""
-    parts = [f"# {_plain(document.title)}", *_blocks(document.lead, 2)]
-    for section in document.sections:
-        parts += [f"## {_plain(section.title)}", *_blocks(section.blocks, 3)]
-    return "\n\n".join(parts) + "\n"
+    """Return the document as GitHub Markdown; figures are links to their files."""
+    return "\n\n".join([f"# {_plain(document.title)}", *_blocks(document.blocks, 2)]) + "\n"
 
 
 def _blocks(blocks: tuple[Block, ...], level: int) -> Iterator[str]:
     for block in blocks:
-        if isinstance(block, Details):
+        if isinstance(block, Section):
             yield f"{'#' * level} {_plain(block.title)}"
             yield from _blocks(block.blocks, level + 1)
         elif isinstance(block, Text):
             yield f"> {_plain(block.text)}" if block.warn else _plain(block.text)
-        elif isinstance(block, Listing):
-            yield "\n".join(f"    {line}" for line in block.text.splitlines())
         elif isinstance(block, Picture):
             yield f"![{_plain(block.alt)}]({block.file})"
             yield _plain(block.caption)
+        elif isinstance(block, Cards):
+            yield "\n".join(f"* **{_plain(card.title)}** {_plain('; '.join(card.lines))}" for card in block.cards)
         else:
             ruler = ["---" if column in block.words | {0} else "---:" for column in range(len(block.header))]
             lines = [block.header, ruler, *(map(_plain, row) for row in block.rows)]

@@ -8,21 +8,16 @@ left out.
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
-
-import msgspec
 
 from retrieval.console.output import show
 from retrieval.evaluation.aggregate import RULE
-from retrieval.evaluation.results import Results, Timings, read_results
+from retrieval.evaluation.results import Details, Results, Timings, read_results
 from retrieval.metrics.registry import SET_SIZES, grasps_metric_name
 from retrieval.model.verification import ERRORS_NEEDED
 from retrieval.report import plots, tables
 from retrieval.report.document import (
     Block,
-    Details,
     Document,
-    Listing,
     Picture,
     Section,
     Table,
@@ -80,18 +75,19 @@ def write_report(out: Path) -> list[Path]:
     if (out / "timings.json").exists():
         timings = read_results(out / "timings.json", Timings)
     found = views(results, timings)
-    lead = [Text(RULE)] if any(row.verdict for view in found for row in view.result.rows.values()) else []
-    lead += [Text(f"{name} was skipped: {why}.") for name, why in results.skipped.items()]
-    sections = [Section("Settings", tuple(_settings(results)))]
+    blocks: list[Block] = []
+    if any(row.verdict for view in found for row in view.result.rows.values()):
+        blocks.append(Text(RULE))
+    blocks += [Text(f"{name} was skipped: {why}.") for name, why in results.skipped.items()]
+    names = [view.result.title for view in found]
     if len(found) == 1:
-        names = [f"{found[0].result.recording.name}: {found[0].result.title}"]
-        lead += _lead(found[0])
-        sections = [Section(title, blocks) for title, blocks in _parts(found[0])] + sections
-    else:
-        names = [view.result.title for view in found]
-        sections = [Section(view.result.title, tuple(_folded(view))) for view in found] + sections
-    title = f"Which object was touched? Evaluation on {', '.join(names)}"
-    return write_document(Document(title, tuple(lead), tuple(sections)), out)
+        names = [f"{found[0].result.recording.name}: {names[0]}"]
+        blocks += [*_lead(found[0]), *_parts(found[0])]
+    for view in found if len(found) > 1 else ():
+        first, *others = _parts(view)
+        blocks.append(Section(view.result.title, (*_lead(view), *first.blocks, *others)))
+    blocks.append(Section("Settings", (_settings(results),)))
+    return write_document(Document(f"Which object was touched? Evaluation on {', '.join(names)}", tuple(blocks)), out)
 
 
 def print_results(results: Results) -> None:
@@ -105,18 +101,10 @@ def print_results(results: Results) -> None:
             show(line)
 
 
-def _parts(view: ProtocolView) -> list[tuple[str, tuple[Block, ...]]]:
-    """Return titles and blocks of all parts that have results."""
-    parts = [(title, tuple(block for block in build(view) if block)) for title, build in PARTS.items()]
-    return [part for part in parts if part[1]]
-
-
-def _folded(view: ProtocolView) -> Iterator[Block]:
-    """Yield the blocks of a protocol; all parts but the first are folded."""
-    (_, first), *others = _parts(view)
-    yield from _lead(view)
-    yield from first
-    yield from (Details(title, blocks) for title, blocks in others)
+def _parts(view: ProtocolView) -> list[Section]:
+    """Return all parts that have results."""
+    parts = [Section(title, tuple(block for block in build(view) if block)) for title, build in PARTS.items()]
+    return [part for part in parts if part.blocks]
 
 
 def _lead(view: ProtocolView) -> Iterator[Text]:
@@ -160,8 +148,7 @@ def _methods(view: ProtocolView) -> Blocks:
     yield tables.choices(view)
 
 
-def _values(view: ProtocolView, keys: list[str]) -> str:
-    """Return measures of all rows as text, for the text alternative of a figure."""
+def _values(view: ProtocolView, keys: list[str]) -> str:  # for the text alternative of a figure
     lines = []
     for key in keys:
         found = view.summaries(key)
@@ -172,7 +159,7 @@ def _values(view: ProtocolView, keys: list[str]) -> str:
 
 
 def _topn(view: ProtocolView) -> Blocks:
-    keys = [key for key in ("topn_k5", "topn_k10") if view.any(key)]
+    keys = [key for key in ("topn_k5", "topn_k10") if view.summaries(key)]
     if keys:
         yield Picture(
             view.figure_name("guess-curves"),
@@ -184,7 +171,7 @@ def _topn(view: ProtocolView) -> Blocks:
 
 
 def _grasps(view: ProtocolView) -> Blocks:
-    if keys := [key for key in map(grasps_metric_name, SET_SIZES) if view.any(key)]:
+    if keys := [key for key in map(grasps_metric_name, SET_SIZES) if view.summaries(key)]:
         yield Picture(
             view.figure_name("grasps"),
             f"Top-1 accuracy against grasps in a query. {_values(view, keys)}.",
@@ -196,7 +183,7 @@ def _grasps(view: ProtocolView) -> Blocks:
 
 def _time(view: ProtocolView) -> Blocks:
     if view.timings and view.times:
-        if key := next((key for key in ("topn_k5", view.result.main) if view.any(key)), None):
+        if key := next((key for key in ("topn_k5", view.result.main) if view.summaries(key)), None):
             yield Picture(
                 view.figure_name("time"),
                 f"Accuracy against time on a logarithmic scale. {_values(view, [key])}. Times in the table.",
@@ -212,10 +199,6 @@ def _gallery(view: ProtocolView) -> Blocks:
         yield table
 
 
-def _comparisons(view: ProtocolView) -> Blocks:
-    yield tables.comparisons(view)
-
-
 # Validity ------------------------------------------------------------------------------------------
 
 
@@ -226,13 +209,13 @@ def _controls(view: ProtocolView) -> Blocks:
             "the order of capture should be at chance. Low-pass touches contain light and coarse shape, so they may be "
             "above chance."
         )
-        yield tables.controls(view)
+        yield tables.controls(view, view.result.controls)
     if table := tables.differences(view):
-        yield Details("Against the controls, all measures", (table,))
+        yield Section("Against the controls, all measures", (table,))
 
 
 def _ceilings(view: ProtocolView) -> Blocks:
-    if table := tables.ceilings(view):
+    if table := tables.controls(view, view.result.ceilings):
         yield Text(
             "CCA trained and tested within one modality. Matching between touch and photo can hardly be better than "
             "the worse of the two. The difference between that ceiling and the result is due to the change of modality."
@@ -243,26 +226,20 @@ def _ceilings(view: ProtocolView) -> Blocks:
 # Objects -------------------------------------------------------------------------------------------
 
 
-def _each(view: ProtocolView, entry: str, show_row: Callable[[ProtocolView, str, Any], Iterator[Block]]) -> Blocks:
-    """Yield the blocks of the main row, then, folded, of the other learned rows whose details have this entry."""
-    for name, details in view.details().items():
-        if name in view.learned and (found := getattr(details, entry)):
-            blocks = tuple(show_row(view, name, found))
-            folded = (Details(capitalized(view.label(name)), blocks),) if blocks else ()
-            yield from blocks if name == view.main_row else folded
+def _each(view: ProtocolView, show_row: Callable[[ProtocolView, str, Details], Iterator[Block]]) -> Blocks:
+    """Yield the blocks of the main row, then, folded, of the other learned rows."""
+    for name, details in view.details.items():
+        if name in view.learned and (blocks := tuple(show_row(view, name, details))):
+            yield from blocks if name == view.main_row else (Section(capitalized(view.label(name)), blocks),)
 
 
-def _objects(view: ProtocolView) -> Blocks:
-    yield from _each(view, "per_object", _objects_of_row)
-
-
-def _objects_of_row(view: ProtocolView, name: str, per_object: dict[str, dict[str, float]]) -> Iterator[Block]:
+def _objects(view: ProtocolView, name: str, details: Details) -> Iterator[Block]:
     label = view.label(name)
     for key, measure, words in (
         ("test", "topn_k5", "(a) candidates: test objects only"),
         ("all", "topn_k5_all_objects", "(b) candidates: all objects (red: test, grey: validation, blue: training)"),
     ):
-        if accuracy := per_object.get(f"{key}_candidates"):
+        if accuracy := details.per_object.get(f"{key}_candidates"):
             best, worst = max(accuracy, key=accuracy.__getitem__), min(accuracy, key=accuracy.__getitem__)
             low, high = percent(accuracy[worst]), percent(accuracy[best])
             yield Picture(
@@ -273,35 +250,26 @@ def _objects_of_row(view: ProtocolView, name: str, per_object: dict[str, dict[st
             )
 
 
-def _confusions(view: ProtocolView) -> Blocks:
-    yield from _each(view, "confusions", tables.confusions)
-
-
 # Decisions -----------------------------------------------------------------------------------------
 
 
-def _calibration(view: ProtocolView) -> Blocks:
-    yield from _each(view, "reliability", _reliability)
-    if fitted := {name: details.calibration for name, details in view.details().items() if details.calibration}:
-        yield Details("Calibration fitted on validation objects", (Listing.of_json(fitted),))
-
-
-def _reliability(view: ProtocolView, name: str, diagrams: dict[str, Any]) -> Iterator[Block]:
-    label = view.label(name)
+def _reliability(view: ProtocolView, name: str, details: Details) -> Iterator[Block]:
+    label, diagrams = view.label(name), details.reliability
     descriptions = [
         f"{text}: ECE {percent(diagrams[key]['ece'])} %" for key, text in plots.RELIABILITIES.items() if key in diagrams
     ]
-    yield Picture(
-        view.figure_name(f"reliability-{name}"),
-        f"Reliability diagrams, {label}. {'; '.join(descriptions)}.",
-        f"Fraction of right answers against the probability that {label} stated; a calibrated method is on the "
-        "diagonal. Below: number of answers (logarithmic).",
-        partial(plots.reliability, view, name),
-    )
+    if descriptions:
+        yield Picture(
+            view.figure_name(f"reliability-{name}"),
+            f"Reliability diagrams, {label}. {'; '.join(descriptions)}.",
+            f"Fraction of right answers against the probability that {label} stated; a calibrated method is on the "
+            "diagonal. Below: number of answers (logarithmic).",
+            partial(plots.reliability, view, name),
+        )
 
 
 def _reject(view: ProtocolView) -> Blocks:
-    found = {name: details.reject for name, details in view.details().items() if details.reject}
+    found = {name: details.reject for name, details in view.details.items() if details.reject}
     if found:
         descriptions = [
             f"{view.label(name)} {percent(one.auroc.value[0])} % "
@@ -318,12 +286,12 @@ def _reject(view: ProtocolView) -> Blocks:
             lambda: plots.reject(view),
         )
         yield tables.rejects(view, found)
-    elif view.details():
+    elif view.details:
         yield Text(TOO_FEW)
 
 
 def _verification(view: ProtocolView) -> Blocks:
-    for found in (details.verification for details in view.details().values() if details.verification):
+    for found in (details.verification for details in view.details.values() if details.verification):
         one = next(iter(found["random"].values()))
         yield tables.verification(found)
         yield Text(
@@ -339,22 +307,16 @@ def _verification(view: ProtocolView) -> Blocks:
 
 def _recording(view: ProtocolView) -> Blocks:
     recording, features = view.result.recording, view.result.features
-    rows = [
-        ("recording", f"{recording.name} ({recording.source})"),
-        ("digest of the recording", recording.digest),
-    ]
+    rows = [("recording", f"{recording.name} ({recording.source})"), ("digest of the recording", recording.digest)]
     if features:
         words = f"touch {features.touch} x {features.fingers} finger(s), photo {features.photo}"
         rows += [("features", words), ("digest of the features", features.digest)]
     yield Table(("property", "value"), tuple(rows), words=frozenset({1}))
     if len(view.result.folds[0]) == 1:
-        yield Details("Objects of each part", (tables.split(view.result.folds[0][0]),))
-    if selected := {name: row.best_params for name, row in view.result.rows.items() if any(map(any, row.best_params))}:
-        words = "Parameters selected on validation objects, for each seed and fold"
-        yield Details(words, (Listing.of_json(selected),))
+        yield Section("Objects of each part", (tables.split(view.result.folds[0][0]),))
 
 
-def _settings(results: Results) -> Iterator[Block]:
+def _settings(results: Results) -> Table:
     setting = results.setting
     rows = [
         ("preset", setting.preset),
@@ -363,10 +325,8 @@ def _settings(results: Results) -> Iterator[Block]:
     ]
     if setting.model:
         rows.insert(1, ("digest of the model", setting.model))
-    yield Table(("setting", "value"), tuple(rows), words=frozenset({1}))
-    yield Details("Configuration", (Listing.of_json(setting.config),))
-    if setting.compared:
-        yield Details("Compared towers", (Listing.of_json(msgspec.to_builtins(setting.compared)),))
+    note = "results.json has the whole configuration, the calibrations and the parameters that methods selected."
+    return Table(("setting", "value"), tuple(rows), (note,), frozenset({1}))
 
 
 PARTS: dict[str, Callable[[ProtocolView], Blocks]] = {
@@ -375,12 +335,12 @@ PARTS: dict[str, Callable[[ProtocolView], Blocks]] = {
     "Several grasps": _grasps,
     "Accuracy and time": _time,
     "Full gallery": _gallery,
-    "Differences between methods": _comparisons,
+    "Differences between methods": lambda view: iter([tables.comparisons(view)]),
     "Controls": _controls,
     "Ceilings": _ceilings,
-    "Accuracy by object": _objects,
-    "Confusions": _confusions,
-    "Calibration": _calibration,
+    "Accuracy by object": lambda view: _each(view, _objects),
+    "Confusions": lambda view: _each(view, tables.confusions),
+    "Calibration": lambda view: _each(view, _reliability),
     "Is the object in the catalogue?": _reject,
     "Is it the expected object?": _verification,
     "Recording": _recording,

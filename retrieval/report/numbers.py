@@ -1,4 +1,4 @@
-"""How reports write numbers: one form for numbers, percentages, intervals and p-values."""
+"""How reports write numbers: one form for numbers, percentages, intervals, probabilities and p-values."""
 
 from collections.abc import Callable
 
@@ -26,6 +26,16 @@ def percent(fraction: float | None, digits: int = 1) -> str:
     return MISSING_VALUE if fraction is None else f"{100 * fraction:.{digits}f}"
 
 
+def probability(value: float) -> str:
+    """Return a probability in percent, never as certain."""
+    return "over 99.9 %" if value > 0.999 else "under 0.1 %" if value < 0.001 else f"{percent(value)} %"
+
+
+def p_value(value: float) -> str:
+    """Return a p-value, never as 0."""
+    return "< 0.0001" if value < 0.0001 else f"{value:.2g}" if value < 0.1 else f"{value:.2f}"
+
+
 def interval(value: float, low: float, high: float, write: Callable[[float], str] = percent) -> str:
     """Return a value and its interval, as in "71.2 [65.0, 77.1]"; `write` formats the three numbers."""
     return f"{write(value)} [{write(low)}, {write(high)}]"
@@ -38,18 +48,11 @@ def with_interval(summary: Summary | None) -> str:
     """
     if summary is None:
         return MISSING_VALUE
-    return interval(summary.value[0], summary.low[0], summary.high[0]) + _mark(summary)
+    mark = FEW_OBJECTS_MARK * summary.few_objects
+    return interval(summary.value[0], summary.low[0], summary.high[0]) + mark
 
 
 def difference(found: Difference) -> str:
     """Return a difference and its interval in percent points, with a mark if there are too few objects."""
-    return interval(found.value, found.low, found.high, lambda fraction: f"{100 * fraction:+.1f}") + _mark(found)
-
-
-def _mark(found: Summary | Difference) -> str:
-    return FEW_OBJECTS_MARK if found.few_objects else ""
-
-
-def probability(value: float) -> str:
-    """Return a p-value as text, never 0."""
-    return "< 0.0001" if value < 0.0001 else f"{value:.2g}" if value < 0.1 else f"{value:.2f}"
+    points = interval(found.value, found.low, found.high, lambda fraction: f"{100 * fraction:+.1f}")
+    return points + FEW_OBJECTS_MARK * found.few_objects

@@ -46,7 +46,6 @@ def overview(view: ProtocolView, keys: Sequence[str]) -> Figure:
 
 
 def _first(summary: Summary) -> tuple[float, float, float]:
-    """Return the first value of a measure and its interval, in percent."""
     return 100 * summary.value[0], 100 * summary.low[0], 100 * summary.high[0]
 
 
@@ -72,7 +71,6 @@ def topn_curves(view: ProtocolView, keys: Sequence[str]) -> Figure:
 
 
 def _legend(figure: Figure, view: ProtocolView, names: Sequence[str]) -> None:
-    """Add one legend on the right, in the order of the tables."""
     from matplotlib.lines import Line2D
 
     handles = [
@@ -87,7 +85,7 @@ def grasps(view: ProtocolView) -> Figure:
     """Plot top-1 accuracy of five against the number of grasps, with 3 photos of each candidate."""
     figure = canvas(8, 4.4)
     panel = figure.subplots()
-    keys = {key: count for count in SET_SIZES if view.any(key := grasps_metric_name(count))}
+    keys = {key: count for count in SET_SIZES if view.summaries(key := grasps_metric_name(count))}
     for place, name in enumerate(view.rows):
         shift, style = 0.055 * (place - (len(view.rows) - 1) / 2), style_of(name)
         found = [(at, summary) for at, key in enumerate(keys) if (summary := view.summary(name, key))]
@@ -104,15 +102,8 @@ def grasps(view: ProtocolView) -> Figure:
 
 
 def objects(view: ProtocolView, row: str, candidates: str, measure: str) -> Figure:
-    """Plot the top-1 accuracy of five for each object, coloured by part.
-
-    Args:
-        view: The protocol.
-        row: The row.
-        candidates: "test_candidates" or "all_candidates".
-        measure: The measure whose chance is drawn.
-    """
-    accuracies, split = view.details()[row].per_object[candidates], view.result.folds[0][0]
+    """Plot the top-1 accuracy of five for each object, coloured by part, and the chance of `measure`."""
+    accuracies, split = view.details[row].per_object[candidates], view.result.folds[0][0]
     ranked = sorted(accuracies, key=lambda name: (-accuracies[name], name))
     bars = [(name, colour) for part, colour in PART_COLOURS.items() for name in ranked if name in split[part]]
     figure = canvas(13, 3.8)
@@ -152,7 +143,7 @@ RELIABILITIES = {
 
 def reliability(view: ProtocolView, row: str) -> Figure:
     """Plot the fraction of right answers against the stated probability, on test objects, with counts below."""
-    diagrams = view.details()[row].reliability
+    diagrams = view.details[row].reliability
     kinds = [kind for kind in RELIABILITIES if kind in diagrams]
     figure = canvas(0.6 + 2.7 * len(kinds), 4.1)
     grid = figure.subplots(2, len(kinds), sharex=True, sharey="row", squeeze=False, height_ratios=[4, 1])
@@ -167,7 +158,7 @@ def reliability(view: ProtocolView, row: str) -> Figure:
         panel.set_title(f"{RELIABILITIES[kind]}\nECE {percent(diagrams[kind]['ece'])} %", fontsize=9)
         counts.bar(stated, [one["count"] for one in bins], width=6, color=colour, alpha=0.6)
         counts.set_yscale("log")
-        logarithmic(counts.yaxis, (1,))
+        logarithmic(counts.yaxis)
         counts.set_xlabel("stated probability, %")
     percent_axis(grid[0][0], "right answers, %")
     grid[1][0].set_ylabel("answers")
@@ -178,7 +169,7 @@ def reject(view: ProtocolView) -> Figure:
     """Plot the ROC curve of "the catalogue contains the object", and the top-1 risk against coverage."""
     figure = canvas(10.5, 4.4)
     accepts, risk = figure.subplots(1, 2)
-    rejections = {name: details.reject for name, details in view.details().items() if details.reject}
+    rejections = {name: details.reject for name, details in view.details.items() if details.reject}
     for name, rejection in reversed(rejections.items()):
         _curve(accepts, name, 100 * np.array(rejection.roc))
         _curve(risk, name, 100 * np.array(rejection.risk_coverage))
@@ -194,8 +185,7 @@ def reject(view: ProtocolView) -> Figure:
     return figure
 
 
-def _curve(panel: Axes, row: str, points: NDArray[np.float64]) -> None:
-    """Plot a curve of many corners (n, 2) with a few markers."""
+def _curve(panel: Axes, row: str, points: NDArray[np.float64]) -> None:  # of many corners, with a few markers
     style, step = style_of(row), max(1, len(points) // 6)
     panel.plot(*points.T, color=style.colour, ls=style.line)
     panel.plot(*points[step:-1:step].T, style.marker, color=style.colour, ms=5)
@@ -212,7 +202,7 @@ def accuracy_and_time(view: ProtocolView, key: str) -> Figure:
     for panel, (kind, title) in zip(panels, titles.items(), strict=True):
         points: list[tuple[float, float]] = []
         for name, summary in view.summaries(key).items():
-            times, style = view.time_of(name), style_of(name)
+            times, style = view.times and view.times.rows.get(name), style_of(name)
             if not (times and (time := getattr(times, kind))):
                 continue
             value, low, high = _first(summary)
@@ -228,8 +218,7 @@ def accuracy_and_time(view: ProtocolView, key: str) -> Figure:
         if front:
             panel.step(*zip(*front, strict=True), where="post", color="#222222", lw=1, alpha=0.45, zorder=0)
         panel.set_xscale("log")
-        low, high = panel.get_xlim()
-        logarithmic(panel.xaxis, (1, 2, 5) if high < 1000 * low else (1,))
+        logarithmic(panel.xaxis)
         panel.set_xlabel(title)
     percent_axis(panels[0], f"{view.measure_label(key)}, %")
     _legend(figure, view, view.rows)

@@ -3,7 +3,7 @@
 import re
 from dataclasses import dataclass
 
-from retrieval.evaluation.results import Details, MethodTimes, ProtocolResult, ProtocolTimes, Results, Timings
+from retrieval.evaluation.results import Details, ProtocolResult, ProtocolTimes, Results, Timings
 from retrieval.methods import CHANCE
 from retrieval.metrics.intervals import Summary
 from retrieval.metrics.registry import METRICS, grasps_metric_name
@@ -57,15 +57,15 @@ class ProtocolView:
         return (self.learned or self.rows)[0]
 
     @property
-    def is_in_depth(self) -> bool:
-        """Whether single objects and decisions are reported, and so many measures that each section has a table."""
-        return any(row.details for row in self.result.rows.values())
+    def details(self) -> dict[str, Details]:
+        """Single objects and decisions, of the rows that have them; such a protocol also has many measures."""
+        return {name: row.details for name, row in self.result.rows.items() if row.details}
 
     @property
     def headlines(self) -> list[str]:
         """The measures of the overview, the deciding one among them."""
-        names = HEADLINES if self.is_in_depth else [key for key, _ in self.result.labels]
-        return [key for key in names if self.any(key)]
+        names = HEADLINES if self.details else [key for key, _ in self.result.labels]
+        return [key for key in names if self.summaries(key)]
 
     def label(self, row: str) -> str:
         """Return the label of a row: that of its method, or the name of a checkpoint that scores as it is."""
@@ -83,24 +83,12 @@ class ProtocolView:
 
     def summaries(self, key: str) -> dict[str, Summary]:
         """Return a measure of all rows that have it."""
-        return {row: found.measures[key] for row, found in self.result.rows.items() if key in found.measures}
-
-    def any(self, *keys: str) -> bool:
-        """Return whether any row has one of these measures."""
-        return any(self.summaries(key) for key in keys)
-
-    def details(self) -> dict[str, Details]:
-        """Return the details of all rows that have them."""
-        return {name: row.details for name, row in self.result.rows.items() if row.details}
+        return {row: found for row in self.rows if (found := self.summary(row, key))}
 
     @property
     def times(self) -> ProtocolTimes | None:
         """The run times; None if they were not measured."""
         return self.timings.protocols.get(self.name) if self.timings else None
-
-    def time_of(self, row: str) -> MethodTimes | None:
-        """Return the run times of a row; None if they were not measured."""
-        return self.times.rows.get(row) if self.times else None
 
     def figure_name(self, name: str) -> str:
         """Return a name of a figure's file that no other protocol of the report has."""

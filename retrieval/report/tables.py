@@ -4,8 +4,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from retrieval.evaluation.aggregate import CONTROL_NAMES
 from retrieval.evaluation.results import (
-    Confusion,
     ControlResult,
+    Details,
     ProtocolTimes,
     Rate,
     Rejection,
@@ -24,8 +24,8 @@ from retrieval.report.numbers import (
     difference,
     format_number,
     interval,
+    p_value,
     percent,
-    probability,
     with_interval,
 )
 from retrieval.report.results import ProtocolView
@@ -50,14 +50,14 @@ def _marked(header: Row, rows: Iterable[Row], notes: Sequence[str] = (), words: 
 
 def section(view: ProtocolView, name: str) -> Table | None:
     """Return the measures of a section; a protocol with few measures has all of them in the section "main"."""
-    if view.is_in_depth:
+    if view.details:
         return measures(view, {key: metric.column for key, metric in METRICS.items() if metric.section == name})
     return measures(view, dict(view.result.labels)) if name == "main" else None
 
 
 def measures(view: ProtocolView, headings: Mapping[str, str]) -> Table | None:
     """Return a line for each row, its low-pass control and chance, and a column for each of these measures."""
-    keys = [key for key in headings if view.any(key)]
+    keys = [key for key in headings if view.summaries(key)]
     if not keys:
         return None
     rows: list[Row] = []
@@ -80,16 +80,14 @@ def _values(measures: Summaries | None, keys: Sequence[str]) -> Iterator[str]:
 
 
 def _without_threshold(view: ProtocolView) -> list[str]:
-    """Return the reasons why methods have no pair accuracy."""
     reasons: dict[str, list[str]] = {}
-    for name, details in view.details().items():
+    for name, details in view.details.items():
         if why := details.pair_threshold.reason:
             reasons.setdefault(why, []).append(view.label(name))
     return [f"No pair accuracy of {', '.join(names)}: {why}." for why, names in reasons.items()]
 
 
 def _basis(view: ProtocolView, keys: Sequence[str]) -> list[str]:
-    """Return queries, objects and gallery of the columns; measures with the same basis are grouped."""
     bases: dict[str, list[str]] = {}
     for key in keys:
         for summary in view.summaries(key).values():
@@ -132,7 +130,7 @@ def comparisons(view: ProtocolView) -> Table | None:
             f"{view.label(one.a)} − {view.label(one.b)}",
             view.measure_label(one.measure),
             difference(one.difference),
-            probability(one.difference.p),
+            p_value(one.difference.p),
         )
         for one in view.result.comparisons
     ]
@@ -143,7 +141,7 @@ def comparisons(view: ProtocolView) -> Table | None:
 def differences(view: ProtocolView) -> Table | None:
     """Return the paired differences between each row and its controls."""
     rows = [
-        (view.label(name), view.measure_label(key), CONTROL_NAMES[control], difference(one), probability(one.p))
+        (view.label(name), view.measure_label(key), CONTROL_NAMES[control], difference(one), p_value(one.p))
         for name, row in view.result.rows.items()
         for control, found in row.differences.items()
         for key, one in found.items()
@@ -169,58 +167,40 @@ def verdicts(view: ProtocolView) -> list[str]:
     return sentences
 
 
-def controls(view: ProtocolView) -> Table | None:
-    """Return the main measures of each control, and whether they equal chance."""
-    keys = _measured(view, view.result.controls)
-    rows = []
-    for name, control in view.result.controls.items():
+def controls(view: ProtocolView, found: Mapping[str, ControlResult]) -> Table | None:
+    """Return the main measures of controls or ceilings, at most three, below those of the methods that they use.
+
+    The last column states whether a control is at chance.
+    """
+    main = dict.fromkeys([view.result.main, *view.headlines])
+    keys = [key for key in main if any(key in (control.measures or {}) for control in found.values())][:3]
+    methods = dict.fromkeys(control.method for control in found.values() if control.method in view.result.rows)
+    rows = [
+        ("the result", view.label(method), *_values(view.result.rows[method].measures, keys), "") for method in methods
+    ]
+    for name, control in found.items():
         at_chance = MISSING_VALUE
-        if found := next(iter((control.measures or {}).values()), None):
-            at_chance = "yes" if found.low[0] <= found.chance[0] <= found.high[0] else "no"
+        if measure := next(iter((control.measures or {}).values()), None):
+            at_chance = "yes" if measure.low[0] <= measure.chance[0] <= measure.high[0] else "no"
         description = f"{control.description} ({control.reason})" if control.reason else control.description
         rows.append((name, description, *_values(control.measures, keys), at_chance))
-    for method in _methods(view, view.result.controls):
-        real = _values(view.result.rows[method].measures, keys)
-        rows.insert(0, ("the result", f"{view.label(method)} without a control", *real, ""))
-    header = ("control", "description", *(f"{view.measure_label(key)}, %" for key in keys), "chance in the interval")
-    return _marked(header, rows, _without_threshold(view), words=(1,))
-
-
-def ceilings(view: ProtocolView) -> Table | None:
-    """Return the measures between touch and photo, and between two touches or two photos of an object."""
-    keys = _measured(view, view.result.ceilings)
-    rows = [
-        ("touch to photo", f"the result of {view.label(method)}", *_values(view.result.rows[method].measures, keys))
-        for method in _methods(view, view.result.ceilings)
-    ]
-    for name, one in view.result.ceilings.items():
-        rows.append((name.replace("_", " "), one.description, *_values(one.measures, keys)))
-    header = ("ceiling", "description", *(f"{view.measure_label(key)}, %" for key in keys))
-    return _marked(header, rows, words=(1,))
-
-
-def _measured(view: ProtocolView, controls: Mapping[str, ControlResult]) -> list[str]:
-    """Return the main measures that the controls have, at most three."""
-    keys = dict.fromkeys([view.result.main, *view.headlines])
-    return [key for key in keys if any(key in (control.measures or {}) for control in controls.values())][:3]
-
-
-def _methods(view: ProtocolView, controls: Mapping[str, ControlResult]) -> Iterable[str]:
-    """Return the rows of the methods that the controls use."""
-    return dict.fromkeys(control.method for control in controls.values() if control.method in view.result.rows)
+    header = ("inputs", "description", *(f"{view.measure_label(key)}, %" for key in keys), "chance in the interval")
+    notes = _without_threshold(view) if "pair_accuracy" in keys else []
+    return _marked(header, rows, notes, words=(1,)) if found else None
 
 
 # Objects and decisions -------------------------------------------------------------------------------
 
 
-def confusions(view: ProtocolView, name: str, pairs: Sequence[Confusion]) -> Iterator[Block]:
+def confusions(view: ProtocolView, name: str, details: Details) -> Iterator[Block]:
     """Yield the most frequent confusions of a row."""
-    rows = tuple((one.object_id, one.mistaken_for, percent(one.share, 0)) for one in pairs)
+    rows = tuple((one.object_id, one.mistaken_for, percent(one.share, 0)) for one in details.confusions)
     note = (
         f"The fraction of the touches of an object for which {view.label(name)} ranked another one first in the full "
         "gallery of unseen objects."
     )
-    yield Table(("object", "mistaken for", "of its touches, %"), rows, (note,), words=frozenset({1}))
+    if rows:
+        yield Table(("object", "mistaken for", "of its touches, %"), rows, (note,), words=frozenset({1}))
 
 
 def rejects(view: ProtocolView, found: Mapping[str, Rejection]) -> Table | None:

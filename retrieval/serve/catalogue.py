@@ -14,7 +14,7 @@ from pydantic import BaseModel, Field
 from retrieval.data.images import read_bytes
 from retrieval.data.text import replace_surrogates
 from retrieval.errors import ImageError
-from retrieval.report.pages import jpeg, thumbnail
+from retrieval.report.pages import thumbnail
 from retrieval.serve.errors import HttpProblem
 from retrieval.serve.service import Parts
 from retrieval.serve.store import IMAGE_TYPES, as_png_or_jpeg
@@ -103,10 +103,7 @@ def photo(
 @lru_cache(512)
 def _thumbnail(path: Path, digest: str, px: int) -> bytes:
     """Return a photo as a small JPEG file; the digest of its content identifies it in the cache."""
-    image = thumbnail(path, px)
-    if image is None:
-        raise ImageError(str(path), "unreadable")
-    return jpeg(image)
+    return thumbnail(path, px)
 
 
 def image_response(data: bytes, headers: Mapping[str, str] | None = None) -> Response:

@@ -3,7 +3,6 @@
 import pytest
 
 from retrieval.report.evaluation import write_report
-from tests import synthetic
 from tests.browser import chromium, page, serious
 from tests.synthetic_evaluation import write_synthetic_results
 
@@ -12,9 +11,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def opened(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("report")
-    recording = synthetic.write_recording(folder / "recording", synthetic.make_objects(12), 3)
-    out = write_synthetic_results(recording, folder / "out", ("late_fusion", "cca", "chance"))
+    out = write_synthetic_results(tmp_path_factory.mktemp("report"), ("late_fusion", "cca", "chance"))
     write_report(out)
     with chromium() as browser, page(browser, (out / "report.html").as_uri(), offline=True) as found:
         yield found

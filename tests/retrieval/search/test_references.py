@@ -13,7 +13,7 @@ from retrieval.errors import BadInput
 from retrieval.indexing.build import build_index
 from retrieval.indexing.sharded import build_sharded
 from retrieval.model.references import SHARPNESS, ReferenceCalibration, unit_embeddings
-from retrieval.report.query import query_html
+from retrieval.report.query import query_page
 from retrieval.report.terminal import print_table
 from retrieval.search.answer import QueryResult
 from retrieval.search.searcher import Searcher
@@ -147,7 +147,7 @@ def test_the_documented_keys_of_references_are_those_written(
 
 def test_pages_and_tables_show_the_nearest_touch(catalogue_with_touches, calibrated_model, tmp_path, touches, capsys):
     result = query_new_index(catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[0]][2])
-    page = query_html(result, catalogue_with_touches)
+    page = query_page(result, catalogue_with_touches)
     assert page.count('alt="reference touch"') == 8  # two fingers of each of four objects
     assert "no photo: scored by its touches only" in page
     assert "calibrated on 40 touches of 20 objects" in page
