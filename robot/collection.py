@@ -1,9 +1,7 @@
 """Collection of a recording with a rig, as in the paper. With a real rig, a person changes the objects.
 
-The steps of an attempt: take a photo, plan (by default: fit a cylinder and draw a random grasp), approach, read the
-gels without contact, close, read the gels, lift, read the gripper's outcome, read the gels again, put the object down.
-The gate then decides whether training uses the grasp. Rejected grasps are recorded too, and attempts without a grasp
-are logged (robot.recording.attempt_log). An object is complete when it has the required number of accepted grasps; the
+The gate decides whether training uses a grasp. Rejected grasps are recorded too, and attempts without a grasp are
+logged (robot.recording.attempt_log). An object is complete when it has the required number of accepted grasps; the
 number of attempts is limited. An ungraspable object is skipped, with the reason in recording.json.
 
 One writer writes all grasps in a fixed order, so the recording does not depend on the number of jobs. A collection
@@ -27,7 +25,7 @@ from robot.errors import RecordingError, RobotConfigError
 from robot.grasping.attempt import AttemptRunner, GraspAttempt
 from robot.grasping.gates import ContactAreaGate, Gate, apply_gate, recorded_touches
 from robot.grasping.settings import AttemptSettings
-from robot.recording.attempt_log import UNGRASPABLE, AttemptLog, LoggedAttempt, Tally, tally
+from robot.recording.attempt_log import AttemptLog, LoggedAttempt, Tally, tally
 from robot.recording.folder import INFO_FILE, RecordingWriter, read_info, read_recording, software_version
 from robot.recording.grasp import RecordedGrasp, check_name
 from robot.rig import Rig
@@ -78,7 +76,7 @@ class Progress:
         objects: Number of objects.
         objects_done: Objects that need no further attempt.
         grasps_target: Number of accepted grasps to collect, over all objects.
-        grasps_done: Accepted grasps, plus the missing grasps of objects that need no further attempt.
+        grasps_done: Accepted grasps, plus the missing ones of objects that need no further attempt.
         accepted: Accepted grasps.
         attempts: Attempts so far.
     """
@@ -173,9 +171,6 @@ def _make_work(make_rig: RigMaker, seed: int, settings: AttemptSettings) -> Work
     return AttemptRunner(rig, seed, settings).run
 
 
-# Entries of recording.json ----------------------------------------------------------------------------------
-
-
 def _recording_info(rig: Rig, seed: int, settings: CollectSettings, gate_name: str) -> dict[str, Any]:
     """Return the content of recording.json: the rig's info and all settings of the collection."""
     collection = {"gate": gate_name, **asdict(settings), "most_attempts": settings.limit}
@@ -197,11 +192,8 @@ def _recording_info(rig: Rig, seed: int, settings: CollectSettings, gate_name: s
 def _check_can_continue(folder: Path, expected: Mapping[str, Any], strict: bool) -> None:
     """Raise RecordingError if an existing recording was collected with other settings.
 
-    Args:
-        folder: The recording.
-        expected: Content of recording.json for this collection.
-        strict: Whether the software version and the settings read back from devices must be equal too. Simulated
-            attempts depend on them. With a real rig, only the requested settings must be equal.
+    With `strict`, the software version and the settings read back from devices must be equal too: simulated attempts
+    depend on them. With a real rig, only the requested settings must be equal.
     """
     if not (folder / INFO_FILE).is_file():
         return
@@ -212,25 +204,23 @@ def _check_can_continue(folder: Path, expected: Mapping[str, Any], strict: bool)
         expected = {**expected, "software_version": software_version()}
     else:
         expected = {name: value for name, value in expected.items() if name != "devices"}
-    stored, expected = ({**info, "collection": {"rounds": False, **info["collection"]}} for info in (stored, expected))
-    for name, value in _flatten(expected).items():
-        old = _flatten(stored).get(name)
-        if old != value:
+    before, now = (
+        _flatten({**info, "collection": {"rounds": False, **info["collection"]}}) for info in (stored, expected)
+    )
+    for name, value in now.items():
+        if before.get(name) != value:
             what = name.replace("collection.", "").replace("_", " ")
             raise RecordingError(
-                f"{folder} was collected with {what} {old!r}, not {value!r}; give another folder, or the same settings"
+                f"{folder} was collected with {what} {before.get(name)!r}, not {value!r}; give another folder, or the "
+                "same settings"
             )
 
 
 def _flatten(info: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Join nested keys by dots."""
     flat: dict[str, Any] = {}
     for key, value in info.items():
         flat |= _flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
     return flat
-
-
-# Collecting -------------------------------------------------------------------------------------------------
 
 
 class _Collection:
@@ -246,8 +236,18 @@ class _Collection:
         progress: Callable[[Progress], None] | None,
         is_enough: Callable[[Sequence[RecordedGrasp]], bool] | None,
     ) -> None:
+        logged = {attempt.grasp_id for attempt in log.attempts} - {None}
+        if lost := writer.grasp_ids - logged:
+            raise RecordingError(
+                f"{log.folder}: attempts.jsonl lacks grasp {min(lost)}; restore it or give a new folder"
+            )
+        order = list(tally(log.attempts))
+        if order != list(names[: len(order)]):
+            raise RecordingError(
+                f"{log.folder} was collected with other objects ({', '.join(order[:3])}, ...); give these objects "
+                "first, in the same order; more may follow"
+            )
         self.writer, self.log, self.names, self.settings, self.gate = writer, log, names, settings, gate
-        _check_log(log, writer, names)
         self.tallies = {name: Tally(name) for name in names} | tally(log.attempts)
         self._seconds = log.attempts[-1].ended_s if log.attempts else 0.0
         self._pending: dict[str, deque[Callable[[], GraspAttempt]]] = defaultdict(deque)
@@ -269,7 +269,7 @@ class _Collection:
                 self._report()
 
     def _turns(self) -> Iterator[tuple[int, str]]:
-        """Yield (target, object) in order: attempt the object until it has `target` accepted grasps, then go on."""
+        """Yield (target, object): attempt the object until it has `target` accepted grasps, then go on."""
         grasps = self.settings.grasps
         for target in range(1, grasps + 1) if self.settings.rounds else (grasps,):
             for name in self.names:
@@ -286,7 +286,7 @@ class _Collection:
                 self._pending[object_id].append(workers.submit(object_id, number))
 
     def _needs_attempt(self, name: str, target: int, ahead: bool = False) -> bool:
-        """Return whether the object has fewer than `target` accepted grasps and may be attempted again.
+        """Return whether the object lacks accepted grasps and may be attempted again.
 
         With `ahead`, assume that all pending attempts are accepted.
         """
@@ -298,25 +298,31 @@ class _Collection:
     def _record(self, attempt: GraspAttempt) -> None:
         """Apply the gate, then write the attempt's log line and its grasp."""
         began, self._seconds = self._seconds, round(self._seconds + attempt.duration_s, 3)
-        logged = self._log_entry(attempt)
-        self.log.append(logged)
-        if logged.grasp_id is not None:
+        name, number, outcome = attempt.object_id, attempt.number, attempt.outcome
+        if outcome in ("no_plan", "ungraspable"):
+            logged = LoggedAttempt(name, number, outcome, False, self._seconds, reason=attempt.reason)
+            self.log.append(logged)
+        else:
+            accepted, score = apply_gate(self.gate, recorded_touches(attempt.images))
+            grasp_id = grasp_id_of(name, number)
+            logged = LoggedAttempt(name, number, outcome, accepted, self._seconds, grasp_id, score, attempt.fit)
+            self.log.append(logged)
             grasp = self.writer.append(
-                logged.grasp_id,
-                attempt.object_id,
+                grasp_id,
+                name,
                 attempt.images,
                 **attempt.fields,
-                grasped=logged.accepted,  # the gate's decision; `outcome` is the gripper's
-                outcome=attempt.outcome,
-                sequence_id=logged.grasp_id,
+                grasped=accepted,  # the gate's decision; `outcome` is the gripper's
+                outcome=outcome,
+                sequence_id=grasp_id,
                 time_s=round(began + attempt.touch_time_s, 3),
             )
-            if logged.accepted and self._is_enough:
+            if accepted and self._is_enough:
                 self._add_accepted(grasp)
-        self.tallies[attempt.object_id].add(logged)
-        if attempt.outcome == UNGRASPABLE:
+        self.tallies[name].add(logged)
+        if outcome == "ungraspable":
             self._record_skipped_objects()
-            del self._pending[attempt.object_id]
+            del self._pending[name]
 
     def _add_accepted(self, grasp: RecordedGrasp) -> None:
         self._accepted[grasp.object_id].append(grasp)
@@ -328,16 +334,6 @@ class _Collection:
         """Write the ungraspable objects, if any, to recording.json."""
         if skipped := {name: reason for name in self.names if (reason := self.tallies[name].skipped) is not None}:
             self.writer.update_info(skipped_objects=skipped)
-
-    def _log_entry(self, attempt: GraspAttempt) -> LoggedAttempt:
-        logged = functools.partial(
-            LoggedAttempt, attempt.object_id, attempt.number, attempt.outcome, ended_s=self._seconds
-        )
-        if attempt.outcome in ("no_plan", UNGRASPABLE):
-            return logged(accepted=False, reason=attempt.reason)
-        accepted, score = apply_gate(self.gate, recorded_touches(attempt.images))
-        grasp_id = grasp_id_of(attempt.object_id, attempt.number)
-        return logged(accepted=accepted, grasp_id=grasp_id, score=score, fit=attempt.fit)
 
     def _report(self) -> None:
         if self._progress is None:
@@ -353,19 +349,6 @@ class _Collection:
                 accepted=sum(counts.accepted for counts in tallies),
                 attempts=sum(counts.attempts for counts in tallies),
             )
-        )
-
-
-def _check_log(log: AttemptLog, writer: RecordingWriter, names: Sequence[str]) -> None:
-    """Raise RecordingError unless the log has every grasp, and its objects are the first of `names`, in this order."""
-    logged = {attempt.grasp_id for attempt in log.attempts} - {None}
-    if lost := writer.grasp_ids - logged:
-        raise RecordingError(f"{log.folder}: attempts.jsonl lacks grasp {min(lost)}; restore it or give a new folder")
-    order = list(tally(log.attempts))
-    if order != list(names[: len(order)]):
-        raise RecordingError(
-            f"{log.folder} was collected with other objects ({', '.join(order[:3])}, ...); give these objects first, "
-            "in the same order; more may follow"
         )
 
 

@@ -4,10 +4,9 @@ Lengths in mm, forces in N, angles in rad, times in s. The origin of the rig's f
 the centre of the workspace, with z up; the camera stands on the -y side. Every gripper force is the force on each
 finger; manufacturers often state the sum over both fingers, twice as much. Images are uint8 RGB, row 0 on top.
 
-The base classes check arguments and results and raise DeviceError: no value out of range reaches a driver, and no
-stale frame reaches a recording. A driver implements `_connect`, `_close` and the abstract methods of its base class;
-they may raise DeviceError or OSError. A device connects completely or not at all; `close` works at any time, twice,
-and after a failure. If a motion (move_to, open, grasp, ...) ends with an exception, the actuator is stopped.
+The base classes check arguments and results: no value out of range reaches a driver, and no stale frame a recording. A
+driver implements `_connect`, `_close` and the abstract methods of its base class, which may raise DeviceError or
+OSError. All public methods raise DeviceError if they fail.
 """
 
 import contextlib
@@ -54,22 +53,15 @@ class Device(ABC):
         return self._connected
 
     def connect(self) -> None:
-        """Connect completely or raise DeviceError; a second call does nothing."""
+        """Connect completely or not at all; a second call does nothing."""
         if self._connected:
             return
-        try:
-            with self._convert_os_errors("cannot be connected"):
-                self._connect()
-        except BaseException as error:
-            try:
-                self._close()
-            except Exception as second:
-                error.add_note(f"and while {self.name} was closed: {second}")
-            raise
+        with _on_error(self._close, f"{self.name} was closed"), self._convert_os_errors("cannot be connected"):
+            self._connect()
         self._connected = True
 
     def close(self) -> None:
-        """Close the device if it is connected; even if this raises DeviceError, it is disconnected afterwards."""
+        """Close the device if it is connected; it is disconnected afterwards, even if this raises."""
         if not self._connected:
             return
         self._connected = False
@@ -77,7 +69,7 @@ class Device(ABC):
             self._close()
 
     def settings(self) -> dict[str, Any]:
-        """Return the settings read back from the device, as plain JSON; raise DeviceError if this fails."""
+        """Return the settings read back from the device, as plain JSON."""
         with self._use("cannot report its settings"):
             return self._settings()
 
@@ -116,7 +108,6 @@ class Device(ABC):
 
     @contextlib.contextmanager
     def _convert_os_errors(self, failure: str) -> Iterator[None]:
-        """Convert each OSError into a DeviceError."""
         try:
             yield
         except OSError as error:
@@ -132,6 +123,19 @@ class Device(ABC):
         if not -_CLOCK_SLACK_S <= age <= max_age_s:
             allowed = f"from {-_CLOCK_SLACK_S:g} to {max_age_s:g} s"
             raise DeviceError(f"{self.name}: the frame's age must be {allowed}, got {age:.3g} s; is the stream frozen?")
+
+
+@contextlib.contextmanager
+def _on_error(action: Callable[[], None], what: str) -> Iterator[None]:
+    """Call `action` if the block raises; an exception of the action itself becomes a note."""
+    try:
+        yield
+    except BaseException as error:
+        try:
+            action()
+        except Exception as second:
+            error.add_note(f"and while {what}: {second}")
+        raise
 
 
 class VirtualDevice(Device):
@@ -159,7 +163,7 @@ class Actuator(Device):
         self.max_speed_mm_s = max_speed_mm_s
 
     def stop(self) -> None:
-        """Stop now and stay usable; a held object may be released. Raise DeviceError if this fails."""
+        """Stop now and stay usable; a held object may be released."""
         with self._use("cannot be stopped"):
             self._stop()
 
@@ -169,16 +173,8 @@ class Actuator(Device):
 
     @contextlib.contextmanager
     def _moving(self, failure: str) -> Iterator[None]:
-        """Like `_use`, and stop on any exception; an exception of the stop itself is added as a note."""
-        with self._use(failure):
-            try:
-                yield
-            except BaseException as error:
-                try:
-                    self._stop()
-                except Exception as second:
-                    error.add_note(f"and while {self.name} was stopped: {second}")
-                raise
+        with self._use(failure), _on_error(self._stop, f"{self.name} was stopped"):
+            yield
 
 
 class Arm(Actuator):
@@ -203,7 +199,7 @@ class Arm(Actuator):
         self.workspace = workspace
 
     def move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
-        """Move to `pose` and return the pose reached; raise DeviceError on failure or outside the workspace."""
+        """Move to `pose`, inside the workspace, and return the pose reached."""
         if not self.workspace.contains(pose) or not math.isfinite(pose.yaw_rad):
             lower, upper = self.workspace.lower, self.workspace.upper
             raise DeviceError(f"{self.name}: a pose must be in the workspace {lower} to {upper}, got {pose}")
@@ -214,7 +210,7 @@ class Arm(Actuator):
             return self._check_reported(self._move_to(pose, speed_mm_s))
 
     def pose(self) -> Pose:
-        """Return the current pose; raise DeviceError if this fails."""
+        """Return the current pose."""
         with self._use("cannot report its pose"):
             return self._check_reported(self._pose())
 
@@ -259,18 +255,18 @@ class Gripper(Actuator):
         self.min_force_n, self.max_force_n = min_force_n, max_force_n
 
     def state(self) -> GripperState:
-        """Return the current state; raise DeviceError if this fails."""
+        """Return the current state."""
         with self._use("cannot report its state"):
             return self._state()
 
     def open(self, opening_mm: float) -> GripperState:
-        """Open or narrow the jaws to `opening_mm`; a held object is released. Return the state or raise DeviceError."""
+        """Open or narrow the jaws to `opening_mm` and return the state; a held object is released."""
         self._check("opening", opening_mm, 0.0, self.stroke_mm, "mm")
         with self._moving("cannot open"):
             return self._open(float(opening_mm))
 
     def grasp(self, force_n: float, speed_mm_s: float = 80.0) -> GripperState:
-        """Close until each finger has `force_n` or the jaws are fully closed; return the state or raise DeviceError."""
+        """Close until each finger has `force_n` or the jaws are fully closed; return the state."""
         self._check("force", force_n, self.min_force_n, self.max_force_n, "N")
         self._check("speed", speed_mm_s, self.min_speed_mm_s, self.max_speed_mm_s, "mm/s")
         with self._moving("cannot grasp"):
@@ -305,7 +301,7 @@ class TactileSensor(Device):
         self.finger = finger
 
     def read(self, max_age_s: float = MAX_AGE_S, near_s: float | None = None) -> Frame:
-        """Return the newest frame, or the buffered one nearest to `near_s`; raise DeviceError if it is too old."""
+        """Return the newest frame, or the buffered one nearest to `near_s`, at most `max_age_s` old."""
         with self._use("cannot be read"):
             frame = self._read() if near_s is None else self._read_near(near_s)
             _check_colour(self.name, frame.pixels)
@@ -323,8 +319,7 @@ class TactileSensor(Device):
 def read_together(sensors: Mapping[str, TactileSensor], max_age_s: float = MAX_AGE_S) -> tuple[dict[str, Frame], float]:
     """Read one frame of each sensor, close in time; return the frames by finger and their skew in s.
 
-    The oldest of the sensors' newest frames sets the time. Each other sensor gives its buffered frame nearest to it, or
-    raises DeviceError.
+    The oldest of the sensors' newest frames sets the time. Each other sensor gives its buffered frame nearest to it.
     """
     newest = {finger: sensor.read(max_age_s) for finger, sensor in sensors.items()}
     common = min(frame.time_s for frame in newest.values())
@@ -357,7 +352,7 @@ class Camera(Device):
         self.extrinsics = _check_rigid(extrinsics)
 
     def read(self, depth: bool = True, max_age_s: float = MAX_AGE_S) -> RGBD:
-        """Return the newest picture, with depth if `depth` is true; raise DeviceError if it is old or lacks depth."""
+        """Return the newest picture, with depth if `depth` is true, at most `max_age_s` old."""
         with self._use("cannot be read"):
             if depth and not self.has_depth:
                 raise DeviceError(f"{self.name} has no depth: read it with depth=False")
@@ -366,7 +361,12 @@ class Camera(Device):
             self._check_age(image.time_s, max_age_s)
             if not depth:
                 return replace(image, depth_m=None)
-            _check_depth(self.name, image)
+            shape, known = image.colour.shape[:2], image.depth_m
+            if known is None or known.dtype != np.float32 or known.shape != shape:
+                got = "none" if known is None else f"{known.shape} {known.dtype}"
+                raise DeviceError(f"{self.name}: depth must be float32 of the picture's shape {shape}, got {got}")
+            if image.intrinsics is None:
+                raise DeviceError(f"{self.name}: a picture with depth must have intrinsics")
             return image
 
     @abstractmethod
@@ -376,17 +376,6 @@ class Camera(Device):
 def _check_colour(name: str, pixels: npt.NDArray[Any]) -> None:
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.size == 0:
         raise DeviceError(f"{name}: a frame must be H x W x 3 uint8, got {pixels.shape} {pixels.dtype}")
-
-
-def _check_depth(name: str, image: RGBD) -> None:
-    depth = image.depth_m
-    if depth is None or depth.dtype != np.float32 or depth.shape != image.colour.shape[:2]:
-        got = "none" if depth is None else f"{depth.shape} {depth.dtype}"
-        raise DeviceError(
-            f"{name}: depth must be float32 with the colour picture's shape {image.colour.shape[:2]}, got {got}"
-        )
-    if image.intrinsics is None:
-        raise DeviceError(f"{name}: a picture with depth must have intrinsics")
 
 
 def _check_rigid(matrix: npt.ArrayLike) -> npt.NDArray[np.float64]:

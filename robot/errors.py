@@ -1,19 +1,7 @@
 """Every error that `robot` raises on purpose.
 
 A message names the requirement, the actual value and the remedy. The command line prints it on one line and
-exits with `exit_code`. Any other exception is a bug.
-
-    RobotError                 the job ran and failed (exit code 1)
-    +-- DeviceError            a device is missing or disconnected, or its answer is late, stale or out of range
-    +-- PlanError              no object is visible, or no grasp of it is possible
-    |   +-- UngraspableError   no attempt at this object can succeed; the collection continues with the next one
-    +-- StorageError           a recording could not be written: disk full, no permission, folder in use
-    +-- BadRobotInput          wrong use or bad input (exit code 2)
-        +-- RecordingError     a recording is not usable. For example: a line that is not JSON
-        +-- ImporterError      a data set does not have the layout that its importer reads
-        +-- UnknownName        no driver or importer has this name
-        +-- RobotConfigError   a setting is unknown or out of range
-        +-- SceneError         a scene is impossible. For example: a mesh that is not closed
+exits with `exit_code`: 1, or 2 for wrong use and bad input. Any other exception is a bug.
 """
 
 

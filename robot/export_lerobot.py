@@ -1,6 +1,6 @@
 """Export of a recording as a LeRobot data set, version 3: `LeRobotDataset("name", root=OUT)`.
 
-Written with pyarrow and PyAV according to the source of lerobot 0.4.4; lerobot itself is not needed.
+Written with pyarrow and PyAV according to the source of lerobot 0.4.4.
 
     meta/info.json                                    features, counts, paths
     meta/stats.json                                   min, max, mean, std and count of each feature
@@ -12,11 +12,12 @@ Written with pyarrow and PyAV according to the source of lerobot 0.4.4; lerobot 
 A grasp is an episode. Its steps are the moments before, during and after the touch that every grasp has. `moment` of a
 step is 0 before, 1 during, 2 after the touch; all steps of an episode have the same photo. Videos are H.264 with key
 frames only and colours at full resolution, but not lossless: on 144 touches of a GelSight Mini the root mean square
-error is 0.86 grey levels, at most 1.2. Only the pictures of the current grasp are in memory.
+error is 0.86 grey levels, at most 1.2.
 """
 
 import contextlib
 import json
+import math
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -74,19 +75,18 @@ def export_lerobot(recording: Recording, out: Path, progress: Progress | None = 
     if not (grasps := recording.grasps):
         raise RecordingError(f"{recording.folder} must contain grasps, but contains none")
     fingers = sorted(grasps[0].touches)
-    counts = dict.fromkeys(MOMENT_SUFFIXES, 0)
     for grasp in grasps:
         if sorted(grasp.touches) != fingers:
             raise RecordingError(
                 f"every grasp must have the same fingers; {grasps[0].grasp_id} has {', '.join(fingers)}, "
                 f"{grasp.grasp_id} has {', '.join(sorted(grasp.touches))}"
             )
-        for moment, suffix in MOMENT_SUFFIXES.items():
-            counts[moment] += grasp.images().keys() >= {f"touch_{finger}{suffix}" for finger in fingers}
-    moments = [moment for moment, count in counts.items() if count == len(grasps)]
-    suffixes = [MOMENT_SUFFIXES[moment] for moment in moments]
+    columns = {moment: [f"touch_{each}{suffix}" for each in fingers] for moment, suffix in MOMENT_SUFFIXES.items()}
+    recorded = {moment: [set(some) <= grasp.images().keys() for grasp in grasps] for moment, some in columns.items()}
+    moments = [moment for moment, each in recorded.items() if all(each)]
     cameras = [_Camera("photo", ["photo"] * len(moments))]
-    cameras += [_Camera(f"touch_{each}", [f"touch_{each}{suffix}" for suffix in suffixes]) for each in fingers]
+    touches = zip(*(columns[moment] for moment in moments), strict=True)
+    cameras += [_Camera(f"touch_{finger}", list(each)) for finger, each in zip(fingers, touches, strict=True)]
     numbers = [list(MOMENT_SUFFIXES).index(moment) for moment in moments]
     tasks = {name: number for number, name in enumerate(dict.fromkeys(grasp.object_id for grasp in grasps))}
     steps: list[dict[str, Any]] = []
@@ -103,9 +103,9 @@ def export_lerobot(recording: Recording, out: Path, progress: Progress | None = 
                     steps.append(dict(zip(_STEP_COLUMNS, values, strict=True)))
                 for camera in cameras:
                     for column in camera.columns:
-                        frame = letterbox(_read_picture(recording.folder / grasp.images()[column]), camera.size)
+                        frame = _letterbox(_read_picture(recording.folder / grasp.images()[column]), camera.size)
                         camera.add(frame)
-                        camera.stats.add(frame.reshape(-1, 3) / 255.0)
+                        camera.summaries.append(_summary(frame.reshape(-1, 3) / 255.0))
                 episodes.append(_episode(episode, grasp, len(moments), cameras))
                 if progress is not None:
                     progress(episode + 1, len(grasps))
@@ -114,14 +114,16 @@ def export_lerobot(recording: Recording, out: Path, progress: Progress | None = 
         types = {key: kinds[kind] for key, kind in _FIELDS.items()}
         _write_table(folder / f"meta/episodes/{_FILE}.parquet".format(**_NUMBERS), episodes, types)
         _write_tasks(folder / "meta" / "tasks.parquet", tasks)
-        stats = {name: _Stats(np.array([[step[name]] for step in steps], np.float64)) for name in _STEP_COLUMNS}
-        stats |= {camera.key: camera.stats for camera in cameras}
-        _write_json(folder / "meta" / "stats.json", {name: values.to_dict() for name, values in stats.items()})
+        values_of = {name: np.array([[step[name]] for step in steps], np.float64) for name in _STEP_COLUMNS}
+        stats = {name: _stats([_summary(values)], len(steps)) for name, values in values_of.items()}
+        for camera in cameras:
+            stats[camera.key] = _stats(camera.summaries, len(camera.summaries) * math.prod(camera.size))
+        _write_json(folder / "meta" / "stats.json", stats)
         _write_json(folder / "meta" / "info.json", _info(recording, moments, cameras, len(tasks)))
     return tuple(
         f"the frames {moment} the touch are left out because some grasps do not have them"
-        for moment, count in counts.items()
-        if 0 < count < len(grasps)
+        for moment, each in recorded.items()
+        if any(each) and not all(each)
     )
 
 
@@ -138,21 +140,17 @@ def _new_folder(out: Path) -> Iterator[Path]:
             os.replace(part, out)
 
 
-# Pictures --------------------------------------------------------------------------------------------------
-
-
 def _read_picture(path: Path) -> Picture:
-    """Return the pixels of a complete PNG or JPEG file: (H, W, 3) uint8, RGB."""
     try:
         image = decode_picture(picture_bytes("picture", path))
     except ImporterError:
         image = None
     if image is None:
         raise RecordingError(f"{path} is missing, damaged or cut off; run `retrieve check`, and remove its line")
-    return np.ascontiguousarray(image[..., ::-1], dtype=np.uint8)
+    return image
 
 
-def letterbox(picture: Picture, size: tuple[int, int]) -> Picture:
+def _letterbox(picture: Picture, size: tuple[int, int]) -> Picture:
     """Scale a picture to fit into (height, width), centred on black; a picture of this size stays as it is."""
     if picture.shape[:2] == size:
         return picture
@@ -186,42 +184,30 @@ def _video(av: Any, path: Path, size: tuple[int, int]) -> Iterator[Any]:
         container.mux(stream.encode())
 
 
-class _Stats:
-    """Minimum, maximum, mean and standard deviation of each channel."""
+def _summary(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return minimum, maximum, mean and mean square of values (n, c), (4, c)."""
+    return np.stack([values.min(0), values.max(0), values.mean(0), np.square(values).mean(0)])
 
-    def __init__(self, values: NDArray[np.float64] | None = None) -> None:
-        self._count, self._sum, self._squares = 0, np.zeros(1), np.zeros(1)
-        self._low, self._high = np.full(1, np.inf), np.full(1, -np.inf)
-        if values is not None:
-            self.add(values)
 
-    def add(self, values: NDArray[np.float64]) -> None:
-        """Add values (n, c)."""
-        self._count += len(values)
-        self._sum = self._sum + values.sum(axis=0)
-        self._squares = self._squares + np.square(values).sum(axis=0)
-        self._low, self._high = np.minimum(self._low, values.min(axis=0)), np.maximum(self._high, values.max(axis=0))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the statistics in the layout of LeRobot: (3, 1, 1) in 0..1 for pictures."""
-        mean = self._sum / self._count
-        deviation = np.sqrt(np.maximum(self._squares / self._count - mean**2, 0.0))
-        statistics = {"min": self._low, "max": self._high, "mean": mean, "std": deviation}
-        shape = (-1, 1, 1) if len(mean) == 3 else (-1,)
-        return {name: value.reshape(shape).tolist() for name, value in statistics.items()} | {"count": [self._count]}
+def _stats(summaries: Sequence[NDArray[np.float64]], count: int) -> dict[str, Any]:
+    """Return the statistics of parts of equal size in the layout of LeRobot: (3, 1, 1) in 0..1 for pictures."""
+    low, high, means, squares = np.stack(summaries, axis=1)
+    mean = means.mean(0)
+    deviation = np.sqrt(np.maximum(squares.mean(0) - mean**2, 0.0))
+    statistics = {"min": low.min(0), "max": high.max(0), "mean": mean, "std": deviation}
+    shape = (-1, 1, 1) if len(mean) == 3 else (-1,)
+    return {name: value.reshape(shape).tolist() for name, value in statistics.items()} | {"count": [count]}
 
 
 class _Camera:
-    """A camera of the data set: its columns of a recording, step by step, and its video."""
+    """A camera of the data set: its columns of a recording, step by step, its video and a summary of each frame."""
 
     size: tuple[int, int]
     add: Callable[[Picture], None]
 
     def __init__(self, name: str, columns: Sequence[str]) -> None:
-        self.key, self.columns, self.stats = f"observation.images.{name}", columns, _Stats()
-
-
-# Tables ----------------------------------------------------------------------------------------------------
+        self.key, self.columns = f"observation.images.{name}", columns
+        self.summaries: list[NDArray[np.float64]] = []
 
 
 def _episode(episode: int, grasp: RecordedGrasp, length: int, cameras: Sequence[_Camera]) -> dict[str, Any]:

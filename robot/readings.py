@@ -5,7 +5,7 @@ Lengths in mm, forces in N, angles in rad, times in s; coordinate frames as in r
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -14,15 +14,14 @@ from robot.errors import DeviceError, RobotConfigError
 
 GripperStatus = Literal["idle", "moving", "holding", "no_part", "part_lost"]
 _MAX_PX = 1e6
-GRIPPER_STATUSES: tuple[GripperStatus, ...] = ("idle", "moving", "holding", "no_part", "part_lost")
 
 
 @dataclass(frozen=True)
 class Pose:
     """Pose of the gripper: the point between the fingertips and the closing direction (cos yaw, sin yaw) of the jaws.
 
-    Finger a pushes along the closing direction, finger b against it; yaw + pi swaps the fingers. At tilt 0 the fingers
-    point straight down. Tilt turns them about the closing direction; at pi / 2 they point along (-sin yaw, cos yaw).
+    Finger a pushes along the closing direction, finger b against it. At tilt 0 the fingers point straight down. Tilt
+    turns them about the closing direction; at pi / 2 they point along (-sin yaw, cos yaw).
 
     >>> robot.Pose(120.0, 0.0, 40.0, yaw_rad=0.0).as_tuple()
     (120.0, 0.0, 40.0, 0.0)
@@ -35,7 +34,7 @@ class Pose:
     tilt_rad: float = 0.0
 
     def as_tuple(self) -> tuple[float, ...]:
-        """Return x, y, z in mm, yaw in rad and, unless it is 0, tilt in rad, as a recording stores them."""
+        """Return x, y, z, yaw and, unless it is 0, tilt, as a recording stores them."""
         upright = self.x_mm, self.y_mm, self.z_mm, self.yaw_rad
         return (*upright, self.tilt_rad) if self.tilt_rad else upright
 
@@ -60,8 +59,7 @@ class Region:
 
     def contains(self, pose: Pose, margin_mm: float = 0.0) -> bool:
         """Return whether the point of the pose lies in the box, or at most `margin_mm` beyond each face."""
-        point = pose.as_tuple()[:3]
-        sides = zip(self.lower, point, self.upper, strict=True)
+        sides = zip(self.lower, pose.as_tuple()[:3], self.upper, strict=True)
         return all(low - margin_mm <= value <= high + margin_mm for low, value, high in sides)
 
 
@@ -130,7 +128,7 @@ class GripperState:
 
     def __post_init__(self) -> None:
         """Raise DeviceError for an unknown status or numbers that are not finite."""
-        if self.status not in GRIPPER_STATUSES:
-            raise DeviceError(f"a gripper's status must be one of {', '.join(GRIPPER_STATUSES)}, got {self.status!r}")
+        if self.status not in (known := get_args(GripperStatus)):
+            raise DeviceError(f"a gripper's status must be one of {', '.join(known)}, got {self.status!r}")
         if not (math.isfinite(self.opening_mm) and math.isfinite(self.force_n)):
             raise DeviceError(f"a gripper must report finite numbers, got {self.opening_mm} mm, {self.force_n} N")

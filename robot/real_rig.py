@@ -21,7 +21,7 @@
 
 The limits do not apply to homing, which has the gripper's own speed. A manual arm's limits apply only to the
 requested poses and speeds. Sawyer's robot and collision states may be as old as the larger of 2 s and `state_age_s`.
-Paths are relative to the working directory of the process that reads the file. Unknown keys are errors.
+Paths are relative to the working directory.
 """
 
 import time
@@ -75,11 +75,7 @@ DRIVERS: Mapping[str, Registry[type[Device]]] = {
         uvc="robot.drivers.usb_camera.driver:UvcCamera",
     ),
 }
-"""Drivers by role and name, imported on first use.
-
-A driver is a subclass of its role's base class (robot.devices). The keys of its table are the keyword arguments of its
-constructor. An installed package registers drivers of all roles in one group of entry points.
-"""
+"""Drivers by role and name; installed packages register drivers of all roles in one group of entry points."""
 
 MAX_HAND_EYE_AGE_DAYS = 30.0
 """Oldest accepted calibration, unless the camera's table sets `hand_eye_days`; a camera may be moved over time."""
@@ -112,10 +108,7 @@ class ObjectSettings(TypedSettings):
 
     def fit(self) -> CylinderFit:
         """Return the fit that a depth camera would have measured."""
-        half = (self.radius_mm, self.radius_mm)
-        return CylinderFit(
-            self.x_mm, self.y_mm, self.height_mm, self.radius_mm, self.error_mm, method="given", half_mm=half
-        )
+        return CylinderFit(**vars(self), method="given", half_mm=(self.radius_mm, self.radius_mm))
 
 
 class RealRig(Rig):
@@ -165,18 +158,7 @@ class RealRig(Rig):
 
 
 def load_driver(role: str, table: Mapping[str, Any], where: str, **arguments: Any) -> Any:
-    """Return the unconnected device that a table of a rig's file describes.
-
-    Args:
-        role: Key of DRIVERS.
-        table: The table.
-        where: Name of the table in messages.
-        arguments: Further keyword arguments of the constructor.
-
-    Raises:
-        UnknownName: No driver has the table's `driver` name.
-        RobotConfigError: A setting is invalid.
-    """
+    """Return the unconnected device of a role that a table of a rig's file describes; raise as `build_named`."""
     return build_named(DRIVERS[role], table, "driver", where=where, clock=time.monotonic, **arguments)
 
 
@@ -198,18 +180,15 @@ def _camera(table: Mapping[str, Any]) -> Camera:
 
 def _attempt(attempt: Mapping[str, Any], grasp: Mapping[str, Any], limits: Limits) -> AttemptSettings:
     """Return the attempt settings: the given values, or defaults capped by [limits]; raise RobotConfigError."""
-    ceilings = {
-        "travel_mm_s": limits.arm_speed_mm_s,
-        "approach_mm_s": limits.arm_speed_mm_s,
-        "closing_mm_s": limits.jaw_speed_mm_s,
-    }
+    ceilings = dict.fromkeys(("travel_mm_s", "approach_mm_s"), limits.arm_speed_mm_s)
+    ceilings["closing_mm_s"] = limits.jaw_speed_mm_s
     capped = {name: min(getattr(AttemptSettings, name), ceiling) for name, ceiling in ceilings.items()}
     force_n = tuple(min(each, limits.force_n) for each in GraspSettings.force_n)
     settings = parse_attempt_settings({**capped, **attempt}, {"force_n": force_n, **grasp})
-    values = {name: getattr(settings, name) for name in ceilings} | {"force_n": settings.grasp.force_n[1]}
-    for name, ceiling in (ceilings | {"force_n": limits.force_n}).items():
-        if values[name] > ceiling:
-            raise RobotConfigError(f"{name} must be at most {ceiling:g}, as [limits] states, got {values[name]:g}")
+    limited = [(name, getattr(settings, name), ceiling) for name, ceiling in ceilings.items()]
+    for name, value, ceiling in (*limited, ("force_n", settings.grasp.force_n[1], limits.force_n)):
+        if value > ceiling:
+            raise RobotConfigError(f"{name} must be at most {ceiling:g}, as [limits] states, got {value:g}")
     for name in ("settle_s", "hold_s"):
         if getattr(settings, name) < MIN_WAIT_S:
             raise RobotConfigError(

@@ -1,7 +1,6 @@
 """The rig: arm, gripper, tactile sensors and camera, connected and closed together; and the planner of its grasps.
 
-A rig's file names the rig and the planner. A planner is a subclass of `GraspPlanner`, by its name or `module:Class`;
-the other keys of its table are the keyword arguments of its constructor:
+A rig's file names the rig and the planner; the other keys of a planner's table are keyword arguments of its class:
 
     rig = "sim"
     fingers = ["a", "b"]   # the other keys are settings of that rig
@@ -58,7 +57,7 @@ class GraspPlan:
         above: Pose after the lift.
         opening_mm: Opening before the grasp.
         force_n: Force on each finger.
-        approach: Poses on the way to `pose`; at the last one, the hand is clear of the object. If empty: `above`.
+        approach: Poses on the way to `pose`, the last one clear of the object; `above` if empty.
         fit: Description of the object, for the attempt log.
 
     >>> pose, above = robot.Pose(0.0, 0.0, 60.0, yaw_rad=1.0), robot.Pose(0.0, 0.0, 240.0, yaw_rad=1.0)
@@ -100,13 +99,9 @@ class GraspPlanner(ABC):
 
     @abstractmethod
     def plan(self, rig: "Rig", image: RGBD, settings: GraspSettings, rng: np.random.Generator) -> GraspPlan:
-        """Draw one grasp of the object in `image`, taken by the rig's camera.
+        """Draw one grasp of the object in `image`, taken by the camera of the connected rig.
 
-        Args:
-            rig: The rig, connected.
-            image: The picture; with depth if `needs_depth`.
-            settings: Settings of the random grasps.
-            rng: Source of all random choices.
+        `rng` is the source of all random choices.
 
         Raises:
             UngraspableError: No attempt at this object can succeed.
@@ -115,16 +110,7 @@ class GraspPlanner(ABC):
 
 
 def load_planner(table: Mapping[str, Any], default: str = "cylinder") -> GraspPlanner:
-    """Return the planner that the table [planner] of a rig's file names.
-
-    Args:
-        table: `name`, and the planner's settings.
-        default: Planner to use if the table has no name.
-
-    Raises:
-        UnknownName: No planner has this name; the message lists the known ones.
-        RobotConfigError: A setting is unknown, missing, or of another type.
-    """
+    """Return the planner that the table [planner] of a rig's file names; raise as `build_named`."""
     return build_named(PLANNERS, table, "name", where="[planner]", default=default)
 
 
@@ -197,18 +183,18 @@ class Rig:
         return Pose((lower[0] + upper[0]) / 2, upper[1], upper[2], 0.0)
 
     def object_ids(self, count: int) -> list[str]:
-        """Return names for `count` objects to collect; a simulated rig returns its own objects."""
+        """Return names for `count` objects to collect."""
         return [f"object-{number:04}" for number in range(1, count + 1)]
 
     def labels(self, object_id: str) -> Mapping[str, float | bool | str]:
-        """Return the labels of an object, for recording.json. Only a simulated rig has labels; others return none."""
+        """Return the labels of an object, for recording.json; only a simulated rig has any."""
         return {}
 
     def prepare(self, object_id: str, number: int) -> None:
-        """Ask a person to put this object on the table for attempt `number`.
+        """Ask a person to put this object on the table for attempt `number`; raise RobotConfigError without a terminal.
 
-        The request appears when the object changes. With `object_fit` it appears for every attempt, because the
-        attempt before may have moved the object from its given position. Raise RobotConfigError without a terminal.
+        The request appears when the object changes; with `object_fit` for every attempt, because the attempt before
+        may have moved the object from its given position.
         """
         fit = self.object_fit
         if object_id == self._object_on_table and fit is None:
@@ -221,7 +207,7 @@ class Rig:
         self._object_on_table = object_id
 
     def settings(self) -> dict[str, dict[str, Any]]:
-        """Return the settings that each device reports, by device name; raise DeviceError if one fails."""
+        """Return the settings that each device reports, by device name."""
         return {device.name: device.settings() for device in self.devices}
 
     def recover(self) -> None:
@@ -237,7 +223,7 @@ class Rig:
             self._connected = connected.pop_all()
 
     def close(self) -> None:
-        """Close every device, the last one first, also after a failure, which is raised; a second call does nothing."""
+        """Close every device, the last one first, even if one fails; a second call does nothing."""
         self._connected.close()
 
     def __enter__(self) -> Self:
@@ -254,12 +240,10 @@ class Rig:
 
 
 def load_rig(spec: str, *, seed: int, **settings: Any) -> Rig:
-    """Build the rig that `spec` names, but do not connect it; `spec` is a name of RIGS or a TOML file.
-
-    The rig's `info` contains its name and settings, so that it can be built again.
+    """Build the rig that `spec` names, but do not connect it.
 
     Args:
-        spec: Name or file.
+        spec: Name of RIGS, or a TOML file.
         seed: Seed of the rig's random choices.
         settings: Settings of the rig; they override those of the file.
 

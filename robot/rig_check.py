@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from robot.devices import Camera, TactileSensor, read_together
+from robot.devices import Camera, Device, TactileSensor, read_together
 from robot.errors import RobotError
 from robot.rig import Rig
 
@@ -62,43 +62,43 @@ def check_rig(rig: Rig, *, motion: bool = True) -> Iterator[DeviceReport]:
     if rig.can_run_jobs:  # a simulated rig needs an object for its gel images
         rig.prepare(rig.object_ids(1)[0], 0)
     sensors = list(rig.sensors.values())
-    yield _check_device([rig.arm], "arm", lambda: _check_arm(rig, motion))
-    yield _check_device([rig.gripper], "gripper", lambda: _check_gripper(rig, motion))
+    yield _check("arm", partial(_check_arm, rig, motion), rig.arm)
+    yield _check("gripper", partial(_check_gripper, rig, motion), rig.gripper)
     for sensor in sensors:
-        yield _check_device([sensor], "gel", partial(_check_frames, rig, sensor))
-    yield _check_device([rig.camera], "camera", lambda: _check_frames(rig, rig.camera))
+        yield _check("gel", partial(_check_frames, rig, sensor), sensor)
+    yield _check("camera", partial(_check_frames, rig, rig.camera), rig.camera)
     if len(sensors) > 1:
-        yield _check_device(sensors, "skew", lambda: _check_skew(rig))
+        yield _check("skew", partial(_check_skew, rig), *sensors)
 
 
-def _check_device(devices: list[Any], role: str, check: Callable[[], dict[str, str]]) -> DeviceReport:
+def _check(role: str, measure: Callable[[], dict[str, str]], *devices: Device) -> DeviceReport:
     row = DeviceReport(" and ".join(device.name for device in devices), role)
     try:
         with contextlib.ExitStack() as connected:
             for device in devices:
                 connected.enter_context(device)
             refused = dict(devices[0].refused) if len(devices) == 1 else {}
-            return replace(row, measured=check(), refused=refused)
+            return replace(row, measured=measure(), refused=refused)
     except RobotError as error:
         return replace(row, failure=str(error))
 
 
 def _check_arm(rig: Rig, motion: bool) -> dict[str, str]:
-    """Move the arm up a little (down, at the top of the workspace), and back."""
     arm = rig.arm
     if arm.is_manual:
         return {"moved": "by a person"}
-    if not motion:
-        return {"motion": "none"} | _round_trip(rig, arm.pose)
-    start = arm.pose()
-    top = arm.workspace.upper[2]
-    target = replace(start, z_mm=start.z_mm + ARM_MM if start.z_mm + ARM_MM <= top else start.z_mm - ARM_MM)
-    speed, began = min(ARM_MM_S, arm.max_speed_mm_s), rig.clock()
-    reached = arm.move_to(target, speed)
-    seconds = rig.clock() - began
-    arm.move_to(start, speed)
-    away = np.linalg.norm(np.subtract(reached.as_tuple()[:3], target.as_tuple()[:3]))
-    return {"moved": f"{ARM_MM:g} mm in {seconds:.2f} s", "off by": f"{away:.2f} mm"} | _round_trip(rig, arm.pose)
+    measured = {"motion": "none"}
+    if motion:
+        start = arm.pose()
+        up_mm = ARM_MM if start.z_mm + ARM_MM <= arm.workspace.upper[2] else -ARM_MM
+        target = replace(start, z_mm=start.z_mm + up_mm)
+        speed, began = min(ARM_MM_S, arm.max_speed_mm_s), rig.clock()
+        reached = arm.move_to(target, speed)
+        seconds = rig.clock() - began
+        arm.move_to(start, speed)
+        off_mm = np.linalg.norm(np.subtract(reached.as_tuple()[:3], target.as_tuple()[:3]))
+        measured = {"moved": f"{ARM_MM:g} mm in {seconds:.2f} s", "off by": f"{off_mm:.2f} mm"}
+    return measured | _round_trip(rig, arm.pose)
 
 
 def _check_gripper(rig: Rig, motion: bool) -> dict[str, str]:
@@ -128,11 +128,9 @@ def _round_trip(rig: Rig, query: Callable[[], Any]) -> dict[str, str]:
 def _check_frames(rig: Rig, device: Camera | TactileSensor) -> dict[str, str]:
     """Read the newest frames of one camera for `MEASURE_S`; the rate is that from its first frame to its last one."""
     times_s, began = set[float](), rig.clock()
-    while True:
+    while not times_s or rig.clock() - began < MEASURE_S:
         picture: Any = device.read(depth=device.has_depth) if isinstance(device, Camera) else device.read()
         times_s.add(picture.time_s)
-        if rig.clock() - began >= MEASURE_S:
-            break
         rig.sleep(_POLL_S)
     measured = {"rate": f"{len(times_s)} frame(s) in {MEASURE_S:g} s"}
     if len(times_s) > 1:
@@ -147,7 +145,6 @@ def _check_frames(rig: Rig, device: Camera | TactileSensor) -> dict[str, str]:
 
 
 def _check_skew(rig: Rig) -> dict[str, str]:
-    """Measure the skew between all gels, read as the collector reads them."""
     skews = []
     for _ in range(_REPEATS):
         skews.append(read_together(rig.sensors)[1])

@@ -68,15 +68,15 @@ def build_named(
 
     Args:
         registry: Classes by name.
-        table: A table of a rig's file.
-        key: The key whose value is the name of the class.
+        table: A table of a rig's file; the value of `key` is the name.
+        key: The key.
         where: Name of the table in messages.
-        default: Name to use if the table has no name; None if the key is required.
+        default: Name to use if the table has none; None if the key is required.
         arguments: Passed to `build`.
 
     Raises:
         UnknownName: The registry lacks this name; the message lists the known ones.
-        RobotConfigError: A setting is invalid; see `build`.
+        RobotConfigError: A setting is invalid.
     """
     settings = dict(table)
     name = settings.pop(key, default)
@@ -89,11 +89,9 @@ def build_named(
 def _keywords(cls: type) -> dict[str, tuple[Any, bool]]:
     """Return the keyword arguments of a class, each with its annotated type and whether it is required."""
     found: dict[str, tuple[Any, bool]] = {}
-    settings: type | None = getattr(cls, "Settings", None)
-    for each in (settings, cls):
-        if each is not None:
-            hints = typing.get_type_hints(each.__init__, include_extras=True)  # type: ignore[misc]
-            for name, parameter in inspect.signature(each).parameters.items():
-                if parameter.kind is not parameter.VAR_KEYWORD:
-                    found[name] = hints.get(name, Any), parameter.default is parameter.empty
+    for each in filter(None, (getattr(cls, "Settings", None), cls)):
+        hints = typing.get_type_hints(each.__init__, include_extras=True)
+        for name, parameter in inspect.signature(each).parameters.items():
+            if parameter.kind is not parameter.VAR_KEYWORD:
+                found[name] = hints.get(name, Any), parameter.default is parameter.empty
     return found

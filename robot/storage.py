@@ -37,7 +37,7 @@ def storage_errors(folder: Path) -> Iterator[None]:
 
 
 def sync_threads() -> Executor:
-    """Return the threads that `write_files` uses, about as many as a grasp has files; the caller shuts them down."""
+    """Return the threads of `write_files`, about as many as a grasp has files; the caller shuts them down."""
     return ThreadPoolExecutor(8)
 
 
@@ -45,14 +45,7 @@ def write_files(contents: Mapping[Path, bytes], threads: Executor) -> None:
     """Write each file completely or leave it untouched: write a temporary file, sync it, then rename it.
 
     All files are written before the first is synced, and they are synced at the same time: the file system then writes
-    its journal once, not file by file. The caller syncs the folder.
-
-    Args:
-        contents: Content of each file.
-        threads: Threads that sync, `sync_threads()`.
-
-    Raises:
-        OSError: A file could not be written; the error names it.
+    its journal once, not file by file. The caller syncs the folder. An OSError names the file.
     """
     parts = {path: path.with_name(path.name + PART_SUFFIX) for path in contents}
     path: Path | None = None
@@ -79,10 +72,7 @@ def write_files(contents: Mapping[Path, bytes], threads: Executor) -> None:
 
 
 def complete_lines(content: bytes) -> bytes:
-    """Return lines without an incomplete last one, which a crash leaves.
-
-    A last line that lacks only its newline is complete; the newline is added.
-    """
+    """Return lines without an incomplete last one, which a crash leaves; a newline that is lacking is added."""
     last = content[content.rfind(b"\n") + 1 :]
     try:
         json.loads(last)
@@ -94,7 +84,7 @@ def complete_lines(content: bytes) -> bytes:
 class LineFile(contextlib.AbstractContextManager["LineFile"]):
     """A file of lines, locked while it is open; after a crash it contains complete lines only.
 
-    Opening creates a missing file and changes nothing else; it raises BlockingIOError if another process has it open.
+    Opening creates a missing file; it raises BlockingIOError if another process has it open.
     """
 
     def __init__(self, path: Path) -> None:
@@ -150,7 +140,7 @@ def file_content(column: str, source: ImageSource) -> tuple[bytes, str]:
     """Return the file content and its suffix: pixels encoded as PNG, PNG and JPEG files unchanged.
 
     Args:
-        column: Name of the image column, for messages; "depth" requires uint16 pixels.
+        column: The image column; "depth" requires uint16 pixels.
         source: The image.
 
     Raises:
@@ -167,19 +157,15 @@ def file_content(column: str, source: ImageSource) -> tuple[bytes, str]:
     raise RecordingError(f"{column} must be a PNG or JPEG file; its first bytes are {data[:4]!r}")
 
 
-def decode_picture(data: bytes, flags: int | None = None) -> npt.NDArray[Any] | None:
-    """Return the pixels of an image file's content in OpenCV's BGR order, or None if it cannot be decoded.
-
-    Args:
-        data: Content of the file.
-        flags: Flags of `cv2.imdecode`; None decodes to 8-bit colour.
-    """
+def decode_picture(data: bytes) -> npt.NDArray[np.uint8] | None:
+    """Return (H, W, 3) RGB of an image file's content, or None if it cannot be decoded."""
     import cv2
 
-    pixels: npt.NDArray[Any] | None = None
-    with contextlib.suppress(cv2.error):  # empty data, or a header that claims too many pixels
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR if flags is None else flags)
-    return pixels
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        return None if pixels is None else np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), np.uint8)
+    except cv2.error:  # empty data, or a header that claims too many pixels
+        return None
 
 
 def read_content(path: str | Path, error_type: type[RobotError]) -> bytes:

@@ -50,14 +50,9 @@ class WorkerPool(Generic[T]):
             self._pool = ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_start_worker, initargs=(make,))
 
     def submit(self, object_id: str, number: int) -> Callable[[], T]:
-        """Start a piece of work; return a callable that waits for its result.
+        """Start an attempt at an object; return a callable that waits for its result.
 
-        Args:
-            object_id: The object.
-            number: Number of the attempt.
-
-        Raises:
-            RobotError: A worker process died. The callable raises it too, for any failure in a worker.
+        Both raise RobotError if a worker process died; the callable does so for any failure in a worker.
         """
         if self._pool is None:
             return functools.partial(self._local_work, object_id, number)

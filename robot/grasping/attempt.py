@@ -21,10 +21,12 @@ from robot.devices import MAX_AGE_S, read_together
 from robot.errors import DeviceError, PlanError, RobotConfigError, UngraspableError
 from robot.grasping.settings import AttemptSettings
 from robot.readings import RGBD, Pose
+from robot.recording.attempt_log import AttemptOutcome
+from robot.recording.grasp import Outcome
 from robot.rig import GraspPlan, Rig
 from robot.storage import file_content
 
-_OUTCOME_FROM = {"holding": "held", "no_part": "missed", "part_lost": "slipped"}
+_OUTCOME_FROM: Mapping[str, Outcome] = {"holding": "held", "no_part": "missed", "part_lost": "slipped"}
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class GraspAttempt:
 
     object_id: str
     number: int
-    outcome: str
+    outcome: AttemptOutcome
     images: Mapping[str, bytes] = field(default_factory=dict)
     fields: Mapping[str, Any] = field(default_factory=dict)
     fit: Mapping[str, Any] = field(default_factory=dict)
@@ -121,9 +123,9 @@ class AttemptRunner:
         try:
             plan = rig.planner.plan(rig, image, self.settings.grasp, rng)
         except PlanError as error:
-            outcome = "ungraspable" if isinstance(error, UngraspableError) else "no_plan"
+            failed: AttemptOutcome = "ungraspable" if isinstance(error, UngraspableError) else "no_plan"
             duration_s = round(rig.clock() - start, 3)
-            return GraspAttempt(object_id, number, outcome, reason=str(error), duration_s=duration_s)
+            return GraspAttempt(object_id, number, failed, reason=str(error), duration_s=duration_s)
         images = self._pictures(image)
         touches, fields, touch_time = self._grasp(plan)
         outcome = self._outcome()
@@ -182,7 +184,7 @@ class AttemptRunner:
         frames, skew_s = read_together(self.rig.sensors, max_age_s=min(MAX_AGE_S, since_s))
         return {f"touch_{finger}{moment}": self._jpeg(frame.pixels) for finger, frame in frames.items()}, skew_s
 
-    def _outcome(self) -> str:
+    def _outcome(self) -> Outcome:
         status = self.rig.gripper.state().status
         if status not in _OUTCOME_FROM:
             raise DeviceError(

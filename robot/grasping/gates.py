@@ -40,8 +40,7 @@ def recorded_touches(images: Mapping[str, bytes]) -> dict[str, GraspFrames]:
     """
 
     def decode(column: str) -> Any:
-        pixels = decode_picture(images[column]) if column in images else None
-        return None if pixels is None else cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
+        return decode_picture(images[column]) if column in images else None
 
     return {
         match[1]: GraspFrames(decode(f"{column}_before"), decode(column), decode(f"{column}_after"))

@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
-import numpy as np
 
 from robot.errors import ImporterError
 from robot.importers.episodes import Picture, Step, episode_images
@@ -251,7 +250,7 @@ class _LeRobotSource:
                     image = decode_picture(data) if data else None
                     if image is None:
                         raise ImporterError("a picture of its episode cannot be decoded")
-                    yield np.ascontiguousarray(image[..., ::-1], dtype=np.uint8)
+                    yield image
 
 
 def _object(row: _Row) -> str:

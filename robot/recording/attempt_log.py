@@ -12,16 +12,15 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal
 
-from robot.errors import RecordingError, RobotConfigError
-from robot.recording.grasp import OUTCOMES
-from robot.settings import build
+from _touch_retrieval.documents import typed
+from robot.errors import RecordingError
+from robot.recording.grasp import Outcome
 from robot.storage import LineFile, complete_lines, parse_object, read_content, storage_errors
 
 ATTEMPTS_FILE = "attempts.jsonl"
-UNGRASPABLE = "ungraspable"
-"""Outcome of the last attempt at an object that cannot be grasped."""
+AttemptOutcome = Outcome | Literal["ungraspable"]
 
 
 @dataclass(frozen=True)
@@ -30,28 +29,13 @@ class LoggedAttempt:
 
     object_id: str
     number: int
-    outcome: str
+    outcome: AttemptOutcome
     accepted: bool
     ended_s: float
     grasp_id: str | None = None
     score: float | None = None
     fit: Mapping[str, Any] | None = None
     reason: str | None = None
-
-    def to_row(self) -> dict[str, Any]:
-        """Return the JSON object without its None values."""
-        return {key: value for key, value in vars(self).items() if value is not None}
-
-    @classmethod
-    def from_row(cls, row: Mapping[str, Any]) -> Self:
-        """Parse a row; raise RecordingError for a row that `to_row` cannot have written."""
-        try:
-            attempt = build(cls, row)
-        except RobotConfigError as error:
-            raise RecordingError(f"not an attempt: {error}") from error
-        if attempt.outcome not in (known := (*OUTCOMES, UNGRASPABLE)):
-            raise RecordingError(f"not an attempt: outcome must be one of {', '.join(known)}, got {attempt.outcome!r}")
-        return attempt
 
 
 def read_attempts(folder: Path, grasp_ids: Set[str]) -> list[LoggedAttempt]:
@@ -66,7 +50,7 @@ def _parse(path: Path, lines: Sequence[bytes], grasp_ids: Set[str]) -> list[Logg
     made: Counter[str] = Counter()
     for number, line in enumerate(lines, start=1):
         try:
-            attempt = LoggedAttempt.from_row(parse_object(line, RecordingError))
+            attempt = typed(parse_object(line, RecordingError), LoggedAttempt, error=RecordingError)
         except RecordingError as error:
             raise RecordingError(f"{path}, line {number}: {error}") from error
         if attempt.grasp_id is not None and attempt.grasp_id not in grasp_ids:
@@ -100,32 +84,19 @@ class AttemptLog(contextlib.AbstractContextManager["AttemptLog"]):
 
     def append(self, attempt: LoggedAttempt) -> None:
         """Write one line and sync it; on failure, remove the partial line and raise StorageError."""
-        data = json.dumps(attempt.to_row(), ensure_ascii=False, allow_nan=False).encode()
+        row = {key: value for key, value in vars(attempt).items() if value is not None}
+        data = json.dumps(row, ensure_ascii=False, allow_nan=False).encode()
         with storage_errors(self.folder):
             self._lines.append(data)
         self.attempts.append(attempt)
 
-    def close(self) -> None:
-        """Close the file."""
-        self._lines.close()
-
     def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-# Acceptance ------------------------------------------------------------------------------------------------
+        self._lines.close()
 
 
 @dataclass
 class Tally:
-    """Counts of the attempts at one object.
-
-    Attributes:
-        object_id: The object.
-        attempts: Attempts so far.
-        accepted: Accepted grasps.
-        skipped: Reason why the object is ungraspable; None if it is graspable.
-    """
+    """Counts of attempts and accepted grasps of one object; `skipped` is the reason why it is ungraspable."""
 
     object_id: str
     attempts: int = 0
@@ -134,7 +105,7 @@ class Tally:
 
     def add(self, attempt: LoggedAttempt) -> None:
         """Count one attempt; an ungraspable one sets `skipped` and is not counted."""
-        if attempt.outcome == UNGRASPABLE:
+        if attempt.outcome == "ungraspable":
             self.skipped = attempt.reason
             return
         self.attempts += 1
@@ -152,9 +123,7 @@ def tally(attempts: Iterable[LoggedAttempt]) -> dict[str, Tally]:
 def acceptance_table(tallies: Sequence[Tally], grasps_target: int) -> str:
     """Return a plain-text table with a line for each object.
 
-    Args:
-        tallies: Counts by object.
-        grasps_target: Objects with fewer accepted grasps are marked "gave up", or show why they are ungraspable.
+    Objects with fewer accepted grasps than `grasps_target` are marked "gave up", or show why they are ungraspable.
     """
     width = max([len(each.object_id) for each in tallies] + [6])
     lines = [f"{'object':{width}}  accepted  of"]

@@ -1,18 +1,14 @@
 """The recording: a folder of grasps, appended one at a time and read by training.
 
     recording.json    schema_version, source, sensor, rig, units, seed, software_version, background, gels (for each
-                      pair used: thickness_mm, modulus_mpa, poisson by finger, or "unknown"), and further keys that the
-                      caller of RecordingWriter gives
+                      pair used: thickness_mm, modulus_mpa, poisson by finger, or "unknown"), and further keys
     metadata.jsonl    one line with a JSON object for each grasp
     images/           PNG or JPEG files; several grasps may share one
-    attempts.jsonl    only if a rig collected it: all attempts, those without a grasp included
-                      (robot.recording.attempt_log)
+    attempts.jsonl    only if a rig collected it: all attempts (robot.recording.attempt_log)
 
-A line contains grasp_id, object_id and, where recorded, force_n, opening_mm, pose, touch_skew_s, grasped (decision
-of the gate; training leaves out grasps with false), outcome (reported by the gripper: held, missed, slipped),
-sequence_id and time_s. Images are paths relative to the folder: photo_file_name, depth_file_name and for each finger
-(a, b, ...) touch_a_file_name, touch_a_before_file_name (no contact) and touch_a_after_file_name. Values that were not
-recorded are left out. Hugging Face datasets ("imagefolder") opens the folder as it is.
+A line contains the fields of `RecordedGrasp` without the values that were not recorded. Images are paths relative to
+the folder: photo_file_name, depth_file_name and for each finger (a, b, ...) touch_a_file_name, touch_a_before_file_name
+(no contact) and touch_a_after_file_name. Hugging Face datasets ("imagefolder") opens the folder as it is.
 
 A line is written after its images are on disk, so a crash leaves complete grasps; an incomplete last line is dropped.
 """
@@ -30,7 +26,7 @@ from typing import Any
 from _touch_retrieval.files import sync, write_atomically
 from robot.errors import RecordingError
 from robot.gel_settings import UNKNOWN
-from robot.recording.grasp import RecordedGrasp, check_name, unknown_keys
+from robot.recording.grasp import RecordedGrasp, check_name
 from robot.storage import (
     ImageSource,
     LineFile,
@@ -65,8 +61,7 @@ class SharedImage:
     """An image of several grasps, such as one no-contact frame for all, stored once.
 
     Attributes:
-        name: Unique name within the recording, with the characters of a grasp id. A later image of the same name is
-            ignored.
+        name: Name with the characters of a grasp id; a later image of the same name is ignored.
         source: The image.
 
     >>> from pathlib import Path
@@ -105,16 +100,10 @@ class Recording:
     notes: tuple[str, ...] = ()
 
 
-# Reading ---------------------------------------------------------------------------------------------------
-
-
 def read_recording(folder: str | Path) -> Recording:
     """Read and check a recording without opening its images.
 
     An incomplete last line, left by a crash, is dropped with a note.
-
-    Args:
-        folder: The recording.
 
     Raises:
         RecordingError: The recording is invalid; the message names the file and the line.
@@ -136,7 +125,6 @@ def read_recording(folder: str | Path) -> Recording:
 
 
 def _grasps(path: Path, lines: bytes) -> Iterator[RecordedGrasp]:
-    """Yield the grasps of metadata.jsonl; raise RecordingError if a line is invalid."""
     grasp_ids: set[str] = set()
     for number, line in enumerate(io.BytesIO(lines), start=1):
         if not line.strip():
@@ -156,39 +144,31 @@ def read_info(root: Path) -> dict[str, Any]:
     path = root / INFO_FILE
     if not os.path.exists(path):  # also False for a name that the file system cannot store
         raise RecordingError(f"{root} must be a recording, but has no {INFO_FILE}; `retrieve import` writes recordings")
-    info = read_json_object(path, RecordingError)
-    _check_info(info, path)
-    return info
+    return _checked_info(read_json_object(path, RecordingError), path)
 
 
-def _check_info(info: Mapping[str, Any], path: str | Path = INFO_FILE) -> None:
+def _checked_info(info: dict[str, Any], path: str | Path = INFO_FILE) -> dict[str, Any]:
     if (version := info.get("schema_version")) != SCHEMA_VERSION:
         raise RecordingError(f"{path}: schema_version must be {SCHEMA_VERSION}, got {version!r}")
     for key in ("source", "sensor"):
         check_name(f"{path}: {key}", info.get(key))
-
-
-# Writing ---------------------------------------------------------------------------------------------------
+    return info
 
 
 class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
     """Appends grasps to a recording that it creates or continues; one writer at a time.
-
-        with RecordingWriter(folder, {"source": "sim", "sensor": "GelSight", "seed": 0}) as writer:
-            writer.append("000001", "mug", {"photo": photo, "touch_a": touch}, force_n=12.0)
 
     An existing recording is continued if its source, sensor, units and background agree; its recording.json is not
     changed. An incomplete last line is removed.
 
     Args:
         folder: The recording.
-        info: Content of recording.json. It must name source and sensor; rig, units, seed, gels and background have
-            defaults, and other keys are stored too.
+        info: Content of recording.json: source, sensor and any other keys.
 
     Raises:
         RecordingError: The input is invalid, or the folder contains other files.
         StorageError: The disk refused a write, or another process is writing the recording. Grasps appended before
-            are complete, and appending may continue.
+            are complete.
 
     >>> from pathlib import Path
     >>> photo, a, b = (Path(name) for name in ("catalog/mug/1.jpg", "a.png", "b.png"))
@@ -216,7 +196,7 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
         for left in self.folder.glob(f".{INFO_FILE}.*.tmp"):  # by a killed writer; this one has locked the folder
             left.unlink()
         if not (self.folder / INFO_FILE).exists():
-            write_atomically(self.folder / INFO_FILE, _encode_info(expected))
+            self._write_info(expected)
         self.info = read_info(self.folder)
         for key in _FIXED_KEYS:
             if (old := self.info.get(key)) != (new := expected.get(key)):
@@ -238,8 +218,8 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
         Args:
             grasp_id: Unique id.
             object_id: The object.
-            images: Images by column without `_file_name` (photo, touch_a, touch_a_before, depth, ...).
-            fields: force_n, opening_mm, pose, touch_skew_s, grasped, outcome, sequence_id, time_s.
+            images: Images by column (photo, touch_a, touch_a_before, depth, ...).
+            fields: Further fields of `RecordedGrasp`.
 
         Raises:
             RecordingError: An argument is invalid, or the writer is closed.
@@ -262,10 +242,11 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
             data, suffix = file_content(column, source)
             paths[f"{column}_file_name"] = path = f"{IMAGES_FOLDER}/{name}{suffix}"
             contents[path] = data
-        row = {"grasp_id": grasp_id, "object_id": object_id, **fields, **paths}
-        if unknown := sorted(unknown_keys(row)):
-            raise RecordingError(f"unknown key {unknown[0]!r}; robot.recording.folder lists the known keys")
+        plain = {key: value.tolist() if hasattr(value, "tolist") else value for key, value in fields.items()}
+        row = {"grasp_id": grasp_id, "object_id": object_id, **plain, **paths}
         grasp = RecordedGrasp.from_row(row)
+        if unknown := sorted({key for key in row if row[key] is not None} - grasp.to_row().keys()):
+            raise RecordingError(f"unknown key {unknown[0]!r}; robot.recording.folder lists the known keys")
         with storage_errors(self.folder):
             write_files({self.folder / path: data for path, data in contents.items()}, self._threads)
             sync(self.folder / IMAGES_FOLDER)
@@ -274,7 +255,7 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
         return grasp
 
     def has_shared(self, name: str) -> bool:
-        """Return whether the recording contains the shared image `name`; raise RecordingError for an invalid name."""
+        """Return whether the recording contains the shared image `name`."""
         return self._shared(name) is not None
 
     def _shared(self, name: str) -> str | None:
@@ -294,8 +275,11 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
         updated = _full_info({**self.info, **info})
         if updated != self.info:
             with storage_errors(self.folder):
-                write_atomically(self.folder / INFO_FILE, _encode_info(updated))
+                self._write_info(updated)
             self.info = updated
+
+    def _write_info(self, info: Mapping[str, Any]) -> None:
+        write_atomically(self.folder / INFO_FILE, json.dumps(info, indent=2).encode() + b"\n")
 
     def close(self) -> None:
         """Close the file and release the folder's lock; a second call does nothing."""
@@ -328,15 +312,9 @@ def _full_info(info: Mapping[str, Any]) -> dict[str, Any]:
         "gels": UNKNOWN,
     }
     try:
-        full: dict[str, Any] = json.loads(json.dumps({**defaults, **info}, allow_nan=False))
+        return _checked_info(json.loads(json.dumps({**defaults, **info}, allow_nan=False)))
     except (TypeError, ValueError) as error:
         raise RecordingError(f"{INFO_FILE} must contain plain JSON: {error}") from error
-    _check_info(full)
-    return full
-
-
-def _encode_info(info: Mapping[str, Any]) -> bytes:
-    return json.dumps(info, indent=2).encode() + b"\n"
 
 
 def software_version() -> str:
@@ -355,9 +333,9 @@ def _check_no_other_files(folder: Path) -> None:
     if not folder.is_dir():
         raise RecordingError(f"a recording must be a folder, and {folder} is a file")
     with storage_errors(folder):
-        names = sorted(path.name for path in folder.iterdir() if not path.name.startswith(f".{INFO_FILE}."))
+        names = {path.name for path in folder.iterdir() if not path.name.startswith(f".{INFO_FILE}.")}
         grasps = METADATA_FILE in names and (folder / METADATA_FILE).stat().st_size > 0
-    if others := [name for name in names if name not in (METADATA_FILE, IMAGES_FOLDER)]:
-        raise RecordingError(f"{folder} contains other files, such as {others[0]}; give a new or an empty folder")
+    if others := names - {METADATA_FILE, IMAGES_FOLDER}:
+        raise RecordingError(f"{folder} contains other files, such as {min(others)}; give a new or an empty folder")
     if grasps:
         raise RecordingError(f"{folder} has a {METADATA_FILE} but no {INFO_FILE}; restore it or give a new folder")

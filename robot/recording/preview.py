@@ -19,15 +19,7 @@ _CAPTION_PX = 24
 
 
 def write_preview(folder: str | Path, out: str | Path, rows: int = 12) -> Path:
-    """Write a PNG with one grasp of each of up to `rows` objects of a recording, evenly chosen.
-
-    Args:
-        folder: the recording.
-        out: the PNG file to write.
-        rows: maximum number of objects.
-
-    Returns:
-        The path of the PNG file.
+    """Write a PNG with one grasp of each of up to `rows` objects of a recording, evenly chosen; return its path.
 
     Raises:
         RecordingError: The recording is invalid or empty.

@@ -80,7 +80,8 @@ def test_a_last_line_whose_grasp_was_never_appended_is_ignored(tmp_path):
     path = write(tmp_path)
     whole = path.read_bytes()
     assert read_attempts(tmp_path, GRASPS - {"cup-0000"}) == list(ALL[:3])
-    AttemptLog(tmp_path, GRASPS - {"cup-0000"}).close()
+    with AttemptLog(tmp_path, GRASPS - {"cup-0000"}):
+        pass
     assert path.read_bytes() == whole[: whole.rindex(b"\n", 0, -1) + 1]
 
 
