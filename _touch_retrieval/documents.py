@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from types import UnionType
-from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 from msgspec import Meta
@@ -75,7 +75,7 @@ def typed(
         _require_finite(document, name)
         return msgspec.convert(document, kind)
     except msgspec.ValidationError as invalid:
-        raise error(_error_message(str(invalid), document, name)) from invalid
+        raise error(_error_message(str(invalid), document, kind, name)) from invalid
     except ValueError as invalid:
         raise error(str(invalid)) from invalid
 
@@ -138,15 +138,29 @@ def _require_finite(document: Any, name: str) -> None:
             _require_finite(value, name)
 
 
-def _error_message(message: str, document: Any, name: str) -> str:
+def _error_message(message: str, document: Any, kind: Any, name: str) -> str:
     place = _PLACE.search(message)
     reason = message[: place.start()] if place else message
     where = (name + place["place"].replace("[...]", "") if place else name).lstrip(".") or "it"
+    if reason.startswith("Invalid enum value"):
+        path = place["place"] if place else ""
+        return f"{where} must be {_choices(kind, path)}, got {_got(document, path, None)}"
     expected = _EXPECTED.fullmatch(reason)
     if expected is None:  # such as a missing field
         return f"{where}: {reason[0].lower()}{reason[1:]}"
     kind = re.sub("`([^`]*)`", _in_words, expected["kind"])
     return f"{where} must be {kind}, got {_got(document, place['place'] if place else '', expected['got'])}"
+
+
+def _choices(kind: Any, place: str) -> str:
+    """Return what the `Literal` at a place of a type, or a union with one, accepts."""
+    for key, *_ in _STEP.findall(place):
+        kind = _hints(kind)[key] if is_dataclass(kind) and isinstance(kind, type) else str
+    kinds = (kind,) if get_origin(kind) is Literal else get_args(kind)
+    values = [repr(value) for each in kinds if get_origin(each) is Literal for value in get_args(each)]
+    return f"one of {', '.join(values)}" + (
+        " or a number" if any(get_origin(each) is Annotated for each in kinds) else ""
+    )
 
 
 def _in_words(kinds: re.Match[str]) -> str:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
@@ -52,14 +52,14 @@ class MatcherConfig:
     """
 
     tower: str = "resnet50"
-    tower_output: str = "classes"
+    tower_output: Literal["classes", "pooled", "stages"] = "classes"
     fingers: Count = 2
     hidden: Count = 1024
     dropout: FractionBelowOne = 0.5
     standardise: bool = False
     embedding_dim: Count = 128
     candidate_width: Annotated[int, Meta(ge=0)] = 0
-    candidate_linear: int = 0
+    candidate_linear: Annotated[int, Meta(ge=0)] = 0
     projection_hidden: Annotated[int, Meta(ge=0)] = 0
     cell_dim: Annotated[int, Meta(ge=0)] = 0
     touch_cells: Count = 4
@@ -85,15 +85,13 @@ class MatcherConfig:
     def __post_init__(self) -> None:
         check_fields(self, "matcher", ConfigError)
         limit = self.embedding_dim - 1 if self.cosine else 0
-        _require(
-            0 <= self.candidate_linear <= limit,
-            f"matcher.candidate_linear must be from 0 to {limit} (below embedding_dim, and 0 without cosine), got "
-            f"{self.candidate_linear}",
-        )
-        _require(
-            not self.cell_dim or self.tower_output == "stages",
-            f'matcher.cell_dim above 0 needs tower_output = "stages", got {self.tower_output!r}',
-        )
+        if self.candidate_linear > limit:
+            raise ConfigError(
+                f"matcher.candidate_linear must be from 0 to {limit} (below embedding_dim, and 0 without cosine), got "
+                f"{self.candidate_linear}"
+            )
+        if self.cell_dim and self.tower_output != "stages":
+            raise ConfigError(f'matcher.cell_dim above 0 needs tower_output = "stages", got {self.tower_output!r}')
 
 
 @dataclass(frozen=True)
@@ -147,10 +145,10 @@ class TrainingConfig:
     negatives_per_touch: Count = 4
     learning_rate: Positive = 1e-4
     tower_rate: Positive = 1.0
-    schedule: str = "constant"
+    schedule: Literal["constant", "cosine", "warmup", "halving"] = "constant"
     weights: Mapping[str, float] = field(default_factory=dict)
     shuffle_fingers: bool = False
-    negatives: str = "auto"
+    negatives: Literal["auto", "batch", "dataset"] = "auto"
     freeze_batch_norm: bool = False
     freeze_towers: bool = False
     freeze_stem: bool = False
@@ -159,26 +157,20 @@ class TrainingConfig:
     validation_fraction: FractionBelowOne = 0.1
     test_fraction: FractionBelowOne = 0.184
     validate_every: Count = 500
-    precision: str = "auto"
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
     seed: Seed = 0
-    workers: Annotated[int, Meta(ge=0)] | str = field(default="auto", compare=False)
+    workers: Annotated[int, Meta(ge=0)] | Literal["auto"] = field(default="auto", compare=False)
 
     def __post_init__(self) -> None:
-        own = {name: self.weights[name] for name in sorted(self.weights) if name not in LOSSES}
-        weights = {name: self.weights.get(name, 0.0) for name in LOSSES} | own
+        others = {name: self.weights[name] for name in sorted(self.weights) if name not in LOSSES}
+        weights = {name: self.weights.get(name, 0.0) for name in LOSSES} | others
         for name, weight in weights.items():
             weights[name] = typed(weight, NonNegative, f"training.{name}{WEIGHT_SUFFIX}", error=ConfigError)
         object.__setattr__(self, "weights", weights)
         check_fields(self, "training", ConfigError)
-        auto = not isinstance(self.workers, str) or self.workers == "auto"
-        _require(auto, f'training.workers must be "auto" or a whole number >= 0, got {self.workers!r}')
-        for name, known in (("schedule", SCHEDULES), ("negatives", NEGATIVES), ("precision", PRECISIONS)):
-            value = getattr(self, name)
-            _require(value in known, f"training.{name} must be one of {', '.join(known)}, got {value!r}")
         held_out = (self.validation_fraction, self.test_fraction)
-        _require(
-            sum(held_out) < 1, f"validation_fraction and test_fraction must leave objects to train on; got {held_out}"
-        )
+        if sum(held_out) >= 1:
+            raise ConfigError(f"validation_fraction and test_fraction must leave objects to train on; got {held_out}")
 
     def tower_init(self, of_one: str) -> str:
         """Return the initial weights of one tower, given its `init_touch` or `init_photo`."""
@@ -198,10 +190,10 @@ class TrainingConfig:
         """
         table: dict[str, Any] = {}
         for name, value in dataclasses.asdict(self).items():
-            if name == "workers":
-                continue
-            weights = name == "weights"
-            table |= {f"{loss}{WEIGHT_SUFFIX}": weight for loss, weight in value.items()} if weights else {name: value}
+            if name == "weights":
+                table |= {f"{loss}{WEIGHT_SUFFIX}": weight for loss, weight in value.items()}
+            elif name != "workers":
+                table[name] = value
         return table
 
     @classmethod
@@ -230,8 +222,6 @@ SCHEDULES: dict[str, Callable[[int, int], float]] = {
     "halving": lambda step, steps: 0.5 ** (4 * step // steps),
 }
 """Factor of the learning rate. "warmup" is "cosine" with a linear rise over the first twentieth of the steps."""
-NEGATIVES = ("auto", "batch", "dataset")
-PRECISIONS = ("auto", "float32", "bfloat16")
 
 
 @dataclass(frozen=True)
@@ -355,8 +345,3 @@ def preset_names() -> list[str]:
     """Return the names of the presets in the package."""
     files = (resources.files("retrieval") / "configs").iterdir()
     return sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml"))
-
-
-def _require(holds: bool, message: str) -> None:
-    if not holds:
-        raise ConfigError(message)

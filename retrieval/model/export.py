@@ -72,9 +72,7 @@ def export(checkpoint: Checkpoint, out: Path | None = None) -> Path:
 
 
 def export_to_cache(checkpoint: Checkpoint) -> Path | None:
-    """Export a checkpoint to the user's cache, unless an export is already there or next to the checkpoint.
-
-    For checkpoints in the folder of an installed package, which we must not write to. Queries also look in the cache.
+    """Export a checkpoint of an installed package to the user's cache, where queries also look.
 
     Returns:
         The file; None if an export exists already or cannot be written. Queries work without it.
@@ -120,34 +118,30 @@ def choose_photo_encoder(checkpoint: Checkpoint) -> PhotoEncoder:
 
 def touch_encoder_to_onnx(checkpoint: Checkpoint) -> bytes:
     """Return the touch encoder as an ONNX model with the checkpoint's digest, for any number of touches at once."""
-    side, fingers = checkpoint.config.preprocessing.touch_px, checkpoint.config.matcher.fingers
-    outputs = ["partial", "embedding"] + (["readings"] if checkpoint.matcher.gel_head else [])
-    encoder = _Encoder(
-        for_inference(checkpoint.matcher, ["touch_tower"]),
-        lambda matcher, images: matcher.encode_touches(images.permute(0, 1, 4, 2, 3)),
-    )
-    return _trace(encoder, (fingers, side, side, 3), outputs, checkpoint)
+    matcher, side = for_inference(checkpoint.matcher, ["touch_tower"]), checkpoint.config.preprocessing.touch_px
+    outputs = ["partial", "embedding"] + (["readings"] if matcher.gel_head else [])
+    encoder = _Encoder(matcher, lambda images: matcher.encode_touches(images.permute(0, 1, 4, 2, 3)))
+    return _trace(encoder, (matcher.config.fingers, side, side, 3), outputs, checkpoint)
 
 
 def photo_encoder_to_onnx(checkpoint: Checkpoint) -> bytes:
     """Return the photo encoder as ONNX: images (B, H, views * W, 3) to partial activations and embeddings."""
-    side, views = checkpoint.config.preprocessing.photo_px, checkpoint.matcher.views
+    matcher, side = for_inference(checkpoint.matcher, ["photo_tower"]), checkpoint.config.preprocessing.photo_px
     encoder = _Encoder(
-        for_inference(checkpoint.matcher, ["photo_tower"]),
-        lambda matcher, images: matcher.photo_search_encoding(matcher.photo_features(images.permute(0, 3, 1, 2))),
+        matcher, lambda images: matcher.photo_search_encoding(matcher.photo_features(images.permute(0, 3, 1, 2)))
     )
-    return _trace(encoder, (side, views * side, 3), ["partial", "embedding"], checkpoint)
+    return _trace(encoder, (side, matcher.views * side, 3), ["partial", "embedding"], checkpoint)
 
 
 class _Encoder(nn.Module):
-    """A function of a matcher and of images with channels last."""
+    """A matcher whose forward pass is a function of images with channels last."""
 
-    def __init__(self, matcher: Matcher, encode: Callable[[Matcher, Tensor], tuple[Tensor, ...]]) -> None:
+    def __init__(self, matcher: Matcher, encode: Callable[[Tensor], tuple[Tensor, ...]]) -> None:
         super().__init__()
         self.matcher, self.encode = matcher, encode
 
     def forward(self, images: Tensor) -> tuple[Tensor, ...]:
-        return self.encode(self.matcher, images)
+        return self.encode(images)
 
 
 def _trace(encoder: nn.Module, shape: tuple[int, ...], outputs: list[str], checkpoint: Checkpoint) -> bytes:

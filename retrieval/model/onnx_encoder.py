@@ -78,12 +78,9 @@ def open_session(model: Path | bytes, checkpoint: str, threads: int | None = Non
 
 
 def cached_export_path(digest: str) -> Path | None:
-    """Return the path of an automatic export in the user's cache; None if the user has no home folder.
+    """Return the path of an automatic export of the checkpoint with this digest; None if the user has no home folder.
 
     It is `$XDG_CACHE_HOME/touch-retrieval/DIGEST.onnx`, by default under `~/.cache`.
-
-    Args:
-        digest: SHA-256 of the checkpoint's file, in hexadecimal.
     """
     try:
         cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
@@ -97,21 +94,13 @@ def find_export(checkpoint: CheckpointInfo, threads: int | None = None) -> OnnxE
 
     The file next to the checkpoint comes first, then the one in the user's cache. An export of another checkpoint is
     not used, and a warning is logged.
-
-    Args:
-        checkpoint: The header of the checkpoint.
-        threads: Threads of ONNX Runtime; None for its own choice.
     """
-    path = checkpoint.path.with_suffix(EXPORT_SUFFIX)
-    if not path.is_file():
-        cached = cached_export_path(checkpoint.digest)
-        if cached is None or not cached.is_file():
-            return None
-        path = cached
-    if find_spec("onnxruntime") is None:
+    places = checkpoint.path.with_suffix(EXPORT_SUFFIX), cached_export_path(checkpoint.digest)
+    files = [path for path in places if path is not None and path.is_file()]
+    if not files or find_spec("onnxruntime") is None:
         return None
     try:
-        return OnnxEncoder(path, checkpoint.digest, threads)
+        return OnnxEncoder(files[0], checkpoint.digest, threads)
     except CheckpointError as error:
         log.warning("%s; PyTorch encodes instead (slower to start): run `retrieve export` again", error)
         return None

@@ -5,7 +5,7 @@
     P(o)    proportional to  (1 - p) / O * exp(w * l(o) + offset)
     P(none) proportional to  p
 
-All probabilities of an answer come from this formula. The catalogue has O objects. p is the prior probability that the
+The catalogue has O objects. p is the prior probability that the
 object in the hand is none of them; the objects have equal priors. `w * l(o) + offset` is the log of the ratio of two
 likelihoods of these touches: on object o, and on an object that the catalogue lacks. The photos of an object are
 equally likely views of it, so their likelihoods are averaged. If an object has one photo, l(o) is its match logit.
@@ -24,10 +24,6 @@ from the logits, never as P(o) / (1 - P(none)): that quotient is 0 / 0 if P(none
 
 A single pair of a touch and a photo is classified as a match above the logit with w * l + offset = 0
 (`Posterior.threshold`), the threshold of pair accuracy.
-
-A query passes through four files. `fusion_scorer.py` sums the match logits z of a photo over the grasps.
-`search/objects.py` computes l(o) of each object; reference touches change it (`references.py`).
-`search/shard.py` chooses the photos to score and samples the others. `EvidenceMass.merged` below sums the shards.
 """
 
 import math
@@ -142,9 +138,9 @@ class Posterior:
     def object_logits(self, logits: ArrayLike, owner: Numbers, counts: Numbers, grasps: int = 1) -> Floats:
         """Return the logit (J,) of each object from the summed match logits (N,) of its scored photos.
 
-        owner (N,) is the index of each photo's object, 0 to J - 1; each object has at least one photo. counts (J,) is
-        the number of photos of each object. Unscored photos of an object add 0 to its mean likelihood; the error is
-        small because they are not among the candidates. Raises NumericalError for a logit that is not finite.
+        owner (N,) is the index of each photo's object, counts (J,) the number of photos of each object, at least 1.
+        Photos that were not scored, because they are no candidates, add 0 to the mean likelihood of their object.
+        Raises NumericalError for a logit that is not finite.
         """
         weight = self.weight(grasps)
         scaled = weight * _finite(logits, "every logit")
@@ -154,10 +150,9 @@ class Posterior:
         return np.asarray((top + np.log(total / counts)) / weight)  # if all photos have one logit: log 1 = 0, exactly
 
     def mass(self, logits: ArrayLike, grasps: int = 1, *, unscored: int = 0, sample: ArrayLike = ()) -> EvidenceMass:
-        """Return the evidence mass of objects.
+        """Return the evidence mass of objects with logits (J,), J >= 1, and `unscored` others.
 
-        logits (J,) are those of the scored objects, J >= 1 (`object_logits`); `unscored` counts the other objects.
-        sample (S,) are the logits of a random sample of these, required if there are any. Raises BadInput, and
+        sample (S,) are the logits of a random sample of the others, required if there are any. Raises BadInput, and
         NumericalError for a logit that is not finite.
         """
         known, drawn = _finite(logits, "every logit"), _finite(sample, "every logit of the sample")

@@ -157,8 +157,7 @@ class TouchReader:
     ) -> list[list[tuple[RgbImage, float]]]:
         """Return the preprocessed images of grasps, each with its difference from its no-contact frame (0 without one).
 
-        The images are decoded in parallel. Of several bad ones, the first is reported. The threads end with the call,
-        because a forked process would not have them.
+        Of several bad images, the first is reported. The threads end with the call: a fork would not have them.
         """
         for source in (source for grasp in grasps for source in grasp):
             # A Pillow image reads its file on the first access to its pixels, which two threads must not do at once.

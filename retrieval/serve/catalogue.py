@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
-from pydantic import BaseModel, Field
 
 from retrieval.data.images import read_bytes
 from retrieval.data.text import replace_surrogates
@@ -28,24 +27,6 @@ MAX_PHOTO_PX = 4096
 """Maximum longer side, in pixels, of a photo that is converted to JPEG."""
 
 
-class PhotoDocument(BaseModel):
-    """A photo of the catalogue. All routes use its `id`. metadata: the user's own."""
-
-    id: str = Field(examples=["mug/1.jpg"])
-    object_id: str = Field(examples=["mug"])
-    metadata: dict[str, Any] = Field(examples=[{"material": "glazed clay"}])
-
-
-class CatalogueDocument(BaseModel):
-    """One page of photos. total: number of matching photos; next: offset of the next page, null at the end."""
-
-    generation: str = Field(examples=["gen-000007"])
-    total: int
-    offset: int
-    next: int | None
-    items: list[PhotoDocument]
-
-
 Offset = Annotated[int, Query(ge=0, le=2**31)]
 Limit = Annotated[int, Query(ge=1, le=500, description="Photos per page.")]
 Search = Annotated[
@@ -57,18 +38,22 @@ ObjectFilter = Annotated[str | None, Query(max_length=1000, alias="object", desc
 @router.get("/v1/catalogue")
 def catalogue(
     parts: Parts, offset: Offset = 0, limit: Limit = 100, search: Search = "", name: ObjectFilter = None
-) -> CatalogueDocument:
-    """Return one page of the index's photos, in index order."""
+) -> dict[str, Any]:
+    """Return one page of the index's photos, in index order.
+
+    total: number of matching photos; next: offset of the next page, null at the end; items: `id`, by which all routes
+    name the photo, `object_id`, and the user's own `metadata`.
+    """
     generation = parts.generations.current
     found = generation.shard.page(search.casefold().split(), name, offset, limit)
     end = offset + len(found.photos)
-    return CatalogueDocument(
-        generation=generation.name,
-        total=found.total,
-        offset=offset,
-        next=end if offset < end < found.total else None,
-        items=[PhotoDocument(id=one.path, object_id=one.object_id, metadata=one.metadata) for one in found.photos],
-    )
+    return {
+        "generation": generation.name,
+        "total": found.total,
+        "offset": offset,
+        "next": end if offset < end < found.total else None,
+        "items": [{"id": one.path, "object_id": one.object_id, "metadata": one.metadata} for one in found.photos],
+    }
 
 
 @router.get("/v1/photos/{photo:path}", response_class=Response, responses=IMAGE_RESPONSES)

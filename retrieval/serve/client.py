@@ -71,14 +71,9 @@ class Client:
         self.close()
 
     def query(self, touches: AnyTouches, **options: Unpack[QueryOptions]) -> QueryResult:
-        """Run `Searcher.query` on the service.
+        """Run `Searcher.query` on the service; paths of touches refer to this machine.
 
-        Args:
-            touches: As for `Searcher.query`; paths refer to this machine.
-            **options: Keyword arguments of `Searcher.query`.
-
-        Returns:
-            The result. `Match.photo_path` refers to the other machine; `photo` returns the picture.
+        `Match.photo_path` of the result refers to the other machine; `photo` returns the picture.
 
         Raises:
             BadInput: The input cannot be used.

@@ -20,12 +20,12 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from retrieval.data.images import MAX_PIXELS, check_pixels, decode, picture_size
-from retrieval.data.resize import resize_unchecked
+from retrieval.data.resize import RgbImage, resize_unchecked
 from retrieval.errors import ImageError, RetrievalError
 from retrieval.model.touches import GelImage
 from retrieval.serve.settings import MAX_BODY_PIXELS
@@ -40,19 +40,6 @@ DECODE_CPU_S = 5
 DECODE_BYTES = 200_000_000
 """Maximum memory for one picture. PNG, JPEG, BMP and TIFF pictures of maximum size need less, some formats more."""
 _LENGTHS = struct.Struct(">II")
-READY: dict[str, Any] = {"ready": True}
-
-
-class PictureSize(NamedTuple):
-    """Size in pixels of a picture, read from its file without decoding it."""
-
-    width: int
-    height: int
-
-    @property
-    def pixels(self) -> int:
-        """Number of pixels of the picture."""
-        return self.width * self.height
 
 
 class Decoders:
@@ -90,19 +77,15 @@ class Decoders:
             HttpProblem: The pictures are too large together.
         """
 
-        async def read_small(name: str, data: bytes) -> GelImage | PictureSize:
+        async def read_small(name: str, data: bytes) -> GelImage | int:
             async with self._small:
                 return await self._run(name, data, px, SMALL_PIXELS)
 
-        found = await asyncio.gather(*(read_small(*one) for one in named_files), return_exceptions=True)
-        for (name, _), one in zip(named_files, found, strict=True):
+        first = await asyncio.gather(*(read_small(*one) for one in named_files), return_exceptions=True)
+        for one in first:
             if isinstance(one, BaseException):
                 raise one
-            if isinstance(one, PictureSize) and one.pixels > MAX_PIXELS:
-                reason = f"{one.width} x {one.height} pixels exceed the limit of {MAX_PIXELS:,}: send a smaller picture"
-                raise ImageError(name, reason)
-        first = [one for one in found if not isinstance(one, BaseException)]
-        total = sum(one.pixels for one in first if isinstance(one, PictureSize))
+        total = sum(one for one in first if isinstance(one, int))
         if total > MAX_BODY_PIXELS:
             from retrieval.serve.errors import HttpProblem  # slow to import
 
@@ -112,22 +95,24 @@ class Decoders:
                 f"the large ones have {total:,}.",
             )
         images = []
-        for (name, data), one in zip(named_files, first, strict=True):
-            if isinstance(one, PictureSize):
+        for (name, data), found in zip(named_files, first, strict=True):
+            if isinstance(found, int):
                 async with self._large:
-                    one = await self._run(name, data, px, MAX_PIXELS)
-            assert isinstance(one, GelImage), "the picture has at most MAX_PIXELS"
-            images.append(one)
+                    found = await self._run(name, data, px, MAX_PIXELS)
+            assert isinstance(found, GelImage), "the picture has at most MAX_PIXELS"
+            images.append(found)
         return images
 
-    async def _run(self, name: str, data: bytes, px: int, max_pixels: int) -> GelImage | PictureSize:
-        """Decode a picture in a process; cancelling ends the process. Raises ImageError or RetrievalError."""
+    async def _run(self, name: str, data: bytes, px: int, max_pixels: int) -> GelImage | int:
+        """Decode a picture in a process, or return the number of its pixels if that is above `max_pixels`.
+
+        Cancelling ends the process. Raises ImageError or RetrievalError.
+        """
         process = self._idle.pop() if self._idle else await _Process.start()
         try:
             document, content = await process.request({"name": name, "px": px, "max_pixels": max_pixels}, data)
             self._idle.append(process)
-            return image_of(document, content)
-        except (EOFError, ConnectionError, MemoryError):
+        except (EOFError, ConnectionError):
             raise ImageError(
                 name,
                 f"decoding needs more than {DECODE_CPU_S} s of CPU time or {DECODE_BYTES // 10**6} MB: "
@@ -138,6 +123,9 @@ class Decoders:
                 task = asyncio.ensure_future(process.end())
                 self._ending.add(task)
                 task.add_done_callback(self._ending.discard)
+        if "error" in document:
+            raise ImageError(document["name"], document["error"])
+        return document["pixels"] if document else GelImage(np.frombuffer(content, np.float32).reshape(px, px, 3))
 
 
 class _Process:
@@ -160,15 +148,13 @@ class _Process:
         except OSError as error:
             raise RetrievalError(f"The image decoder process cannot be started: {error}") from error
         try:
-            if (await process._answer())[0] == READY:
-                return process
-        except EOFError:
-            pass
-        except BaseException:
+            await process._answer()
+        except BaseException as error:
             await process.end()
+            if isinstance(error, EOFError):
+                raise RetrievalError("The image decoder process ended during its start.") from error
             raise
-        await process.end()
-        raise RetrievalError("The image decoder process ended during its start. See the log of the service.")
+        return process
 
     async def request(self, document: dict[str, Any], content: bytes) -> tuple[dict[str, Any], bytes]:
         """Send a request and return the answer; raises EOFError or ConnectionError if the process ended."""
@@ -204,62 +190,44 @@ def serve_pictures() -> None:
     _one_thread()
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # keep output of libraries out of the answers
-    answers.write(frame(READY))
+    answers.write(frame({}))  # the imports are done
     answers.flush()
     while lengths := sys.stdin.buffer.read(_LENGTHS.size):
         answers.write(_answer(sys.stdin.buffer, *_LENGTHS.unpack(lengths)))
         answers.flush()
 
 
-def frame(document: dict[str, Any], *contents: bytes | memoryview) -> bytes:
+def frame(document: dict[str, Any], content: bytes = b"") -> bytes:
     """Return a request or an answer as bytes."""
     text = json.dumps(document).encode()
-    return b"".join((_LENGTHS.pack(len(text), sum(map(len, contents))), text, *contents))
+    return _LENGTHS.pack(len(text), len(content)) + text + content
 
 
-def image_of(document: dict[str, Any], content: bytes) -> GelImage | PictureSize:
-    """Return the picture, or its size, from an answer. Raises ImageError, or MemoryError of the process."""
-    match document:
-        case {"size": size}:
-            return PictureSize(*size)
-        case {"error": str(reason), "name": str(name)}:
-            raise ImageError(name, reason)
-        case {"px": int(px)}:
-            return GelImage(np.frombuffer(content, np.float32).reshape(px, px, 3))
-        case _:
-            raise MemoryError
-
-
-def read_gel_image(data: bytes, name: str, px: int, max_pixels: int) -> GelImage | PictureSize:
-    """Decode and resize a picture, or return only its size if it has more than `max_pixels` pixels.
+def read_gel_image(data: bytes, name: str, px: int, max_pixels: int) -> RgbImage | int:
+    """Decode and resize a picture, or return the number of its pixels if that is above `max_pixels`.
 
     Raises:
         ImageError: The file is not a readable picture.
     """
-    size = PictureSize(*picture_size(data, name))
-    if size.pixels > max_pixels:
-        return size
-    check_pixels(size, name)
-    return GelImage(resize_unchecked(decode(data, name), (px, px)))
+    width, height = picture_size(data, name)
+    check_pixels((width, height), name)
+    return resize_unchecked(decode(data, name), (px, px)) if width * height <= max_pixels else width * height
 
 
 def _answer(requests: BinaryIO, text: int, content: int) -> bytes:
+    """Return the answer to a request; the process ends if a picture needs too much memory."""
     options, data = json.loads(requests.read(text)), requests.read(content)
+    _limit(resource.RLIMIT_CPU, math.ceil(time.process_time()) + DECODE_CPU_S)
+    if sys.platform == "linux":  # other systems do not enforce the limit
+        pages = int(Path("/proc/self/statm").read_text().split()[5])
+        _limit(resource.RLIMIT_DATA, pages * resource.getpagesize() + DECODE_BYTES)
     try:
-        _limit(resource.RLIMIT_CPU, math.ceil(time.process_time()) + DECODE_CPU_S)
-        if sys.platform == "linux":  # other systems do not enforce the limit
-            pages = int(Path("/proc/self/statm").read_text().split()[5])
-            _limit(resource.RLIMIT_DATA, pages * resource.getpagesize() + DECODE_BYTES)
         found = read_gel_image(data, **options)
     except ImageError as error:
         if isinstance(error.__cause__, MemoryError):
-            return frame({"memory": DECODE_BYTES})
+            raise SystemExit(1) from error
         return frame({"error": error.reason, "name": error.path})
-    except MemoryError:
-        return frame({"memory": DECODE_BYTES})
-    if isinstance(found, PictureSize):
-        return frame({"size": found})
-    return frame({"px": len(found.touch)}, found.touch.tobytes())
+    return frame({"pixels": found}) if isinstance(found, int) else frame({}, found.tobytes())
 
 
 def _one_thread() -> None:

@@ -1,7 +1,6 @@
 """Routes of the human baseline (`retrieval.serve.trials`)."""
 
-import secrets
-import time
+from collections.abc import Sequence
 from string import ascii_lowercase
 from typing import Annotated, Any
 
@@ -11,26 +10,17 @@ from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
 from retrieval.data.images import read_bytes
+from retrieval.metrics.intervals import binomial_interval
 from retrieval.serve.catalogue import IMAGE_RESPONSES, image_response
 from retrieval.serve.errors import HttpProblem
 from retrieval.serve.service import Parts, Service
-from retrieval.serve.store import HistoryStore, TrialChoice, TrialRun, new_id
-from retrieval.serve.trials import CHOICES, Trial, Trials, trial_accuracy
+from retrieval.serve.store import HistoryStore, TrialChoice
+from retrieval.serve.trials import CHOICES, Trial, Trials
 from retrieval.serve.uploads import RequestBody
 
 router = APIRouter(tags=["human baseline"])
+Participant = Annotated[str, InPath(min_length=1, max_length=200, description="Name of a person.")]
 Number = Annotated[int, InPath(ge=1, le=10_000)]
-
-
-class RunBody(RequestBody):
-    """A new series of trials.
-
-    count: number of trials; participant: name of the person; seed: the same seed gives the same trials.
-    """
-
-    count: int = Field(20, ge=1, le=10_000)
-    participant: str = Field("", max_length=200)
-    seed: int | None = Field(None, ge=0, lt=2**31)
 
 
 class ChoiceBody(RequestBody):
@@ -51,104 +41,88 @@ def _require_trials(parts: Service) -> tuple[Trials, HistoryStore]:
     return parts.trials, parts.history_writer.store
 
 
-def _document(run: TrialRun, store: HistoryStore) -> dict[str, Any]:
-    """Return a series and its results so far. next: the first open trial, null at the end."""
-    choices = store.choices(run.id)
-    remaining = set(range(1, run.count + 1)) - {one.number for one in choices}
+def _trial(parts: Service, number: int) -> Trial:
+    return _require_trials(parts)[0].trial(parts.generations.current, number)
+
+
+def _accuracy(right: Sequence[bool]) -> dict[str, float]:
+    """Return the accuracy of choices with its exact 95 % confidence interval (Clopper and Pearson 1934)."""
+    low, high = binomial_interval(sum(right), len(right))
     return {
-        **vars(run),
-        "choices": CHOICES,
-        "completed": len(choices),
-        "next": min(remaining, default=None),
-        "human_baseline": trial_accuracy([one.choice == one.truth for one in choices]),
-        "model": trial_accuracy([one.model == one.truth for one in choices]),
-        "chance": 1 / CHOICES,
+        "right": sum(right),
+        "trials": len(right),
+        "accuracy": sum(right) / len(right),
+        "low": low,
+        "high": high,
     }
-
-
-def _run(parts: Service, name: str) -> TrialRun:
-    trials, store = _require_trials(parts)
-    found = next((run for run in store.runs(trials.folder.name) if run.id == name), None)
-    if found is None:
-        raise HttpProblem("unknown", f"{trials.folder.name} has no series of trials {name[:64]!r}.")
-    return found
-
-
-def _trial(parts: Service, name: str, number: int) -> Trial:
-    run = _run(parts, name)
-    if number > run.count:
-        raise HttpProblem("unknown", f"This series has {run.count} trials, got number {number}.")
-    return _require_trials(parts)[0].trial(parts.generations.current, run.seed, number)
 
 
 @router.get("/v1/trials")
 def trials(parts: Parts) -> dict[str, Any]:
-    """Return the number of unseen objects, and all series of the recording."""
+    """Return the number of unseen objects, and the accuracy of each person and of the model in the same trials.
+
+    next: the number of the person's next trial.
+    """
     known, store = _require_trials(parts)
+    choices = store.choices(known.folder.name)
+    groups = [
+        [one for one in choices if one.participant == name] for name in dict.fromkeys(c.participant for c in choices)
+    ]
     return {
         "recording": known.folder.name,
         "objects": len(known.unseen(parts.generations.current)),
         "choices": CHOICES,
-        "runs": [_document(run, store) for run in store.runs(known.folder.name)],
+        "chance": 1 / CHOICES,
+        "participants": [
+            {
+                "participant": group[0].participant,
+                "next": 1 + max(one.number for one in group),
+                "human_baseline": _accuracy([one.choice == one.truth for one in group]),
+                "model": _accuracy([one.model == one.truth for one in group]),
+            }
+            for group in groups
+        ],
     }
 
 
-@router.post("/v1/trials", status_code=201)
-def begin_run(body: RunBody, parts: Parts) -> dict[str, Any]:
-    """Begin a series of trials."""
-    known, store = _require_trials(parts)
-    seed = secrets.randbelow(2**31) if body.seed is None else body.seed
-    known.trial(parts.generations.current, seed, 1)  # raises if a trial is impossible
-    run = TrialRun(new_id(), time.time(), body.participant, seed, body.count, known.folder.name)
-    store.add_run(run)
-    return _document(run, store)
-
-
-@router.get("/v1/trials/{name}")
-def get_run(name: str, parts: Parts) -> dict[str, Any]:
-    """Return a series with the accuracy of the person and of the model in the same trials."""
-    return _document(_run(parts, name), _require_trials(parts)[1])
-
-
-@router.get("/v1/trials/{name}/{number}")
-def trial(name: str, number: Number, parts: Parts) -> dict[str, Any]:
-    """Return a trial. choice, truth, model: photo numbers counted from 1, null until the trial is done."""
-    sampled_trial = _trial(parts, name, number)
-    done = next((one for one in _require_trials(parts)[1].choices(name) if one.number == number), None)
-    where = f"/v1/trials/{name}/{number}"
+@router.get("/v1/trials/{number}")
+def trial(number: Number, parts: Parts) -> dict[str, Any]:
+    """Return the pictures of a trial, which is the same for everybody."""
+    fingers = len(_trial(parts, number).grasp.touches)
     return {
         "number": number,
-        "touches": [f"{where}/touches/{finger}" for finger in ascii_lowercase[: len(sampled_trial.grasp.touches)]],
-        "photos": [f"{where}/photos/{place}" for place in range(1, CHOICES + 1)],
-        "choice": done and done.choice,
-        "truth": done and done.truth,
-        "model": done and done.model,
+        "touches": [f"/v1/trials/{number}/touches/{finger}" for finger in ascii_lowercase[:fingers]],
+        "photos": [f"/v1/trials/{number}/photos/{place}" for place in range(1, CHOICES + 1)],
     }
 
 
-@router.post("/v1/trials/{name}/{number}")
-async def choose(body: ChoiceBody, request: Request, name: str, number: Number, parts: Parts) -> dict[str, Any]:
-    """Store the choice of a trial, once; the response contains the right photo and the model's choice."""
+@router.post("/v1/trials/{number}/{participant:path}")
+async def choose(
+    body: ChoiceBody, request: Request, number: Number, participant: Participant, parts: Parts
+) -> dict[str, Any]:
+    """Store a person's choice in a trial, once.
+
+    choice, truth, model: photo numbers, counted from 1, of the person's choice, the right photo and the model's choice.
+    """
     known, store = _require_trials(parts)
-    sampled_trial = await run_in_threadpool(lambda: _trial(parts, name, number))
-    model = await parts.queue.submit(lambda generation: known.model_choice(generation, sampled_trial), request)
-    choice = TrialChoice(number, body.choice, sampled_trial.truth, model)
-    if not await run_in_threadpool(store.choose, name, choice):
-        raise HttpProblem("conflict", f"Trial {number} is done already.")
-    return await run_in_threadpool(trial, name, number, parts)
+    shown = await run_in_threadpool(_trial, parts, number)
+    model = await parts.queue.submit(lambda generation: known.model_choice(generation, shown), request)
+    choice = TrialChoice(participant, number, body.choice, shown.truth, model)
+    if not await run_in_threadpool(store.add_choice, known.folder.name, choice):
+        raise HttpProblem("conflict", f"{participant} has done trial {number} already.")
+    return vars(choice)
 
 
-@router.get("/v1/trials/{name}/{number}/touches/{finger}", response_class=Response, responses=IMAGE_RESPONSES)
-def touch(name: str, number: Number, finger: str, parts: Parts) -> Response:
+@router.get("/v1/trials/{number}/touches/{finger}", response_class=Response, responses=IMAGE_RESPONSES)
+def touch(number: Number, finger: str, parts: Parts) -> Response:
     """Return a gel image of the trial's grasp."""
-    files = _trial(parts, name, number).grasp.touches
-    place = ascii_lowercase.find(finger) if len(finger) == 1 else -1
-    if not 0 <= place < len(files):
+    files = dict(zip(ascii_lowercase, _trial(parts, number).grasp.touches, strict=False))
+    if finger not in files:
         raise HttpProblem("unknown", f"The grasp has no finger {finger[:10]!r}.")
-    return image_response(read_bytes(files[place]))
+    return image_response(read_bytes(files[finger]))
 
 
-@router.get("/v1/trials/{name}/{number}/photos/{place}", response_class=Response, responses=IMAGE_RESPONSES)
-def photo(name: str, number: Number, place: Annotated[int, InPath(ge=1, le=CHOICES)], parts: Parts) -> Response:
+@router.get("/v1/trials/{number}/photos/{place}", response_class=Response, responses=IMAGE_RESPONSES)
+def photo(number: Number, place: Annotated[int, InPath(ge=1, le=CHOICES)], parts: Parts) -> Response:
     """Return one of the trial's photos, counted from 1."""
-    return image_response(read_bytes(_trial(parts, name, number).photos[place - 1]))
+    return image_response(read_bytes(_trial(parts, number).photos[place - 1]))

@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from string import ascii_lowercase
 from threading import Lock
@@ -42,24 +42,20 @@ RIGHT, OBJECT, NONE = "right", "object", "none"
 _VERSION = 3
 _SCHEMA = f"""
 BEGIN;
-CREATE TABLE queries (
+CREATE TABLE IF NOT EXISTS queries (
     id TEXT PRIMARY KEY, time REAL NOT NULL, verdict TEXT NOT NULL, best TEXT NOT NULL, answer TEXT NOT NULL
 ) STRICT;
-CREATE TABLE pictures (
+CREATE TABLE IF NOT EXISTS pictures (
     query TEXT NOT NULL REFERENCES queries ON DELETE CASCADE, grasp INTEGER NOT NULL, finger TEXT NOT NULL,
     data BLOB NOT NULL, PRIMARY KEY (query, grasp, finger)
 ) STRICT;
-CREATE TABLE feedback (
+CREATE TABLE IF NOT EXISTS feedback (
     query TEXT PRIMARY KEY REFERENCES queries, time REAL NOT NULL, feedback TEXT NOT NULL, object_id TEXT,
     photo BLOB
 ) STRICT;
-CREATE TABLE runs (
-    id TEXT PRIMARY KEY, time REAL NOT NULL, participant TEXT NOT NULL, seed INTEGER NOT NULL, count INTEGER NOT NULL,
-    recording TEXT NOT NULL
-) STRICT;
-CREATE TABLE choices (
-    run TEXT NOT NULL REFERENCES runs, number INTEGER NOT NULL, choice INTEGER NOT NULL, truth INTEGER NOT NULL,
-    model INTEGER NOT NULL, time REAL NOT NULL, PRIMARY KEY (run, number)
+CREATE TABLE IF NOT EXISTS trials (
+    recording TEXT NOT NULL, participant TEXT NOT NULL, number INTEGER NOT NULL, choice INTEGER NOT NULL,
+    truth INTEGER NOT NULL, model INTEGER NOT NULL, time REAL NOT NULL, PRIMARY KEY (recording, participant, number)
 ) STRICT;
 PRAGMA user_version = {_VERSION};
 COMMIT;
@@ -84,21 +80,10 @@ class StoredQuery:
 
 
 @dataclass(frozen=True)
-class TrialRun:
-    """A series of trials of one person."""
-
-    id: str
-    time: float
-    participant: str
-    seed: int
-    count: int
-    recording: str
-
-
-@dataclass(frozen=True)
 class TrialChoice:
-    """Result of one trial, as photo numbers from 1: the person's choice, the right photo, and the model's choice."""
+    """Result of a person's trial, as photo numbers from 1: the person's choice, the right photo, the model's choice."""
 
+    participant: str
     number: int
     choice: int
     truth: int
@@ -125,10 +110,10 @@ class HistoryStore:
             execute = self._database.execute
             execute("PRAGMA journal_mode = WAL")
             execute("PRAGMA foreign_keys = ON")
-            if not execute("SELECT 1 FROM sqlite_master").fetchone():
-                self._database.executescript(_SCHEMA)
-            if (version := execute("PRAGMA user_version").fetchone()[0]) != _VERSION:
+            version = execute("PRAGMA user_version").fetchone()[0]
+            if version != _VERSION and execute("SELECT 1 FROM sqlite_master").fetchone():
                 raise sqlite3.DatabaseError(f"it has version {version}, not {_VERSION}")
+            self._database.executescript(_SCHEMA)
         except sqlite3.Error as error:
             raise BadInput(f"{path} must be the history of a service: {error}. Use another folder.") from error
         self._database.create_function("casefold", 1, str.casefold, deterministic=True)
@@ -139,24 +124,18 @@ class HistoryStore:
             self._database.close()
 
     @contextmanager
-    def _using(self, action: str) -> Iterator[sqlite3.Connection]:
-        """Lock the database for one thread; raise RetrievalError if the disk fails. action: "read" or "written"."""
+    def _transaction(self, synchronous: str = "FULL") -> Iterator[sqlite3.Connection]:
+        """Run a transaction of one thread; with "FULL" it is on the disk at the end. Raises RetrievalError."""
         with self._lock:
             try:
-                yield self._database
+                self._database.execute(f"PRAGMA synchronous = {synchronous}")
+                with self._database as database:
+                    yield database
             except sqlite3.Error as error:
-                raise RetrievalError(f"{self.path} cannot be {action}: {error}") from error
-
-    @contextmanager
-    def _writing(self, synchronous: str = "FULL") -> Iterator[sqlite3.Connection]:
-        """Run a transaction; with "FULL" it is on the disk at the end."""
-        with self._using("written") as database:
-            database.execute(f"PRAGMA synchronous = {synchronous}")
-            with database:
-                yield database
+                raise RetrievalError(f"{self.path} cannot be read or written: {error}") from error
 
     def _read(self, text: str, values: Sequence[Any] = ()) -> list[Any]:
-        with self._using("read") as database:
+        with self._transaction() as database:
             return database.execute(text, values).fetchall()
 
     # Queries ------------------------------------------------------------------------------------------------
@@ -172,7 +151,7 @@ class HistoryStore:
         ]
         best = replace_surrogates(result.results[0].object_id) if result.results else ""
         row = (name, time.time(), result.verdict, best, json.dumps(result.to_dict()))
-        with self._writing("NORMAL") as database:
+        with self._transaction("NORMAL") as database:
             database.execute("INSERT INTO queries VALUES (?, ?, ?, ?, ?)", row)
             database.executemany("INSERT INTO pictures VALUES (?, ?, ?, ?)", pictures)
             database.execute(
@@ -228,7 +207,7 @@ class HistoryStore:
         Raises:
             BadInput: Different feedback is stored already.
         """
-        with self._writing() as database:
+        with self._transaction() as database:
             text = "SELECT feedback, object_id FROM queries LEFT JOIN feedback ON query = id WHERE id = ?"
             before = database.execute(text, [name]).fetchone()
             if before == (feedback, object_id):
@@ -252,27 +231,16 @@ class HistoryStore:
 
     # Trials -------------------------------------------------------------------------------------------------
 
-    def add_run(self, run: TrialRun) -> None:
-        """Store a new series of trials."""
-        with self._writing() as database:
-            values = (run.id, run.time, run.participant, run.seed, run.count, run.recording)
-            database.execute("INSERT INTO runs VALUES (?, ?, ?, ?, ?, ?)", values)
+    def add_choice(self, recording: str, one: TrialChoice) -> bool:
+        """Store the result of a trial; return False if the person has done this trial already."""
+        row = (recording, *astuple(one), time.time())
+        with self._transaction() as database:
+            return database.execute("INSERT OR IGNORE INTO trials VALUES (?, ?, ?, ?, ?, ?, ?)", row).rowcount == 1
 
-    def runs(self, recording: str) -> list[TrialRun]:
-        """Return all series of a recording, the newest first."""
-        rows = self._read("SELECT * FROM runs WHERE recording = ? ORDER BY id DESC", [recording])
-        return [TrialRun(*row) for row in rows]
-
-    def choose(self, run: str, choice: TrialChoice) -> bool:
-        """Store the result of a trial; return False if the trial has a result already."""
-        with self._writing() as database:
-            values = (run, choice.number, choice.choice, choice.truth, choice.model, time.time())
-            return database.execute("INSERT OR IGNORE INTO choices VALUES (?, ?, ?, ?, ?, ?)", values).rowcount == 1
-
-    def choices(self, run: str) -> list[TrialChoice]:
-        """Return the results of a series, by trial number."""
-        found = self._read("SELECT number, choice, truth, model FROM choices WHERE run = ? ORDER BY number", [run])
-        return [TrialChoice(*row) for row in found]
+    def choices(self, recording: str) -> list[TrialChoice]:
+        """Return the results of all trials with a recording, in their order."""
+        text = "SELECT participant, number, choice, truth, model FROM trials WHERE recording = ? ORDER BY time"
+        return [TrialChoice(*row) for row in self._read(text, [recording])]
 
 
 _COLUMNS = "id, queries.time, verdict, answer, feedback, object_id"

@@ -2,11 +2,10 @@
 
 In Lin, Calandra and Levine (ICRA 2019) people did 420 such trials. Here a trial uses objects of a recording that the
 model was not trained on: a grasp, a photo of the same object from another grasp, and one photo of each of nine other
-objects. The seed of a series determines its trials, so they need not be stored.
+objects. Everybody gets the same trials in the same order.
 """
 
 from collections import defaultdict
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +13,6 @@ import numpy as np
 
 from retrieval.data.dataset import Grasp, finger_count, load_grasps
 from retrieval.errors import BadInput
-from retrieval.metrics.intervals import binomial_interval
 from retrieval.search.embeddings import embed_photos
 from retrieval.serve.generations import ServedGeneration
 
@@ -30,26 +28,8 @@ class Trial:
     truth: int
 
 
-def trial_accuracy(right: Sequence[bool]) -> dict[str, float | None]:
-    """Return the accuracy of choices with its exact 95 % confidence interval (Clopper and Pearson 1934).
-
-    accuracy, low, high: null before the first trial.
-    """
-    count, trials = sum(right), len(right)
-    low, high = binomial_interval(count, trials) if right else (None, None)
-    accuracy = count / trials if right else None
-    return {"right": count, "trials": trials, "accuracy": accuracy, "low": low, "high": high}
-
-
 class Trials:
-    """The trials of one recording.
-
-    Args:
-        folder: Folder of the recording.
-
-    Raises:
-        DatasetError: The recording cannot be read.
-    """
+    """The trials of the recording in a folder. Raises DatasetError if it cannot be read."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -64,13 +44,8 @@ class Trials:
         training_objects = {*split.train, *split.validation} if split else set()
         return sorted(set(self._by_object) - training_objects)
 
-    def trial(self, generation: ServedGeneration, seed: int, number: int) -> Trial:
-        """Return one trial of a series.
-
-        Args:
-            generation: The generation whose model is compared.
-            seed: Seed of the series.
-            number: Number of the trial, counted from 1.
+    def trial(self, generation: ServedGeneration, number: int) -> Trial:
+        """Return a trial by its number, from 1.
 
         Raises:
             BadInput: The recording has too few unseen objects, or another number of fingers than the model.
@@ -83,8 +58,8 @@ class Trials:
         if (fingers := finger_count(self._grasps)) != generation.fingers:
             raise BadInput(f"The model takes {generation.fingers} gel image(s); {self.folder} has {fingers}.")
         cycle, place = divmod(number - 1, len(names))  # each cycle shows every object once
-        name = names[np.random.default_rng([seed, cycle]).permutation(len(names))[place]]
-        rng = np.random.default_rng([seed, cycle, place])
+        name = names[np.random.default_rng(cycle).permutation(len(names))[place]]
+        rng = np.random.default_rng([cycle, place])
         own = self._by_object[name]
         grasp = own[rng.integers(len(own))]
         others = [each for each in own if each.photo != grasp.photo] or [grasp]

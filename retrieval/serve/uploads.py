@@ -24,10 +24,8 @@ from retrieval.serve.settings import MAX_BODY_BYTES, MAX_PICTURES, MAX_SMALL_BOD
 
 PICTURE_PATHS = frozenset({"/v1/query", "/v1/verify"})
 """Routes whose bodies contain pictures: up to `MAX_BODY_BYTES`. All others: up to `MAX_SMALL_BODY_BYTES`."""
-LARGE_BYTES = 1_000_000
-"""Size in bytes above which a body is treated as large."""
-MAX_HELD_BYTES, MAX_HELD_BYTES_FOR_LARGE = 60_000_000, 40_000_000
-"""Maximum total size of the bodies in memory, and the size above which no large body may grow."""
+MAX_HELD_BYTES = 60_000_000
+"""Maximum total size of the bodies in memory."""
 MAX_JSON_VALUES = 2_000
 """Maximum number of JSON values of a body. A body with `MAX_PICTURES` pictures, each in its own lists, and with all
 options has fewer than 800 values."""
@@ -78,7 +76,7 @@ class BodyLimit:
             self.held_bytes += size
             if received > max_bytes:
                 raise too_large(max_bytes)
-            if self.held_bytes > (MAX_HELD_BYTES if received <= LARGE_BYTES else MAX_HELD_BYTES_FOR_LARGE):
+            if self.held_bytes > MAX_HELD_BYTES:
                 raise HttpProblem(
                     "busy", "Too many large requests are arriving. Try again.", _CLOSE | {"retry-after": "1"}
                 )

@@ -23,7 +23,6 @@ TOWERS: Registry[Any] = Registry(
     base="retrieval.model.towers.tower:Tower",
 )
 TOWER_SEPARATOR = "+"
-OUTPUTS = ("classes", "pooled", "stages")
 
 
 def tower_name(choice: str | type) -> str:

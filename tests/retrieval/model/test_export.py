@@ -25,7 +25,7 @@ from retrieval.model.export import choose_photo_encoder, export
 from retrieval.model.fusion import GelHead, Matcher
 from retrieval.model.onnx_encoder import OnnxEncoder
 from retrieval.model.shipped import shipped_model
-from retrieval.model.towers import OUTPUTS, TOWERS
+from retrieval.model.towers import TOWERS
 from retrieval.search.searcher import Searcher
 from tests.project.test_imports import run_blocked
 from tests.project.test_project import PROJECT
@@ -69,7 +69,7 @@ def export_random_matcher(path, config, seed=0, *, gel_head=False):
 
 
 MAKES = [{"tower": tower, "tower_output": "stages"} for tower in sorted(TOWERS) if tower != "resnet50"]
-MAKES += [{"tower_output": name} for name in OUTPUTS]
+MAKES += [{"tower_output": name} for name in ("classes", "pooled", "stages")]
 MAKES += [{"fingers": 1}, {"standardise": False}, {"candidate_width": 0}]
 MAKES += [{"tower_output": "stages", "cell_dim": 4, "touch_cells": 2, "cosine": True, "projection_hidden": 12}]
 

@@ -129,26 +129,26 @@ decoders.serve_pictures()
 
 
 @pytest.mark.parametrize(
-    ("seconds", "size", "output"),
+    ("seconds", "size", "ended"),
     [
-        (5, 200_000_000, b'"px": 32'),
+        (5, 200_000_000, 0),
         pytest.param(
             5,
             5_000_000,
-            b"memory",
+            1,
             marks=pytest.mark.skipif(sys.platform != "linux", reason="only Linux enforces the memory limit"),
         ),
-        (0, 200_000_000, None),
+        (0, 200_000_000, -signal.SIGXCPU),
     ],
 )
-def test_a_process_ends_beyond_its_cpu_limit_and_refuses_pictures_beyond_its_memory_limit(seconds, size, output):
+def test_a_process_ends_beyond_its_limits_of_cpu_time_and_memory(seconds, size, ended):
     line = [sys.executable, "-c", LIMITS, str(seconds), str(size)]
     request = frame({"name": "x", "px": 32, "max_pixels": MAX_PIXELS}, LARGE)
-    done = subprocess.run(line, input=request * (1 if output else 200), capture_output=True, check=False, timeout=300)
-    if output is None:
-        assert done.returncode == -signal.SIGXCPU
-    else:
-        assert output in done.stdout, done.stderr.decode()
+    done = subprocess.run(
+        line, input=request * (200 if seconds == 0 else 1), capture_output=True, check=False, timeout=300
+    )
+    assert done.returncode == ended, done.stderr.decode()
+    assert ended < 0 or (len(done.stdout) > 4 * 3 * 32**2) == (ended == 0)
 
 
 # The service ----------------------------------------------------------------------------------------------------------

@@ -165,37 +165,35 @@ def client_with_trials(index, folder, tmp_path):
 
 def test_a_trial_shows_one_photo_of_the_object_and_nine_of_others(client_with_trials):
     parts = client_with_trials.app.state.service
-    trials = [parts.trials.trial(parts.generations.current, 5, number) for number in range(1, 25)]
+    trials = [parts.trials.trial(parts.generations.current, number) for number in range(1, 25)]
     for trial in trials:
         owners = [path.name.rsplit("-", 1)[0] for path in trial.photos]
         assert len(set(owners)) == 10
         assert owners[trial.truth - 1] == trial.grasp.object_id
         assert trial.photos[trial.truth - 1] != trial.grasp.photo  # of another grasp
     assert len({trial.grasp.object_id for trial in trials[:12]}) == 12
-    assert [trial.truth for trial in trials] == [
-        parts.trials.trial(parts.generations.current, 5, number).truth for number in range(1, 25)
-    ]
+    assert trials == [parts.trials.trial(parts.generations.current, number) for number in range(1, 25)]
 
 
-def test_trial_run_counts_human_and_model_choices(client_with_trials):
-    assert client_with_trials.get("/v1/trials").json()["objects"] == 12
-    run = client_with_trials.post("/v1/trials", json={"count": 4, "participant": "Ada", "seed": 3}).json()
-    where, right, model = f"/v1/trials/{run['id']}", 0, 0
-    assert (run["next"], run["human_baseline"]["accuracy"], run["chance"]) == (1, None, 0.1)
+def test_choices_of_people_and_of_the_model_are_counted(client_with_trials):
+    known = client_with_trials.get("/v1/trials").json()
+    assert (known["objects"], known["chance"], known["participants"]) == (12, 0.1, [])
+    right = model = 0
     for number in (1, 2, 3):
-        trial = client_with_trials.get(f"{where}/{number}").json()
-        assert (trial["truth"], trial["model"], len(trial["touches"]), len(trial["photos"])) == (None, None, 2, 10)
+        trial = client_with_trials.get(f"/v1/trials/{number}").json()
+        assert (len(trial["touches"]), len(trial["photos"])) == (2, 10)
         for path in (*trial["touches"], *trial["photos"]):
             assert client_with_trials.get(path).headers["content-type"].startswith("image/")
-        done = client_with_trials.post(f"{where}/{number}", json={"choice": 4}).json()
+        done = client_with_trials.post(f"/v1/trials/{number}/Ada", json={"choice": 4}).json()
         right, model = right + (done["truth"] == 4), model + (done["model"] == done["truth"])
-    problem(client_with_trials.post(f"{where}/1", json={"choice": 1}), 409, "conflict")
-    problem(client_with_trials.post(f"{where}/5", json={"choice": 1}), 404, "unknown")
-    state = client_with_trials.get(where).json()
-    assert (state["completed"], state["next"]) == (3, 4)
-    assert (state["human_baseline"]["right"], state["model"]["right"]) == (right, model)
-    assert state["human_baseline"]["trials"] == state["model"]["trials"] == 3
-    human = state["human_baseline"]
+    problem(client_with_trials.post("/v1/trials/1/Ada", json={"choice": 1}), 409, "conflict")
+    assert client_with_trials.post("/v1/trials/1/Bob%2FB", json={"choice": 1}).status_code == 200
+    problem(client_with_trials.get("/v1/trials/1/touches/c"), 404, "unknown")
+    ada, bob = client_with_trials.get("/v1/trials").json()["participants"]
+    assert (ada["participant"], ada["next"], bob["participant"], bob["next"]) == ("Ada", 4, "Bob/B", 2)
+    assert (ada["human_baseline"]["right"], ada["model"]["right"]) == (right, model)
+    assert ada["human_baseline"]["trials"] == ada["model"]["trials"] == 3
+    human = ada["human_baseline"]
     assert 0 <= human["low"] <= human["accuracy"] <= human["high"] <= 1
 
 
@@ -204,5 +202,5 @@ def test_too_few_unseen_objects_are_reported(index, folder, recording, tmp_path)
     shutil.copytree(recording, tmp_path / "recording")
     with with_history(index, folder, tmp_path / "recording") as client:
         assert "requires 10 objects that the model was not trained on" in problem(
-            client.post("/v1/trials", json={}), 422, "bad-input"
+            client.get("/v1/trials/1"), 422, "bad-input"
         )

@@ -26,7 +26,7 @@ def test_every_body_and_every_error_is_described(client):
     for operation in operations:
         assert set(operation["responses"]["default"]["content"]) == {"application/problem+json"}
     bodies = [operation["requestBody"]["content"] for operation in operations if "requestBody" in operation]
-    assert len(bodies) == 6
+    assert len(bodies) == 5
     assert {"application/json", "multipart/form-data"} in [set(body) for body in bodies]
     assert all(body["application/json"]["schema"] for body in bodies)
 

@@ -83,7 +83,7 @@ def test_the_page_has_no_inline_script_or_style(client):
 
 
 def test_an_unexpected_error_reveals_no_internals(client, monkeypatch):
-    monkeypatch.setattr("retrieval.serve.catalogue.CatalogueDocument", lambda **_: 1 / 0)
+    monkeypatch.setattr(client.app.state.service.generations.current.shard, "page", lambda *_: 1 / 0)
     response = client.get("/v1/catalogue")
     detail = problem(response, 500, "failed")
     assert detail == "Unexpected ZeroDivisionError. See the log of the service."

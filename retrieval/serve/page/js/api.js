@@ -117,8 +117,6 @@ export const feedback = (query, value, objectId = null) =>
   json("/v1/feedback", jsonPost({ query, feedback: value, ...(objectId && { object_id: objectId }) }));
 
 export const trials = () => json("/v1/trials");
-export const beginTrials = (count, participant) => json("/v1/trials", jsonPost({ count, participant }));
-export const series = (id) => json(`/v1/trials/${encodeURIComponent(id)}`);
-export const trial = (id, number) => json(`/v1/trials/${encodeURIComponent(id)}/${number}`);
-export const choose = (id, number, choice) =>
-  json(`/v1/trials/${encodeURIComponent(id)}/${number}`, jsonPost({ choice }));
+export const trial = (number) => json(`/v1/trials/${number}`);
+export const choose = (number, participant, choice) =>
+  json(`/v1/trials/${number}/${encodeURIComponent(participant)}`, jsonPost({ choice }));

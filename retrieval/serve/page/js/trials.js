@@ -8,48 +8,36 @@ const wholePercent = (fraction) => `${Math.round(100 * fraction)}\u00a0%`;
 
 export function trialsView() {
   const element = h("div", { class: "trials" });
-  let state = null; // the current series
+  let participant = "";
   let choose = () => {};
 
-  async function show(id) {
+  async function show(name) {
+    choose = () => {};
+    participant = name;
     try {
-      if (id) await openSeries(id);
-      else overview(await api.trials());
+      const known = await api.trials();
+      const before = known.participants.find((person) => person.participant === participant);
+      if (participant) ask(await api.trial(before ? before.next : 1));
+      else overview(known);
     } catch (error) {
       element.replaceChildren(
         h("h1", { tabindex: "-1" }, "Test yourself"),
-        problemCard(error, () => show(id)),
+        problemCard(error, () => show(name)),
       );
     }
   }
 
   function overview(known) {
-    choose = () => {};
-    const number = h("input", {
-      type: "number",
-      id: "trial-count",
-      min: "1",
-      max: "10000",
-      value: "20",
-      required: true,
-    });
-    const participant = h("input", { type: "text", id: "trial-participant", maxlength: "200", autocomplete: "name" });
-    const problems = h("div", {});
+    const name = h("input", { type: "text", id: "trial-participant", maxlength: "200", autocomplete: "name", required: true });
     const form = h(
       "form",
       { class: "begin" },
-      h("div", { class: "field" }, h("label", { for: "trial-count" }, "Trials"), number),
-      h("div", { class: "field" }, h("label", { for: "trial-participant" }, "Your name (optional)"), participant),
+      h("div", { class: "field" }, h("label", { for: "trial-participant" }, "Your name"), name),
       h("button", { class: "primary" }, "Begin"),
     );
-    form.addEventListener("submit", async (event) => {
+    form.addEventListener("submit", (event) => {
       event.preventDefault();
-      try {
-        const series = await api.beginTrials(Number(number.value), participant.value);
-        location.hash = `#/test/${series.id}`;
-      } catch (error) {
-        problems.replaceChildren(problemCard(error));
-      }
+      location.hash = `#/test/${encodeURIComponent(name.value)}`;
     });
     const enough = known.objects >= known.choices;
     element.replaceChildren(
@@ -67,16 +55,13 @@ export function trialsView() {
             { class: "notice" },
             `A trial requires ${known.choices} objects that the model was not trained on; this recording has ${known.objects}.`,
           ),
-      problems,
-      ...(known.runs.length ? [h("h2", {}, "Series so far")] : []),
-      h("ul", { class: "series" }, known.runs.map(seriesCard)),
+      ...(known.participants.length ? [h("h2", {}, "Results so far")] : []),
+      h(
+        "ul",
+        { class: "series" },
+        known.participants.map((person) => personCard(person, known.chance)),
+      ),
     );
-  }
-
-  async function openSeries(id) {
-    state = await api.series(id);
-    if (state.next === null) showResult();
-    else ask(await api.trial(id, state.next));
   }
 
   function ask(trial) {
@@ -96,11 +81,12 @@ export function trialsView() {
       choose = () => {};
       buttons.forEach((button) => (button.disabled = true));
       try {
-        const done = await api.choose(state.id, trial.number, chosen);
-        state = await api.series(state.id);
-        reveal(done, buttons, trialResult);
+        const done = await api.choose(trial.number, participant, chosen);
+        const known = await api.trials();
+        const person = known.participants.find((one) => one.participant === participant);
+        reveal(done, scores(person, known.chance), buttons, trialResult);
       } catch (error) {
-        trialResult.replaceChildren(problemCard(error, () => show(state.id)));
+        trialResult.replaceChildren(problemCard(error, () => show(participant)));
       }
     };
     element.replaceChildren(
@@ -108,12 +94,12 @@ export function trialsView() {
         "div",
         { class: "view-head" },
         h("h1", { tabindex: "-1" }, "Which object was touched?"),
-        h("a", { href: "#/test", class: "link" }, "All series"),
+        h("a", { href: "#/test", class: "link" }, "All results"),
       ),
       h(
         "p",
         { class: "muted" },
-        `Trial ${trial.number} of ${state.count}. Choose a photo, or press its number (0 for the tenth).`,
+        `Trial ${trial.number}. Choose a photo, or press its number (0 for the tenth).`,
       ),
       h(
         "div",
@@ -129,7 +115,7 @@ export function trialsView() {
     element.querySelector("h1").focus({ preventScroll: true });
   }
 
-  function reveal(done, buttons, trialResult) {
+  function reveal(done, results, buttons, trialResult) {
     const right = done.choice === done.truth;
     const modelChoice = `the model chose photo ${done.model}`;
     const modelRight = done.model === done.truth;
@@ -149,25 +135,14 @@ export function trialsView() {
     });
     const next = h(
       "button",
-      { type: "button", class: "primary", onclick: () => show(state.id) },
-      state.next === null ? "Result" : "Next",
+      { type: "button", class: "primary", onclick: () => show(participant) },
+      "Next",
     );
-    trialResult.replaceChildren(h("p", { class: "verdict-line" }, text), next, scores(state));
+    trialResult.replaceChildren(h("p", { class: "verdict-line" }, text), next, results);
     announce(text);
     next.focus({ preventScroll: true });
     if (next.getBoundingClientRect().bottom > innerHeight || next.getBoundingClientRect().top < 0)
       next.scrollIntoView({ block: "center" });
-  }
-
-  function showResult() {
-    choose = () => {};
-    element.replaceChildren(
-      h("h1", { tabindex: "-1" }, "Result"),
-      h("p", { class: "lead" }, sentence(state)),
-      scores(state),
-      h("p", {}, h("a", { href: "#/test" }, "All series")),
-    );
-    element.querySelector("h1").focus({ preventScroll: true });
   }
 
   addEventListener("keydown", (event) => {
@@ -184,35 +159,22 @@ export function trialsView() {
   return { element, show };
 }
 
-function sentence({ human_baseline: human, model, count: trials }) {
-  const differ = human.low > model.high || model.low > human.high;
-  const better =
-    human.right === model.right
-      ? "You and the model were right equally often"
-      : human.right > model.right
-        ? "You were right more often than the model"
-        : "The model was right more often than you";
-  return `${better}: you ${human.right}, the model ${model.right} of ${count(trials, "trial")}.${differ ? "" : " The intervals overlap: this may be chance."}`;
-}
-
-function seriesCard(run) {
-  const done = run.next === null ? "done" : `${run.completed} of ${run.count} done`;
+function personCard(person, chance) {
   return h(
     "li",
     {},
     h(
       "div",
       { class: "view-head" },
-      h("strong", {}, run.participant || "Anonymous"),
-      h("a", { href: `#/test/${run.id}` }, run.next === null ? "Result" : "Continue"),
+      h("strong", {}, person.participant),
+      h("a", { href: `#/test/${encodeURIComponent(person.participant)}` }, "Continue"),
     ),
-    h("p", { class: "muted" }, `${count(run.count, "trial")}, ${done}`),
-    run.completed > 0 && scores(run),
+    scores(person, chance),
   );
 }
 
 /** Accuracy of the person and of the model with 95 % intervals, and chance. */
-function scores({ human_baseline: human, model, chance }) {
+function scores({ human_baseline: human, model }, chance) {
   const row = (name, result) =>
     h(
       "div",
@@ -234,7 +196,6 @@ function scores({ human_baseline: human, model, chance }) {
         `${result.right} of ${result.trials}, ${wholePercent(result.accuracy)} [${wholePercent(result.low)}, ${wholePercent(result.high)}]`,
       ),
     );
-  if (!human.trials) return h("p", {});
   return h(
     "div",
     { class: "scores" },
