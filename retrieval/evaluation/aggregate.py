@@ -1,8 +1,8 @@
 """From measures to results: values with intervals, paired differences from the controls, and the verdict."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import asdict, dataclass, replace
+from types import MappingProxyType
 
 from retrieval.data.dataset import Split
 from retrieval.evaluation.inputs import INPUTS
@@ -10,7 +10,6 @@ from retrieval.evaluation.protocol import Protocol, RecordingFacts
 from retrieval.evaluation.results import (
     Comparison,
     ControlResult,
-    Details,
     FeatureCounts,
     ProtocolResult,
     RecordingResult,
@@ -35,6 +34,7 @@ CONTROL_NAMES = {
 """Control of a verdict -> its name."""
 
 MeasuresBySeed = Sequence[Mapping[str, Measure]]
+"""Measures by name, of each training seed or of each choice of test objects."""
 
 
 @dataclass(frozen=True)
@@ -70,47 +70,15 @@ def _shared(by_seed: MeasuresBySeed) -> list[str]:
     return [name for name in by_seed[0] if all(name in one for one in by_seed)]
 
 
-@dataclass(frozen=True, eq=False)
-class MeasuredRow:
-    """Measures of a row, by seed or choice.
-
-    Attributes:
-        method: Name of the method.
-        model: Digest of the checkpoint of its towers, if there is one.
-        touch: Measures of the touches.
-        low_pass: Measures of low-pass touches; empty for a row without a verdict.
-        no_contact: Measures with no-contact frames as input, if the verdict uses this control.
-        best_params: Selected parameters, by seed and fold.
-        details: The details of a protocol in depth.
-    """
-
-    method: str
-    model: str | None
-    touch: MeasuresBySeed
-    low_pass: MeasuresBySeed = ()
-    no_contact: MeasuresBySeed = ()
-    best_params: Sequence[list[dict[str, Any]]] = ()
-    details: Details | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class MeasuredControl:
-    """A control or a ceiling: kind of inputs, method, and measures by seed or choice; or why there are none."""
-
-    kind: str
-    method: str
-    measures: MeasuresBySeed = ()
-    reason: str | None = None
-
-
 def protocol_result(
     protocol: Protocol,
     facts: RecordingFacts,
     folds: Iterable[Sequence[Split]],
-    rows: Mapping[str, MeasuredRow],
-    controls: Sequence[MeasuredControl],
+    rows: Mapping[str, RowResult],
+    measures: Mapping[tuple[str, str], MeasuresBySeed],
     compared: Iterable[tuple[str, str]],
     aggregation: Aggregation,
+    reasons: Mapping[str, str] = MappingProxyType({}),
     features: FeatureCounts | None = None,
 ) -> ProtocolResult:
     """Return the results of a protocol.
@@ -119,22 +87,23 @@ def protocol_result(
         protocol: The protocol.
         facts: The recording.
         folds: The splits of each seed.
-        rows: Measures of the rows.
-        controls: Measures of controls and ceilings.
+        rows: The rows, without measures.
+        measures: Measures by row and kind of inputs; the row of controls and ceilings is "".
         compared: Pairs of rows whose paired differences are stated.
         aggregation: How measures are aggregated.
+        reasons: Why a control or a ceiling was not measured.
         features: Counts of the features.
     """
-    order = next((one.measures for one in controls if one.kind == "order"), ())
-    results = {
-        one.kind: ControlResult(
-            INPUTS[one.kind],
-            one.method,
-            aggregation.summaries(one.measures) if one.measures else None,
-            one.reason,
+    controls = {
+        kind: ControlResult(
+            INPUTS[kind],
+            method,
+            aggregation.summaries(measures["", kind]) if ("", kind) in measures else None,
+            reasons.get(kind),
         )
-        for one in controls
+        for kind, method in {**protocol.controls, **protocol.ceilings}.items()
     }
+    differences = {(a, b): aggregation.differences(measures[a, "touch"], measures[b, "touch"]) for a, b in compared}
     return ProtocolResult(
         title=protocol.title,
         rule=protocol.rule,
@@ -151,43 +120,42 @@ def protocol_result(
         ),
         features=features,
         folds=[[asdict(split) for split in splits] for splits in folds],
-        rows={name: _row_result(protocol, row, order, aggregation) for name, row in rows.items()},
-        controls={kind: one for kind, one in results.items() if kind not in protocol.ceilings},
-        ceilings={kind: one for kind, one in results.items() if kind in protocol.ceilings},
-        comparisons=_comparisons(protocol, rows, compared, aggregation),
+        rows={name: _measured(protocol, name, row, measures, aggregation) for name, row in rows.items()},
+        controls={kind: one for kind, one in controls.items() if kind not in protocol.ceilings},
+        ceilings={kind: one for kind, one in controls.items() if kind in protocol.ceilings},
+        comparisons=[
+            Comparison(a, b, name, found[name])
+            for name in protocol.control_measures or protocol.measures
+            for (a, b), found in differences.items()
+            if name in found
+        ],
     )
 
 
-def _row_result(protocol: Protocol, row: MeasuredRow, order: MeasuresBySeed, aggregation: Aggregation) -> RowResult:
-    measures = aggregation.summaries(row.touch)
-    controls = {"low_pass": row.low_pass, "order": order, "no_contact": row.no_contact} if row.low_pass else {}
-    differences = {kind: aggregation.differences(row.touch, one) for kind, one in controls.items() if one}
-    main = protocol.main
-    return RowResult(
-        row.method,
-        row.model,
-        measures,
-        list(row.best_params),
-        aggregation.summaries(row.low_pass) if row.low_pass else None,
-        differences,
-        verdict(measures[main], {kind: one[main] for kind, one in differences.items()}) if differences else None,
-        row.details,
-    )
-
-
-def _comparisons(
+def _measured(
     protocol: Protocol,
-    rows: Mapping[str, MeasuredRow],
-    compared: Iterable[tuple[str, str]],
+    name: str,
+    row: RowResult,
+    measures: Mapping[tuple[str, str], MeasuresBySeed],
     aggregation: Aggregation,
-) -> list[Comparison]:
-    differences = {(a, b): aggregation.differences(rows[a].touch, rows[b].touch) for a, b in compared}
-    return [
-        Comparison(a, b, name, found[name])
-        for name in protocol.control_measures or protocol.measures
-        for (a, b), found in differences.items()
-        if name in found
-    ]
+) -> RowResult:
+    """Return a row with its measures, and if it has a low-pass control, with differences and verdict."""
+    touch, main = measures[name, "touch"], protocol.main
+    row = replace(row, measures=aggregation.summaries(touch))
+    if (name, "low_pass") not in measures:
+        return row
+    controls = {"low_pass": name, "order": "", "no_contact": name}
+    differences = {
+        kind: aggregation.differences(touch, measures[control, kind])
+        for kind, control in controls.items()
+        if (control, kind) in measures
+    }
+    return replace(
+        row,
+        low_pass=aggregation.summaries(measures[name, "low_pass"]),
+        differences=differences,
+        verdict=verdict(row.measures[main], {kind: one[main] for kind, one in differences.items()}),
+    )
 
 
 def verdict(main: Summary, differences: Mapping[str, Difference]) -> Verdict:

@@ -4,10 +4,9 @@ A control runs a method on inputs that lack information that the method should u
 modality alone identifies the object, and so which modality limits the result.
 """
 
-import dataclasses
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
@@ -18,7 +17,7 @@ from retrieval.data.dataset import Grasp, finger_count
 from retrieval.errors import DatasetError
 from retrieval.methods import METHODS
 from retrieval.methods.cca import Cca
-from retrieval.methods.late_fusion import frozen_matcher
+from retrieval.methods.late_fusion import LateFusion, frozen_matcher
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
@@ -57,7 +56,7 @@ class TowerEncoder:
         config: Configuration of the towers, and of heads that are fitted on them.
         matcher: Matcher with the towers.
         checkpoint: The model of the towers, with which late fusion scores as it is; None if heads are fitted.
-        cache: Folder of encoded features.
+        cache: Folder of the cache of features.
         quiet: No progress on stderr.
     """
 
@@ -70,39 +69,32 @@ class TowerEncoder:
     _encoded: dict[tuple[str, bool, int | None], Features] = field(default_factory=dict)
 
     @classmethod
-    def of_config(cls, grasps: list[Grasp], config: Config, cache: Path, quiet: bool) -> Self:
-        """Return the frozen towers of a configuration."""
-        matcher = dataclasses.replace(config.matcher, fingers=finger_count(grasps))
-        config = dataclasses.replace(config, matcher=matcher)
-        return cls(grasps, config, frozen_matcher(config), None, cache, quiet)
+    def of(cls, grasps: list[Grasp], source: Config | Checkpoint, iterations: int, cache: Path, quiet: bool) -> Self:
+        """Return the frozen towers of a configuration, or the towers of a checkpoint.
 
-    @classmethod
-    def of_checkpoint(
-        cls, grasps: list[Grasp], checkpoint: Checkpoint, iterations: int, cache: Path, quiet: bool
-    ) -> Self:
-        """Return the towers of a checkpoint.
-
-        If the model has two fingers and the recording one, both fingers get the same touch.
+        If a checkpoint has two fingers and the recording one, both fingers get the same touch.
 
         Args:
             grasps: The grasps of the recording.
-            checkpoint: The checkpoint.
-            iterations: Optimiser steps of heads that are fitted on its towers.
-            cache: Folder of encoded features.
+            source: The configuration or the checkpoint.
+            iterations: Optimiser steps of heads that are fitted on the towers of a checkpoint.
+            cache: Folder of the cache of features.
             quiet: No progress on stderr.
 
         Raises:
-            DatasetError: The recording has more fingers than the model.
+            DatasetError: The recording has more fingers than the checkpoint.
         """
-        fingers, recorded = checkpoint.config.matcher.fingers, finger_count(grasps)
-        if recorded not in (1, fingers):
+        recorded = finger_count(grasps)
+        if isinstance(source, Config):
+            config = replace(source, matcher=replace(source.matcher, fingers=recorded))
+            return cls(grasps, config, frozen_matcher(config), None, cache, quiet)
+        if recorded not in (1, fingers := source.config.matcher.fingers):
             raise DatasetError(
-                f"{checkpoint.path} needs {fingers} finger(s), but the recording has {recorded}. Evaluate a model for "
+                f"{source.path} needs {fingers} finger(s), but the recording has {recorded}. Evaluate a model for "
                 f"{recorded} finger(s)."
             )
-        grasps = with_fingers(grasps, fingers)
-        training = dataclasses.replace(
-            checkpoint.config.training,
+        training = replace(
+            source.config.training,
             init="random",
             init_photo="",
             start="",
@@ -110,8 +102,8 @@ class TowerEncoder:
             iterations=iterations,
             freeze_towers=True,
         )
-        config = dataclasses.replace(checkpoint.config, training=training)
-        return cls(grasps, config, checkpoint.matcher, checkpoint, cache, quiet)
+        config = replace(source.config, training=training)
+        return cls(with_fingers(grasps, fingers), config, source.matcher, source, cache, quiet)
 
     def inputs(self, kind: str, with_cells: bool = True, max_grasps: int | None = None) -> Features:
         """Return the features on which a method is fitted and scored.
@@ -125,6 +117,13 @@ class TowerEncoder:
         if key not in self._encoded:
             self._encoded[key] = self._inputs(*key)
         return self._encoded[key]
+
+    def touches(self, grasps: Sequence[Grasp], touch_variant: str) -> NDArray[np.float32]:
+        """Return the features (G, fingers * F) of other touches, without cells; their photos are not read."""
+        ids = tuple(grasp.grasp_id for grasp in grasps)
+        no_photos = Features(ids, ids, np.zeros((len(ids), 1, 1), np.float32), np.zeros((len(ids), 1), np.float32))
+        encoded = self._encode(with_fingers(grasps, self.config.matcher.fingers), touch_variant, "photo", no_photos)
+        return encoded.pooled(self.matcher).touch.reshape(len(ids), -1)
 
     def missing_reason(self, kind: str) -> str | None:
         """Return why the recording cannot give this kind of inputs; None if it can."""
@@ -144,21 +143,26 @@ class TowerEncoder:
             if kind == "permuted":  # the experiment permutes the touches of each part
                 return touches
             if kind == "order":
-                return dataclasses.replace(touches, touch=clock_features(len(touches))[:, None])
+                return replace(touches, touch=clock_features(len(touches))[:, None])
             if kind == "touch_to_touch":
-                return dataclasses.replace(touches, photo=touches.touch.reshape(len(touches), -1))
-            return dataclasses.replace(touches, touch=touches.photo[:, None])
+                return replace(touches, photo=touches.touch.reshape(len(touches), -1))
+            return replace(touches, touch=touches.photo[:, None])
         if not with_cells:
             return self.inputs(kind, max_grasps=max_grasps).pooled(self.matcher)
-        is_touch, is_background = kind == "touch", kind == "background"
+        grasps = thin_grasps(self.grasps, max_grasps) if max_grasps else self.grasps
+        if kind in ("touch", "background"):
+            return self._encode(grasps, "touch", "margin" if kind == "background" else "photo", None)
+        return self._encode(grasps, kind, "photo", self.inputs("touch"))
+
+    def _encode(self, grasps: Sequence[Grasp], touch: str, photo: str, photos_from: Features | None) -> Features:
         return encode_recording(
-            thin_grasps(self.grasps, max_grasps) if max_grasps else self.grasps,
+            grasps,
             self.matcher,
             self.config,
             self.cache,
-            touch_variant="touch" if is_touch or is_background else kind,
-            photo_variant="margin" if is_background else "photo",
-            photo_features_from=None if is_touch or is_background else self.inputs("touch"),
+            touch_variant=touch,
+            photo_variant=photo,
+            photo_features_from=photos_from,
             quiet=self.quiet,
         )
 
@@ -171,13 +175,16 @@ class Row:
     method: str
     towers: TowerEncoder
 
+    @property
+    def is_whole_model(self) -> bool:
+        """Whether a checkpoint scores as it is, without a fit."""
+        return self.towers.checkpoint is not None and issubclass(METHODS.load(self.method), LateFusion)
+
 
 def with_fingers(grasps: Sequence[Grasp], fingers: int) -> list[Grasp]:
     """Return the grasps for a model of this many fingers: each finger gets the touch of a grasp that has only one."""
     copies = fingers if len(grasps[0].touches) == 1 else 1
-    return [
-        dataclasses.replace(one, touches=one.touches * copies, backgrounds=one.backgrounds * copies) for one in grasps
-    ]
+    return [replace(one, touches=one.touches * copies, backgrounds=one.backgrounds * copies) for one in grasps]
 
 
 def missing_no_contact_reason(grasps: Sequence[Grasp]) -> str | None:

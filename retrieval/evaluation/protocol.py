@@ -12,7 +12,7 @@ from _touch_retrieval.files import read_json
 from retrieval.data.dataset import Grasp, Split, data_digest, load_grasps
 from retrieval.errors import DatasetError
 from retrieval.evaluation.inputs import CONTROL_CCA
-from retrieval.metrics.registry import METRICS, Metric, k_way_measure
+from retrieval.metrics.registry import Metric, k_way
 
 VALIDATION_OBJECTS = 5
 """Default number of validation objects, on which methods select their settings."""
@@ -27,18 +27,23 @@ class RecordingFacts:
     """A recording with the facts that protocols need.
 
     Attributes:
-        name: Name of its folder.
+        folder: Its folder.
         source: Source of the recording.
         grasps: The grasps.
         objects: object_id -> metadata of the data set.
         splits: Name -> published split.
     """
 
-    name: str
+    folder: Path
     source: str
     grasps: list[Grasp]
     objects: Mapping[str, Mapping[str, Any]]
     splits: Mapping[str, Split]
+
+    @property
+    def name(self) -> str:
+        """Name of its folder."""
+        return self.folder.resolve().name
 
     @cached_property
     def digest(self) -> str:
@@ -82,7 +87,7 @@ def read_recording_facts(folder: Path) -> RecordingFacts:
             splits[path.stem] = Split.from_dict(read_json(path))
         except ValueError as error:
             raise DatasetError(f"{path} is not a JSON file: {error}") from error
-    return RecordingFacts(folder.resolve().name, str(info["source"]), grasps, objects, splits)
+    return RecordingFacts(folder, str(info["source"]), grasps, objects, splits)
 
 
 @dataclass(frozen=True)
@@ -176,14 +181,6 @@ def folds(names: Sequence[str], tests: Sequence[Sequence[str]], seed: int) -> li
     ]
 
 
-# Measures --------------------------------------------------------------------------------------------
-
-
-def registered_metrics(*names: str) -> dict[str, Metric]:
-    """Return registered metrics by name."""
-    return {name: METRICS[name] for name in names}
-
-
 def topn_accuracy(k: int, *, grasps: int = 1, photos: int = 1) -> dict[str, Metric]:
     """Return the metric of top-1..top-k accuracy among k objects.
 
@@ -200,6 +197,6 @@ def topn_accuracy(k: int, *, grasps: int = 1, photos: int = 1) -> dict[str, Metr
         name: Metric(
             label,
             "real",
-            lambda of: k_way_measure(of.test if grasps == 1 else of.sets.get(grasps), k, of.seed, photos),
+            lambda of: k_way(of.test if grasps == 1 else of.sets.get(grasps), k, photos=photos, seed=of.seed),
         )
     }

@@ -1,9 +1,7 @@
 """Queries of an evaluation: touches, sets of grasps and photos, drawn once for all methods."""
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -43,18 +41,11 @@ class Queries:
     part_of: tuple[str, ...]
     sets: dict[int, Rows]
 
-    def of_part(self, owner: Rows, part: str) -> Rows:
-        """Return the places of the items whose owner is in `part`."""
+    def of_part(self, owner: Rows, part: str | None) -> Rows:
+        """Return the places of the items whose owner is in `part`; None for all parts."""
+        if part is None:
+            return np.arange(len(owner))
         return np.flatnonzero(np.array(self.part_of, dtype=str)[owner] == part)
-
-    @cached_property
-    def digest(self) -> str:
-        """Return a SHA-256 digest of the queries."""
-        digest = hashlib.sha256(repr((self.objects, self.part_of, sorted(self.sets))).encode())
-        arrays = [self.touches, self.photos, self.own_photo, self.touch_owner, self.photo_owner]
-        for array in [*arrays, *(self.sets[size] for size in sorted(self.sets))]:
-            digest.update(f"{array.shape}".encode() + np.ascontiguousarray(array).data)
-        return digest.hexdigest()
 
 
 def draw_queries(grasps: Sequence[Grasp], split: Split, seed: int, max_grasps: Mapping[str, int]) -> Queries:
@@ -105,9 +96,9 @@ def draw_queries(grasps: Sequence[Grasp], split: Split, seed: int, max_grasps: M
 
 def _draw_touches(grasps: Sequence[Grasp], name: str, max_grasps: int | None, rng: np.random.Generator) -> Rows:
     rows = np.array([row for row, grasp in enumerate(grasps) if grasp.object_id == name])
-    return (
-        rows if max_grasps is None or len(rows) <= max_grasps else np.sort(rng.choice(rows, max_grasps, replace=False))
-    )
+    if max_grasps is None or len(rows) <= max_grasps:
+        return rows
+    return np.sort(rng.choice(rows, max_grasps, replace=False))
 
 
 def _draw_sets(touches_of: Sequence[Rows], size: int, rng: np.random.Generator) -> Rows:

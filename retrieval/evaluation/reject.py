@@ -6,21 +6,18 @@ higher by chance, so that an uninformative scorer would seem better than chance.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from retrieval.evaluation.calibrate import posterior_questions
+from retrieval.evaluation.calibration import identification_trials
 from retrieval.metrics.measure import Measure, object_weights, weight_below
 from retrieval.metrics.table import ScoreTable
 from retrieval.model.posterior import Posterior
 
 TRUE_ACCEPTS = 0.95
 _CURVE_POINTS = 200
-_IDENTITY_POSTERIOR = Posterior(slope=1.0, offset=0.0)
-"""Posterior that uses log-likelihood ratios as logits."""
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -28,12 +25,14 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class RejectionMeasures:
-    """Rejection performance of a posterior on objects that it was not fitted on, for one training seed.
+    """Rejection performance of a posterior on objects that it was not fitted on; rows of an object weigh as one.
 
     Attributes:
-        auroc: Area under the ROC curve.
-        balanced_accuracy: Mean of true accept rate and true reject rate, at even prior.
-        false_accepts_at_95: False accept rate at a true accept rate of 95 %.
+        auroc: Area under the ROC curve: how often the statistic of a row with its object in the gallery exceeds that of
+            a row without; ties count 1/2. Chance: 1/2.
+        balanced_accuracy: Mean of true accept rate and true reject rate; a row is accepted if "one of these" is at
+            least as likely as none, at even prior. Chance: 1/2.
+        false_accepts_at_95: False accept rate at the threshold with a true accept rate of 95 %. Chance: 0.95.
         roc: [false accept rate, true accept rate], from accepting none to accepting all.
         risk_coverage: [fraction answered, top-1 error rate among these], from the most confident answers to all. Half
             of the queries are without their object.
@@ -46,29 +45,20 @@ class RejectionMeasures:
     risk_coverage: list[list[float]]
 
 
-class Galleries(NamedTuple):
-    """Log-likelihood ratios (T, O), -inf outside the gallery.
-
-    Attributes:
-        present: Galleries with each row's object.
-        absent: Galleries without it.
-    """
-
-    present: Floats
-    absent: Floats
-
-
-def galleries(ratios: Floats, true: Bools, seed: int = 0) -> Galleries:
-    """Return galleries of all objects but one: a random rival is dropped, or the row's own object.
+def galleries(ratios: Floats, true: Bools, seed: int = 0) -> tuple[Floats, Floats]:
+    """Return galleries of all objects but one: with a random rival dropped, and with the row's own object dropped.
 
     Args:
         ratios: (T, O) log-likelihood ratios.
         true: (T, O) whether the object is the row's own.
         seed: Seed of the dropped rivals.
+
+    Returns:
+        Ratios (T, O) of the galleries with and without each row's object, -inf outside the gallery.
     """
     keys = np.random.default_rng([seed, 3]).random(true.shape)
     dropped = np.where(true, -1, keys).argmax(1)[:, None] == np.arange(true.shape[1])
-    return Galleries(*(np.where(left_out, -np.inf, ratios) for left_out in (dropped, true)))
+    return np.where(dropped, -np.inf, ratios), np.where(true, -np.inf, ratios)
 
 
 def statistic(gallery: Floats) -> Floats:
@@ -83,14 +73,6 @@ def statistic(gallery: Floats) -> Floats:
 def reject(posterior: Posterior, table: ScoreTable, *, seed: int = 0) -> RejectionMeasures:
     """Measure the rejection performance of a posterior on objects that it was not fitted on.
 
-    The prior of "none of these" is even. Objects have equal weight.
-
-    * auroc: probability that the statistic of a row with its object in the gallery exceeds that of a row without; ties
-      count 1/2. Chance: 1/2.
-    * balanced_accuracy: a row is accepted if "one of these" is at least as likely as none. Chance: 1/2.
-    * false_accepts_at_95: rate of accepted rows without the object, at the threshold that accepts 95 % of the rows with
-      it. Chance: 0.95.
-
     Args:
         posterior: The fitted posterior.
         table: Scores of the other objects.
@@ -101,7 +83,7 @@ def reject(posterior: Posterior, table: ScoreTable, *, seed: int = 0) -> Rejecti
     """
     targets = table.with_targets
     true = np.asarray(targets.touch_owner[:, None] == targets.objects)
-    pair = galleries(posterior_questions(targets, seed).log_ratios(posterior), true, seed)
+    pair = galleries(identification_trials(targets, seed).log_ratios(posterior), true, seed)
     present, absent = map(statistic, pair)
     weights = object_weights(targets.touch_owner)
     words = f"{table.gallery}; each query with its object in the gallery, and with a rival in its place"
@@ -112,9 +94,9 @@ def reject(posterior: Posterior, table: ScoreTable, *, seed: int = 0) -> Rejecti
     return RejectionMeasures(
         auroc=measure(_areas(present, absent, weights), 0.5),
         balanced_accuracy=measure(((present >= 0) + 1.0 - (absent >= 0)) / 2, 0.5),
-        false_accepts_at_95=measure(_false_accepts(present, absent, targets.touch_owner), TRUE_ACCEPTS),
+        false_accepts_at_95=measure(false_accepts(present, absent, targets.touch_owner), TRUE_ACCEPTS),
         roc=_roc(present, absent, weights),
-        risk_coverage=_risk_coverage(pair, true, weights),
+        risk_coverage=_risk_coverage(np.concatenate(pair), np.tile(true, (2, 1)), np.tile(weights, 2) / 2),
     )
 
 
@@ -127,61 +109,52 @@ def _areas(present: Floats, absent: Floats, weights: Floats) -> Floats:
     return np.asarray(hits + alarms - np.sum(weights * hits))
 
 
-def _false_accepts(present: Floats, absent: Floats, owner: NDArray[np.int64]) -> Floats:
+def false_accepts(present: Floats, absent: Floats, owner: NDArray[np.int64]) -> Floats:
     """Return values (T,): their object-weighted mean is the false accept rate; their object means give its variance.
 
     The threshold depends on the same queries, so the true accepts of an object change the rate too. Each object's value
     is a jackknife pseudo-value, from the rate without it.
     """
-    weights = object_weights(owner)
-    rate = _false_accept_rate(present, absent, weights)
+    rate = _false_accept_rate(present, absent, owner)
     objects, place = np.unique(owner, return_inverse=True)
     if len(objects) == 1:
         return np.full(len(owner), rate)
-    without = [
-        _false_accept_rate(present[rest], absent[rest], object_weights(owner[rest]))
-        for rest in (owner != name for name in objects)
-    ]
-    moved = (len(objects) - 1) * (np.mean(without) - np.array(without))
-    return np.asarray((rate + moved)[place])
+    without = np.array(
+        [_false_accept_rate(*(part[owner != name] for part in (present, absent, owner))) for name in objects]
+    )
+    return np.asarray((rate + (len(objects) - 1) * (without.mean() - without))[place])
 
 
-def _false_accept_rate(present: Floats, absent: Floats, weights: Floats) -> float:
+def _false_accept_rate(present: Floats, absent: Floats, owner: NDArray[np.int64]) -> float:
     """Return the accept rate of queries without the object when 95 % of those with it are accepted.
 
     A fraction of the ties at the threshold is accepted, so that the true accept rate is exactly 95 %.
     """
-    order = np.argsort(-present, kind="stable")
+    weights, order = object_weights(owner), np.argsort(-present, kind="stable")
     accepted = np.cumsum(weights[order])
     threshold = present[order][min(int(np.searchsorted(accepted, TRUE_ACCEPTS * accepted[-1])), len(order) - 1)]
-    tied, above = (weights[test(present, threshold)].sum() for test in (np.equal, np.greater))
+    tied, above = weights[present == threshold].sum(), weights[present > threshold].sum()
     part = (TRUE_ACCEPTS * accepted[-1] - above) / tied
     return float(weights[absent > threshold].sum() + part * weights[absent == threshold].sum())
 
 
 def _roc(present: Floats, absent: Floats, weights: Floats) -> list[list[float]]:
     thresholds = np.unique(np.append(present, absent))[::-1]
-    points = [
-        [float(weights[absent >= threshold].sum()), float(weights[present >= threshold].sum())]
-        for threshold in thresholds
-    ]
+    points = [[float(weights[part >= threshold].sum()) for part in (absent, present)] for threshold in thresholds]
     return _thin_points([[0.0, 0.0], *points])
 
 
-def _risk_coverage(pair: Galleries, true: Bools, weights: Floats) -> list[list[float]]:
+def _risk_coverage(ratios: Floats, true: Bools, weights: Floats) -> list[list[float]]:
     """Return the risk-coverage curve, in descending order of the top-1 probability; ties are answered together.
 
     If several objects tie for top-1, each is equally likely to be the answer.
     """
-    first = np.concatenate([gallery == gallery.max(1, keepdims=True) for gallery in pair])
-    wrong = 1 - (first & np.tile(true, (2, 1))).sum(1) / first.sum(1)
-    finite = [row[np.isfinite(row)] for row in np.concatenate(pair)]
-    confidences = np.array(
-        [_IDENTITY_POSTERIOR.probabilities_given(row, _IDENTITY_POSTERIOR.mass(row)).objects.max() for row in finite]
-    )
-    fraction = np.tile(weights, 2) / 2
+    first = ratios == ratios.max(1, keepdims=True)
+    wrong = 1 - (first & true).sum(1) / first.sum(1)
+    # Log of the probability at even prior, which is 1 for all sure answers: odds of each object over 1 plus their sum.
+    confidences = ratios.max(1) - np.log(np.isfinite(ratios).sum(1)) - np.logaddexp(0, statistic(ratios))
     levels, place = np.unique(-confidences, return_inverse=True)
-    answered, failed = (np.cumsum(np.bincount(place, part, len(levels))) for part in (fraction, fraction * wrong))
+    answered, failed = (np.cumsum(np.bincount(place, part, len(levels))) for part in (weights, weights * wrong))
     return _thin_points(np.stack([answered / answered[-1], failed / answered], axis=1).tolist())
 
 

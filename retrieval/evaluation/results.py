@@ -47,15 +47,7 @@ class Confusion:
 
 @dataclass(frozen=True)
 class Rejection:
-    """Decisions that an object is not in the catalogue; curves are those of the first seed.
-
-    Attributes:
-        auroc: Area under the ROC curve.
-        false_accepts_at_95: False accept rate at a true accept rate of 95 %.
-        balanced_accuracy: Mean of true accept rate and true reject rate, at even prior.
-        roc: [false accept rate, true accept rate].
-        risk_coverage: [fraction answered, error rate of these answers].
-    """
+    """Decisions that an object is not in the catalogue (`reject.RejectionMeasures`); curves of the first seed."""
 
     auroc: Summary
     false_accepts_at_95: Summary
@@ -76,14 +68,7 @@ class Rate:
 
 @dataclass(frozen=True)
 class VerificationRates:
-    """Error rates of verification by sequences of one number of grasps.
-
-    Attributes:
-        objects: Touched objects.
-        sequences: Sequences of grasps.
-        eer: Equal error rate.
-        frr: False-reject rate by false-accept rate ("0.01").
-    """
+    """Counts of objects and of sequences of grasps, equal error rate, false-reject rate by false-accept rate "0.01"."""
 
     objects: int
     sequences: int
@@ -99,7 +84,7 @@ class Details:
         pair_threshold: The threshold of pair accuracy.
         per_object: Mean top-1 accuracy of 5 of each object: "test_candidates" among test objects, "all_candidates".
         confusions: The most frequent ones.
-        calibration: Calibrations of the first seed: "pairs" and "posteriors" by number of grasps.
+        calibration: "posteriors" of the first seed, by number of grasps.
         reliability: "pairs", "k5", "k10", "k5_g5" -> {"ece", "bins"}.
         reject: None with too few objects.
         verification: Impostors ("random", "similar") -> number of grasps -> rates; None with too few objects, and for
@@ -122,8 +107,8 @@ class RowResult:
     Attributes:
         method: Name of the method.
         model: Digest of the checkpoint that scores as it is, or whose towers are used; None for other towers.
-        measures: Measures of the touches.
         best_params: Parameters that the method selected, by seed and fold.
+        measures: Measures of the touches.
         low_pass: Measures with low-pass touches; None without this control of the row.
         differences: Control ("low_pass", "order", "no_contact") -> measure -> touch minus control.
         verdict: None for rows without controls of their own.
@@ -132,8 +117,8 @@ class RowResult:
 
     method: str
     model: str | None
-    measures: Summaries
     best_params: list[list[dict[str, Any]]]
+    measures: Summaries = field(default_factory=dict)
     low_pass: Summaries | None = None
     differences: dict[str, dict[str, Difference]] = field(default_factory=dict)
     verdict: Verdict | None = None
@@ -183,16 +168,12 @@ class FeatureCounts:
 
 @dataclass(frozen=True)
 class ProtocolResult:
-    """Results of one protocol.
+    """Results of one protocol, described in `rule`.
 
     Attributes:
-        title: Title.
-        rule: The split, in sentences.
-        published_results: Results of others, in sentences.
         main: The measure that decides.
         labels: Measure and label, in the order of tables.
         unit: What intervals resample: "object" or "sequence"; or "choice", if they cover choices of test objects.
-        recording: The recording.
         features: None for touch to touch.
         folds: The splits of each seed; one list if all seeds have the same splits.
         rows: Rows by name, in the order of tables.
@@ -218,15 +199,7 @@ class ProtocolResult:
 
 @dataclass(frozen=True)
 class Setting:
-    """Settings of an evaluation.
-
-    Attributes:
-        preset: Name of the configuration.
-        config: The configuration.
-        model: Digest of the evaluated checkpoint, if one was given.
-        compared: Name -> configuration of towers that are compared.
-        seeds: Training seeds.
-    """
+    """Settings: name and content of the configuration, digest of `--model`, compared digests or configurations."""
 
     preset: str
     config: dict[str, Any]
@@ -289,11 +262,7 @@ def write_results(path: Path, results: Results | Timings) -> None:
 
 
 def read_results(path: Path, kind: type[T]) -> T:
-    """Read a file that `write_results` wrote.
-
-    Args:
-        path: The file.
-        kind: `Results` or `Timings`.
+    """Read a file that `write_results` wrote, as `Results` or `Timings`.
 
     Raises:
         BadInput: The file cannot be read, or another version wrote it.

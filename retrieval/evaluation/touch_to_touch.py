@@ -11,7 +11,7 @@ sequences is the cosine of their first principal components; scaling and compone
 """
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -25,15 +25,14 @@ from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, Split
 from retrieval.data.images import encode_image, read_rgb
 from retrieval.errors import DatasetError
-from retrieval.evaluation.aggregate import Aggregation, MeasuredControl, MeasuredRow, protocol_result
-from retrieval.evaluation.inputs import TowerEncoder, clock_features, missing_no_contact_reason, with_fingers
+from retrieval.evaluation.aggregate import Aggregation, protocol_result
+from retrieval.evaluation.inputs import TowerEncoder, clock_features, missing_no_contact_reason
 from retrieval.evaluation.protocol import Protocol, RecordingFacts
-from retrieval.evaluation.results import ProtocolResult
-from retrieval.metrics import protocols
+from retrieval.evaluation.results import ProtocolResult, RowResult
+from retrieval.metrics import registry
 from retrieval.metrics.measure import Measure, pooled
 from retrieval.metrics.registry import MethodScoreTables, Metric
 from retrieval.metrics.table import ScoreTable
-from retrieval.training.features import Features, encode_recording
 
 COMPONENTS = 60
 REPRESENTATIONS = ("difference", "common-frame")
@@ -45,15 +44,11 @@ METHOD = "nearest"
 Vectors = NDArray[np.float64]
 
 MEASURES = {
-    "recall_1": Metric("top-1", "real", lambda of: protocols.recall(of.test, 1)),
-    "recall_5": Metric("R@5", "real", lambda of: protocols.recall(of.test, 5)),
-    "map": Metric("mAP", "real", lambda of: protocols.average_precision(of.test)),
+    "recall_1": Metric("top-1", "real", lambda of: registry.recall(of.test, 1)),
+    "recall_5": Metric("R@5", "real", lambda of: registry.recall(of.test, 5)),
+    "map": Metric("mAP", "real", lambda of: registry.average_precision(of.test)),
 }
 """Measures of sequence-to-sequence retrieval; the first one decides."""
-
-
-def _no_folds(facts: RecordingFacts, seed: int) -> list[Split]:
-    return []
 
 
 @dataclass(frozen=True)
@@ -63,8 +58,11 @@ class TouchToTouch(Protocol):
     It needs a no-contact frame for each touch. Methods are not fitted; a row is a tower with one of `REPRESENTATIONS`.
     """
 
-    folds: Any = _no_folds
+    folds: Any = lambda facts, seed: []
     measures: Mapping[str, Metric] = dataclasses.field(default_factory=lambda: MEASURES)
+    controls: Mapping[str, str] = dataclasses.field(
+        default_factory=lambda: dict.fromkeys(("order", "no_contact", "permuted"), METHOD)
+    )
 
 
 def leave_one_out_scores(vectors: Vectors, components: int = COMPONENTS) -> NDArray[np.float32]:
@@ -138,11 +136,19 @@ class Sequences:
         """Return the mean (S, F) of features (G, F) over the grasps of each sequence."""
         return np.stack([features[rows].mean(0, dtype=np.float64) for rows in self.rows])
 
-    def table(self, scores: NDArray[np.float32], owner: NDArray[np.int64] | None = None) -> ScoreTable:
-        """Return scores (S, S) as a table: each sequence is a query, and is not compared with itself."""
+    def measures(
+        self, protocol: Protocol, scores: NDArray[np.float32], owner: NDArray[np.int64] | None = None
+    ) -> dict[str, Measure]:
+        """Return the measures of scores (S, S): each sequence is a query, and is not compared with itself.
+
+        `owner` replaces the objects of the sequences.
+        """
         owner = self.owner if owner is None else owner
-        words = {"row_words": "sequences", "column_words": "sequences"}
-        return ScoreTable(scores, owner, owner, np.eye(len(owner), dtype=np.bool_), **words)
+        own = np.eye(len(owner), dtype=np.bool_)
+        table = ScoreTable(scores, owner, owner, own, row_words="sequences", column_words="sequences")
+        tables = MethodScoreTables(table, table, {}, None, 0)
+        found = {name: metric.compute(tables) for name, metric in protocol.measures.items()}
+        return {name: pooled([one]) for name, one in found.items() if one}
 
 
 def with_common_frame(grasps: Sequence[Grasp], folder: Path, *, quiet: bool = True) -> list[Grasp]:
@@ -170,7 +176,8 @@ def with_common_frame(grasps: Sequence[Grasp], folder: Path, *, quiet: bool = Tr
             for finger, (touch, before) in enumerate(zip(grasp.touches, grasp.backgrounds, strict=True)):
                 path = folder / f"{grasp.grasp_id}-{finger}.png"
                 if not path.is_file():
-                    write_atomically(path, _png(_on_common_frame(touch, before, common[finger])))
+                    image = _on_common_frame(touch, before, common[finger])
+                    write_atomically(path, encode_image(np.clip(np.rint(255 * image), 0, 255).astype(np.uint8)))
                 files.append(path)
             found.append(dataclasses.replace(grasp, touches=tuple(files), backgrounds=grasps[0].backgrounds))
             bar.advance()
@@ -187,49 +194,19 @@ def _on_common_frame(touch: Path, before: Path, common: NDArray[np.float32]) -> 
     return common + pressed - no_contact
 
 
-def _png(image: NDArray[np.float32]) -> bytes:
-    """Return an RGB image (H, W, 3) in 0..1 as the bytes of a PNG file."""
-    return encode_image(np.clip(np.rint(255 * image), 0, 255).astype(np.uint8))
+def _vectors(sequences: Sequences, towers: TowerEncoder, common: Sequence[Grasp], variant: str) -> dict[str, Vectors]:
+    """Return vectors (S, F) of each representation and of the no-contact frame.
 
-
-@dataclass(frozen=True, eq=False)
-class _SequenceEncoder:
-    """Encodes the sequences of a recording with the towers of one row; each kind of image is encoded once."""
-
-    sequences: Sequences
-    towers: TowerEncoder
-    common: Sequence[Grasp]
-
-    def vectors(self, representation: str, touch_variant: str) -> Vectors:
-        """Return vectors (S, F) of a representation; `touch_variant` is "touch" or, for the control, "low_pass"."""
-        if representation == "common-frame":
-            return self.sequences.mean(self._features(self.common, touch_variant))
-        return self.sequences.mean(self._features(self.sequences.grasps, touch_variant)) - self.no_contact(
-            touch_variant
-        )
-
-    def no_contact(self, touch_variant: str = "touch") -> Vectors:
-        """Return the features (S, F) of each sequence's no-contact frame, that of its first grasp."""
-        first = [self.sequences.grasps[rows[0]] for rows in self.sequences.rows]
-        frames = [dataclasses.replace(grasp, touches=grasp.backgrounds) for grasp in first]
-        return self._features(frames, touch_variant).astype(np.float64)
-
-    def _features(self, grasps: Sequence[Grasp], touch_variant: str) -> NDArray[np.float32]:
-        """Return the features (G, fingers * F) of these touches without cells, whose place in the image would count."""
-        grasps = with_fingers(grasps, self.towers.config.matcher.fingers)
-        ids = tuple(grasp.grasp_id for grasp in grasps)
-        no_photos = Features(ids, ids, np.zeros((len(ids), 1, 1), np.float32), np.zeros((len(ids), 1), np.float32))
-        towers = self.towers
-        found = encode_recording(
-            grasps,
-            towers.matcher,
-            towers.config,
-            towers.cache,
-            touch_variant=touch_variant,
-            photo_features_from=no_photos,
-            quiet=towers.quiet,
-        )
-        return found.pooled(towers.matcher).touch.reshape(len(ids), -1)
+    `variant` is "touch" or, for the control, "low_pass".
+    """
+    first = [sequences.grasps[rows[0]] for rows in sequences.rows]
+    frames = [dataclasses.replace(grasp, touches=grasp.backgrounds) for grasp in first]
+    no_contact = towers.touches(frames, variant).astype(np.float64)
+    return {
+        "no_contact": no_contact,
+        "difference": sequences.mean(towers.touches(sequences.grasps, variant)) - no_contact,
+        "common-frame": sequences.mean(towers.touches(common, variant)),
+    }
 
 
 def run_touch_to_touch(
@@ -257,52 +234,30 @@ def run_touch_to_touch(
     if reason := missing_no_contact_reason(facts.grasps):
         raise DatasetError(f"Touch to touch needs the no-contact frame of each sequence: {reason}.")
     common = with_common_frame(facts.grasps, folder / facts.digest[:32], quiet=quiet)
-    order = _measures(protocol, sequences, clock_features(len(sequences.names)).astype(np.float64))
-    rows: dict[str, MeasuredRow] = {}
-    controls: dict[str, list[dict[str, Measure]]] = {"order": [order]}
+    order = leave_one_out_scores(clock_features(len(sequences.names)).astype(np.float64))
+    measures = {("", "order"): [sequences.measures(protocol, order)]}
+    rows: dict[str, RowResult] = {}
     for label, towers in towers_of.items():
-        encoder = _SequenceEncoder(sequences, towers, common)
-        no_contact = _measures(protocol, sequences, encoder.no_contact())
-        controls.setdefault("no_contact", [no_contact])
-        for representation in REPRESENTATIONS:
-            table = sequences.table(leave_one_out_scores(encoder.vectors(representation, "touch")))
-            low_pass = _measures(protocol, sequences, encoder.vectors(representation, "low_pass"))
-            rows[f"{label}-{representation}"] = MeasuredRow(
-                METHOD,
-                towers.checkpoint.digest if towers.checkpoint else None,
-                [_measure_table(protocol, table)],
-                [low_pass],
-                [no_contact],
-            )
-            controls.setdefault("permuted", list(_permuted_measures(protocol, sequences, table.scores, seeds)))
+        digest = towers.checkpoint.digest if towers.checkpoint else None
+        touch, low_pass = (_vectors(sequences, towers, common, variant) for variant in ("touch", "low_pass"))
+        no_contact = [sequences.measures(protocol, leave_one_out_scores(touch["no_contact"]))]
+        measures.setdefault(("", "no_contact"), no_contact)
+        for each in REPRESENTATIONS:
+            row, scores = f"{label}-{each}", leave_one_out_scores(touch[each])
+            rows[row] = RowResult(METHOD, digest, best_params=[])
+            measures[row, "touch"] = [sequences.measures(protocol, scores)]
+            measures[row, "low_pass"] = [sequences.measures(protocol, leave_one_out_scores(low_pass[each]))]
+            measures[row, "no_contact"] = no_contact
+            if ("", "permuted") not in measures:
+                owners = [np.random.default_rng([seed, 41]).permutation(sequences.owner) for seed in seeds]
+                measures["", "permuted"] = [sequences.measures(protocol, scores, owner) for owner in owners]
     first, *others = towers_of
     return protocol_result(
         protocol,
         facts,
         [[Split(seeds[0], (), (), (name,)) for name in sequences.names]],
         rows,
-        [MeasuredControl(kind, METHOD, by_seed) for kind, by_seed in controls.items()],
+        measures,
         [(f"{other}-{each}", f"{first}-{each}") for other in others for each in REPRESENTATIONS],
         Aggregation(seeds[0]),
     )
-
-
-def _measures(protocol: Protocol, sequences: Sequences, vectors: Vectors) -> dict[str, Measure]:
-    return _measure_table(protocol, sequences.table(leave_one_out_scores(vectors)))
-
-
-def _measure_table(protocol: Protocol, table: ScoreTable) -> dict[str, Measure]:
-    """Return the measures of a table, queries in the order of their objects."""
-    found = {
-        name: metric.compute(MethodScoreTables(table, table, {}, None, 0)) for name, metric in protocol.measures.items()
-    }
-    same = {int(name): int(name) for name in table.objects}
-    return {name: pooled([one], [same]) for name, one in found.items() if one is not None}
-
-
-def _permuted_measures(
-    protocol: Protocol, sequences: Sequences, scores: NDArray[np.float32], seeds: Sequence[int]
-) -> Iterator[dict[str, Measure]]:
-    for seed in seeds:
-        owner = np.random.default_rng([seed, 41]).permutation(sequences.owner)
-        yield _measure_table(protocol, sequences.table(scores, owner))

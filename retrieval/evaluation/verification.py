@@ -33,14 +33,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Errors:
-    """Error rates of the sequences of one number of grasps, for one training seed.
-
-    Attributes:
-        objects: Touched objects.
-        sequences: Sequences of grasps.
-        eer: Equal error rate.
-        frr: False-reject rates at `FARS`.
-    """
+    """Errors of one number of grasps and training seed: objects, sequences, equal error rate, and FRR at `FARS`."""
 
     objects: int
     sequences: int
@@ -66,8 +59,7 @@ def verification_errors(scores: MethodScores, features: Features, checkpoint: Ch
         The errors; None for fewer than three test objects, or for a model without posterior and fewer than three
         validation objects.
     """
-    queries, posterior = scores.queries, checkpoint.posterior
-    test = scores.scored_touches("test")
+    queries, posterior, test = scores.queries, checkpoint.posterior, scores.scored_touches("test")
     if posterior is None:
         validation = scores.scored_touches("validation")
         if len(np.unique(validation.photo_owner)) >= MIN_OBJECTS:
@@ -82,11 +74,10 @@ def verification_errors(scores: MethodScores, features: Features, checkpoint: Ch
     for grasps in GRASPS:
         sequences = verification_sequences(test, posterior, scores.seed, grasps)
         objects, genuine = len(np.unique(sequences.owner)), sequences.genuine[-1]
-        if objects < MIN_OBJECTS:
-            continue
-        for kind, impostors in (("random", sequences.impostor.ravel()), ("similar", sequences.similar)):
-            frr = tuple(false_rejects(far, genuine, impostors) for far in FARS)
-            found[kind][str(grasps)] = Errors(objects, len(genuine), equal_error_rate(genuine, impostors), frr)
+        if objects >= MIN_OBJECTS:
+            for kind, impostors in (("random", sequences.impostor.ravel()), ("similar", sequences.similar)):
+                frr = tuple(false_rejects(far, genuine, impostors) for far in FARS)
+                found[kind][str(grasps)] = Errors(objects, len(genuine), equal_error_rate(genuine, impostors), frr)
     return found if found["random"] else None
 
 
@@ -101,25 +92,18 @@ def verification_rates(by_seed: Sequence[ErrorsByImpostors]) -> dict[str, dict[s
 def _rates(kind: str, by_seed: Sequence[Errors]) -> VerificationRates:
     objects = by_seed[0].objects
 
-    def rate(values: Sequence[float], far: float) -> Rate:
-        value = float(np.mean(values))
+    def rate(value: float, far: float) -> Rate:
         needed = objects_needed(far) if kind == "random" else math.ceil(ERRORS_NEEDED / far)
-        return _rate(value, objects, needed)
+        if objects < needed:
+            return Rate(None, None, None, needed)
+        return Rate(**asdict(error_rate(value, objects)), objects_needed=needed)
 
     eer = float(np.mean([one.eer for one in by_seed]))
     return VerificationRates(
         objects,
         by_seed[0].sequences,
-        rate([eer], eer) if eer else Rate(None, None, None, None),
-        {f"{far:g}": rate([one.frr[place] for one in by_seed], far) for place, far in enumerate(FARS)},
-    )
-
-
-def _rate(value: float, objects: int, needed: int) -> Rate:
-    return (
-        Rate(None, None, None, needed)
-        if objects < needed
-        else Rate(**asdict(error_rate(value, objects)), objects_needed=needed)
+        rate(eer, eer) if eer else Rate(None, None, None, None),
+        {f"{far:g}": rate(float(np.mean([one.frr[place] for one in by_seed])), far) for place, far in enumerate(FARS)},
     )
 
 

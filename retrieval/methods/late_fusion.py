@@ -43,7 +43,7 @@ class LateFusion(Method):
         self._use_checkpoint(trained_checkpoint(self.settings, train, validation))
 
     def _use_checkpoint(self, checkpoint: Checkpoint) -> None:
-        self._matcher = checkpoint.matcher
+        self.checkpoint, self._matcher = checkpoint, checkpoint.matcher
         self.best_params = {"step": checkpoint.provenance["step"], **checkpoint.provenance["metrics"]}
 
     @torch.inference_mode()

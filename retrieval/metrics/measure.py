@@ -40,25 +40,19 @@ class Measure:
         return object_means(self.values, self.owner)
 
 
-def pooled(parts: Sequence[Measure], units: Sequence[Mapping[int, int]] | None = None) -> Measure:
+def pooled(parts: Sequence[Measure], unit_of: Mapping[int, int] | None = None) -> Measure:
     """Return one measure of queries against several galleries, such as those of folds.
 
     Values keep their order within a unit. Chance is averaged like the values.
 
     Args:
-        parts: The measures.
-        units: For each part, the unit that replaces an object's number: the object, or a group of objects that are
-            correlated. None for the objects' own numbers.
-
-    Raises:
-        BadInput: There are no parts.
+        parts: The measures, at least one.
+        unit_of: The unit that replaces an object's number: the object, or a group of objects that are correlated. None
+            for the objects' own numbers.
     """
-    if not parts:
-        raise BadInput("pooling needs at least one measure; got none")
-    owners = [part.owner for part in parts]
-    if units is not None:
-        owners = [np.array([unit[name] for name in own.tolist()]) for own, unit in zip(owners, units, strict=True)]
-    owner = np.concatenate(owners)
+    owner = np.concatenate([part.owner for part in parts])
+    if unit_of is not None:
+        owner = np.array([unit_of[name] for name in owner.tolist()])
     order = np.argsort(owner, kind="stable")
     chance = parts[0].chance
     if not all(np.array_equal(part.chance, chance) for part in parts):  # the mean of equal numbers may be rounded

@@ -3,7 +3,6 @@
 Ranking uses logits and never these probabilities, which are for people to read.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,55 +18,28 @@ BINS = 15
 _LARGEST = float(np.finfo(np.float32).max)
 
 
-@dataclass(frozen=True)
-class Calibration:
-    """`log_odds = slope * logit + intercept`, fitted on validation pairs at even odds."""
-
-    slope: float
-    intercept: float
-
-    def log_odds(self, logit: ArrayLike) -> NDArray[np.float64]:
-        """Return the calibrated log-odds of match logits.
-
-        Raises:
-            NumericalError: A logit is not finite. NaN, for example, would silently be classified as "no match".
-        """
-        z = np.asarray(logit, dtype=np.float64)
-        if not np.isfinite(z).all():
-            raise NumericalError(f"every logit must be finite to be calibrated; got {z[~np.isfinite(z)][0]}")
-        return self.slope * z + self.intercept
-
-    def probability(self, logit: ArrayLike) -> NDArray[np.float64]:
-        """Return the probability of a match at even odds, for people; never rank by it."""
-        return np.asarray(expit(self.log_odds(logit)))
-
-
-def fit_calibration(logits: ArrayLike, labels: ArrayLike) -> Calibration:
-    """Fit slope and intercept by maximum likelihood with Platt's smoothed targets (Platt 1999, section 2.2).
+def fit_calibration(logits: ArrayLike, labels: ArrayLike) -> tuple[float, float]:
+    """Fit log-odds `slope * logit + intercept` at even odds, with Platt's smoothed targets (Platt 1999, section 2.2).
 
     Smoothing gives separable data a finite optimum. The slope is kept within `SLOPE_BOUNDS`; it is at the lower bound
     if the logits carry no information, or wrong information.
 
+    Two nested root searches find the maximum of the likelihood, whose derivatives are monotonous: they work at any
+    scale and offset of the logits. A quasi-Newton search for slope and intercept together stops too early if, for
+    example, the logits are 1000 +- 1.
+
     Args:
         logits: (P,) match logits.
         labels: (P,) of 0 and 1.
+
+    Returns:
+        Slope and intercept.
 
     Raises:
         BadInput: A class is missing.
         NumericalError: A logit is not a finite float32.
     """
     z, y = _checked(logits, labels)
-    return Calibration(*_likeliest(z, y))
-
-
-def _likeliest(z: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the slope (within its bounds) and the intercept with the smallest loss.
-
-    Two nested root searches find them. The loss is convex in both. Its derivative by the intercept grows with the
-    intercept, and at the best intercept its derivative by the slope grows with the slope. Bracketed roots are found at
-    any scale and offset of the logits. A quasi-Newton search for slope and intercept together stops too
-    early if, for example, the logits are 1000 +- 1.
-    """
     positives, negatives = y.sum(), (1 - y).sum()
     targets = np.where(y == 1, (positives + 1) / (positives + 2), 1 / (negatives + 2))
     # Both classes have the same weight, whatever their counts: the odds are even by definition.

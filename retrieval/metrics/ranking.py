@@ -11,7 +11,6 @@ is the fraction of the relevant items among the first k.
 """
 
 from math import comb
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,24 +21,14 @@ Scores = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
 
-class FirstRelevant(NamedTuple):
-    """Position of the first relevant item of each row (Q,).
+def recall_at(k: int, scores: Scores, relevant: Mask, in_gallery: Mask) -> NDArray[np.float64]:
+    """Return the probability (Q,) that a relevant item is among the first k.
 
-    Attributes:
-        before: Number of items with a higher score; they are not relevant.
-        tied: Number of items with the same score, including itself.
-        right: Number of relevant items among these.
-    """
-
-    before: NDArray[np.int64]
-    tied: NDArray[np.int64]
-    right: NDArray[np.int64]
-
-
-def first_relevant(scores: Scores, relevant: Mask, in_gallery: Mask) -> FirstRelevant:
-    """Return the position of the best relevant item of each query.
+    Hypergeometric: of m tied items, r of them relevant, the first j contain none with probability
+    prod_{i<j} (m - r - i) / (m - i).
 
     Args:
+        k: Number of first items.
         scores: (Q, N), finite.
         relevant: (Q, N); every query has a relevant item in its gallery.
         in_gallery: (Q, N) whether the item is in the query's gallery.
@@ -47,21 +36,13 @@ def first_relevant(scores: Scores, relevant: Mask, in_gallery: Mask) -> FirstRel
     good = relevant & in_gallery
     best = np.where(good, scores, -np.inf).max(1, keepdims=True)
     equal = in_gallery & (scores == best)
-    return FirstRelevant((in_gallery & (scores > best)).sum(1), equal.sum(1), (equal & good).sum(1))
-
-
-def recall_at(k: int, first: FirstRelevant) -> NDArray[np.float64]:
-    """Return the probability (Q,) that a relevant item is among the first k.
-
-    Hypergeometric: of m tied items, r of them relevant, the first j contain none with probability
-    prod_{i<j} (m - r - i) / (m - i).
-    """
-    none = np.ones(len(first.before))
+    before, tied, right = (in_gallery & (scores > best)).sum(1), equal.sum(1), (equal & good).sum(1)
+    none = np.ones(len(scores))
     for turn in range(k):
         # Higher scores take the first `before` places; after the tied items a relevant one was certainly found.
-        left = first.tied - turn
-        fraction = np.clip((left - first.right) / np.maximum(left, 1), 0, 1)
-        none *= np.where(turn < k - first.before, fraction, 1)
+        left = tied - turn
+        fraction = np.clip((left - right) / np.maximum(left, 1), 0, 1)
+        none *= np.where(turn < k - before, fraction, 1)
     return 1 - none
 
 
@@ -70,10 +51,7 @@ def average_precision(scores: Scores, relevant: Mask, in_gallery: Mask) -> NDArr
 
     Average precision at a cutoff is a different measure; do not compare the two.
 
-    Args:
-        scores: (Q, N), finite.
-        relevant: (Q, N); every query has a relevant item in its gallery.
-        in_gallery: (Q, N) whether the item is in the query's gallery.
+    Arguments are those of `recall_at`.
     """
     harmonic = np.append(0.0, np.cumsum(1 / np.arange(1.0, scores.shape[1] + 1)))
     rows = zip(scores, relevant & in_gallery, in_gallery, strict=True)

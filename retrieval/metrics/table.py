@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.errors import BadInput, NumericalError
-from retrieval.metrics.ranking import FirstRelevant, first_relevant
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,11 +80,6 @@ class ScoreTable:
         words = f"{len(self.objects)} {self.object_words}, {len(self.photo_owner)} {self.column_words}; {own}"
         missing = np.count_nonzero(~self.has_target)
         return words + (f"; {missing} {self.row_words} left out, which have no other" if missing else "")
-
-    @cached_property
-    def first(self) -> FirstRelevant:
-        """Position of the first photo of each row's object, without own photos; every row needs `has_target`."""
-        return first_relevant(self.scores, self.relevant, ~self.own)
 
     @cached_property
     def objects(self) -> NDArray[np.int64]:

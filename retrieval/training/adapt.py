@@ -378,8 +378,7 @@ def _log_odds(parts: Iterable[ScoredTouches]) -> tuple[float, float]:
         count = min(len(pairs[0]), len(pairs[1]), 20_000)
         cosines += [part.logits.ravel()[drawn[:count]] for drawn in pairs]
         labels += [np.ones(count), np.zeros(count)]
-    found = fit_calibration(np.concatenate(cosines), np.concatenate(labels))
-    return found.slope, found.intercept
+    return fit_calibration(np.concatenate(cosines), np.concatenate(labels))
 
 
 @torch.no_grad()

@@ -119,7 +119,7 @@ def test_the_naive_fits_equal_ours_on_overlapping_pairs():
     logits, labels = np.append(rng.normal(1, 1, 20_000), rng.normal(-1, 1, 20_000)), np.repeat([1, 0], 20_000)
     fitted = probability.fit_calibration(logits, labels)
     # Platt's targets differ from 0 and 1 by 1 in 20,000.
-    assert probability.naive_fit(logits, labels) == pytest.approx((fitted.slope, fitted.intercept), rel=1e-3, abs=1e-3)
+    assert probability.naive_fit(logits, labels) == pytest.approx(fitted, rel=1e-3, abs=1e-3)
     scores = rng.normal(0, 1, (5000, 5)) + 1.5 * np.eye(5)[0]
     fitted = probability.fit_posterior(probability.scored_choices(scores))
     assert probability.naive_slope(scores) == pytest.approx(fitted.slope, rel=2e-2)

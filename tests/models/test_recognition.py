@@ -7,7 +7,7 @@ import pytest
 
 from models import recognition
 from retrieval.data.dataset import load_grasps
-from retrieval.metrics.protocols import k_way
+from retrieval.metrics.registry import k_way
 from retrieval.metrics.table import ScoreTable
 
 

@@ -5,12 +5,15 @@ drift of the capture identifies them.
 """
 
 from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 
 from retrieval.data.dataset import Split
 from retrieval.errors import DatasetError
-from retrieval.evaluation.protocol import Protocol, RecordingFacts, registered_metrics, topn_accuracy
+from retrieval.evaluation.protocol import Protocol, RecordingFacts, topn_accuracy
+from retrieval.metrics.registry import METRICS
 
 _PARTS = 4
 
@@ -33,15 +36,18 @@ def by_billet(facts: RecordingFacts) -> dict[str, list[str]]:
     return billets
 
 
+def _split(seed: int, *parts: Iterable[str]) -> Split:
+    return Split(seed, *(tuple(sorted(part)) for part in parts))
+
+
 def _unseen(facts: RecordingFacts, seed: int) -> list[Split]:
     billets = by_billet(facts)
-    names = list(billets)
-    found = []
+    names, found = list(billets), []
     for number, name in enumerate(names):
         others = names[number + 1 :] + names[:number]
         validation = others[seed % len(others)]
         train = [place for other in others if other != validation for place in billets[other]]
-        found.append(Split(seed, tuple(sorted(train)), tuple(billets[validation]), tuple(billets[name])))
+        found.append(_split(seed, train, billets[validation], billets[name]))
     return found
 
 
@@ -51,12 +57,8 @@ def _places(facts: RecordingFacts, seed: int) -> list[Split]:
         order = np.random.default_rng([seed, 29, number]).permutation(len(places))
         for turn, place in enumerate(order):
             parts[turn % _PARTS].append(places[place])
-    found = []
-    for number, test in enumerate(parts):
-        validation = parts[(number + 1) % _PARTS]
-        train = [place for part in parts if part is not test and part is not validation for place in part]
-        found.append(Split(seed, tuple(sorted(train)), tuple(sorted(validation)), tuple(sorted(test))))
-    return found
+    turned = [parts[number:] + parts[:number] for number in range(_PARTS)]  # test, validation, and two to train
+    return [_split(seed, [*first, *second], validation, test) for test, validation, first, second in turned]
 
 
 UNSEEN = Protocol(
@@ -65,17 +67,15 @@ UNSEEN = Protocol(
     "Each welded billet is the test billet once; settings are selected on another one. The gallery contains the places "
     "of the test billet.",
     _unseen,
-    {**topn_accuracy(5), **topn_accuracy(10), **topn_accuracy(16), **registered_metrics("pair_auc")},
+    {**topn_accuracy(5), **topn_accuracy(10), **topn_accuracy(16), "pair_auc": METRICS["pair_auc"]},
     allows_own_photos=True,
     is_by_sequence=True,
 )
-PLACES = Protocol(
-    "billets",
-    "Billets: an unseen place of a seen welded billet",
-    "Of the places of each welded billet a quarter is for test, a quarter for validation and half for training; every "
-    "place is tested once. The gallery contains the four test places of the same billet.",
-    _places,
-    {**topn_accuracy(4), **registered_metrics("pair_auc")},
-    allows_own_photos=True,
-    is_by_sequence=True,
+PLACES = replace(
+    UNSEEN,
+    title="Billets: an unseen place of a seen welded billet",
+    rule="Of the places of each welded billet a quarter is for test, a quarter for validation and half for training; "
+    "every place is tested once. The gallery contains the four test places of the same billet.",
+    folds=_places,
+    measures={**topn_accuracy(4), "pair_auc": METRICS["pair_auc"]},
 )

@@ -3,8 +3,9 @@
 import numpy as np
 
 from retrieval.data.dataset import Split
-from retrieval.evaluation.calibrate import MIN_THRESHOLD_OBJECTS
-from retrieval.evaluation.protocol import Protocol, RecordingFacts, fold, registered_metrics
+from retrieval.evaluation.protocol import Protocol, RecordingFacts, fold
+from retrieval.evaluation.scoring import MIN_THRESHOLD_OBJECTS
+from retrieval.metrics.registry import METRICS
 
 _OBJECTS, _TEST = 98, 18
 
@@ -23,7 +24,7 @@ PAPER = Protocol(
     "98 random objects: 18 for test and 80 for training. Settings and pair threshold are selected on ten of the 80. "
     "Only successful grasps are used. A touch is never compared with the photo of its own grasp.",
     _paper,
-    registered_metrics("topn_k5", "topn_k10", "pair_accuracy", "pair_auc"),
+    {name: METRICS[name] for name in ("topn_k5", "topn_k10", "pair_accuracy", "pair_auc")},
     published_results=(
         "On its own data, with this rig's sensors, the paper reports a pair accuracy of 64.3 % (Lin, Calandra, "
         "Levine, ICRA 2019); it gives its top-K curves without numbers.",

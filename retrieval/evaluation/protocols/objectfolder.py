@@ -2,9 +2,8 @@
 
 from retrieval.data.dataset import Split
 from retrieval.errors import DatasetError
-from retrieval.evaluation.protocol import Protocol, RecordingFacts, registered_metrics
-from retrieval.metrics import protocols
-from retrieval.metrics.registry import Metric
+from retrieval.evaluation.protocol import Protocol, RecordingFacts
+from retrieval.metrics.registry import METRICS, Metric, average_precision
 
 
 def _published(facts: RecordingFacts, seed: int) -> list[Split]:
@@ -25,12 +24,13 @@ PUBLISHED = Protocol(
     _published,
     {
         "objectfolder_touch_to_photo": Metric(
-            "mAP, touch to photo", "real", lambda of: protocols.average_precision(of.test.with_own())
+            "mAP, touch to photo", "real", lambda of: average_precision(of.test.with_own())
         ),
         "objectfolder_photo_to_touch": Metric(
-            "mAP, photo to touch", "real", lambda of: protocols.average_precision(of.test.transposed().with_own())
+            "mAP, photo to touch", "real", lambda of: average_precision(of.test.transposed().with_own())
         ),
-        **registered_metrics("pair_auc", "topn_k10"),
+        "pair_auc": METRICS["pair_auc"],
+        "topn_k10": METRICS["topn_k10"],
     },
     published_results=(
         "On 100 unseen simulated objects the benchmark's authors report a mAP from touch to photo of 8.50 % for CCA "

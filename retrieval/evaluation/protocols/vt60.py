@@ -4,30 +4,21 @@
 """
 
 from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
 from retrieval.data.dataset import Split
 from retrieval.errors import DatasetError
-from retrieval.evaluation.protocol import (
-    Protocol,
-    RecordingFacts,
-    folds,
-    registered_metrics,
-    topn_accuracy,
-)
+from retrieval.evaluation.protocol import Protocol, RecordingFacts, folds, topn_accuracy
+from retrieval.metrics.registry import METRICS
 
 LEFT_OUT = "bottlefull"
 GALLERY = 9
 DRAWN_CHOICES = 9
 _CLASSES_OF_A_FOLD = 3
-_MEASURES = {
-    **topn_accuracy(GALLERY),
-    **topn_accuracy(GALLERY, photos=3),
-    **topn_accuracy(GALLERY, grasps=5, photos=3),
-    **registered_metrics("pair_auc"),
-}
 _SPLIT_NOTE = (
     "08_bottlefull is left out, because it is 02_bottleempty filled. Settings are selected on five of the other "
     "objects."
@@ -40,24 +31,25 @@ def by_class(facts: RecordingFacts) -> dict[str, list[str]]:
     Raises:
         DatasetError: The recording lacks the class of an object.
     """
+    if facts.kind_of is None:
+        raise DatasetError(
+            "recording.json lacks the class of an object. Import the data set again with `retrieve import vt60`."
+        )
     found: dict[str, list[str]] = defaultdict(list)
-    for name in facts.names:
-        kind = facts.objects.get(name, {}).get("class")
-        if kind is None:
-            raise DatasetError(
-                f"recording.json lacks the class of {name}. Import the data set again with `retrieve import vt60`."
-            )
+    for name, kind in facts.kind_of.items():
         if kind != LEFT_OUT:
-            found[str(kind)].append(name)
+            found[kind].append(name)
     return dict(sorted(found.items()))
+
+
+def _names(classes: Mapping[str, Sequence[str]]) -> list[str]:
+    return [name for names in classes.values() for name in names]
 
 
 def _seen_classes(facts: RecordingFacts, seed: int) -> list[Split]:
     """Return a fold for each instance number i, which tests instance i of every class."""
     classes = by_class(facts)
-    fewest = min(map(len, classes.values()))
-    tests = [[names[turn] for names in classes.values()] for turn in range(fewest)]
-    return folds([name for names in classes.values() for name in names], tests, seed)
+    return folds(_names(classes), list(zip(*classes.values(), strict=False)), seed)
 
 
 def _choices(facts: RecordingFacts, seed: int) -> list[Split]:
@@ -78,21 +70,17 @@ def _choices(facts: RecordingFacts, seed: int) -> list[Split]:
     tests = [[names[turn] for names in classes.values() for turn in pair] for pair in combinations(range(fewest), 2)]
     for _ in range(DRAWN_CHOICES):
         tests.append([name for names in classes.values() for name in rng.choice(names, 2, replace=False).tolist()])
-    return folds([name for names in classes.values() for name in names], tests, seed)
+    return folds(_names(classes), tests, seed)
 
 
 def _one_of_each_class(facts: RecordingFacts, split: Split) -> dict[str, str]:
     """Return galleries with one test object of each class: the first of each, the second, and so on."""
-    test = set(split.test)
-    return {
-        name: f"instance {place}"
-        for names in by_class(facts).values()
-        for place, name in enumerate(name for name in names if name in test)
-    }
+    tested = [[name for name in names if name in split.test] for names in by_class(facts).values()]
+    return {name: f"instance {place}" for names in tested for place, name in enumerate(names)}
 
 
 def _random(facts: RecordingFacts, seed: int) -> list[Split]:
-    names = [name for members in by_class(facts).values() for name in members]
+    names = _names(by_class(facts))
     order = [names[place] for place in np.random.default_rng([seed, 19]).permutation(len(names))]
     count = max(1, len(names) // GALLERY)
     return folds(names, [order[turn::count] for turn in range(count)], seed)
@@ -103,8 +91,7 @@ def _classes(facts: RecordingFacts, seed: int) -> list[Split]:
     kinds = list(classes)
     order = [kinds[place] for place in np.random.default_rng([seed, 23]).permutation(len(kinds))]
     groups = [order[start : start + _CLASSES_OF_A_FOLD] for start in range(0, len(order), _CLASSES_OF_A_FOLD)]
-    names = [name for members in classes.values() for name in members]
-    return folds(names, [[name for kind in group for name in classes[kind]] for group in groups], seed)
+    return folds(_names(classes), [[name for kind in group for name in classes[kind]] for group in groups], seed)
 
 
 SEEN_CLASSES = Protocol(
@@ -113,36 +100,36 @@ SEEN_CLASSES = Protocol(
     "A fold tests one instance of each of nine classes and trains on the others; every object is tested once. "
     f"{_SPLIT_NOTE}",
     _seen_classes,
-    _MEASURES,
+    {
+        **topn_accuracy(GALLERY),
+        **topn_accuracy(GALLERY, photos=3),
+        **topn_accuracy(GALLERY, grasps=5, photos=3),
+        "pair_auc": METRICS["pair_auc"],
+    },
     allows_own_photos=True,
 )
-CHOICES = Protocol(
-    "vt60",
-    "VT60: two unseen instances of each class, over choices of them",
-    "A fold tests two instances of each of nine classes and trains on the others. All pairs of instance numbers are "
-    f"held out, the same in every class, and {DRAWN_CHOICES} seeded draws of two instances in each class. A gallery "
-    "contains one test object of each class; each query searches its own gallery. 08_bottlefull is left out, because "
-    "it is 02_bottleempty filled. Settings are selected within the training objects of each fold.",
-    _choices,
-    _MEASURES,
-    allows_own_photos=True,
+CHOICES = replace(
+    SEEN_CLASSES,
+    title="VT60: two unseen instances of each class, over choices of them",
+    rule="A fold tests two instances of each of nine classes and trains on the others. All pairs of instance numbers "
+    f"are held out, the same in every class, and {DRAWN_CHOICES} seeded draws of two instances in each class. A "
+    "gallery contains one test object of each class; each query searches its own gallery. 08_bottlefull is left out, "
+    "because it is 02_bottleempty filled. Settings are selected within the training objects of each fold.",
+    folds=_choices,
     galleries=_one_of_each_class,
     choices=True,
 )
-RANDOM = Protocol(
-    "vt60",
-    "VT60: nine random unseen objects",
-    f"Objects are randomly assigned to folds of nine, again for each seed; every object is tested once. {_SPLIT_NOTE}",
-    _random,
-    _MEASURES,
-    allows_own_photos=True,
+RANDOM = replace(
+    SEEN_CLASSES,
+    title="VT60: nine random unseen objects",
+    rule="Objects are randomly assigned to folds of nine, again for each seed; every object is tested once. "
+    f"{_SPLIT_NOTE}",
+    folds=_random,
 )
-CLASSES = Protocol(
-    "vt60",
-    "VT60: unseen classes",
-    "A fold tests all instances of three unseen classes, drawn again for each seed; a gallery contains nine of their "
-    f"objects. {_SPLIT_NOTE}",
-    _classes,
-    _MEASURES,
-    allows_own_photos=True,
+CLASSES = replace(
+    SEEN_CLASSES,
+    title="VT60: unseen classes",
+    rule="A fold tests all instances of three unseen classes, drawn again for each seed; a gallery contains nine of "
+    f"their objects. {_SPLIT_NOTE}",
+    folds=_classes,
 )

@@ -289,7 +289,7 @@ def test_a_control_is_left_out_without_no_contact_frames(run, tmp_path):
     assert [name for name, control in found.controls.items() if not control.reason] == ["permuted", "low_pass"]
     assert len(found.folds[0][0]["validation"]) == 2  # too few for a posterior
     assert found.rows["chance"].details.reject is None
-    assert set(found.rows["chance"].details.reliability) == {"pairs"}
+    assert found.rows["chance"].details.reliability == {}
 
 
 def test_an_informative_modality_has_a_high_ceiling_and_noise_stays_at_chance(tmp_path):
@@ -305,7 +305,7 @@ def test_an_informative_modality_has_a_high_ceiling_and_noise_stays_at_chance(tm
     features = Features(tuple(map(str, range(144))), owners, touch, photo)
     encoded = {("touch", with_cells, None): features for with_cells in (True, False)}
     row = Row("cca", "cca", TowerEncoder(grasps, CONFIG, None, None, tmp_path, True, encoded))
-    protocol, facts = PROTOCOLS.load(UNSEEN_OBJECTS), RecordingFacts("drawn", "drawn", grasps, {}, {})
+    protocol, facts = PROTOCOLS.load(UNSEEN_OBJECTS), RecordingFacts(Path("drawn"), "drawn", grasps, {}, {})
     found = {}
     with Cache(tmp_path / "cache.sqlite") as cache:
         for kind in protocol.ceilings:

@@ -24,7 +24,7 @@ def facts(sequence_of, about=None, splits=None):
         for name, sequence in sequence_of.items()
         for turn in range(2)
     ]
-    return RecordingFacts("drawn", "drawn", grasps, about or {}, splits or {})
+    return RecordingFacts(Path("drawn"), "drawn", grasps, about or {}, splits or {})
 
 
 def vt60(instances=4):
@@ -232,7 +232,7 @@ def test_an_interval_over_choices_is_the_corrected_resampled_t_interval():
 def test_pooled_galleries_have_every_query_under_its_unit():
     one = Measure(np.array([[0.5], [1.0]]), np.array([3, 7]), np.array([0.25]), "four")
     two = Measure(np.array([[0.0]]), np.array([3]), np.array([0.5]), "two")
-    whole = pooled([one, two], [{3: 1, 7: 0}, {3: 1}])
+    whole = pooled([one, two], {3: 1, 7: 0})
     assert whole.owner.tolist() == [0, 1, 1]
     assert whole.values.ravel().tolist() == [1.0, 0.5, 0.0]
     assert whole.chance.tolist() == [pytest.approx((0.25 + (0.25 + 0.5) / 2) / 2)]  # equal unit weights

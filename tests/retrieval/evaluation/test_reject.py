@@ -5,13 +5,13 @@ import json
 import numpy as np
 import pytest
 
-from retrieval.evaluation.calibrate import posterior_questions
-from retrieval.evaluation.reject import _false_accepts, galleries, reject, statistic
+from retrieval.evaluation.calibration import fit_posterior as fit
+from retrieval.evaluation.calibration import identification_trials
+from retrieval.evaluation.reject import false_accepts, galleries, reject, statistic
 from retrieval.metrics.intervals import summarise
 from retrieval.metrics.measure import object_means
 from retrieval.metrics.table import ScoreTable
 from retrieval.model.posterior import Posterior
-from retrieval.training.calibration.posterior import fit_posterior_to_trials
 
 
 def table_of(scores, owner):
@@ -25,10 +25,6 @@ def planted(objects=12, grasps=8, gap=3.0, seed=0, scale=1.0):
     rng = np.random.default_rng(seed)
     owner = np.repeat(np.arange(objects), grasps)
     return table_of(scale * (gap * (owner[:, None] == owner) + rng.normal(size=(len(owner),) * 2)), owner)
-
-
-def fit(table):
-    return fit_posterior_to_trials([posterior_questions(table)])
 
 
 def rejection(gap, **more):
@@ -108,7 +104,7 @@ def by_hand(posterior, table):
 
 def test_the_decision_is_that_of_a_query_at_even_prior():
     posterior, table = fit(planted(gap=1.5, seed=1)), planted(gap=1.5, seed=2, objects=5, grasps=2)
-    ratios = posterior_questions(table).log_ratios(posterior)
+    ratios = identification_trials(table).log_ratios(posterior)
     true = table.touch_owner[:, None] == table.objects
     for gallery in galleries(ratios, true):
         for row, log_odds in zip(gallery, statistic(gallery), strict=True):
@@ -121,7 +117,7 @@ def test_false_accepts_use_the_threshold_with_95_percent_true_accepts():
     """Of 200 sorted queries the 190th is the last accepted one."""
     posterior, table = Posterior(), planted(objects=100, grasps=2, gap=1.5)
     found = reject(posterior, table)
-    ratios, true = posterior_questions(table).log_ratios(posterior), table.touch_owner[:, None] == table.objects
+    ratios, true = identification_trials(table).log_ratios(posterior), table.touch_owner[:, None] == table.objects
     present, absent = statistics(ratios, true)
     threshold = sorted(present, reverse=True)[190 - 1]
     assert value(found.false_accepts_at_95) == pytest.approx(np.mean(absent >= threshold))
@@ -130,7 +126,7 @@ def test_false_accepts_use_the_threshold_with_95_percent_true_accepts():
 def test_the_risk_equals_a_loop_over_the_most_confident_answers():
     posterior, table = fit(planted(gap=1.5, seed=1)), planted(gap=1.5, seed=2, objects=5, grasps=3)
     found = np.array(reject(posterior, table).risk_coverage)
-    ratios, true = posterior_questions(table).log_ratios(posterior), table.touch_owner[:, None] == table.objects
+    ratios, true = identification_trials(table).log_ratios(posterior), table.touch_owner[:, None] == table.objects
     answers = []
     for gallery in galleries(ratios, true):
         for row, own in zip(gallery, true, strict=True):
@@ -182,7 +178,7 @@ def test_the_false_accept_rate_varies_over_objects_as_over_draws_of_objects():
         owner = np.repeat(np.arange(18), 12)
         present = (2 + rng.normal(size=18))[owner] + rng.normal(size=len(owner))
         absent = rng.normal(size=18)[owner] + rng.normal(size=len(owner))
-        means = object_means(_false_accepts(present, absent, owner)[:, None], owner)[1]
+        means = object_means(false_accepts(present, absent, owner)[:, None], owner)[1]
         rates.append(means.mean())
         errors.append(means.std(ddof=1) / np.sqrt(18))
         accepted = (absent >= np.quantile(present, 0.05))[:, None].astype(float)

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from retrieval.evaluation.predictions import Predictions
 from retrieval.evaluation.queries import Queries
 from retrieval.evaluation.results import Rate
 from retrieval.evaluation.scoring import MethodScores
@@ -63,7 +62,7 @@ def evaluated(objects, grasps=7, gap=0.0, posterior=POSTERIOR, validation=0):
     features = SimpleNamespace(photo=np.eye(objects // 2, dtype=np.float32)[owner // 2])
     matcher = SimpleNamespace(photo_encoding=lambda photo: SimpleNamespace(embedding=photo))
     checkpoint = SimpleNamespace(matcher=matcher, posterior=posterior)
-    scores = MethodScores(queries, Predictions(logits.astype(np.float32), {}, {}, {}), 0)
+    scores = MethodScores(queries, logits.astype(np.float32), {}, {}, {}, 0)
     errors = verification_errors(scores, features, checkpoint)
     return errors and verification_rates([errors])
 

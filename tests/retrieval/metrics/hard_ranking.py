@@ -12,7 +12,6 @@ from retrieval.metrics.intervals import binomial_interval, bootstrap_interval, s
 from retrieval.metrics.pairs import pair_auc
 from retrieval.metrics.ranking import (
     average_precision,
-    first_relevant,
     k_way_accuracies,
     recall_at,
 )
@@ -99,8 +98,7 @@ def _constant_scorer() -> HardCase:
     scores, relevant = np.zeros((1, 100)), np.arange(100)[None] == 0
     shown = np.ones_like(relevant)
     place = int(np.flatnonzero(np.argsort(-scores[0], kind="stable") == 0)[0])
-    first = first_relevant(scores, relevant, shown)
-    ours = [float(recall_at(1, first)[0]), float(average_precision(scores, relevant, shown)[0])]
+    ours = [float(recall_at(1, scores, relevant, shown)[0]), float(average_precision(scores, relevant, shown)[0])]
     chance = [0.01, float((1 / np.arange(1, 101)).mean())]
     holds = bool(np.allclose(ours, chance, rtol=1e-9))
     naive = f"recall {1.0 * (place == 0)}, precision {1 / (place + 1)}"

@@ -8,15 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from retrieval.metrics.ranking import FirstRelevant, average_precision, first_relevant, recall_at
+from retrieval.metrics.ranking import average_precision, recall_at
 
 
 def measures(scores, relevant, shown=None):
     """Return all measures of one row."""
     scores, relevant = np.array([scores], dtype=float), np.array([relevant], dtype=bool)
     shown = np.ones_like(relevant) if shown is None else np.array([shown], dtype=bool)
-    first = first_relevant(scores, relevant, shown)
-    found = {k: float(recall_at(k, first)[0]) for k in (1, 2, 3, 5)}
+    found = {k: float(recall_at(k, scores, relevant, shown)[0]) for k in (1, 2, 3, 5)}
     found["map"] = float(average_precision(scores, relevant, shown)[0])
     return found
 
@@ -78,10 +77,9 @@ def test_a_constant_scorer_has_the_value_of_a_random_order(count, right, hidden,
     shown = np.ones_like(relevant)
     shown[:, count:] = False
     scores = np.full(relevant.shape, value)
-    first = first_relevant(scores, relevant, shown)
     missed = [comb(count - right, k) / comb(count, k) for k in range(count + 1)]
     for k in (1, 5, 10):
-        assert recall_at(k, first)[0] == pytest.approx(1 - missed[min(k, count)], abs=1e-12)
+        assert recall_at(k, scores, relevant, shown)[0] == pytest.approx(1 - missed[min(k, count)], abs=1e-12)
     p = (right - 1) / max(count - 1, 1)
     precision = 1 if right == count else p + (1 - p) * sum(1 / place for place in range(1, count + 1)) / count
     assert average_precision(scores, relevant, shown)[0] == pytest.approx(precision, rel=1e-10)
@@ -91,7 +89,8 @@ def test_many_ties_neither_overflow_nor_lose_precision():
     """Binomials of 4,000 items overflow a float; the products do not. Compared with the mean over 20,000 orders."""
     with pytest.raises(OverflowError):
         float(comb(4000, 2000))
-    first = FirstRelevant(*(np.array([value]) for value in (5, 4000, 44)))
+    scores, relevant = np.zeros((1, 4005)), np.zeros((1, 4005), dtype=bool)
+    scores[:, :5], relevant[:, -44:] = 1, True  # five items before 4,000 equal ones, of which 44 are relevant
     rng = np.random.default_rng(0)
     drawn = np.array([rng.choice(4000, 44, replace=False).min() for _ in range(20_000)])
-    assert recall_at(10, first)[0] == pytest.approx((drawn < 5).mean(), abs=0.006)
+    assert recall_at(10, scores, relevant, np.ones_like(relevant))[0] == pytest.approx((drawn < 5).mean(), abs=0.006)

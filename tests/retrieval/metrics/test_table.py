@@ -9,7 +9,7 @@ import pytest
 from retrieval.errors import BadInput, NumericalError
 from retrieval.metrics.measure import Measure
 from retrieval.metrics.table import ScoreTable, object_scores
-from tests.retrieval.metrics.test_protocols import table_of, uneven
+from tests.retrieval.metrics.test_registry import table_of, uneven
 
 # The table -------------------------------------------------------------------------------------------------
 

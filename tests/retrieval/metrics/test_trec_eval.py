@@ -5,8 +5,8 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from retrieval.metrics import protocols
-from retrieval.metrics.ranking import average_precision, first_relevant, recall_at
+from retrieval.metrics import registry
+from retrieval.metrics.ranking import average_precision, recall_at
 from retrieval.metrics.table import ScoreTable
 
 trec_eval = pytest.importorskip("pytrec_eval")
@@ -17,9 +17,8 @@ NAMES = {"map": "map", **{k: f"success_{k}" for k in KS}}
 
 
 def ours(scores, relevant, in_gallery):
-    first = first_relevant(scores, relevant, in_gallery)
     measures = {"map": average_precision(scores, relevant, in_gallery)}
-    return measures | {k: recall_at(k, first) for k in KS}
+    return measures | {k: recall_at(k, scores, relevant, in_gallery) for k in KS}
 
 
 def theirs(scores, relevant, in_gallery, names=None):
@@ -80,7 +79,7 @@ def test_a_query_without_a_relevant_item_is_0_for_trec_eval_and_no_query_for_us(
     table = ScoreTable(scores, owner, photos, np.zeros((2, 3), bool))
     every = np.ones((2, 3), bool)
     assert theirs(scores, table.relevant, every)["map"] == pytest.approx([7 / 12, 0])
-    measure = protocols.average_precision(table)
+    measure = registry.average_precision(table)
     assert measure.values == pytest.approx(7 / 12)
     assert "1 touches left out" in measure.gallery
 
@@ -92,6 +91,6 @@ def test_own_photos_are_neither_in_the_run_nor_in_the_qrels():
     scores = rng.permuted(np.tile(np.arange(24, dtype=np.float32), (24, 1)), axis=1)
     table = ScoreTable(scores, touch_owner, touch_owner, np.eye(24, dtype=bool))
     expected = theirs(scores, table.relevant, ~table.own)
-    found = {"map": protocols.average_precision(table)}
-    found |= {k: protocols.recall(table, k) for k in KS}
+    found = {"map": registry.average_precision(table)}
+    found |= {k: registry.recall(table, k) for k in KS}
     assert_equal({key: measure.values[:, 0] for key, measure in found.items()}, expected)

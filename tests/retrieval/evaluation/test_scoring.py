@@ -8,8 +8,9 @@ import pytest
 
 from retrieval.data.dataset import Grasp, Split
 from retrieval.errors import DatasetError
-from retrieval.evaluation.predictions import predict
-from retrieval.evaluation.queries import SET_SIZES, SETS_OF_AN_OBJECT, draw_queries
+from retrieval.evaluation.queries import SET_SIZES, SETS_OF_AN_OBJECT, Queries, draw_queries
+from retrieval.evaluation.results import PairThreshold
+from retrieval.evaluation.scoring import MethodScores, score_queries
 from retrieval.methods.chance import Chance
 from retrieval.methods.method import MethodSettings
 from retrieval.training.features import Features
@@ -69,9 +70,10 @@ def test_sets_have_different_grasps_of_one_object_and_leave_three_photos():
 
 
 def test_queries_depend_on_the_seed():
-    assert draw_queries(GRASPS, SPLIT, 0, MAX_GRASPS).digest == QUERIES.digest
-    assert draw_queries(GRASPS, SPLIT, 1, MAX_GRASPS).digest != QUERIES.digest
-    assert replace(QUERIES, sets={1: QUERIES.sets[1]}).digest != QUERIES.digest
+    again, other = (draw_queries(GRASPS, SPLIT, seed, MAX_GRASPS) for seed in (0, 1))
+    assert [again.touches.tolist(), again.sets[3].tolist()] == [QUERIES.touches.tolist(), QUERIES.sets[3].tolist()]
+    assert other.touches.tolist() != QUERIES.touches.tolist()
+    assert other.sets[3].tolist() != QUERIES.sets[3].tolist()
 
 
 @pytest.mark.parametrize("part", ["train", "validation", "test"])
@@ -102,27 +104,41 @@ class Largest(Chance):
         return self._score(touch_encodings, photo_encodings)[sets].max(1)
 
 
-@pytest.fixture(scope="module")
-def predictions(features):
-    return predict(fitted(Chance, features), features, QUERIES, 2.5)
-
-
-def test_predictions_are_the_scores_of_the_queries_in_their_order(features, predictions):
+def test_scores_are_those_of_the_method_for_touches_and_sets(features):
     method = fitted(Chance, features)
-    assert predictions.scores.shape == (len(QUERIES.touches), len(QUERIES.photos))
-    for row, column in ((0, 0), (7, 20), (30, 5)):
-        touch = features.touch[QUERIES.touches[row]][None]
-        photo = features.photo[QUERIES.photos[column]][None]
-        single = method.score(method.encode_touch(touch), method.encode_photo(photo))
-        assert predictions.scores[row, column] == pytest.approx(single[0, 0], abs=1e-6)
-
-
-def test_scores_of_sets_are_those_of_the_method(features, predictions):
-    method = fitted(Chance, features)
+    found = score_queries(method, features, QUERIES)
     codes = method.encode_touch(features.touch[QUERIES.touches]), method.encode_photo(features.photo[QUERIES.photos])
+    np.testing.assert_allclose(found.scores, method.score(*codes), atol=1e-6)  # float32 sums
+    largest = score_queries(fitted(Largest, features), features, QUERIES)
     for size, sets in QUERIES.sets.items():
-        np.testing.assert_allclose(predictions.set_scores[size], method.score_sets(*codes, sets), rtol=1e-6, atol=1e-6)
-    fused = predict(fitted(Largest, features), features, QUERIES, 0.0)
-    for size, sets in QUERIES.sets.items():
-        expected = np.array([predictions.scores[list(row)].max(0) for row in sets])
-        np.testing.assert_array_equal(fused.set_scores[size], expected)
+        np.testing.assert_allclose(found.set_scores[size], method.score_sets(*codes, sets), rtol=1e-6, atol=1e-6)
+        np.testing.assert_array_equal(largest.set_scores[size], [found.scores[list(row)].max(0) for row in sets])
+
+
+def test_tables_have_the_rows_and_photos_of_their_parts_and_mark_photos_of_own_grasps(features):
+    found = score_queries(fitted(Chance, features), features, QUERIES)
+    table = found.touches("test", None)
+    assert {QUERIES.objects[number] for number in table.touch_owner} == set(SPLIT.test)
+    assert set(table.photo_owner) == set(range(6))
+    assert table.own.sum(1).tolist() == [1] * len(table.own)
+    for size, sets in found.sets("validation").items():
+        assert {QUERIES.objects[number] for number in sets.touch_owner} <= set(SPLIT.validation)
+        assert (sets.own.sum(1) <= size).all()
+    assert not replace(found, allows_own_photos=True).touches("test", "test").own.any()
+
+
+def test_pair_accuracy_uses_the_threshold_of_the_checkpoint_or_of_a_posterior_of_ten_validation_objects():
+    def threshold(objects, **best_params):
+        owner, places = np.repeat(np.arange(objects), 4), np.arange(4 * objects)
+        scores = np.random.default_rng(0).normal(2.0 * (owner[:, None] == owner) + 5).astype(np.float32)
+        parts = ("validation",) * objects
+        queries = Queries(places, places, places, owner, owner, tuple(map(str, range(objects))), parts, {})
+        return MethodScores(queries, scores, {}, best_params, {}, 0)
+
+    few, enough = threshold(9).pair_threshold, threshold(10)
+    assert (few.at, few.source) == (None, None)
+    assert "at least 10 validation objects; the split has 9" in few.reason
+    assert enough.pair_threshold.source == "validation objects"
+    assert enough.posterior.log_ratio(enough.pair_threshold.at, 1) == pytest.approx(0, abs=1e-9)
+    assert 5 < enough.pair_threshold.at < 7  # between the means of wrong and right pairs
+    assert threshold(2, pair_threshold=1.5).pair_threshold == PairThreshold(1.5, "the checkpoint")

@@ -1,0 +1,167 @@
+"""Calibration of match logits and measures of pairs: by hand, by grids and loops, and where logits are extreme."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import expit
+
+from retrieval.errors import BadInput, NumericalError
+from retrieval.metrics.pairs import (
+    SLOPE_BOUNDS,
+    fit_calibration,
+    negative_log_likelihood,
+    pair_accuracy,
+    pair_auc,
+    reliability_bins,
+)
+
+FLOAT32_MAX = float(np.finfo(np.float32).max)
+
+
+def overlapping(count=200, offset=0.0, scale=1.0):
+    """Return logits and labels; half of the pairs are true, their logits one deviation higher."""
+    labels = np.arange(count) % 2
+    return scale * (np.random.default_rng(0).normal(size=count) + labels) + offset, labels
+
+
+def log_odds(fitted, logits):
+    slope, intercept = fitted
+    return slope * np.asarray(logits) + intercept
+
+
+@pytest.mark.parametrize("function", [fit_calibration, pair_accuracy, pair_auc, negative_log_likelihood])
+@pytest.mark.parametrize(
+    ("logits", "labels", "error", "message"),
+    [
+        ([0.1, 0.2, 0.3], [1, 1, 1], BadInput, "of 3, 3 are 1 and 0 0"),
+        ([0.1, 0.2, 0.3], [0, 1, 2], BadInput, "of 3, 1 are 1 and 1 0"),
+        ([0.1, 0.2, 0.3], [0, 1, math.nan], BadInput, "of 3, 1 are 1 and 1 0"),
+        ([], [], BadInput, "of 0, 0 are 1 and 0 0"),
+        ([1.0, 2.0], [0, 1, 1], BadInput, "vectors of one length"),
+        ([[1.0, 2.0]], [[0, 1]], BadInput, "vectors of one length"),
+        ([0.1, 0.2, math.nan], [0, 1, 0], NumericalError, "pair 2 has nan"),
+        ([0.1, 0.2, 1e39], [0, 1, 0], NumericalError, "pair 2 has 1e"),
+    ],
+)
+def test_finite_logits_of_true_and_false_pairs_are_required(function, logits, labels, error, message):
+    with pytest.raises(error, match=message):
+        function(logits, labels)
+
+
+# The fit ---------------------------------------------------------------------------------------------------
+
+
+def smoothed_loss(logits, labels, slope, intercept):
+    """Return the objective of the fit, pair by pair: classes of equal weight, Platt's targets."""
+    total, positives, negatives = 0.0, sum(labels), len(labels) - sum(labels)
+    for logit, label in zip(logits, labels, strict=True):
+        target = (positives + 1) / (positives + 2) if label else 1 / (negatives + 2)
+        x = slope * logit + intercept
+        loss = target * np.logaddexp(0, -x) + (1 - target) * np.logaddexp(0, x)
+        total += 0.5 / (positives if label else negatives) * loss
+    return total
+
+
+@pytest.mark.parametrize(
+    ("logits", "labels"),
+    [
+        ([-1.0, 0.5, 0.2, 2.0, -0.3, 1.0], [0, 0, 1, 1, 0, 1]),
+        ([3.0, 1.0, 2.0, 6.0], [0, 1, 0, 1]),
+        ([-2.0, -1.0, 0.0, 1.0, 5.0], [0, 0, 0, 0, 1]),
+    ],
+)
+def test_no_point_of_a_fine_grid_has_a_smaller_loss(logits, labels):
+    slope, intercept = fit_calibration(logits, labels)
+    best = smoothed_loss(logits, labels, slope, intercept)
+    grid = smoothed_loss(logits, labels, np.geomspace(*SLOPE_BOUNDS, 61)[:, None], np.linspace(-12, 12, 97))
+    near = np.array([-1e-3, 0, 1e-3])
+    nearby = smoothed_loss(logits, labels, slope + near[:, None], intercept + near)
+    assert best <= grid.min()
+    assert best <= nearby.min() + 1e-15  # float64 rounding of a loss below 1
+
+
+def test_one_pair_of_each_class_gives_its_smoothed_targets():
+    """Two parameters fit two targets: (1 + 1) / (1 + 2) for the true pair, 1 / (1 + 2) for the false one."""
+    fitted = fit_calibration([-1.0, 3.0], [0, 1])
+    np.testing.assert_allclose(expit(log_odds(fitted, [-1.0, 3.0])), [1 / 3, 2 / 3], rtol=1e-9)
+    assert fitted[0] == pytest.approx(2 * math.log(2) / 4)
+
+
+def test_the_fit_recovers_the_true_odds_also_if_true_pairs_are_rare():
+    """Two normal distributions at distance 1 with deviation 1: the log-odds of a logit z are z - 1/2."""
+    logits, labels = overlapping(40_000)
+    assert fit_calibration(logits, labels) == pytest.approx((1, -0.5), abs=0.05)  # the standard error is about 0.015
+    rare = np.concatenate([np.flatnonzero(labels == 0), np.flatnonzero(labels == 1)[:4000]])
+    # Naively, the log-odds would fall by log(5) = 1.6 with the fraction of true pairs.
+    assert fit_calibration(logits[rare], labels[rare]) == pytest.approx((1, -0.5), abs=0.1)
+
+
+@pytest.mark.parametrize(("scale", "offset"), [(1, 1e3), (1, -1e5), (1, 1e6), (0.05, 0), (60, 0)])
+def test_scale_and_offset_of_all_logits_do_not_change_the_odds(scale, offset):
+    """A quasi-Newton fit of both parameters gave slope 0.89 instead of 1.21 at an offset of 1000."""
+    (logits, labels), plain = overlapping(), fit_calibration(*overlapping())
+    fitted = fit_calibration(scale * logits + offset, labels)
+    # float64 rounds the product with a logit of 1e6 to 1e-10
+    np.testing.assert_allclose(log_odds(fitted, scale * logits + offset), log_odds(plain, logits), atol=1e-6)
+
+
+@pytest.mark.parametrize(("scale", "bound"), [(1e-3, 1), (1e3, 0), (1e30, 0)])
+def test_a_slope_beyond_its_bounds_is_exactly_the_bound(scale, bound):
+    assert fit_calibration(*overlapping(scale=scale))[0] == SLOPE_BOUNDS[bound]
+
+
+@pytest.mark.parametrize("value", [0.0, 5.0, -1e4, 1e30])
+def test_constant_logits_make_both_answers_equally_likely(value):
+    fitted = fit_calibration([value] * 6, [0, 1, 0, 1, 1, 0])
+    assert (fitted[0], log_odds(fitted, value)) == (SLOPE_BOUNDS[0], 0)
+
+
+finite_logits = st.floats(-FLOAT32_MAX, FLOAT32_MAX, width=32)
+
+
+@settings(max_examples=60)
+@given(st.lists(st.tuples(finite_logits, st.integers(0, 1)), max_size=20), finite_logits, finite_logits)
+def test_any_finite_logits_of_both_classes_can_be_calibrated(pairs, one, two):
+    slope, intercept = fit_calibration(*zip(*pairs, (one, 0), (two, 1), strict=True))
+    assert math.isfinite(intercept)
+    assert SLOPE_BOUNDS[0] <= slope <= SLOPE_BOUNDS[1]
+
+
+# Metrics ---------------------------------------------------------------------------------------------------
+
+few_values = st.sampled_from([-1e30, -1.0, 0.0, 1e-30, 1.0, 2.0])
+
+
+@settings(max_examples=60)
+@given(st.lists(st.tuples(few_values, st.integers(0, 1)), max_size=30), few_values, few_values)
+def test_the_auc_is_the_fraction_of_won_comparisons_with_ties_as_one_half(pairs, one, two):
+    pairs = [*pairs, (one, 0), (two, 1)]
+    true, false = ([logit for logit, label in pairs if label == wanted] for wanted in (1, 0))
+    won = [1.0 if a > b else 0.5 if a == b else 0.0 for a in true for b in false]
+    assert pair_auc(*zip(*pairs, strict=True)) == pytest.approx(np.mean(won), abs=1e-15)
+
+
+def test_a_constant_scorer_has_exactly_an_auc_of_one_half():
+    for true, false in ((1, 1), (3, 7), (333, 1001)):
+        assert pair_auc([2.5] * (true + false), [1] * true + [0] * false) == 0.5
+
+
+def test_pair_accuracy_equals_that_by_hand_and_counts_zero_as_one_half():
+    assert pair_accuracy([2.0, -1.0, 0.0, 3.0], [1, 1, 1, 0]) == (1 + 0 + 0.5 + 0) / 4
+    assert pair_accuracy([-0.0, 1e-30, -1e-30, 1e30], [1, 1, 0, 1]) == 3.5 / 4
+
+
+def test_reliability_bins_and_their_error_by_hand():
+    """Bins of width 1/15: .1 alone; .30 and .32 in one, half of them true; 1.0 in the last."""
+    found = reliability_bins([0.1, 0.3, 0.32, 1.0], [0, 1, 0, 1])
+    assert found["bins"] == [
+        {"probability": pytest.approx(0.1), "frequency": 0, "count": 1},
+        {"probability": pytest.approx(0.31), "frequency": 0.5, "count": 2},
+        {"probability": 1.0, "frequency": 1, "count": 1},
+    ]
+    assert found["ece"] == pytest.approx((0.1 + 2 * 0.19 + 0) / 4)
+    with pytest.raises(BadInput, match="between 0 and 1"):
+        reliability_bins([1.1], [1])
