@@ -1,5 +1,7 @@
 """Registries of classes and functions by name: built-in ones, entry points, and `module:Class` of any module."""
 
+import hashlib
+import inspect
 import sys
 from collections.abc import Collection, Iterator, Mapping
 from importlib import import_module
@@ -136,3 +138,19 @@ def _attribute_or_none(place: str) -> Any:
         return _attribute(module, place)
     except AttributeError:
         return None
+
+
+def code_digest(*classes: type) -> dict[str, str]:
+    """Return {"code": SHA-256} of the source of classes outside this project, or {} without any.
+
+    So an edited loss or method is fitted again. The source is that of the module, or of the class for a notebook.
+    """
+    sources = []
+    for each in classes:
+        if not each.__module__.startswith("retrieval."):
+            module = sys.modules[each.__module__]
+            try:
+                sources.append(inspect.getsource(module if getattr(module, "__file__", None) else each))
+            except (OSError, TypeError):  # typed into an interpreter, without source
+                sources.append(each.__qualname__)
+    return {"code": hashlib.sha256("\n".join(sources).encode()).hexdigest()} if sources else {}

@@ -69,7 +69,7 @@ def train(
             say(line)
         return
     from retrieval.training import distributed
-    from retrieval.training.licences import training_licences
+    from retrieval.training.initial_weights import training_licences
     from retrieval.training.train import train as train_matcher
 
     try:

@@ -42,7 +42,7 @@ from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writ
 from retrieval.model.config import Config, named_config
 from retrieval.model.encode import one_thread, photo_features, touch_features
 from retrieval.training.batches import BatchImages
-from retrieval.training.licences import training_licences
+from retrieval.training.initial_weights import training_licences
 from retrieval.training.train import Trainer
 from retrieval.version import __version__
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from _touch_retrieval.cache import Cache, cache_key
+from _touch_retrieval.registry import code_digest
 from retrieval.console.output import say
 from retrieval.data.dataset import Split
 from retrieval.errors import BadInput
@@ -29,7 +30,6 @@ from retrieval.metrics.table import ScoreTable
 from retrieval.model.encode import one_thread
 from retrieval.model.losses import LOSSES
 from retrieval.training.features import Features
-from retrieval.training.loop import code_digest
 from retrieval.version import __version__
 
 MAX_CONTROL_GRASPS = 12

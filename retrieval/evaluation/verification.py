@@ -73,8 +73,8 @@ def verification_errors(scores: MethodScores, features: Features, checkpoint: Ch
     found: ErrorsByImpostors = {"random": {}, "similar": {}}
     for grasps in GRASPS:
         sequences = verification_sequences(test, posterior, scores.seed, grasps)
-        objects, genuine = len(np.unique(sequences.owner)), sequences.genuine[-1]
-        if objects >= MIN_OBJECTS:
+        if sequences is not None and (objects := len(np.unique(sequences.owner))) >= MIN_OBJECTS:
+            genuine = sequences.genuine[-1]
             for kind, impostors in (("random", sequences.impostor.ravel()), ("similar", sequences.similar)):
                 frr = tuple(false_rejects(far, genuine, impostors) for far in FARS)
                 found[kind][str(grasps)] = Errors(objects, len(genuine), equal_error_rate(genuine, impostors), frr)

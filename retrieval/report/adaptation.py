@@ -12,12 +12,12 @@ ROWS = {
     "the same with low-pass touches": "held_out_{}_low_pass",
     "unadapted model": "baseline_{}",
 }
-"""Label -> name of a measure in `Estimate.measures`."""
+"""Label -> name of a measure in `Adaptation.measures`."""
 
 
 def print_adaptation(result: Adaptation) -> None:
     """Print a table of the accuracies, two sentences on them, and what was fitted."""
-    estimate, measures = result.estimate, result.estimate.measures
+    measures = result.measures
     rows = [
         [label, *(with_interval(summarise([measures[name.format(key)]])) for key in MEASURES)]
         for label, name in ROWS.items()
@@ -33,10 +33,10 @@ def print_adaptation(result: Adaptation) -> None:
         show("Better than the low-pass control: the fit uses more than light and coarse shape.")
     else:
         show("Not better than the low-pass control: no evidence that the fit uses touch. Record more objects.")
-    if estimate.is_baseline_better:
+    if result.is_baseline:
         show(
             "The unadapted model is used: its pair accuracy is at least that of the fit. Only its calibrations and its "
             "check of gel images are fitted."
         )
-    objects, touches = len(set(result.features.object_ids)), len(result.features)
-    say(f"{result.checkpoint.path}: fitted to {objects} objects, {touches} touches")
+    touched = measures["held_out_top1"].owner
+    say(f"{result.checkpoint.path}: fitted to {len(set(touched.tolist()))} objects, {len(touched)} touches")

@@ -10,7 +10,7 @@ than a fit to a few objects: it is then kept, with new calibrations.
 """
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -48,20 +48,16 @@ from retrieval.model.towers import TOWER_SEPARATOR
 from retrieval.model.towers.tower import Tower
 from retrieval.model.towers.weights import GEL
 from retrieval.training.batches import FrozenFeatures
-from retrieval.training.calibration.calibrate import fit_calibrations, with_gel_check
+from retrieval.training.calibration.calibrate import with_calibrations, with_gel_check
 from retrieval.training.calibration.touches import ScoredTouches, score_touches
-from retrieval.training.calibration.verification import fit_verification
 from retrieval.training.cca_towers import (
     MAX_CALIBRATION_TOUCHES,
-    CcaProjections,
     CcaSelection,
-    TowerWidths,
     select_settings,
-    touch_rows,
     tower_widths,
 )
 from retrieval.training.features import Features, encode_recording, features_by_image
-from retrieval.training.licences import checkpoint_licences
+from retrieval.training.initial_weights import checkpoint_licences
 from retrieval.training.selection import held_out_folds
 
 PRESET = "adapt"
@@ -75,6 +71,28 @@ MIN_OBJECTS = 6
 """Minimum number of objects of an estimate: two folds of three."""
 
 
+@dataclass(frozen=True, eq=False)
+class Adaptation:
+    """Result of `adapt`.
+
+    Attributes:
+        checkpoint: The written checkpoint.
+        measures: Accuracy on held-out objects: "held_out_top1" and "held_out_pair_accuracy" of the fit, the same with
+            "_low_pass" touches (8 x 6, the control), and "baseline_top1" and "baseline_pair_accuracy" of the unadapted
+            start model, which are absent if it has another number of fingers.
+        is_baseline: Whether the checkpoint is the start model, since its pair accuracy is at least that of the fit.
+
+    >>> from pathlib import Path
+    >>> made = retrieval.adapt("lab", Path("own.safetensors"), "model.safetensors", init="none", quiet=True)
+    >>> 0 <= made.checkpoint.provenance["metrics"]["held_out_top1"] <= 1
+    True
+    """
+
+    checkpoint: Checkpoint
+    measures: dict[str, Measure]
+    is_baseline: bool
+
+
 def adapt(
     recording: AnyRecording,
     out: Path,
@@ -83,7 +101,7 @@ def adapt(
     init: str = "imagenet",
     split: Split | None = None,
     quiet: bool = False,
-) -> "Adaptation":
+) -> Adaptation:
     """Fit a model to a recording from another sensor with your objects, and write the checkpoint `out`.
 
     If the pair accuracy of the start model on held-out objects is at least that of the fit, `out` is a copy of the
@@ -105,89 +123,82 @@ def adapt(
 
     >>> from pathlib import Path
     >>> made = retrieval.adapt("lab", Path("mine.safetensors"), "model.safetensors", init="none", quiet=True)
-    >>> made.checkpoint.path.name, len(made.features)
-    ('mine.safetensors', 24)
+    >>> made.checkpoint.path.name, made.is_baseline in (True, False)
+    ('mine.safetensors', True)
     """
     require_writable(out)
     recording = folder_of(recording)
     grasps = load_grasps(recording)
+    fingers = finger_count(grasps)
     if not isinstance(start, Checkpoint):
-        start = load_checkpoint(start or shipped_model(min(finger_count(grasps), 2)))
+        start = load_checkpoint(start or shipped_model(min(fingers, 2)))
     if split is not None:
         grasps = [grasp for grasp in grasps if grasp.object_id not in split.test]
-    folds = draw_folds(grasps, load_config(PRESET).training.seed)
-    data = AdaptationData.of(recording, grasps, start, init, quiet)
-    estimate = estimate_accuracy(data, start, folds, quiet)
-    calibrated = _calibrated_baseline if estimate.is_baseline_better else _calibrated_fit
-    checkpoint = calibrated(start, data, estimate, quiet)
-    store_checkpoint(checkpoint, out)
-    return Adaptation(load_checkpoint(out), data.features, estimate)
+    config = config_for(start, fingers, init)
+    seed = config.training.seed
+    folds = draw_folds(grasps, seed)
+    matcher = Matcher(config.matcher, len(config.preprocessing.views)).eval()
+    load_towers(matcher, start, init)
+    encode = partial(encode_recording, grasps, cache=None, quiet=quiet)
+    features = encode(matcher, config)
+    low_pass = encode(matcher, config, touch_variant="low_pass", photo_features_from=features)
+    baseline = encode(start.matcher, start.config) if start.config.matcher.fingers == fingers else None
+    widths, kinds, linked = tower_widths(config, features), object_kinds(recording), linked_objects(grasps)
+
+    def fit(some: Features) -> CcaSelection:
+        return select_settings(some, widths, held_out_folds(some, kinds, linked, seed))
+
+    with one_thread():
+        measures = dict[str, Measure]()
+        for suffix, each in (("", features), ("_low_pass", low_pass)):
+            fits = fit_folds(each, folds, fit, f"estimate{suffix}".replace("_", " "), quiet)
+            parts = [each.of_objects(fold) for fold in folds]
+            cosines = [
+                one.projections.cosines(part.touch_rows, part.photo) for one, part in zip(fits, parts, strict=True)
+            ]
+            measures |= {f"held_out_{name}{suffix}": found for name, found in accuracies(cosines, parts).items()}
+        if baseline is not None:
+            logits = [part.logits for part in _baseline_touches(start, baseline, folds)]
+            of_start = accuracies(logits, [baseline.of_objects(fold) for fold in folds])
+            measures |= {f"baseline_{name}": found for name, found in of_start.items()}
+    metrics = {name: float(measure.by_object()[1].mean()) for name, measure in measures.items()}
+    is_baseline = metrics.get("baseline_pair_accuracy", 0.0) >= metrics["held_out_pair_accuracy"]
+    licences = dict.fromkeys([*checkpoint_licences(start), recording_licence(recording)])
+    about: dict[str, object] = {"source": recording_source(recording), "data_digest": data_digest(grasps)}
+    provenance = {
+        LICENCES: [dataclasses.asdict(licence) for licence in licences],
+        "metrics": metrics | {"held_out_top1_chance": float(measures["held_out_top1"].chance[0])},
+    }
+    if baseline is not None and is_baseline:
+        made = dataclasses.replace(start, provenance=start.provenance | {"adapted_to": about} | provenance)
+        touches = partial(_baseline_touches, start, baseline, max_touches=MAX_CALIBRATION_TOUCHES)
+        # Nothing was fitted to the objects, so a verification compares all of them with each other.
+        pooled_touches = touches(folds, pooled=True) if start.config.matcher.cell_dim else []
+        made = with_calibrations(made, touches(folds), pooled_touches, touches([baseline.object_ids]))
+    else:
+        with one_thread():
+            choice = fit(features)
+        made = Checkpoint(
+            path=start.path,
+            digest="",
+            config=config,
+            provenance={"step": 0, **about, **provenance},
+            matcher=matcher,
+            split=Split(seed, tuple(sorted(set(features.object_ids))), (), ()),
+        )
+        # The projections are overfitted to the fitted objects: calibrate on those that were held out.
+        made = with_calibrations(made, install_projections(matcher, choice))
+    # The gel check is fitted on half of the objects, with thresholds from the others.
+    names, device = sorted(set(features.object_ids)), default_device()
+    groups = [[grasp for grasp in grasps if grasp.object_id in names[side::2]] for side in (0, 1)]
+    made.matcher.to(device)
+    known = baseline if baseline is not None and is_baseline else features
+    source = FrozenFeatures(made.config, features_by_image(grasps, known, device))
+    store_checkpoint(with_gel_check(made, source, *groups, quiet=quiet), out)
+    return Adaptation(load_checkpoint(out), measures, is_baseline)
 
 
-@dataclass(frozen=True, eq=False)
-class Adaptation:
-    """Result of `adapt`.
-
-    Attributes:
-        checkpoint: The written checkpoint.
-        features: Features of the fitted grasps.
-        estimate: Accuracy on held-out objects.
-
-    >>> from pathlib import Path
-    >>> made = retrieval.adapt("lab", Path("own.safetensors"), "model.safetensors", init="none", quiet=True)
-    >>> 0 <= made.estimate.to_dict()["held_out_top1"] <= 1
-    True
-    """
-
-    checkpoint: Checkpoint
-    features: Features
-    estimate: "Estimate"
-
-
-# Features of the combined towers ---------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class AdaptationData:
-    """The recorded grasps, the combined towers, and the features.
-
-    Attributes:
-        grasps: The grasps.
-        config: Configuration of the fitted matcher.
-        matcher: Matcher with the combined towers.
-        features: Tower features of the grasps.
-        low_pass: The same with low-pass (8 x 6) touches.
-        widths: Feature widths of the combined towers.
-        kind_of: The class of each object, as far as the recording has it.
-        provenance: Source, licences and digest of the data.
-    """
-
-    grasps: list[Grasp]
-    config: Config
-    matcher: Matcher
-    features: Features
-    low_pass: Features
-    widths: TowerWidths
-    kind_of: dict[str, str]
-    provenance: dict[str, object]
-
-    @classmethod
-    def of(cls, recording: Path, grasps: list[Grasp], start: Checkpoint, init: str, quiet: bool) -> "AdaptationData":
-        """Encode grasps of a recording with the towers of `config_for`."""
-        config = config_for(start, finger_count(grasps), init)
-        matcher = Matcher(config.matcher, len(config.preprocessing.views)).eval()
-        load_towers(matcher, start, init)
-        encode = partial(encode_recording, grasps, matcher, config, None, quiet=quiet)
-        features = encode()
-        low_pass = encode(touch_variant="low_pass", photo_features_from=features)
-        licences = dict.fromkeys([*checkpoint_licences(start), recording_licence(recording)])
-        provenance: dict[str, object] = {
-            "source": recording_source(recording),
-            LICENCES: [dataclasses.asdict(licence) for licence in licences],
-            "data_digest": data_digest(grasps),
-        }
-        widths, kinds = tower_widths(config, features), object_kinds(recording)
-        return cls(grasps, config, matcher, features, low_pass, widths, kinds, provenance)
+# The combined towers ---------------------------------------------------------------------------------------
 
 
 def config_for(start: Checkpoint, fingers: int, init: str) -> Config:
@@ -230,56 +241,6 @@ def _tower_sources(start: Checkpoint, init: str) -> tuple[list[Tower | str], lis
 # Accuracy on held-out objects ------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """Accuracy on held-out objects, of the fit, of the low-pass control and of the unadapted start model.
-
-    Attributes:
-        choice: The fit to all objects; its settings were selected by holding out half of each kind.
-        folds: Objects that are left out together. The fit to the others selects its settings among them.
-        baseline: Features of the grasps by the unadapted start model; None if it has another number of fingers.
-        measures: "top1" and "pair_accuracy" of each, such as "held_out_top1", "held_out_top1_low_pass" and
-            "baseline_top1".
-    """
-
-    choice: CcaSelection
-    folds: list[tuple[str, ...]]
-    baseline: Features | None
-    measures: dict[str, Measure]
-
-    @property
-    def is_baseline_better(self) -> bool:
-        """Whether the unadapted model has at least the pair accuracy of the fit."""
-        means = self.to_dict()
-        return means.get("baseline_pair_accuracy", 0.0) >= means["held_out_pair_accuracy"]
-
-    def to_dict(self) -> dict[str, float]:
-        """Return the metrics that the checkpoint stores: means over objects."""
-        means = {name: float(measure.by_object()[1].mean()) for name, measure in self.measures.items()}
-        return means | {"held_out_top1_chance": float(self.measures["held_out_top1"].chance[0])}
-
-
-@one_thread()
-def estimate_accuracy(data: AdaptationData, start: Checkpoint, folds: list[tuple[str, ...]], quiet: bool) -> Estimate:
-    """Return the accuracy on the objects of each fold, of fits to the other objects."""
-    measures: dict[str, Measure] = {}
-    for suffix, features in (("", data.features), ("_low_pass", data.low_pass)):
-        fits = fit_folds(features, folds, data, f"estimate{suffix}".replace("_", " "), quiet)
-        left_out = [features.of_objects(fold) for fold in folds]
-        scores = [
-            fit.projections.cosines(touch_rows(part), part.photo) for fit, part in zip(fits, left_out, strict=True)
-        ]
-        found = accuracies(scores, left_out)
-        measures |= {f"held_out_{name}{suffix}": measure for name, measure in found.items()}
-    baseline = None
-    if start.config.matcher.fingers == finger_count(data.grasps):
-        baseline = encode_recording(data.grasps, start.matcher, start.config, None, quiet=quiet)
-        scores = [part.logits for part in _baseline_touches(start, baseline, folds)]
-        found = accuracies(scores, [baseline.of_objects(fold) for fold in folds])
-        measures |= {f"baseline_{name}": measure for name, measure in found.items()}
-    return Estimate(_choose_settings(data.features, data), folds, baseline, measures)
-
-
 def draw_folds(grasps: Sequence[Grasp], seed: int) -> list[tuple[str, ...]]:
     """Draw folds of about `GALLERY` objects, each left out once; objects that share a sequence stay together.
 
@@ -297,20 +258,18 @@ def draw_folds(grasps: Sequence[Grasp], seed: int) -> list[tuple[str, ...]]:
 
 
 def fit_folds(
-    features: Features, folds: Sequence[Sequence[str]], data: AdaptationData, title: str, quiet: bool
+    features: Features,
+    folds: Sequence[Sequence[str]],
+    fit: Callable[[Features], CcaSelection],
+    title: str,
+    quiet: bool,
 ) -> Iterator[CcaSelection]:
     """Yield the fit to the objects outside each fold. The settings are selected on the same objects."""
     everyone = {name for fold in folds for name in fold}
     with Bar(title, len(folds), "folds", quiet=quiet) as bar:
         for fold in folds:
-            yield _choose_settings(features.of_objects(everyone.difference(fold)), data)
+            yield fit(features.of_objects(everyone.difference(fold)))
             bar.advance()
-
-
-def _choose_settings(features: Features, data: AdaptationData) -> CcaSelection:
-    """Return settings, selected by holding out half of each kind of objects, and projections fitted to all objects."""
-    parts = held_out_folds(features, data.kind_of, linked_objects(data.grasps), data.config.training.seed)
-    return select_settings(features, data.widths, parts)
 
 
 def accuracies(scores: Sequence[NDArray[np.float32]], folds: Sequence[Features]) -> dict[str, Measure]:
@@ -356,16 +315,15 @@ def _baseline_touches(
     """Return the touches of each fold, at most `max_touches` of an object; `pooled`: without late interaction."""
     parts = []
     for part in map(features.of_objects, folds):
-        if max_touches is not None:
-            rows = [np.flatnonzero(part.owner == name)[:max_touches] for name in np.unique(part.owner)]
-            part = part.select(np.concatenate(rows))
-        tensors = torch.from_numpy(part.touch).flatten(1), torch.from_numpy(part.photo)
+        rows = [np.flatnonzero(part.owner == name)[:max_touches] for name in np.unique(part.owner)]
+        part = part.select(np.sort(np.concatenate(rows)))
+        tensors = torch.from_numpy(part.touch_rows), torch.from_numpy(part.photo)
         own = np.eye(len(part), dtype=np.bool_)
         parts.append(score_touches(start.matcher, tensors, (part.owner, part.owner), own, pooled=pooled))
     return parts
 
 
-# The checkpoint --------------------------------------------------------------------------------------------
+# The fit ---------------------------------------------------------------------------------------------------
 
 
 def _log_odds(parts: Iterable[ScoredTouches]) -> tuple[float, float]:
@@ -381,9 +339,14 @@ def _log_odds(parts: Iterable[ScoredTouches]) -> tuple[float, float]:
     return fit_calibration(np.concatenate(cosines), np.concatenate(labels))
 
 
+@one_thread()
 @torch.no_grad()
-def install_projections(matcher: Matcher, projections: CcaProjections, scale: float, offset: float) -> None:
-    """Make the match logit `scale * cosine + offset` of the projected features; the layers of the head contribute 0."""
+def install_projections(matcher: Matcher, choice: CcaSelection) -> list[ScoredTouches]:
+    """Make the match logit `scale * cosine + offset` of the projected features, and return the held-out touches.
+
+    The layers of the head contribute 0. The touches have these logits, by projections that were fitted without them.
+    """
+    projections, (scale, offset) = choice.projections, _log_odds(choice.held_out_touches)
     for layer, found in ((matcher.touch_projection, projections.touch), (matcher.photo_projection, projections.photo)):
         assert isinstance(layer, nn.Linear)  # the configuration of `adapt` has no hidden layer
         used = found.weight.shape[1]  # shorter encodings leave zeros, which do not change the cosine
@@ -393,67 +356,8 @@ def install_projections(matcher: Matcher, projections: CcaProjections, scale: fl
         layer.bias[:used] = torch.from_numpy(found.bias.astype(np.float32))
     for parameter in matcher.head.parameters():
         parameter.zero_()
-    matcher.head.out.bias.fill_(offset)
     assert matcher.cosine_scale is not None
     matcher.cosine_scale.fill_(scale)
-
-
-def _calibrated_fit(start: Checkpoint, data: AdaptationData, estimate: Estimate, quiet: bool) -> Checkpoint:
-    """Return a checkpoint with projections fitted to all objects, calibrations and a gel check.
-
-    The calibrations are fitted on the touches of held-out objects (half of each kind at a time), because the
-    projections are overfitted to the fitted objects.
-    """
-    held_out, matcher = estimate.choice.held_out_touches, data.matcher
-    with one_thread():
-        scale, offset = _log_odds(held_out)
-        install_projections(matcher, estimate.choice.projections, scale, offset)
-    assert matcher.cosine_scale is not None
+    matcher.head.out.bias.fill_(offset)
     scale, offset = matcher.cosine_scale.item(), matcher.head.out.bias.item()  # float32
-    left_out = [dataclasses.replace(part, logits=scale * part.logits + offset) for part in held_out]
-    posterior, references = fit_calibrations(left_out)
-    made = Checkpoint(
-        path=start.path,
-        digest="",
-        config=data.config,
-        provenance={"step": 0, **data.provenance, "metrics": estimate.to_dict()},
-        verification=fit_verification(left_out, posterior),
-        matcher=matcher,
-        split=Split(data.config.training.seed, tuple(sorted(set(data.features.object_ids))), (), ()),
-        posterior=posterior,
-        references=references,
-    )
-    return _with_gel_check(made, data.grasps, data.features, quiet)
-
-
-def _calibrated_baseline(start: Checkpoint, data: AdaptationData, estimate: Estimate, quiet: bool) -> Checkpoint:
-    """Return the start model with a gel check and calibrations fitted to the recorded objects."""
-    assert estimate.baseline is not None
-    checkpoint = _with_gel_check(start, data.grasps, estimate.baseline, quiet)
-    about = {name: data.provenance[name] for name in ("source", "data_digest")}
-    provenance = start.provenance | {
-        "adapted_to": about,
-        LICENCES: data.provenance[LICENCES],
-        "metrics": estimate.to_dict(),
-    }
-    touches = partial(_baseline_touches, start, estimate.baseline, max_touches=MAX_CALIBRATION_TOUCHES)
-    posterior, references = fit_calibrations(touches(estimate.folds))
-    # Nothing was fitted to the objects, so a verification compares all of them with each other.
-    verification = fit_verification(touches([data.features.object_ids]), posterior)
-    made = dataclasses.replace(
-        checkpoint, provenance=provenance, posterior=posterior, references=references, verification=verification
-    )
-    if start.config.matcher.cell_dim:
-        posterior, references = fit_calibrations(touches(estimate.folds, pooled=True))
-        made = dataclasses.replace(made, pooled_posterior=posterior, pooled_references=references)
-    return made
-
-
-def _with_gel_check(checkpoint: Checkpoint, grasps: list[Grasp], features: Features, quiet: bool) -> Checkpoint:
-    """Return the checkpoint with a gel check: fitted on half of the objects, with thresholds from the others."""
-    device = default_device()
-    names = sorted({grasp.object_id for grasp in grasps})
-    groups = [[grasp for grasp in grasps if grasp.object_id in names[side::2]] for side in (0, 1)]
-    checkpoint.matcher.to(device)
-    source = FrozenFeatures(checkpoint.config, features_by_image(grasps, features, device))
-    return with_gel_check(checkpoint, source, *groups, quiet=quiet)
+    return [dataclasses.replace(part, logits=scale * part.logits + offset) for part in choice.held_out_touches]

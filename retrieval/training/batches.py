@@ -21,6 +21,7 @@ from retrieval.model.config import Config
 from retrieval.model.encode import (
     Image,
     autocast,
+    batches,
     one_thread,
     photo_features,
     to_batch,
@@ -79,48 +80,28 @@ class BatchImages:
         return grasp.touches + (grasp.backgrounds if self.uses_background else ())
 
 
-@dataclass(frozen=True)
-class _RankPart:
-    """What a worker loads: the rows of a batch's touches and photos that rank `rank` encodes in step `step`."""
-
-    step: int
-    batch: PairBatch
-    touch_rows: list[int]
-    photo_rows: list[int]
-    rank: int
-
-
-class _PartLoader(Dataset[LoadedBatch | RetrievalError]):
-    """Loads the images of parts of batches, in the processes of a `DataLoader`."""
+class _RankLoader(Dataset[LoadedBatch | RetrievalError]):
+    """Loads this rank's images of a batch, in the processes of a `DataLoader`."""
 
     def __init__(self, config: Config, images: BatchImages) -> None:
-        self.config, self.images = config, images
+        self.config, self.images, self.rank = config, images, distributed.rank()
 
-    def __getitem__(self, part: _RankPart) -> LoadedBatch | RetrievalError:
-        """Return the images of a part, or the error: a `DataLoader` would add a worker's traceback to its text."""
+    def __getitem__(self, part: tuple[int, PairBatch, list[int], list[int]]) -> LoadedBatch | RetrievalError:
+        """Return the images of the rank's touches and photos, or the error: a `DataLoader` would add a traceback."""
+        step, batch, touch_rows, photo_rows = part
         try:
-            return self._load(part)
+            touches = touch_batch([self.images.touch(batch.grasps[row]) for row in touch_rows])
+            photos = to_batch([self.images.photo(batch.photos[row]) for row in photo_rows])
         except RetrievalError as error:
             return error
-
-    def _load(self, part: _RankPart) -> LoadedBatch:
-        touches = touch_batch([self.images.touch(part.batch.grasps[row]) for row in part.touch_rows])
-        photos = to_batch([self.images.photo(part.batch.photos[row]) for row in part.photo_rows])
         if self.config.training.augment:
-            touches, photos = self._augment(part, touches, photos)
-        return LoadedBatch(part.batch, touches, photos)
-
-    def _augment(self, part: _RankPart, touches: Tensor, photos: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the images, augmented. The touches and photos of an object are mirrored together."""
-        seed, batch = self.config.training.seed, part.batch
-        is_mirrored = np.random.default_rng([seed, 5, part.step]).random(1 + int(batch.photo_objects.max())) < 0.5
-        rng = np.random.default_rng([seed, 6, part.step, part.rank])
-        return (
-            augment_touches(touches, is_mirrored[batch.touch_objects[part.touch_rows]], rng),
-            augment_photos(
-                photos, len(self.config.preprocessing.views), is_mirrored[batch.photo_objects[part.photo_rows]], rng
-            ),
-        )
+            seed, views = self.config.training.seed, len(self.config.preprocessing.views)
+            # The touches and photos of an object are mirrored together.
+            is_mirrored = np.random.default_rng([seed, 5, step]).random(1 + int(batch.photo_objects.max())) < 0.5
+            rng = np.random.default_rng([seed, 6, step, self.rank])
+            touches = augment_touches(touches, is_mirrored[batch.touch_objects[touch_rows]], rng)
+            photos = augment_photos(photos, views, is_mirrored[batch.photo_objects[photo_rows]], rng)
+        return LoadedBatch(batch, touches, photos)
 
 
 def _ignore_interruption(worker: int) -> None:
@@ -140,20 +121,11 @@ class TrainedFeatures:
 
     def batches(self, matcher: Matcher, batches: Iterable[tuple[int, PairBatch]]) -> Iterator[LoadedBatch]:
         """Yield this rank's part of each batch, given with its step; the same parts for any number of workers."""
-        parts = (
-            _RankPart(
-                step,
-                batch,
-                distributed.rank_rows(len(batch.grasps)),
-                distributed.rank_rows(len(batch.photos)),
-                distributed.rank(),
-            )
-            for step, batch in batches
-        )
+        rows = distributed.rank_rows
         loader = DataLoader(
-            _PartLoader(self.config, self.images),
+            _RankLoader(self.config, self.images),
             batch_size=None,
-            sampler=parts,
+            sampler=((step, batch, rows(len(batch.grasps)), rows(len(batch.photos))) for step, batch in batches),
             num_workers=self._workers,
             pin_memory=self.device.type == "cuda",
             worker_init_fn=_ignore_interruption,
@@ -207,8 +179,8 @@ class FrozenFeatures:
         new = {grasp.grasp_id: grasp for grasp in grasps if grasp.grasp_id not in self._features}
         new_photos = [path for path in photos if path not in self._features]
         touch, photo = _encoded(matcher, self.images, list(new.values()), new_photos)
-        self._features.update(zip(new, touch, strict=True))
-        self._features.update(zip(new_photos, photo, strict=True))
+        self._features |= zip(new, touch, strict=True)
+        self._features |= zip(new_photos, photo, strict=True)
         touches = torch.stack([self._features[grasp.grasp_id] for grasp in grasps])
         return touches, torch.stack([self._features[path] for path in photos])
 
@@ -232,12 +204,7 @@ _CHUNK = 64
 
 @torch.inference_mode()
 def recorded_features(
-    matcher: Matcher,
-    source: FeatureSource,
-    grasps: Sequence[Grasp],
-    *,
-    what: str,
-    quiet: bool = False,
+    matcher: Matcher, source: FeatureSource, grasps: Sequence[Grasp], *, what: str, quiet: bool = False
 ) -> tuple[Tensor, dict[Path, Tensor]]:
     """Return features of the touches of grasps (G, fingers * F) and of each of their photo files (F,).
 
@@ -246,8 +213,7 @@ def recorded_features(
     touches: list[Tensor] = []
     photos: dict[Path, Tensor] = {}
     with Bar(f"encode for {what}", len(grasps), "grasps", quiet=quiet) as bar:
-        for start in range(0, len(grasps), _CHUNK):
-            part = grasps[start : start + _CHUNK]
+        for part in batches(grasps, _CHUNK):
             files = list(dict.fromkeys(grasp.photo for grasp in part))
             touch, photo = source.eval_features(matcher, part, files)
             touches.append(touch)

@@ -11,7 +11,7 @@ Settings are chosen from `GRID` on held-out training objects (`select_settings`)
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby, product
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -80,63 +80,6 @@ class AffineMap(NamedTuple):
         """Return (n, k) for rows x (n, F)."""
         return np.asarray(x @ self.weight + self.bias)
 
-    def compose(self, other: "AffineMap") -> "AffineMap":
-        """Return this map followed by another, as one map."""
-        return AffineMap(self.weight @ other.weight, self.bias @ other.weight + other.bias)
-
-
-@dataclass(frozen=True, eq=False)
-class ReducedFeatures:
-    """One modality of n items in the widest directions of each tower's features.
-
-    Attributes:
-        views: A decomposition for each tower, of a limited number of directions.
-        widths: Feature width of each tower.
-        towers: Number of towers; with several fingers, each tower has several views.
-    """
-
-    views: tuple[CcaView, ...]
-    widths: tuple[int, ...]
-    towers: int = 1
-
-    @classmethod
-    def of(cls, x: Rows, blocks: Sequence[int], max_directions: int, *, towers: int = 1) -> Self:
-        """Return the reduction of features x (n, F) of concatenated towers, whose widths are `blocks`."""
-        parts = np.split(x, np.cumsum(blocks)[:-1], axis=1)
-        return cls(tuple(decompose(part, max_directions) for part in parts), tuple(blocks), towers)
-
-    def _used(self, last_tower: bool) -> list[int]:
-        """Return the places of the used views: all, or those of the last tower."""
-        return [place for place in range(len(self.views)) if not last_tower or (place + 1) % self.towers == 0]
-
-    def items(self, directions: int, *, last_tower: bool = False) -> Matrix:
-        """Return the items (n, k) in `directions` directions of each tower; the variances of each tower add up to 1.
-
-        Args:
-            directions: Number of directions of each tower.
-            last_tower: Use only the last tower.
-        """
-        columns, used = slice(directions), [self.views[place] for place in self._used(last_tower)]
-        parts = [view.left[:, columns] * view.singular[columns] / _size(view, directions) for view in used]
-        return np.concatenate(parts, axis=1)
-
-    def map(self, directions: int, *, last_tower: bool = False) -> AffineMap:
-        """Return the map from features to `items`."""
-        weight, bias, starts = [], [], np.cumsum([0, *self.widths])
-        for place in self._used(last_tower):
-            view = self.views[place]
-            rank = min(len(view.singular), directions)
-            part = view.right[:rank].T / view.standardise.scale[:, None] / _size(view, directions)
-            columns = np.zeros((sum(self.widths), rank))
-            columns[starts[place] + view.standardise.columns] = part
-            weight.append(columns)
-            bias.append(-(view.standardise.mean @ part))
-        return AffineMap(np.concatenate(weight, axis=1), np.concatenate(bias))
-
-
-def _size(view: CcaView, directions: int) -> float:
-    return float(np.sqrt((view.singular[:directions] ** 2).sum() / len(view.left)))
-
 
 class CcaProjections(NamedTuple):
     """Maps from touches and photos to encodings; the cosine is high if both show the same object."""
@@ -149,32 +92,52 @@ class CcaProjections(NamedTuple):
         return unit_rows(self.touch(touch)) @ unit_rows(self.photo(photo)).T
 
 
-def fit_projections(
-    features: Features, widths: TowerWidths, settings: Sequence[CcaSettings] = GRID
-) -> dict[CcaSettings, CcaProjections]:
-    """Return the projections of grasps for each of the settings; `widths` are those of their towers."""
-    reduced, every = _Reduced.of(features, widths, settings), np.arange(len(features))
-    return {one: reduced.of_features(one, projections) for one, projections in reduced.fit(every, settings)}
+class _Modality:
+    """One modality of n items, with the features of each of `towers` towers (times fingers) decomposed."""
+
+    def __init__(self, x: Rows, widths: Sequence[int], max_directions: int, towers: int = 1) -> None:
+        parts = np.split(x, np.cumsum(widths)[:-1], axis=1)
+        self.views = [decompose(part, max_directions) for part in parts]
+        self.widths, self.towers = widths, towers
+
+    def _used(self, settings: CcaSettings) -> Iterator[tuple[int, CcaView, float]]:
+        """Yield place, decomposition and size of each used tower: of all, or of the last one of each finger."""
+        for place, view in enumerate(self.views):
+            if not settings.last_tower or (place + 1) % self.towers == 0:
+                variances = view.singular[: settings.directions] ** 2
+                yield place, view, float(np.sqrt(variances.sum() / len(view.left)))
+
+    def items(self, settings: CcaSettings) -> Matrix:
+        """Return the items (n, k) in the widest directions of each tower; the variances of each tower add up to 1."""
+        columns = slice(settings.directions)
+        parts = [view.left[:, columns] * view.singular[columns] / size for _, view, size in self._used(settings)]
+        return np.concatenate(parts, axis=1)
+
+    def compose(self, settings: CcaSettings, other: AffineMap) -> AffineMap:
+        """Return the map from features to `items`, followed by another, as one map."""
+        weight, bias, starts = [], [], np.cumsum([0, *self.widths])
+        for place, view, size in self._used(settings):
+            part = view.right[: settings.directions].T / view.standardise.scale[:, None] / size
+            columns = np.zeros((sum(self.widths), part.shape[1]))
+            columns[starts[place] + view.standardise.columns] = part
+            weight.append(columns)
+            bias.append(-(view.standardise.mean @ part))
+        return AffineMap(
+            np.concatenate(weight, axis=1) @ other.weight, np.concatenate(bias) @ other.weight + other.bias
+        )
 
 
-@dataclass(frozen=True, eq=False)
 class _Reduced:
-    """Grasps in the widest directions of each tower's features, and their objects (n,)."""
+    """Grasps in the widest directions of each tower's features."""
 
-    touch: ReducedFeatures
-    photo: ReducedFeatures
-    owner: Numbers
-
-    @classmethod
-    def of(cls, features: Features, widths: TowerWidths, settings: Sequence[CcaSettings]) -> Self:
-        limit = max(one.directions for one in settings)
-        touch = ReducedFeatures.of(touch_rows(features), widths.touch, limit, towers=widths.touch_towers)
-        return cls(touch, ReducedFeatures.of(features.photo, widths.photo, limit), features.owner)
+    def __init__(self, features: Features, widths: TowerWidths, settings: Sequence[CcaSettings]) -> None:
+        limit, self.owner = max(one.directions for one in settings), features.owner
+        self.touch = _Modality(features.touch_rows, widths.touch, limit, widths.touch_towers)
+        self.photo = _Modality(features.photo, widths.photo, limit)
 
     def items(self, settings: CcaSettings) -> tuple[Matrix, Matrix]:
         """Return the reduced touches (n, k) and photos (n, k')."""
-        touch = self.touch.items(settings.directions, last_tower=settings.last_tower)
-        return touch, self.photo.items(settings.directions)
+        return self.touch.items(settings), self.photo.items(settings)
 
     def fit(self, rows: Numbers, settings: Sequence[CcaSettings]) -> Iterator[tuple[CcaSettings, CcaProjections]]:
         """Yield the projections of reduced items, fitted on the given rows, for each of the settings."""
@@ -191,11 +154,12 @@ class _Reduced:
                     maps = (AffineMap(each, -mean @ each) for each, mean in zip(variates, means, strict=True))
                     yield one, CcaProjections(*maps)
 
-    def of_features(self, settings: CcaSettings, projections: CcaProjections) -> CcaProjections:
-        """Return the projections of features, given those of reduced items."""
-        touch = self.touch.map(settings.directions, last_tower=settings.last_tower)
-        photo = self.photo.map(settings.directions)
-        return CcaProjections(touch.compose(projections.touch), photo.compose(projections.photo))
+    def fit_all(self, settings: Sequence[CcaSettings]) -> dict[CcaSettings, CcaProjections]:
+        """Return the projections of features, fitted on all grasps, for each of the settings."""
+        return {
+            one: CcaProjections(self.touch.compose(one, found.touch), self.photo.compose(one, found.photo))
+            for one, found in self.fit(np.arange(len(self.owner)), settings)
+        }
 
 
 def _reduction(settings: CcaSettings) -> tuple[int, bool]:
@@ -208,6 +172,13 @@ def _centred_view(x: Matrix) -> CcaView:
     return decompose(x, MAX_DIRECTIONS, unscaled)
 
 
+def fit_projections(
+    features: Features, widths: TowerWidths, settings: Sequence[CcaSettings] = GRID
+) -> dict[CcaSettings, CcaProjections]:
+    """Return the projections of grasps for each of the settings; `widths` are those of their towers."""
+    return _Reduced(features, widths, settings).fit_all(settings)
+
+
 @dataclass(frozen=True, eq=False)
 class CcaSelection:
     """Settings that were chosen on held-out objects.
@@ -217,7 +188,8 @@ class CcaSelection:
         auc: Their mean AUC over the folds.
         projections: The maps, fitted to all objects.
         held_out_touches: For each fold, the cosines of its touches with its photos by maps that were fitted without its
-            objects, and the encodings of both: the input of the calibrations.
+            objects, and the encodings of both: the input of the calibrations. Of each object at most
+            `MAX_CALIBRATION_TOUCHES` touches, evenly spaced.
     """
 
     settings: CcaSettings
@@ -244,14 +216,13 @@ def select_settings(
     """
     if settings is None:
         settings = GRID if widths.touch_towers == 1 else (*GRID, *(one._replace(last_tower=True) for one in GRID))
-    reduced = _Reduced.of(features, widths, settings)
+    reduced = _Reduced(features, widths, settings)
     items = {_reduction(one): reduced.items(one) for one in settings}
     found: dict[CcaSettings, list[tuple[float, CcaProjections]]] = {one: [] for one in settings}
     rows_of = [np.flatnonzero(np.isin(features.object_ids, fold)) for fold in folds]
     for rows in rows_of:
-        held_out = features.select(rows)
-        some = validation_rows(held_out, MAX_CHOICE_TOUCHES)
-        owner, places = held_out.select(some).owner, rows[some]
+        places = rows[validation_rows(features.select(rows), MAX_CHOICE_TOUCHES)]
+        owner = features.select(places).owner
         others = np.setdiff1d(np.arange(len(features)), rows)
         for one, projections in reduced.fit(others, settings):
             touch, photo = items[_reduction(one)]
@@ -259,34 +230,14 @@ def select_settings(
     aucs = {one: float(np.mean([auc for auc, _ in each])) for one, each in found.items()}
     best = max(aucs, key=lambda one: (aucs[one], one))
     touch, photo = items[_reduction(best)]
-    parts = [
-        held_out_touches(features.select(rows), projections, touch[rows], photo[rows])
-        for rows, (_, projections) in zip(rows_of, found[best], strict=True)
-    ]
-    projections = dict(reduced.fit(np.arange(len(features)), [best]))[best]
-    return CcaSelection(best, aucs[best], reduced.of_features(best, projections), parts)
-
-
-def held_out_touches(
-    features: Features, projections: CcaProjections, touch: NDArray[np.floating], photo: NDArray[np.floating]
-) -> ScoredTouches:
-    """Return touches of objects that the projections were fitted without, for the calibrations.
-
-    Args:
-        features: The grasps. Of each object at most `MAX_CALIBRATION_TOUCHES` are used, evenly spaced.
-        projections: The maps.
-        touch: (n, k) reduced touches.
-        photo: (n, k') reduced photos.
-    """
-    rows = validation_rows(features, MAX_CALIBRATION_TOUCHES * len(set(features.object_ids)))
-    owner, own = features.owner[rows], np.eye(len(rows), dtype=np.bool_)
-    embeddings = unit_rows(projections.touch(touch[rows])), unit_rows(projections.photo(photo[rows]))
-    return ScoredTouches(projections.cosines(touch[rows], photo[rows]), owner, owner, own, *embeddings)
-
-
-def touch_rows(features: Features) -> Rows:
-    """Return touch features (n, fingers * F)."""
-    return features.touch.reshape(len(features), -1)
+    parts = []
+    for rows, (_, projections) in zip(rows_of, found[best], strict=True):
+        held_out = features.select(rows)
+        some = validation_rows(held_out, MAX_CALIBRATION_TOUCHES * len(set(held_out.object_ids)))
+        owner, own, places = held_out.owner[some], np.eye(len(some), dtype=np.bool_), rows[some]
+        encodings = unit_rows(projections.touch(touch[places])), unit_rows(projections.photo(photo[places]))
+        parts.append(ScoredTouches(encodings[0] @ encodings[1].T, owner, owner, own, *encodings))
+    return CcaSelection(best, aucs[best], reduced.fit_all([best])[best], parts)
 
 
 def tower_widths(config: Config, features: Features) -> TowerWidths:
@@ -300,7 +251,7 @@ def tower_widths(config: Config, features: Features) -> TowerWidths:
     towers = [part.feature_count for part in matcher.touch_tower.backbones]
     touch_view = towers * features.touch.shape[1]
     photo_view = [part.feature_count for part in matcher.photo_tower.backbones] * len(config.preprocessing.views)
-    expected, got = (sum(touch_view), sum(photo_view)), (touch_rows(features).shape[1], features.photo.shape[1])
+    expected, got = (sum(touch_view), sum(photo_view)), (features.touch_rows.shape[1], features.photo.shape[1])
     if expected != got:
         raise BadInput(
             f"features must be those of the towers {config.matcher.tower} ({config.matcher.tower_output}), "

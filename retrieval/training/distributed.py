@@ -4,9 +4,6 @@ Every rank has the whole batch (the sampler is stateless), encodes its rows of t
 features of the other ranks. The gather is differentiable, so the loss and the mean of the ranks' gradients equal those
 of one process up to rounding. (With negatives from one rank only, the gradient would differ by half.) `torchrun` starts
 the ranks; without it there is one rank.
-
-On GPUs batch normalisation in the towers uses the statistics of all ranks' images (torch.nn.SyncBatchNorm). PyTorch has
-no such layer for CPUs: there the statistics must stay frozen.
 """
 
 import os
@@ -48,22 +45,14 @@ def world_size() -> int:
 
 
 def rank_rows(count: int) -> list[int]:
-    """Return the rows of a batch of `count` that this rank encodes.
-
-    Every rank gets the same number of rows; the last row of the batch is repeated as padding.
-    """
+    """Return the rows of a batch of `count` that this rank encodes: equally many on each rank, padded by the last."""
     size = -(-count // world_size())
     start_row = rank() * size
     return [min(row, count - 1) for row in range(start_row, start_row + size)]
 
 
 def gather_rows(local: Tensor, count: int) -> Tensor:
-    """Gather all ranks' rows (count, d), with gradients to the other ranks.
-
-    Args:
-        local: Values (len(rank_rows(count)), d) of this rank's rows.
-        count: Number of rows in the batch.
-    """
+    """Return all ranks' rows (count, d), with gradients to the other ranks, given those of `rank_rows(count)`."""
     if world_size() == 1:
         return local
     rows: Tensor = _Gather.apply(local)  # type: ignore[no-untyped-call]
@@ -96,14 +85,10 @@ def any_rank(flag: bool, device: torch.device) -> bool:
 
 
 def synchronise_batch_norm(tower: nn.Module, device: torch.device) -> None:
-    """Make the batch normalisation of a tower use the statistics of all ranks' images.
-
-    Args:
-        tower: The tower, in the mode of its training.
-        device: Where it computes.
+    """Make the batch normalisation of a tower, in its training mode, use the statistics of all ranks' images.
 
     Raises:
-        ConfigError: Several ranks of a CPU would each use the statistics of their own images.
+        ConfigError: PyTorch has no such layer for CPUs, where each rank would use the statistics of its own images.
     """
     layers = (module for module in tower.modules() if isinstance(module, nn.BatchNorm2d))
     if world_size() == 1 or not any(layer.training for layer in layers):

@@ -113,6 +113,11 @@ class Features:
             digest.update(np.ascontiguousarray(part).data)
         return digest.hexdigest()
 
+    @property
+    def touch_rows(self) -> NDArray[np.float32]:
+        """(G, fingers * F_touch) features of the touches."""
+        return self.touch.reshape(len(self), -1)
+
     @cached_property
     def owner(self) -> NDArray[np.int64]:
         """(G,) index of each row's object into `sorted(set(object_ids))`."""

@@ -1,18 +1,24 @@
-"""The initial weights of a matcher: random, published, from a file, or of a checkpoint."""
+"""Initial weights of a matcher (random, published, from a file, or of a checkpoint), and the licences of their data."""
 
 from functools import partial
 from pathlib import Path
 
 from torch import Tensor, nn
 
+from retrieval.data.dataset import recording_licence
+from retrieval.data.licences import DataLicence, stored_licences
 from retrieval.errors import CheckpointError
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.model.config import Config
+from retrieval.model.checkpoint_info import CheckpointInfo, read_checkpoint_info
+from retrieval.model.config import Config, TrainingConfig
 from retrieval.model.fusion import Matcher
-from retrieval.model.shipped import shipped_model
+from retrieval.model.shipped import is_shipped, shipped_model
+from retrieval.model.towers import TOWER_SEPARATOR
+from retrieval.model.towers.weights import GEL, SHIPPED
 
 TOWER_WEIGHTS = ("touch_tower.", "photo_tower.")
 """Prefixes of the names of the towers' weights in a matcher."""
+_SHIPPED = DataLicence("simulated objects of the shipped models", "MIT", "as touch-retrieval")
 
 
 def build_matcher(config: Config) -> Matcher:
@@ -21,12 +27,9 @@ def build_matcher(config: Config) -> Matcher:
     if settings.start:
         _start_from(matcher, Path(settings.start))
     else:
-        for tower, init, side in (
-            (matcher.touch_tower, settings.init_touch, "touch_tower"),
-            (matcher.photo_tower, settings.init_photo, "photo_tower"),
-        ):
+        for side, init in (("touch_tower", settings.init_touch), ("photo_tower", settings.init_photo)):
             shipped = partial(_shipped_tower, config.matcher.fingers, side)
-            tower.initialise(settings.tower_init(init), shipped)
+            getattr(matcher, side).initialise(settings.tower_init(init), shipped)
     for tower in (matcher.touch_tower, matcher.photo_tower):
         tower.requires_grad_(not settings.freeze_towers)
         if settings.freeze_stem:
@@ -54,13 +57,35 @@ def _start_from(matcher: Matcher, path: Path) -> None:
         if tensor.shape != ours[name].shape:
             raise CheckpointError(
                 f"{path} cannot start this training: {name} is {tuple(tensor.shape)}, must be "
-                f"{tuple(ours[name].shape)}; "
-                "use the configuration of that checkpoint, or another checkpoint"
+                f"{tuple(ours[name].shape)}; use the configuration of that checkpoint, or another checkpoint"
             )
     matcher.load_state_dict(shared, strict=False)
 
 
 def _shipped_tower(fingers: int, side: str) -> dict[str, Tensor]:
-    checkpoint = load_checkpoint(shipped_model(min(fingers, 2)))
-    tower: nn.Module = getattr(checkpoint.matcher, side)
+    tower: nn.Module = getattr(load_checkpoint(shipped_model(min(fingers, 2))).matcher, side)
     return tower.state_dict()
+
+
+def training_licences(recording: Path, settings: TrainingConfig) -> list[DataLicence]:
+    """Return the licences of all data that a training with these settings uses.
+
+    Published weights (`init = "imagenet"`) are not data of a recording and are left out.
+
+    Raises:
+        CheckpointError: The checkpoint `start` cannot be read.
+    """
+    found = [recording_licence(recording)]
+    if settings.start:  # replaces the initial weights, which are not read
+        found += checkpoint_licences(read_checkpoint_info(Path(settings.start)))
+    else:
+        inits = {settings.tower_init(init) for init in (settings.init_touch, settings.init_photo)}
+        for name in sorted({part for init in inits for part in init.split(TOWER_SEPARATOR)} - {"random", "imagenet"}):
+            found.append(_SHIPPED if name in (SHIPPED, GEL) else DataLicence(name))
+    return list(dict.fromkeys(found))
+
+
+def checkpoint_licences(info: CheckpointInfo) -> list[DataLicence]:
+    """Return the licences that a checkpoint lists; for one of an older version, that its licence is not stated."""
+    unlisted = _SHIPPED if is_shipped(info.path) else DataLicence(str(info.provenance.get("source", info.path)))
+    return stored_licences(info.provenance) or [unlisted]

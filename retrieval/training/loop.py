@@ -4,11 +4,8 @@ A step depends only on its number, the seed and the state. So a run that is stop
 gives the same bits as an uninterrupted run.
 """
 
-import hashlib
-import inspect
 import json
 import math
-import sys
 import threading
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
@@ -62,6 +59,11 @@ class BestStep:
 
     step: int = 0
     metrics: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def scores(self) -> list[tuple[str, float]]:
+        """Name and value of the score; empty without validation."""
+        return [*self.metrics.items()][:1]
 
 
 class TrainingInterrupted(JobInterrupted):
@@ -157,16 +159,16 @@ def train_loop(
             # from old weights would seem up to date.
             increment_version(list(module.parameters()))
             done += 1
-            bar.advance(note=f"loss {value:.3f}{_best_note(best)}")
+            best_score = [f"  best {name.replace('_', ' ')} {score:.3f}" for name, score in best.scores]
+            bar.advance(note="".join([f"loss {value:.3f}", *best_score]))
             # All ranks must stop after the same step, or the remaining ranks would wait forever.
             is_stopped = state is not None and distributed.any_rank(stop.is_set(), current.device)
             if is_stopped or done % plan.validate_every == 0 or done == plan.steps:
-                metrics = validate() if validate else {}
-                if not metrics:
-                    best = BestStep(done)
-                elif not best.metrics or _score(metrics) > _score(best.metrics):
-                    best = BestStep(done, metrics)
-                    best_weights = {name: tensor.clone() for name, tensor in module.state_dict().items()}
+                reached = BestStep(done, validate() if validate else {})
+                if not reached.metrics:
+                    best = reached
+                elif not best.metrics or reached.scores[0][1] > best.scores[0][1]:
+                    best, best_weights = reached, {name: each.clone() for name, each in module.state_dict().items()}
                 if state:
                     if not distributed.rank():
                         _save(state, module, optimizer, done, best, best_weights)
@@ -182,14 +184,6 @@ def train_loop(
             best,
         )
     return best
-
-
-def _score(metrics: Mapping[str, float]) -> float:
-    return next(iter(metrics.values()))
-
-
-def _best_note(best: BestStep) -> str:
-    return "".join(f"  best {name.replace('_', ' ')} {value:.3f}" for name, value in [*best.metrics.items()][:1])
 
 
 def freeze_batch_norm(module: nn.Module) -> None:
@@ -243,19 +237,3 @@ def _load(
                 for quantity, tensor in quantities.items()
             }
     return header["step"], BestStep(header["best_step"], header["metrics"]), part(_BEST)
-
-
-def code_digest(*classes: type) -> dict[str, str]:
-    """Return {"code": SHA-256} of the source of classes outside this project, or {} without any.
-
-    So an edited loss or method is fitted again. The source is that of the module, or of the class for a notebook.
-    """
-    sources = []
-    for each in classes:
-        if not each.__module__.startswith("retrieval."):
-            module = sys.modules[each.__module__]
-            try:
-                sources.append(inspect.getsource(module if getattr(module, "__file__", None) else each))
-            except (OSError, TypeError):  # typed into an interpreter, without source
-                sources.append(each.__qualname__)
-    return {"code": hashlib.sha256("\n".join(sources).encode()).hexdigest()} if sources else {}

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from _touch_retrieval.registry import code_digest
 from retrieval.console.interruption import interruption
 from retrieval.data.check.split import require_fit
 from retrieval.data.dataset import (
@@ -40,15 +41,12 @@ from retrieval.training.batches import FeatureSource, FrozenFeatures, LoadedBatc
 from retrieval.training.calibration.calibrate import calibrate_checkpoint
 from retrieval.training.distil import add_candidate_encoder
 from retrieval.training.features import Features, features_by_image
-from retrieval.training.initial_weights import TOWER_WEIGHTS, build_matcher
-from retrieval.training.licences import training_licences
+from retrieval.training.initial_weights import TOWER_WEIGHTS, build_matcher, training_licences
 from retrieval.training.loop import (
     RATE,
-    BestStep,
     Plan,
     StateFile,
     TrainingInterrupted,
-    code_digest,
     freeze_batch_norm,
     state_path,
     train_loop,
@@ -100,8 +98,8 @@ def train(
         )
     else:
         require_fit(split, grasps)
-    source, licences = recording_source(recording), training_licences(recording, settings)
-    return Trainer(config, split, grasps, out, source, licences=licences).run(quiet)
+    licences = training_licences(recording, settings)
+    return Trainer(config, split, grasps, out, recording_source(recording), licences=licences).run(quiet)
 
 
 _DATA_AND_CODE = ("data_digest", "code")
@@ -137,9 +135,8 @@ class Trainer:
         self.config, self.split, self.out = config, split, out
         self.device = default_device()
         torch.manual_seed(settings.seed)
-        self.config_without_encoder = config.without_candidate_encoder()
         self.has_images = known is None
-        self.matcher = build_matcher(self.config_without_encoder).to(self.device)
+        self.matcher = build_matcher(config.without_candidate_encoder()).to(self.device)
         self.sampler = self._sampler(split.select(grasps, "train"))
         self.losses = WeightedLosses(settings.weights, self.matcher, len(self.sampler.grasps)).to(self.device)
         self.modules = nn.ModuleDict({"matcher": self.matcher, "losses": self.losses})
@@ -151,7 +148,8 @@ class Trainer:
         # On a CPU, PyTorch's default optimizer reads every tensor eight times. The fused optimizer reads it once. On
         # CUDA the default optimizer is fast.
         self.optimizer = torch.optim.Adam(groups, lr=settings.learning_rate, fused=self.device.type == "cpu")
-        self.optimizer.register_step_post_hook(lambda *_: self._clamp())
+        for clamp in (self.matcher.clamp_scale, self.losses.clamp):
+            self.optimizer.register_step_post_hook(lambda *_, clamp=clamp: clamp())
         held_out = split.select(grasps, "validation")
         self.validation = self._sampler(held_out).evaluation_pairs() if split.validation else None
         self.features: FeatureSource = (
@@ -160,14 +158,14 @@ class Trainer:
             else TrainedFeatures(config, self.device)
         )
         set_training_mode(self.matcher, settings)
-        own = [module for module in self.matcher.modules() if isinstance(module, Tower)]
         for tower in (self.matcher.touch_tower, self.matcher.photo_tower):
             distributed.synchronise_batch_norm(tower, self.device)
+        towers = [module for module in self.matcher.modules() if isinstance(module, Tower)]
         self.provenance = {
             "source": source,
             LICENCES: [dataclasses.asdict(licence) for licence in licences],
             "data_digest": known.digest if known else data_digest(grasps),
-            **code_digest(*map(type, (*self.losses.terms, *own))),
+            **code_digest(*map(type, (*self.losses.terms, *towers))),
         }
 
     def _sampler(self, chosen: list[Grasp]) -> PairSampler:
@@ -182,10 +180,6 @@ class Trainer:
             share_photos=shared,
         )
 
-    def _clamp(self) -> None:
-        self.matcher.clamp_scale()
-        self.losses.clamp()
-
     def run(self, quiet: bool = False, *, replace: bool = False) -> Checkpoint:
         """Train from the first step, or from that of the state file, to the last; write the checkpoint and return it.
 
@@ -195,10 +189,10 @@ class Trainer:
             CheckpointError: The state file belongs to another run.
             JobInterrupted: After Ctrl-C.
         """
-        settings, provenance = self.config.training, self.provenance
-        touches, quiet = settings.touches_per_batch, quiet or distributed.rank() > 0
+        settings, touches = self.config.training, self.config.training.touches_per_batch
+        quiet = quiet or distributed.rank() > 0
         identity: dict[str, Any] = {"config": self.config.to_dict(), "split": self.split.to_dict()}
-        identity |= {name: provenance.get(name) for name in _DATA_AND_CODE}
+        identity |= {name: self.provenance.get(name) for name in _DATA_AND_CODE}
         state = StateFile(state_path(self.out), identity, is_replaceable=replace)
         interrupted = None
         try:
@@ -219,8 +213,15 @@ class Trainer:
         except TrainingInterrupted as stopped:
             best, interrupted = stopped.best, f"{stopped} {self.out} can already rank photos."
         if not distributed.rank():
+            made = Checkpoint(
+                self.out,
+                digest="",
+                config=self.config.without_candidate_encoder(),
+                provenance={"step": best.step, **self.provenance, "metrics": best.metrics},
+                matcher=self.matcher.eval(),
+                split=self.split,
+            )
             try:
-                made = self._checkpoint(best)
                 store_checkpoint(made, self.out)
                 if not interrupted:
                     store_checkpoint(self._completed(made, quiet), self.out)
@@ -280,25 +281,13 @@ class Trainer:
             "validation_nll": negative_log_likelihood(logits, pairs.labels),
         }
 
-    def _checkpoint(self, best: BestStep) -> Checkpoint:
-        return Checkpoint(
-            self.out,
-            digest="",
-            config=self.config_without_encoder,
-            provenance={"step": best.step, **self.provenance, "metrics": best.metrics},
-            matcher=self.matcher.eval(),
-            split=self.split,
-        )
-
     def _completed(self, made: Checkpoint, quiet: bool) -> Checkpoint:
         """Add the parts that are fitted after training: candidate encoder, calibrations and gel check."""
         train = [grasp for part in self.sampler.grasps for grasp in part]
         held_out = self.validation.grasps if self.validation else []
         if self.config.matcher.candidate_width:
             made = add_candidate_encoder(made, self.config, self.features, train, held_out, quiet=quiet)
-        if self.has_images:
-            made = calibrate_checkpoint(made, self.features, train, held_out, quiet=quiet)
-        return made
+        return calibrate_checkpoint(made, self.features, train, held_out, quiet=quiet) if self.has_images else made
 
 
 def set_training_mode(matcher: Matcher, settings: TrainingConfig) -> None:
@@ -323,12 +312,7 @@ class WeightedLosses(nn.Module):
     """The losses of a training run whose weight is above 0, with their own parameters."""
 
     def __init__(self, weights: Mapping[str, float], matcher: Matcher, objects: int) -> None:
-        """Create the losses with a weight above 0.
-
-        Args:
-            weights: Weight of each loss by name.
-            matcher: The model that they train.
-            objects: Number of training objects.
+        """Create the losses by name, to train `matcher` on this number of objects.
 
         Raises:
             ConfigError: A name is unknown.
@@ -350,18 +334,13 @@ class WeightedLosses(nn.Module):
 
 
 def batch_loss(
-    matcher: Matcher,
-    losses: WeightedLosses,
-    batch: PairBatch,
-    touch_features: Tensor,
-    photo_features: Tensor,
+    matcher: Matcher, losses: WeightedLosses, batch: PairBatch, touch_features: Tensor, photo_features: Tensor
 ) -> Tensor:
     """Return the loss (scalar) of a batch, from features of its distinct touches and photos."""
     arrays = batch.touch_index, batch.photo_index, batch.labels, batch.touch_objects, batch.photo_objects
     touch_index, photo_index, labels, *objects = (torch.from_numpy(array).to(touch_features.device) for array in arrays)
     touch, photo = matcher.touch_encoding(touch_features), matcher.photo_encoding(photo_features)
-    logits = matcher.head(touch.partial[touch_index], photo.partial[photo_index])
-    loss = match_loss(logits, labels)
+    loss = match_loss(matcher.head(touch.partial[touch_index], photo.partial[photo_index]), labels)
     for term in losses(EncodedBatch(matcher, touch, photo, *objects)):
         loss = loss + term
     return loss

@@ -7,8 +7,6 @@ import numpy as np
 
 from retrieval.data.dataset import Grasp
 from retrieval.model.checkpoint import Checkpoint
-from retrieval.model.posterior import Posterior
-from retrieval.model.references import ReferenceCalibration
 from retrieval.training.batches import FeatureSource, recorded_features
 from retrieval.training.calibration.gel_check import (
     PENALTY,
@@ -42,32 +40,56 @@ def calibrate_checkpoint(
 ) -> Checkpoint:
     """Return the checkpoint with calibrations and a gel check, if there are enough validation grasps.
 
-    A posterior needs three validation objects, and a touch with a second photo of its object. A model with late
-    interaction has a second one, for an index without cells. At most `max_grasps` grasps of each part are used, and
-    `foreign` foreign pictures for fitting. The checkpoint's matcher is reused and modified.
+    A posterior needs three validation objects, and a touch with a second photo of its object. At most `max_grasps`
+    grasps of each part are used, and `foreign` foreign pictures for fitting. The checkpoint's matcher is reused and
+    modified.
     """
     seed, matcher = checkpoint.config.training.seed, checkpoint.matcher
-    grasps = _sample_grasps(validation, seed)[:max_grasps]
+    grasps = _sample_grasps(validation, seed, max_grasps)
     if not train or not grasps:
         return checkpoint
     touches, photos = recorded_features(matcher, source, grasps, what="posterior", quiet=quiet)
-    if (scored := score_grasps(matcher, grasps, touches, photos)) is not None:
-        posterior, references = fit_calibrations([scored], seed)
-        verification = fit_verification([scored], posterior, seed)
-        checkpoint = dataclasses.replace(
-            checkpoint, posterior=posterior, references=references, verification=verification
-        )
-        if matcher.config.cell_dim:
-            pooled = score_grasps(matcher, grasps, touches, photos, pooled=True)
-            assert pooled is not None  # the same touches and photos
-            posterior, references = fit_calibrations([pooled], seed)
-            checkpoint = dataclasses.replace(checkpoint, pooled_posterior=posterior, pooled_references=references)
+    scored = [
+        each
+        for pooled in ((False, True) if matcher.config.cell_dim else (False,))
+        if (each := score_grasps(matcher, grasps, touches, photos, pooled=pooled)) is not None
+    ]
+    if scored:
+        checkpoint = with_calibrations(checkpoint, scored[:1], scored[1:], seed=seed)
     return with_gel_check(checkpoint, source, train, validation, foreign=foreign, max_grasps=max_grasps, quiet=quiet)
 
 
-def fit_calibrations(parts: Sequence[ScoredTouches], seed: int = 0) -> tuple[Posterior, ReferenceCalibration | None]:
-    """Return the posterior and the calibration of reference touches; `parts` come from one matcher or several."""
-    return fit_posterior(*parts, seed=seed), fit_references(*parts, seed=seed)
+def with_calibrations(
+    checkpoint: Checkpoint,
+    scored: Sequence[ScoredTouches],
+    pooled: Sequence[ScoredTouches] = (),
+    verified: Sequence[ScoredTouches] | None = None,
+    *,
+    seed: int = 0,
+) -> Checkpoint:
+    """Return the checkpoint with calibrations.
+
+    Args:
+        checkpoint: The checkpoint.
+        scored: Touches of objects outside the fit, of one matcher or several.
+        pooled: The same without late interaction, for an index without cells; empty for a model without cells.
+        verified: Touches for verification. Default: `scored`.
+        seed: Seed of the trials.
+    """
+    posterior = fit_posterior(*scored, seed=seed)
+    checkpoint = dataclasses.replace(
+        checkpoint,
+        posterior=posterior,
+        references=fit_references(*scored, seed=seed),
+        verification=fit_verification(scored if verified is None else verified, posterior, seed),
+    )
+    if not pooled:
+        return checkpoint
+    return dataclasses.replace(
+        checkpoint,
+        pooled_posterior=fit_posterior(*pooled, seed=seed),
+        pooled_references=fit_references(*pooled, seed=seed),
+    )
 
 
 def with_gel_check(
@@ -82,7 +104,7 @@ def with_gel_check(
 ) -> Checkpoint:
     """Return the checkpoint with a gel check, if there are `MIN_GRASPS` validation grasps (`calibrate_checkpoint`)."""
     seed, matcher, settings = checkpoint.config.training.seed, checkpoint.matcher, checkpoint.config.preprocessing
-    train, validation = (_sample_grasps(part, seed)[:max_grasps] for part in (train, validation))
+    train, validation = (_sample_grasps(part, seed, max_grasps) for part in (train, validation))
     if len(validation) < MIN_GRASPS:
         return checkpoint
     fitting, test = (
@@ -101,11 +123,8 @@ def with_gel_check(
     return dataclasses.replace(checkpoint, gel_check=check)
 
 
-def _sample_grasps(grasps: Sequence[Grasp], seed: int) -> list[Grasp]:
-    """Return the grasps object by object, in random order of the objects."""
-    by_object: dict[str, list[Grasp]] = {}
-    for grasp in grasps:
-        by_object.setdefault(grasp.object_id, []).append(grasp)
-    names = sorted(by_object)
-    order = np.random.default_rng([seed, 5]).permutation(len(names))
-    return [grasp for index in order for grasp in by_object[names[index]]]
+def _sample_grasps(grasps: Sequence[Grasp], seed: int, count: int) -> list[Grasp]:
+    """Return the first `count` grasps, object by object in random order."""
+    names = sorted({grasp.object_id for grasp in grasps})
+    place = dict(zip(names, np.random.default_rng([seed, 5]).permutation(len(names)).argsort(), strict=True))
+    return sorted(grasps, key=lambda grasp: place[grasp.object_id])[:count]

@@ -66,7 +66,7 @@ class GelCheckFeatures:
         `touches` are the features (G, fingers * F) of the grasps' touches, perhaps with cells.
         """
         fingers = matcher.config.fingers
-        frames = list(_no_contact_images(settings, grasps, fingers))
+        frames = _no_contact_images(settings, grasps, fingers)
         rows = np.linspace(0, len(grasps) - 1, min(_MAX_PHOTOS, len(grasps))).round().astype(int)
         sample = [grasps[row] for row in rows]
         # Whole photos, not the model's views of them: a photo given instead of a gel image is mostly background.
@@ -95,19 +95,16 @@ def _small_photo(path: Path) -> RgbImage:
     return resize(photo, (height, width))
 
 
-def _no_contact_images(settings: Preprocessing, grasps: Sequence[Grasp], fingers: int) -> Iterator[list[Image]]:
-    """Yield preprocessed no-contact frames.
+def _no_contact_images(settings: Preprocessing, grasps: Sequence[Grasp], fingers: int) -> list[list[Image]]:
+    """Return preprocessed no-contact frames.
 
     With background subtraction, the reference is the no-contact frame of the previous grasp, since a frame minus
     itself has no noise.
     """
     if settings.background == "none":
-        for grasp in grasps:
-            if len(grasp.backgrounds) == fingers:
-                yield [settings.load_touch(path) for path in grasp.backgrounds]
-        return
-    for first, second in _consecutive_frames(grasps):
-        yield [settings.load_touch(now, before) for before, now in zip(first, second, strict=True)]
+        frames = [grasp.backgrounds for grasp in grasps if len(grasp.backgrounds) == fingers]
+        return [list(map(settings.load_touch, paths)) for paths in frames]
+    return [list(map(settings.load_touch, second, first)) for first, second in _consecutive_frames(grasps)]
 
 
 def _consecutive_frames(grasps: Iterable[Grasp]) -> Iterator[tuple[tuple[Path, ...], tuple[Path, ...]]]:

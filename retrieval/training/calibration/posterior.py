@@ -34,15 +34,9 @@ def fit_posterior(*parts: ScoredTouches, seed: int = 0) -> Posterior:
 def identification_trials(scored: ScoredTouches, seed: int) -> Iterator["IdentificationTrials"]:
     """Yield the trials of single touches, then of sets of two grasps, three and so on, while objects have enough."""
     for grasps in range(1, MAX_GRASPS + 1):
-        rng = np.random.default_rng([seed, grasps])
-        sets = []  # touches of one object that do not mask all its photos; for one grasp: each touch alone
-        for name in np.unique(scored.touch_owner):
-            touches = np.flatnonzero(scored.touch_owner == name)
-            draws = touches[:, None] if grasps == 1 else [rng.permutation(touches)[:grasps] for _ in range(_SETS)]
-            photos = scored.photo_owner == name
-            sets += [rows for rows in draws if len(rows) == grasps and (photos & ~scored.own[rows].any(0)).any()]
-        if sets or grasps == 1:
-            yield IdentificationTrials.of(scored, np.array(sets, dtype=np.int64).reshape(-1, grasps), seed)
+        sets = scored.draw_sets(grasps, None if grasps == 1 else _SETS, np.random.default_rng([seed, grasps]))
+        if len(sets) or grasps == 1:
+            yield IdentificationTrials.of(scored, sets, seed)
 
 
 @dataclass(frozen=True, eq=False)

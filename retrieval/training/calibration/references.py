@@ -17,7 +17,6 @@ from retrieval.training.calibration.posterior import (
 )
 from retrieval.training.calibration.touches import ScoredTouches
 
-Numbers = NDArray[np.int64]
 MAX_REFERENCES = 3
 """Largest number of references of an object in the fit: a typical number if a user records few."""
 WEIGHT_BOUNDS = (0.01, 1000.0)
@@ -86,10 +85,11 @@ def _reference_trials(part: ScoredTouches, max_references: int) -> _ReferenceTri
     rows = [mine for mine in rows if len(mine) > 1]
     if len(rows) < MIN_OBJECTS:
         return None
-    references = [
-        _evenly_spaced(mine[: max(len(mine) // 4, min(MAX_REFERENCES, len(mine) // 2))], max_references)
-        for mine in rows
-    ]
+    references = []
+    for mine in rows:
+        shown = mine[: max(len(mine) // 4, min(MAX_REFERENCES, len(mine) // 2))]
+        places = np.linspace(0, len(shown) - 1, min(max_references, len(shown)))  # evenly spaced
+        references.append(shown[places.round().astype(np.int64)])
     queries = np.concatenate([mine[len(mine) // 2 :] for mine in rows])
     owner = np.repeat(np.arange(len(rows)), [len(mine) - len(mine) // 2 for mine in rows])
     cosines = part.touch_embeddings[queries] @ part.touch_embeddings[np.concatenate(references)].T
@@ -101,12 +101,6 @@ def _reference_trials(part: ScoredTouches, max_references: int) -> _ReferenceTri
         ScoredTouches(near, owner, np.arange(len(rows)), np.zeros(near.shape, np.bool_)),
         ScoredTouches(part.logits[np.ix_(queries, known)], owner, photo_owner, part.own[np.ix_(queries, known)]),
     )
-
-
-def _evenly_spaced(rows: Numbers, max_references: int) -> Numbers:
-    """Return at most `max_references` of the rows, evenly spaced."""
-    places = np.linspace(0, len(rows) - 1, min(max_references, len(rows)))
-    return np.asarray(rows[places.round().astype(np.int64)])
 
 
 def _weight(trials: Sequence[_ReferenceTrials], seed: int) -> float:

@@ -43,6 +43,21 @@ class ScoredTouches:
     touch_embeddings: Embeddings = field(default_factory=_no_embeddings)
     photo_embeddings: Embeddings = field(default_factory=_no_embeddings)
 
+    def draw_sets(self, grasps: int, draws: int | None, rng: np.random.Generator) -> Numbers:
+        """Return sets (S, grasps) of touches of one object, if it has so many, and a photo of another grasp.
+
+        Args:
+            grasps: Touches of a set.
+            draws: Random sets of each object; None for each single touch.
+            rng: The random choices.
+        """
+        sets = []
+        for name in np.unique(self.touch_owner):
+            touches, photos = np.flatnonzero(self.touch_owner == name), self.photo_owner == name
+            drawn = touches[:, None] if draws is None else [rng.permutation(touches)[:grasps] for _ in range(draws)]
+            sets += [rows for rows in drawn if len(rows) == grasps and (photos & ~self.own[rows].any(0)).any()]
+        return np.array(sets, dtype=np.int64).reshape(-1, grasps)
+
 
 @torch.inference_mode()
 def score_touches(
@@ -59,7 +74,7 @@ def score_touches(
         matcher: The matcher.
         features: Features of the touches (T, fingers * F) and of the photos (N, F').
         owners: Objects of the touches (T,) and of the photos (N,).
-        own: (T, N) whether the photo was taken in the grasp of that touch.
+        own: As in `ScoredTouches`.
         pooled: Score without late interaction, as an index without cells does.
     """
     touch_partials = matcher.touch_encoding(features[0]).partial.cpu().numpy()
@@ -84,12 +99,11 @@ def score_grasps(
         photos: Features of each photo by file.
         pooled: Score without late interaction.
     """
-    objects = sorted({grasp.object_id for grasp in grasps})
-    object_of = {grasp.photo: grasp.object_id for grasp in grasps}
+    names, touch_owner = np.unique([grasp.object_id for grasp in grasps], return_inverse=True)
+    owner_of = {grasp.photo: owner for grasp, owner in zip(grasps, touch_owner, strict=True)}
+    photo_owner = np.array([owner_of[photo] for photo in photos])
     own = np.array([[grasp.photo == photo for photo in photos] for grasp in grasps])
-    touch_owner = np.array([objects.index(grasp.object_id) for grasp in grasps])
-    photo_owner = np.array([objects.index(object_of[photo]) for photo in photos])
-    if len(objects) < 3 or not ((touch_owner[:, None] == photo_owner) & ~own).any():
+    if len(names) < 3 or not ((touch_owner[:, None] == photo_owner) & ~own).any():
         return None
     features = touches, torch.stack(list(photos.values()))
     return score_touches(matcher, features, (touch_owner, photo_owner), own, pooled=pooled)

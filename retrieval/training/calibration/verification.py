@@ -35,12 +35,11 @@ class VerificationSequences(NamedTuple):
 
 
 def verification_sequences(
-    scored: ScoredTouches,
-    posterior: Posterior,
-    seed: int = 0,
-    grasps: int = MAX_GRASPS,
-) -> VerificationSequences:
+    scored: ScoredTouches, posterior: Posterior, seed: int = 0, grasps: int = MAX_GRASPS
+) -> VerificationSequences | None:
     """Draw and score `SEQUENCES` sequences of each object that has `grasps` grasps and a photo of another grasp.
+
+    Returns None without any such object.
 
     Args:
         scored: Match logits of the touches with the photos, whose embeddings give the most similar object.
@@ -48,17 +47,10 @@ def verification_sequences(
         seed: Seed of the sequences. Shorter sequences of the same seed are the first grasps of longer ones.
         grasps: Number of grasps, G.
     """
-    rng = np.random.default_rng([seed, 7])
-    sequences = []
-    for name in np.unique(scored.touch_owner):
-        touches, photos = np.flatnonzero(scored.touch_owner == name), scored.photo_owner == name
-        drawn = [rng.permutation(touches)[:grasps] for _ in range(SEQUENCES)]
-        sequences += [rows for rows in drawn if len(rows) == grasps and (photos & ~scored.own[rows].any(0)).any()]
-    sets = np.array(sequences, dtype=np.int64).reshape(-1, grasps)
-    owner, objects = scored.touch_owner[sets[:, 0]], np.unique(scored.photo_owner)
+    sets = scored.draw_sets(grasps, SEQUENCES, np.random.default_rng([seed, 7]))
     if not len(sets):
-        none = np.zeros((0, grasps))
-        return VerificationSequences(owner, none, none.T, np.zeros((0, len(objects) - 1)), none[:, 0])
+        return None
+    owner, objects = scored.touch_owner[sets[:, 0]], np.unique(scored.photo_owner)
     ratios = np.stack(
         [IdentificationTrials.of(scored, sets[:, :count], seed).log_ratios(posterior) for count in range(1, grasps + 1)]
     )
@@ -89,8 +81,7 @@ def fit_verification(
         The calibration; None if fewer than `MIN_OBJECTS` objects have sequences (`verification_sequences`), or if
         their pairs do not support `CARD_FAR`.
     """
-    found = [verification_sequences(part, posterior, seed) for part in parts]
-    found = [each for each in found if len(each.owner)]
+    found = [each for part in parts if (each := verification_sequences(part, posterior, seed)) is not None]
     sizes = tuple(len(np.unique(each.owner)) for each in found)
     if not supports_calibration(sizes):
         return None

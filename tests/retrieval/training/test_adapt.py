@@ -1,7 +1,6 @@
 """Adaptation to a new sensor: linear maps, cross-validation over objects, and an ordinary checkpoint."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,14 +11,10 @@ from retrieval.commands.main import main
 from retrieval.commands.options import training_config
 from retrieval.data.dataset import Split, load_grasps
 from retrieval.errors import BadInput, CheckpointError
-from retrieval.model.checkpoint import load_checkpoint
-from retrieval.model.config import load_config
+from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
 from retrieval.model.fusion import Matcher
 from retrieval.model.towers.tower import build_tower
-from retrieval.report.adaptation import print_adaptation
-from retrieval.training import adapt as adaptation
-from retrieval.training import cca_towers
-from retrieval.training.adapt import Estimate, accuracies, adapt, config_for, draw_folds, fit_folds, load_towers
+from retrieval.training.adapt import accuracies, adapt, config_for, draw_folds, fit_folds, load_towers
 from retrieval.training.calibration.posterior import fit_posterior
 from retrieval.training.calibration.touches import ScoredTouches
 from retrieval.training.calibration.verification import fit_verification, verification_sequences
@@ -29,10 +24,13 @@ from retrieval.training.initial_weights import build_matcher
 from tests.verification import calibration
 
 
-@pytest.fixture
-def unchecked(monkeypatch):
-    """Skip the gel check, whose 700 foreign images take most of the time."""
-    monkeypatch.setattr("retrieval.training.adapt.with_gel_check", lambda made, *_, **__: made)
+@pytest.fixture(scope="module")
+def published(tmp_path_factory):
+    """Random weights in place of those of a published tower."""
+    path = tmp_path_factory.mktemp("weights") / "mobilenet_v2.pth"
+    torch.manual_seed(0)
+    torch.save(build_tower("mobilenet_v2", "pooled").state_dict(), path)
+    return path
 
 
 def correlated_features(objects=30, grasps=6, seed=0):
@@ -95,64 +93,24 @@ def test_every_object_is_held_out_once_and_objects_of_one_sequence_together(reco
         draw_folds(few, 0)
 
 
-def with_noise(features, names, seed):
-    """Return the features with those of `names` replaced by noise."""
-    rng, rows = np.random.default_rng(seed), np.isin(features.object_ids, names)
+def test_a_held_out_fold_affects_neither_settings_nor_fit():
+    """The features of its objects are replaced by noise, which would change every fit to them."""
+    features = as_features(*correlated_features(objects=24))
+    names = sorted(set(features.object_ids))
+    folds = [names[:8], names[8:16], names[16:]]
+    rng, noisy = np.random.default_rng(0), np.isin(features.object_ids, folds[0])
     touch, photo = features.touch.copy(), features.photo.copy()
-    touch[rows], photo[rows] = (rng.standard_normal(part[rows].shape) for part in (touch, photo))
-    return dataclasses.replace(features, touch=touch, photo=photo)
+    touch[noisy], photo[noisy] = (rng.standard_normal(part[noisy].shape) for part in (touch, photo))
+    changed = dataclasses.replace(features, touch=touch, photo=photo)
 
+    def fit(some):
+        objects = sorted(set(some.object_ids))
+        return select_settings(some, TowerWidths([12], [10]), [objects[::2], objects[1::2]])
 
-def test_a_held_out_fold_affects_neither_settings_nor_fit(monkeypatch):
-    touch, photo, owner = correlated_features(objects=24)
-    features = as_features(touch, photo, owner)
-    names = features.object_ids
-    data = SimpleNamespace(grasps=[], kind_of={}, widths=TowerWidths([12], [10]), config=load_config("adapt"))
-    drawn = [names[start : start + 8 * 6 : 6] for start in range(0, len(names), 8 * 6)]
-    calls = []
-    monkeypatch.setattr(adaptation, "select_settings", lambda *args: calls.append(args) or select_settings(*args))
-
-    def fit(inputs):
-        return list(fit_folds(inputs, drawn, data, "fit", quiet=True))
-
-    fit(features)
-    for fold, (fitted, _, inner) in zip(drawn, calls, strict=False):
-        assert not set(fold) & {*fitted.object_ids, *(name for part in inner for name in part)}
-    first = fit(features)[0]
-    noise, other = (fit(with_noise(features, drawn[0], seed))[0] for seed in range(2))
-    for found in (noise, other):
-        assert found.settings == first.settings
-        np.testing.assert_array_equal(found.projections.touch.weight, first.projections.touch.weight)
-    # Noise in fitted objects does change the fit.
-    changed = fit(with_noise(features, drawn[1], 0))[0]
-    assert not np.array_equal(changed.projections.touch.weight, first.projections.touch.weight)
-
-
-def test_a_setting_that_is_best_only_on_the_held_out_fold_is_not_selected(monkeypatch):
-    """Planted: one setting is perfect on the objects of one fold and useless on all others."""
-    touch, photo, owner = correlated_features(objects=24)
-    features = as_features(touch, photo, owner)
-    names = features.object_ids
-    data = SimpleNamespace(grasps=[], kind_of={}, widths=TowerWidths([12], [10]), config=load_config("adapt"))
-    drawn = [names[start : start + 8 * 6 : 6] for start in range(0, len(names), 8 * 6)]
-    planted, plain = GRID[0], GRID[-1]
-    current = []
-    fit = cca_towers._Reduced.fit
-    monkeypatch.setattr(cca_towers._Reduced, "fit", lambda *args: (current.append(one[0]) or one for one in fit(*args)))
-    held_out = []
-    monkeypatch.setattr(
-        cca_towers,
-        "ranking_auc",
-        lambda *_: float(current[-1] == planted if held_out[-1] <= set(drawn[0]) else current[-1] == plain),
-    )
-    rows = cca_towers.validation_rows
-    monkeypatch.setattr(
-        cca_towers, "validation_rows", lambda part, count: held_out.append(set(part.object_ids)) or rows(part, count)
-    )
-    found = list(fit_folds(features, drawn, data, "fit", quiet=True))
-    assert found[0].settings == plain
-    # With the fold itself the planted setting is selected.
-    assert select_settings(features, TowerWidths([12], [10]), drawn[:1]).settings == planted
+    before, after = (list(fit_folds(inputs, folds, fit, "fit", quiet=True)) for inputs in (features, changed))
+    assert after[0].settings == before[0].settings
+    np.testing.assert_array_equal(after[0].projections.touch.weight, before[0].projections.touch.weight)
+    assert not np.array_equal(after[1].projections.touch.weight, before[1].projections.touch.weight)
 
 
 def test_accuracy_of_hand_made_scores():
@@ -198,26 +156,14 @@ def test_touches_are_encoded_by_the_shipped_the_gel_and_the_published_tower_and_
         assert torch.allclose(matcher.photo_tower.eval()(images), parts[1], atol=1e-5)
 
 
-@pytest.mark.slow
-def test_the_adapted_checkpoint_is_an_ordinary_checkpoint(recording, model, catalogue, touch, tmp_path, monkeypatch):
-    monkeypatch.setattr(Estimate, "is_baseline_better", False)
-    out = tmp_path / "own.safetensors"
-    features = adapt(recording, out, load_checkpoint(model), init="none", quiet=True).features
-    made = load_checkpoint(out)
-    assert set(made.split.train) == {grasp.object_id for grasp in load_grasps(recording)}
-    assert made.posterior is not None
-    # The logit is only the scaled cosine of the projections.
-    matcher = made.matcher
-    with torch.inference_mode():
-        touch_codes = matcher.touch_encoding(torch.from_numpy(features.touch).flatten(1))
-        photo_codes = matcher.photo_encoding(torch.from_numpy(features.photo))
-        logits = matcher.head(touch_codes.partial, photo_codes.partial)
-        cosines = (touch_codes.embedding * photo_codes.embedding).sum(1)
-    assert torch.allclose(logits, matcher.cosine_scale.item() * cosines + matcher.head.out.bias.item(), atol=1e-4)
-    assert matcher.cosine_scale > 0
-    retrieval.build_index(catalogue, made, tmp_path / "index", quiet=True)
-    answer = retrieval.open(tmp_path / "index", model=out).query([touch])
-    assert 0 <= answer.none_probability <= 1
+def test_initial_weights_are_for_all_towers_or_for_each(published):
+    two = build_tower("mobilenet_v2+small", "pooled")
+    two.initialise(f"{published}+random")
+    assert torch.equal(
+        two.parts[0].features[0][0].weight, torch.load(published, weights_only=True)["features.0.0.weight"]
+    )
+    with pytest.raises(CheckpointError, match="2 concatenated towers need initial weights each"):
+        two.initialise("random+random+random")
 
 
 def test_thresholds_of_verifications_come_from_objects_outside_the_fit():
@@ -242,30 +188,63 @@ def test_thresholds_of_verifications_come_from_objects_outside_the_fit():
     assert (ratios >= fitted.bounds(0.05).accept).mean() > 0.065
 
 
-@pytest.mark.usefixtures("unchecked")
-def test_the_calibrations_of_a_fit_are_fitted_on_held_out_touches(recording, model, tmp_path, monkeypatch):
-    monkeypatch.setattr(Estimate, "is_baseline_better", False)
-    given = []
-    monkeypatch.setattr("retrieval.training.adapt.fit_verification", lambda parts, posterior: given.extend(parts))
-    made = adapt(recording, tmp_path / "own.safetensors", load_checkpoint(model), init="none", quiet=True)
-    held_out = made.estimate.choice.held_out_touches
-    assert len(given) == len(held_out) > 1
-    scale, offset = made.checkpoint.matcher.cosine_scale.item(), made.checkpoint.matcher.head.out.bias.item()
-    for part, expected in zip(given, held_out, strict=True):
-        np.testing.assert_allclose(part.logits, scale * expected.logits + offset, rtol=1e-5)
+# The checkpoint ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("unchecked")
-def test_a_better_baseline_is_stored_with_fitted_probabilities(recording, model, tmp_path, monkeypatch, capsys):
-    start = dataclasses.replace(load_checkpoint(model), verification=calibration(accept=1.0, reject=-1.0))
-    estimate = adapt(recording, tmp_path / "own.safetensors", start, init="none", quiet=True).estimate
-    assert estimate.is_baseline_better == (
-        estimate.to_dict()["baseline_pair_accuracy"] >= estimate.to_dict()["held_out_pair_accuracy"]
+@pytest.fixture(scope="module")
+def fitted(recording, model, tmp_path_factory):
+    """An adaptation that left three test objects out. The start model has one finger, so it cannot be kept."""
+    start, names = load_checkpoint(model), sorted({grasp.object_id for grasp in load_grasps(recording)})
+    config = dataclasses.replace(start.config, matcher=dataclasses.replace(start.config.matcher, fingers=1))
+    start = dataclasses.replace(start, config=config, matcher=Matcher(config.matcher))
+    split = Split(0, tuple(names[3:]), (), tuple(names[:3]))
+    return adapt(
+        recording, tmp_path_factory.mktemp("fit") / "own.safetensors", start, init="none", split=split, quiet=True
     )
-    monkeypatch.setattr(Estimate, "is_baseline_better", True)
-    print_adaptation(adapt(recording, tmp_path / "own.safetensors", start, init="none", quiet=True))
-    made = load_checkpoint(tmp_path / "own.safetensors")
-    assert "unadapted model is used" in capsys.readouterr().out
+
+
+def test_the_adapted_checkpoint_is_an_ordinary_checkpoint(fitted, catalogue, touch, tmp_path):
+    assert not fitted.is_baseline
+    assert set(fitted.measures) == {
+        f"held_out_{name}{suffix}" for name in ("top1", "pair_accuracy") for suffix in ("", "_low_pass")
+    }
+    made = fitted.checkpoint
+    assert made.posterior is not None
+    retrieval.build_index(catalogue, made, tmp_path / "index", quiet=True)
+    answer = retrieval.open(tmp_path / "index", model=made.path).query([touch])
+    assert 0 <= answer.none_probability <= 1
+
+
+def test_test_objects_of_a_split_are_left_out_of_everything(fitted, recording):
+    names = sorted({grasp.object_id for grasp in load_grasps(recording)})
+    assert set(fitted.checkpoint.split.train) == set(names[3:])
+    assert len(fitted.measures["held_out_top1"].by_object()[0]) == 9
+
+
+def test_the_logit_is_only_the_scaled_cosine_of_the_projections(fitted):
+    matcher = fitted.checkpoint.matcher
+    touch, photo = (
+        torch.randn(5, count)
+        for count in (matcher.config.fingers * matcher.touch_tower.output_count, matcher.photo_feature_count)
+    )
+    with torch.inference_mode():
+        touch_codes, photo_codes = matcher.touch_encoding(touch), matcher.photo_encoding(photo)
+        logits = matcher.head(touch_codes.partial, photo_codes.partial)
+    cosines = (touch_codes.embedding * photo_codes.embedding).sum(1)
+    assert torch.allclose(logits, matcher.cosine_scale.item() * cosines + matcher.head.out.bias.item(), atol=1e-4)
+    assert matcher.cosine_scale > 0
+
+
+def test_a_better_baseline_is_stored_with_fitted_probabilities(recording, model, tmp_path, capsys):
+    start = dataclasses.replace(load_checkpoint(model), verification=calibration(accept=1.0, reject=-1.0))
+    store_checkpoint(start, tmp_path / "start.safetensors")
+    out = tmp_path / "own.safetensors"
+    files = ["--out", str(out), "--model", str(tmp_path / "start.safetensors")]
+    assert main(["adapt", str(recording), *files, "--init", "none"]) == 0
+    output, made = capsys.readouterr(), load_checkpoint(out)
+    for part in ("top-1 accuracy", "low-pass touches", "pair accuracy", "held out once", "unadapted model is used"):
+        assert part in output.out
+    assert "fitted to 12 objects, 36 touches" in output.err
     assert made.config == start.config
     for name, tensor in start.matcher.state_dict().items():
         assert torch.equal(tensor, made.matcher.state_dict()[name])
@@ -273,51 +252,3 @@ def test_a_better_baseline_is_stored_with_fitted_probabilities(recording, model,
     # Those of the start model are for its posterior; 12 objects are too few for new ones
     assert made.verification is None
     assert set(made.provenance["adapted_to"]) == {"source", "data_digest"}
-    monkeypatch.undo()
-    best = {
-        name: dataclasses.replace(each, values=np.ones_like(each.values)) for name, each in estimate.measures.items()
-    }
-    assert dataclasses.replace(estimate, measures=best).is_baseline_better
-    for name in ("baseline_top1", "baseline_pair_accuracy"):  # of a model for another number of fingers
-        del best[name]
-    assert not dataclasses.replace(estimate, measures=best, baseline=None).is_baseline_better
-
-
-@pytest.mark.usefixtures("unchecked")
-def test_test_objects_of_a_split_are_left_out_of_everything(recording, model, tmp_path, monkeypatch):
-    monkeypatch.setattr(Estimate, "is_baseline_better", False)
-    names = sorted({grasp.object_id for grasp in load_grasps(recording)})
-    split = Split(0, tuple(names[3:]), (), tuple(names[:3]))
-    out = tmp_path / "own.safetensors"
-    made = adapt(recording, out, load_checkpoint(model), init="none", split=split, quiet=True)
-    assert set(made.features.object_ids) == set(names[3:])
-    assert set(load_checkpoint(tmp_path / "own.safetensors").split.train) == set(names[3:])
-
-
-@pytest.fixture(scope="module")
-def published(tmp_path_factory):
-    """Random weights in place of those of a published tower."""
-    path = tmp_path_factory.mktemp("weights") / "mobilenet_v2.pth"
-    torch.manual_seed(0)
-    torch.save(build_tower("mobilenet_v2", "pooled").state_dict(), path)
-    return path
-
-
-def test_initial_weights_are_for_all_towers_or_for_each(published):
-    two = build_tower("mobilenet_v2+small", "pooled")
-    two.initialise(f"{published}+random")
-    assert torch.equal(
-        two.parts[0].features[0][0].weight, torch.load(published, weights_only=True)["features.0.0.weight"]
-    )
-    with pytest.raises(CheckpointError, match="2 concatenated towers need initial weights each"):
-        two.initialise("random+random+random")
-
-
-@pytest.mark.usefixtures("unchecked")
-def test_the_command_prints_the_estimate(recording, model, tmp_path, capsys):
-    out = tmp_path / "own.safetensors"
-    assert main(["adapt", str(recording), "--out", str(out), "--model", str(model), "--init", "none"]) == 0
-    output = capsys.readouterr()
-    for part in ("top-1 accuracy", "low-pass touches", "pair accuracy", "Each object was held out once"):
-        assert part in output.out
-    assert "fitted to 12 objects, 36 touches" in output.err

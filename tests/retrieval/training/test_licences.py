@@ -13,7 +13,7 @@ from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.export import touch_encoder_to_onnx
 from retrieval.model.shipped import shipped_model
 from retrieval.training.adapt import adapt
-from retrieval.training.licences import checkpoint_licences, training_licences
+from retrieval.training.initial_weights import checkpoint_licences, training_licences
 from retrieval.training.train import train
 from tests.conftest import TINY
 
