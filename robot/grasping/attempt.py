@@ -20,7 +20,7 @@ from _touch_retrieval.documents import Seed, typed
 from robot.devices import MAX_AGE_S, read_together
 from robot.errors import DeviceError, PlanError, RobotConfigError, UngraspableError
 from robot.grasping.settings import AttemptSettings
-from robot.readings import RGBD, Pose
+from robot.readings import Pose
 from robot.recording.attempt_log import AttemptOutcome
 from robot.recording.grasp import Outcome
 from robot.rig import GraspPlan, Rig
@@ -37,7 +37,7 @@ class GraspAttempt:
         object_id: The object.
         number: Number of the attempt at this object.
         outcome: "held", "missed" or "slipped", as the gripper reports after the lift. Without images: "no_plan", or
-            "ungraspable" if no further attempt can succeed; `reason` gives the cause.
+            "ungraspable" if no further attempt can succeed.
         images: Content of JPEG and PNG files by key (photo, touch_a, touch_a_before, ...).
         fields: Further fields of the recorded grasp.
         fit: The plan's description of the object, for the log.
@@ -58,16 +58,7 @@ class GraspAttempt:
 
 
 class AttemptRunner:
-    """Makes attempts with a connected rig.
-
-    Args:
-        rig: The rig.
-        seed: Seed of the planner's random choices.
-        settings: Settings of the attempts.
-
-    Raises:
-        RobotConfigError: A setting is outside the limits of the rig.
-    """
+    """Makes attempts with a connected rig; raises RobotConfigError if a setting is outside the rig's limits."""
 
     def __init__(self, rig: Rig, seed: int, settings: AttemptSettings) -> None:
         typed(seed, Seed, "seed", error=RobotConfigError)
@@ -77,8 +68,7 @@ class AttemptRunner:
     def run(self, object_id: str, number: int) -> GraspAttempt:
         """Make attempt `number`; after a DeviceError, recover the rig and repeat it, or raise after all retries.
 
-        After any exception, Ctrl-C included, the jaws are opened. If this fails, the exception's message, or a note on
-        the exception, states it.
+        After any exception, Ctrl-C included, the jaws are opened. If this fails, the exception states it.
         """
         for retry in range(self.settings.retries + 1):
             try:
@@ -126,9 +116,16 @@ class AttemptRunner:
             failed: AttemptOutcome = "ungraspable" if isinstance(error, UngraspableError) else "no_plan"
             duration_s = round(rig.clock() - start, 3)
             return GraspAttempt(object_id, number, failed, reason=str(error), duration_s=duration_s)
-        images = self._pictures(image)
+        images = {"photo": self._jpeg(image.colour)}
+        if "depth" in self.settings.outputs and image.depth_m is not None:
+            images["depth"], _ = file_content("depth", depth_in_mm(image.depth_m))
         touches, fields, touch_time = self._grasp(plan)
-        outcome = self._outcome()
+        status = rig.gripper.state().status
+        if status not in _OUTCOME_FROM:
+            raise DeviceError(
+                f"{rig.gripper.name} must report holding, no_part or part_lost after a lift, got {status}"
+            )
+        outcome = _OUTCOME_FROM[status]
         if "after" in self.settings.outputs:
             touches |= self._read_touches("_after", self.settings.hold_s)[0]
         self._put_down(plan, outcome == "held", rng)
@@ -144,7 +141,7 @@ class AttemptRunner:
         )
 
     def _rise(self) -> None:
-        """Move straight up from the current pose; on another path, the open jaws would hit an object between them."""
+        """Move straight up; on another path, the open jaws would hit an object between them."""
         arm = self.rig.arm
         if arm.is_manual:
             return
@@ -179,24 +176,15 @@ class AttemptRunner:
         """Read gel images by key, at most `since_s` old, and their skew in s.
 
         With contact, `since_s` is the wait after the last motion, so no frame is older than the end of that motion.
-        Without contact, frames from the approach are valid, too.
         """
         frames, skew_s = read_together(self.rig.sensors, max_age_s=min(MAX_AGE_S, since_s))
         return {f"touch_{finger}{moment}": self._jpeg(frame.pixels) for finger, frame in frames.items()}, skew_s
 
-    def _outcome(self) -> Outcome:
-        status = self.rig.gripper.state().status
-        if status not in _OUTCOME_FROM:
-            raise DeviceError(
-                f"{self.rig.gripper.name} must report holding, no_part or part_lost after a lift, got {status}"
-            )
-        return _OUTCOME_FROM[status]
-
     def _put_down(self, plan: GraspPlan, held: bool, rng: np.random.Generator) -> None:
         """Release a held object on the table at a random position and yaw, and open the jaws.
 
-        In two cases it is released at the position of the grasp: with a given `object_fit`, which fixes the position of
-        the object, and after a tilted grasp, because a tilted hand has room to withdraw there.
+        It is released at the position of the grasp with a given `object_fit`, which fixes the position of the object,
+        and after a tilted grasp, because a tilted hand has room to withdraw there.
         """
         rig, settings = self.rig, self.settings
         low, high = np.array(rig.arm.workspace.lower), np.array(rig.arm.workspace.upper)
@@ -213,12 +201,6 @@ class AttemptRunner:
         rig.gripper.open(rig.gripper.stroke_mm)
         if held:
             rig.arm.move_to(plan.approach[-1] if plan.approach and is_returned else over, settings.approach_mm_s)
-
-    def _pictures(self, image: RGBD) -> dict[str, bytes]:
-        pictures = {"photo": self._jpeg(image.colour)}
-        if "depth" in self.settings.outputs and image.depth_m is not None:
-            pictures["depth"], _ = file_content("depth", depth_in_mm(image.depth_m))
-        return pictures
 
     def _jpeg(self, pixels: npt.NDArray[np.uint8]) -> bytes:
         quality = [cv2.IMWRITE_JPEG_QUALITY, self.settings.jpeg_quality]

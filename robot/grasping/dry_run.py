@@ -10,14 +10,10 @@ Report = Callable[[str], object]
 
 
 def make_dry_run(rig: Rig, report: Report) -> Rig:
-    """Replace the arm and the gripper of an unconnected rig, so that neither is connected or moved; return the rig.
+    """Replace the arm and the gripper of an unconnected rig by ones that `report` each motion; return the rig.
 
-    The limits of the rig's file are checked. The limits that a gripper reports when it connects are unknown here;
-    typical values replace them, so the rig may still refuse a motion of a dry run.
-
-    Args:
-        rig: The rig.
-        report: Called with a sentence for each motion.
+    The limits of the rig's file are checked. Typical values replace the limits that a gripper reports when it connects,
+    so the rig may still refuse a motion of a dry run.
     """
     rig.arm = DryRunArm(rig.arm, report)
     rig.gripper = DryRunGripper(rig.gripper, report)

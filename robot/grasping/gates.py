@@ -33,11 +33,7 @@ class GraspFrames:
 
 
 def recorded_touches(images: Mapping[str, bytes]) -> dict[str, GraspFrames]:
-    """Return each finger's frames as recorded, so the gate gets the same pixels as training.
-
-    Args:
-        images: Content of the image files by column; touch_a and others, encoded by robot.grasping.attempt.
-    """
+    """Return each finger's frames from the content of image files by column: the gate gets the pixels of training."""
 
     def decode(column: str) -> Any:
         return decode_picture(images[column]) if column in images else None
@@ -58,11 +54,6 @@ def apply_gate(gate: Gate, touches: Mapping[str, GraspFrames]) -> tuple[bool, fl
     if not 0.0 <= score <= 1.0:  # also rejects NaN
         raise RobotError(f"a gate must return true, false or a probability, got {score}")
     return score >= 0.5, score
-
-
-def difference(frame: Picture, before: Picture) -> npt.NDArray[np.float32]:
-    """Return the signed change of colour in grey levels, (H, W, 3) float32; uint8 would wrap round below 0."""
-    return np.subtract(frame, before, dtype=np.float32)
 
 
 @dataclass(frozen=True)
@@ -87,20 +78,15 @@ class ContactAreaGate(TypedSettings):
 
     def __call__(self, touches: Mapping[str, GraspFrames]) -> bool:
         """Return whether the grasp is accepted; raise RobotConfigError if a no-contact frame is missing."""
-        enough = (self._changed_fraction(finger, frames) >= self.least_share for finger, frames in touches.items())
+        enough = (self.changed_fraction(frames) >= self.least_share for frames in touches.values())
         return (all if self.every_finger else any)(enough)  # stops at the first finger that decides
 
-    def changed_fractions(self, touches: Mapping[str, GraspFrames]) -> dict[str, float]:
-        """Return the fraction of changed pixels, 0 to 1, by finger."""
-        return {finger: self._changed_fraction(finger, frames) for finger, frames in touches.items()}
-
-    def _changed_fraction(self, finger: str, frames: GraspFrames) -> float:
+    def changed_fraction(self, frames: GraspFrames) -> float:
+        """Return the fraction of changed pixels, 0 to 1."""
         if frames.before is None:
-            raise RobotConfigError(
-                f"the contact-area gate requires no-contact frames, but finger {finger} has none; record the output "
-                "`before`"
-            )
-        change = difference(frames.during if frames.after is None else frames.after, frames.before)
+            raise RobotConfigError("the contact-area gate requires no-contact frames; record the output `before`")
+        touch = frames.during if frames.after is None else frames.after
+        change = np.subtract(touch, frames.before, dtype=np.float32)  # uint8 would wrap round below 0
         smooth = cv2.blur(change, (self.blur_px, self.blur_px), borderType=cv2.BORDER_REPLICATE)
         within = cv2.inRange(smooth, (-self.noise_levels,) * 3, (self.noise_levels,) * 3)
         return float((within.size - cv2.countNonZero(within)) / within.size)

@@ -27,7 +27,7 @@ class CylinderPlanner(GraspPlanner):
         self.search_margin_mm = search_margin_mm
 
     def plan(self, rig: Rig, image: RGBD, settings: GraspSettings, rng: np.random.Generator) -> GraspPlan:
-        """Fit the cylinder and draw one grasp of it; raise PlanError if this is impossible."""
+        """Fit the cylinder and draw one grasp of it."""
         workspace, margin = rig.arm.workspace, self.search_margin_mm
         (left, front, _), (right, back, top) = workspace.lower, workspace.upper
         region = Region((left - margin, front - margin, -1.0), (right + margin, back + margin, top))
@@ -43,15 +43,7 @@ def plan_grasp(
 
     The point between the fingertips lies on the cylinder's axis plus a jitter, at a random height within the object.
     The closing direction is uniform over half a turn, and the force is uniform over its range. All numbers are drawn
-    before the first check. So a plan that fails uses as many random numbers as one that succeeds, and later plans from
-    the same `rng` do not change.
-
-    Args:
-        fit: The cylinder.
-        settings: Settings of the random grasps.
-        workspace: Limits of the point between the fingertips.
-        stroke_mm: Largest opening of the jaws.
-        rng: Source of the random choices.
+    before the first check, so later plans from the same `rng` do not depend on whether this one fails.
 
     Raises:
         PlanError: The rig cannot make this grasp; the message gives the reason.
@@ -111,12 +103,7 @@ class SpreadPlanner(GraspPlanner):
         self.planner.check(rig)
 
     def plan(self, rig: Rig, image: RGBD, settings: GraspSettings, rng: np.random.Generator) -> GraspPlan:
-        """Plan the grasp that is farthest from the earlier ones; the first grasp is the first draw.
-
-        Raises:
-            UngraspableError: No attempt at this object can succeed.
-            PlanError: All drawn grasps are impossible; the message is that of the last one.
-        """
+        """Plan the grasp that is farthest from the earlier ones; raise the last error if all draws are impossible."""
         plans: list[GraspPlan] = []
         for _ in range(self.draws if self.heights_mm else 1):
             try:
@@ -127,8 +114,5 @@ class SpreadPlanner(GraspPlanner):
                 failed = error
         if not plans:
             raise failed
-        return max(plans, key=self._distance_mm)
-
-    def _distance_mm(self, plan: GraspPlan) -> float:
-        """Return the difference to the nearest earlier height."""
-        return min((abs(plan.pose.z_mm - height) for height in self.heights_mm), default=0.0)
+        earlier = self.heights_mm
+        return max(plans, key=lambda plan: min((abs(plan.pose.z_mm - height) for height in earlier), default=0.0))

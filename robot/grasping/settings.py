@@ -40,7 +40,6 @@ class GraspSettings(TypedSettings):
     lift_mm: Annotated[float, Meta(ge=1)] = 180.0
 
     def __post_init__(self) -> None:
-        """Raise RobotConfigError for a setting of another type or out of range."""
         super().__post_init__()
         if not 0 < self.force_n[0] <= self.force_n[1]:
             raise RobotConfigError(f"force_n must be a range of forces above 0, lower first, got {self.force_n}")
@@ -88,7 +87,6 @@ class AttemptSettings(TypedSettings):
     jpeg_quality: Annotated[int, Meta(ge=0, le=100)] = 95
 
     def __post_init__(self) -> None:
-        """Raise RobotConfigError for a setting of another type or out of range."""
         super().__post_init__()
         if unknown := sorted(set(self.outputs) - set(OUTPUTS)):
             raise RobotConfigError(f"outputs must be among {', '.join(OUTPUTS)}; got {unknown[0]!r}")

@@ -18,24 +18,13 @@ from robot.recording.folder import Recording
 class Importer(Protocol):
     """A function that reads the files of a data set below `src` and writes or continues the recording `out`.
 
-    Its further keyword-only parameters, each with a default, are its options (`options_of`). The docstring of its
-    module begins with a line on the data set. The module contains `DATA_SET`, the facts of the data set.
+    Its keyword-only parameters, each with a default, are its options. The docstring of its module begins with a line on
+    the data set. The module contains `DATA_SET`, the facts of the data set. Raises ImporterError if `src` is not this
+    data set or an option is wrong.
     """
 
     def __call__(self, src: Path, out: Path, progress: Progress | None = None, **options: Any) -> Recording:
-        """Import the data set.
-
-        Args:
-            src: Folder of the data set.
-            out: Recording folder to write or continue.
-            progress: Called with (done, total) after each grasp.
-            **options: Options of this importer.
-
-        Raises:
-            ImporterError: `src` is not this data set, or an option is wrong.
-            RecordingError: The recording cannot be continued.
-            StorageError: The recording cannot be written.
-        """
+        """Import the data set; call `progress` with (done, total) after each grasp."""
 
 
 IMPORTERS: "Registry[Importer]" = Registry(
@@ -58,10 +47,7 @@ IMPORTERS: "Registry[Importer]" = Registry(
 
 
 def load_importer(name: str) -> Importer:
-    """Return the importer with this name.
-
-    Args:
-        name: Name in `IMPORTERS`, or "module:function".
+    """Return the importer with this name of `IMPORTERS`, or "module:function".
 
     Raises:
         UnknownName: There is no such importer; the message lists the known ones.
@@ -73,26 +59,15 @@ def load_importer(name: str) -> Importer:
 
 
 def title_of(name: str) -> str:
-    """Return the line that describes the data set of an importer.
-
-    Raises:
-        UnknownName: There is no such importer.
-    """
+    """Return the line that describes the data set of an importer."""
     module = sys.modules[load_importer(name).__module__]
     return (module.__doc__ or "").strip().split("\n")[0].rstrip(".")
 
 
 def data_set_of(name: str) -> DataSet:
-    """Return the facts of the data set of an importer, `DATA_SET` of its module.
-
-    Raises:
-        UnknownName: There is no such importer.
-    """
+    """Return the facts of the data set of an importer, `DATA_SET` of its module."""
     facts: DataSet = sys.modules[load_importer(name).__module__].DATA_SET
     return facts
-
-
-# Options ---------------------------------------------------------------------------------------------------
 
 
 def options_of(importer: Importer) -> dict[str, tuple[type, Any]]:
@@ -106,14 +81,7 @@ def options_of(importer: Importer) -> dict[str, tuple[type, Any]]:
 
 
 def read_options(importer: Importer, words: Sequence[str]) -> dict[str, Any]:
-    """Parse options of the form "name=value".
-
-    Args:
-        importer: The importer that defines the options.
-        words: One option each.
-
-    Returns:
-        Value of each given option, of its type.
+    """Return the values of options "name=value" of an importer.
 
     Raises:
         ImporterError: An option is unknown, or its value has another type.

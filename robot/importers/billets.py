@@ -33,7 +33,6 @@ DATA_SET = DataSet(
     ),
 )
 _FILE = re.compile(r"(?P<place>[^.].*)_(?P<kind>touch|photo)\.(png|jpg|jpeg)", re.IGNORECASE)
-_Files = dict[str, Path]  # "photo" and "touch" -> file, of one place
 
 
 def import_billets(src: Path, out: Path, progress: Progress | None = None) -> Recording:

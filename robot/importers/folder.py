@@ -66,16 +66,6 @@ def import_folder(
 ) -> Recording:
     """Import pictures below `src`.
 
-    Args:
-        src: Folder with the pictures.
-        out: Recording folder to write or continue.
-        progress: Called with (done, total) after each grasp.
-        touch: Pattern of the gel images.
-        photo: Pattern of the photos.
-        background: Pattern of the no-contact frames; empty if there are none.
-        sensor: Name of the sensor.
-        licence: Licence of the pictures.
-
     Raises:
         ImporterError: A pattern is invalid, or no picture matches.
     """

@@ -1,8 +1,8 @@
 """The common part of all importers: the facts of a data set, and the loop that writes its grasps to a recording.
 
 An importer yields the grasps of its data set one by one as `Item`, or as `Skip` for one that is not available;
-`import_items` does the rest. Only the current item is in memory. Grasps that the recording already contains are not
-read again, so a stopped import resumes where it stopped.
+`import_items` does the rest. Grasps that the recording already contains are not read again, so a stopped import
+resumes where it stopped.
 
     recording.json        also: licence, terms, citation, fingers, notes (caveats, and unverified parts of the layout),
                           objects (object_id -> metadata of the data set), skipped (reason -> count)
@@ -47,8 +47,8 @@ class DataSet:
     """Facts of a data set that are known before its files are opened.
 
     Attributes:
-        source: Name or address of the data set.
-        licence: Name of the licence of the data, such as "CC BY 4.0"; `NOT_STATED` if none is known.
+        source: Name or address.
+        licence: Licence of the data, such as "CC BY 4.0"; `NOT_STATED` if none is known.
         citation: Publication to cite.
         sensor: Tactile sensor.
         rig: Robot, camera and other devices.
@@ -82,25 +82,13 @@ class DataSet:
         return {**plain, "notes": self.notes()}
 
     def mismatch_error(self, src: Path, lacking: str) -> ImporterError:
-        """Return the error for a source that is not this data set.
-
-        Args:
-            src: The source.
-            lacking: Sentence on the missing part.
-        """
+        """Return the error for a source that is not this data set, with a sentence on the missing part."""
         return ImporterError(f"{src} must contain {self.expects.replace('`', '')}; {lacking}")
 
 
 @dataclass(frozen=True)
 class Item:
-    """One grasp to append.
-
-    Attributes:
-        grasp_id: Unique id.
-        object_id: Its object.
-        images: Its images by column.
-        fields: sequence_id, grasped and further arguments of `RecordingWriter.append`.
-    """
+    """One grasp to append, with the arguments of `RecordingWriter.append`."""
 
     grasp_id: str
     object_id: str
@@ -110,12 +98,7 @@ class Item:
 
 @dataclass(frozen=True)
 class Skip:
-    """One grasp that is not available.
-
-    Attributes:
-        reason: Completes "skipped 3: ..."; grasps are counted by reason.
-        name: Name of the grasp or its file.
-    """
+    """One grasp, or its file, that is not available; `reason` completes "skipped 3: ..."."""
 
     reason: str
     name: str
@@ -155,14 +138,12 @@ def import_items(
     with RecordingWriter(out, data_set.info()) as writer:
         names: set[str] = set()
         for done, item in enumerate(_readable(items), start=1):
-            skip: Skip | None = None
-            if isinstance(item, Skip):
-                skip = item
-            elif item.grasp_id in names:
-                skip = Skip("another grasp has the same name", item.grasp_id)
-            elif item.grasp_id not in writer.grasp_ids:
-                skip = _append(writer, item)
+            skip = item if isinstance(item, Skip) else None
             if isinstance(item, Item):
+                if item.grasp_id in names:
+                    skip = Skip("another grasp has the same name", item.grasp_id)
+                elif item.grasp_id not in writer.grasp_ids:
+                    skip = _append(writer, item)
                 names.add(item.grasp_id)
             if skip is not None:
                 skipped.setdefault(skip.reason, []).append(skip.name)
@@ -206,10 +187,6 @@ def _append(writer: RecordingWriter, item: Item) -> Skip | None:
 def picture_bytes(column: str, source: Source) -> bytes:
     """Return the content of a complete PNG or JPEG file.
 
-    Args:
-        column: Column of the image, for errors.
-        source: The image, or a function that returns it.
-
     Raises:
         ImporterError: The image is missing, cut off or not a picture. The message does not name the file.
     """
@@ -241,13 +218,8 @@ def _write_split(out: Path, split: Mapping[str, Sequence[str]]) -> list[str]:
     return []
 
 
-# Files and names of a source --------------------------------------------------------------------------------
-
-
 def safe_name(*parts: str) -> str:
-    """Return the parts as a grasp_id, joined by "-".
-
-    If the result is not a valid grasp_id, invalid characters are replaced and a digest of the parts is appended.
+    """Return the parts as a grasp_id, joined by "-"; invalid characters are replaced and a digest is appended.
 
     >>> safe_name("mug", "01"), safe_name("my mug", "01")
     ('mug-01', 'my-mug-01-b68d33c2')
@@ -278,15 +250,7 @@ def natural_sort_key(name: str) -> tuple[list[str | int], str]:
 
 
 def import_extra(name: str, purpose: str) -> Any:
-    """Import a package of the extra `importers`.
-
-    Args:
-        name: Package or module.
-        purpose: The format that needs it, for the error.
-
-    Raises:
-        ImporterError: The package is missing.
-    """
+    """Import a package of the extra `importers`; raise ImporterError that names `purpose`, the format, without it."""
     try:
         return import_module(name)
     except ImportError as error:

@@ -13,7 +13,6 @@ differ most from the first is the touch. If the episodes have fields for object 
 `retrieve export-recording`, these fields are imported. Otherwise the task is the object and the episode the sequence.
 """
 
-import json
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -71,13 +70,6 @@ def import_lerobot(
 ) -> Recording:
     """Import the episodes below `src`.
 
-    Args:
-        src: Folder of the data set.
-        out: Recording folder to write or continue.
-        progress: Called with (done, total) after each grasp.
-        touch: Gel cameras, separated by commas; empty for those with such a name.
-        photo: Camera of the photo; empty for the first other camera.
-
     Raises:
         ImporterError: pyarrow or av is missing, or `src` is not a data set of version 3.
     """
@@ -117,7 +109,6 @@ class _Info(msgspec.Struct):
 
 
 def _read_info(path: Path) -> _Info:
-    """Read info.json; raise ImporterError for another version of LeRobot or other paths."""
     try:
         info = msgspec.json.decode(read_content(path, ImporterError), type=_Info)
         msgspec.convert(info.recording, _Moments)
@@ -159,17 +150,8 @@ class _LeRobotSource:
         own_terms = {"terms": ""} if "licence" in texts else {}
         return {"sensor": ", ".join(self.touch)} | own_terms | texts
 
-    # Episodes ----------------------------------------------------------------------------------------------
-
     def episodes(self, columns: Sequence[str]) -> Iterator[_Row]:
-        """Yield the rows of meta/episodes; only a few are in memory.
-
-        Args:
-            columns: Columns to read; missing ones are left out.
-
-        Raises:
-            ImporterError: A file is missing or damaged.
-        """
+        """Yield the rows of meta/episodes, with those of the columns that exist."""
         paths = sorted((self.src / "meta" / "episodes").glob("*/*.parquet"))
         if not paths:
             raise ImporterError(f"{self.src} must contain meta/episodes/chunk-000/file-000.parquet")
@@ -197,9 +179,9 @@ class _LeRobotSource:
             sequence = row.get("sequence_id") or f"episode-{number}"
             moments = self._moments if row["length"] == len(self._moments or ()) else None
             images = episode_images(partial(self._steps, row), len(self.touch), moments)
-            yield Item(name, _object(row), images, {"sequence_id": str(sequence), **fields})
-
-    # Pictures ----------------------------------------------------------------------------------------------
+            tasks = row.get("tasks")
+            object_id = row.get("object_id") or (next(iter(tasks), None) if isinstance(tasks, list) else tasks)
+            yield Item(name, str(object_id or "unknown"), images, {"sequence_id": str(sequence), **fields})
 
     def _steps(self, row: _Row) -> Iterator[Step]:
         read = {"image": self._image_frames, "video": self._video_frames}
@@ -253,12 +235,6 @@ class _LeRobotSource:
                     yield image
 
 
-def _object(row: _Row) -> str:
-    tasks = row.get("tasks")
-    name = row.get("object_id") or ((tasks[0] if tasks else None) if isinstance(tasks, list) else tasks)
-    return str(name or "unknown")
-
-
 def _file_of(row: _Row, kind: str) -> str:
     """Return the chunk and file of an episode's data or video."""
     numbers = {key: row.get(f"{kind}/{key}") for key in ("chunk_index", "file_index")}
@@ -269,9 +245,9 @@ def _file_of(row: _Row, kind: str) -> str:
 
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
-    """Convert errors of pyarrow for a damaged file to ImporterError."""
+    """Convert pyarrow's errors for a damaged file to ImporterError."""
     pa = import_extra("pyarrow", _WHAT)
     try:
         yield
     except (pa.ArrowException, OSError, ValueError, KeyError) as error:
-        raise ImporterError(f"{path} cannot be read: {json.dumps(str(error)[:200])}") from error
+        raise ImporterError(f"{path} cannot be read: {str(error)[:200]!r}") from error

@@ -60,13 +60,7 @@ _MAX_CHUNK_BYTES = 512 * 2**20
 def import_open_x_tactile(
     src: Path, out: Path, progress: Progress | None = None, *, camera: str = "camera_main_rgb"
 ) -> Recording:
-    """Import the stores below `src`.
-
-    Args:
-        src: A store, or a folder with stores.
-        out: Recording folder to write or continue.
-        progress: Called with (done, total) after each grasp.
-        camera: Camera of the photo.
+    """Import a store, or the stores in a folder, with the photos of `camera`.
 
     Raises:
         ImporterError: zarr is missing, or a store does not have this layout.
@@ -137,12 +131,7 @@ class _Task:
 
 
 class _Store:
-    """A zarr store, version 2: a folder, or a .zip file of it.
-
-    Attributes:
-        path: The folder or file.
-        names: Paths of its arrays, sorted. Its groups can be implicit.
-    """
+    """A zarr store, version 2: a folder, or a .zip file of it; `names` are the paths of its arrays, sorted."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -152,13 +141,9 @@ class _Store:
             raise ImporterError(f"{path} cannot be read as a zip file: {error}") from error
         inside = list(root.iterdir())
         self._top = f"{inside[0].name}/" if path.is_file() and len(inside) == 1 else ""  # the folder of the store
-        self._root = root / self._top if self._top else root
-        arrays = [array for group in self._root.iterdir() if group.is_dir() for array in group.iterdir()]
+        self.root = root / self._top if self._top else root
+        arrays = [array for group in self.root.iterdir() if group.is_dir() for array in group.iterdir()]
         self.names = sorted(f"{each.parent.name}/{each.name}" for each in arrays if (each / ".zarray").is_file())
-
-    def has(self, name: str) -> bool:
-        """Whether the store contains a file."""
-        return bool((self._root / name).is_file())
 
     def texts(self, name: str) -> list[str]:
         """Return the distinct texts of a small array, in order; none if the array is missing."""
@@ -173,15 +158,11 @@ class _Store:
         return _read(array, ..., f"{self.path.name}/{name}")
 
     def open(self, name: str) -> tuple[Any, str]:
-        """Return an array and the separator in the names of its chunks. Its codecs are checked before zarr opens it.
-
-        Raises:
-            ImporterError: The array is damaged, its chunks are too large, or it has other codecs.
-        """
+        """Return an array and the separator in the names of its chunks. Its codecs are checked before zarr opens it."""
         label = f"{self.path.name}/{name}"
         zarr = import_extra("zarr", "Open-X-Tactile")
         try:
-            metadata = json.loads((self._root / name / ".zarray").read_bytes())
+            metadata = json.loads((self.root / name / ".zarray").read_bytes())
             codec = metadata.get("compressor")
             is_known = (codec is None or codec["id"] in _CODECS) and not metadata.get("filters")
             if metadata.get("zarr_format") != 2 or not is_known:
@@ -210,7 +191,7 @@ class _Steps:
 
     def __getitem__(self, step: int) -> NDArray[np.uint8]:
         """Return the pictures of a step; raise ImporterError for a missing chunk, which zarr would read as zeros."""
-        if not self._store.has(self._chunk.format(step // self._array.chunks[0])):
+        if not (self._store.root / self._chunk.format(step // self._array.chunks[0])).is_file():
             raise ImporterError(f"a chunk of {self._label} is missing")
         return _read(self._array, step, self._label)
 

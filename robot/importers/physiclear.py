@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from _touch_retrieval.documents import Count, typed
 from robot.errors import ImporterError
 from robot.importers.importing import (
     NOT_STATED,
@@ -58,20 +59,13 @@ Frame = NDArray[np.uint8]
 
 
 def import_physiclear(src: Path, out: Path, progress: Progress | None = None, *, frames: int = 5) -> Recording:
-    """Import the frames of strongest contact from the videos in `src`.
-
-    Args:
-        src: Folder of the data set.
-        out: Recording folder to write or continue.
-        progress: Called with (done, total) after each grasp.
-        frames: Grasps per video.
+    """Import `frames` grasps of each video in `src`.
 
     Raises:
         ImporterError: There is no video, or av is missing.
     """
     src = Path(src)
-    if frames < 1:
-        raise ImporterError(f"frames must be at least 1, got {frames}")
+    typed(frames, Count, "frames", error=ImporterError)
     videos = numbered_files(src / "dataset" if (src / "dataset").is_dir() else src, _VIDEO)
     if not videos:
         raise DATA_SET.mismatch_error(src, "it contains no such video")
@@ -92,14 +86,7 @@ def _items(part: str, path: Path, frames: int) -> Iterator[Item | Skip]:
 
 
 def strongest_frames(path: Path, count: int) -> list[Frame]:
-    """Return the first frame of a video, and those that differ most from it, in order of time.
-
-    Args:
-        path: The video.
-        count: Number of frames besides the first.
-
-    Returns:
-        1 + count frames: (H, W, 3) uint8, RGB.
+    """Return the first frame of a video and the `count` that differ most from it, in order of time: (H, W, 3) RGB.
 
     Raises:
         ImporterError: The video cannot be decoded, or too few of its frames differ from the first.

@@ -17,15 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from robot.errors import ImporterError
-from robot.importers.importing import (
-    NOT_STATED,
-    DataSet,
-    Item,
-    Progress,
-    Skip,
-    import_items,
-    safe_name,
-)
+from robot.importers.importing import NOT_STATED, DataSet, Item, Progress, Skip, import_items, safe_name
 from robot.recording.folder import Recording, SharedImage
 
 DATA_SET = DataSet(
@@ -61,14 +53,6 @@ def import_rct(
     sensor: str = "",
 ) -> Recording:
     """Import the rows of force_metadata.csv.
-
-    Args:
-        src: Folder of the data set.
-        out: Recording folder to write or continue.
-        progress: Called with (done, total) after each grasp.
-        touch: Path of a gel image, with names of columns in braces.
-        photo: Path of a photo, likewise.
-        sensor: Import the rows of this sensor only; empty for all.
 
     Raises:
         ImporterError: The table is missing, or no row has its pictures.

@@ -20,11 +20,11 @@ Messages are ordered by the times at which the bag recorded them.
 names a sensor_msgs/JointState: the sum of positions, in metre, is the opening, and the mean absolute effort, in newton,
 the force.
 
-Repair a bag whose recording was cut off before you import it: `rosbag reindex` (ROS 1), `mcap recover` (MCAP). A bag is
-read twice, one message at a time; only times and numbers of its messages stay in memory.
+Repair a bag whose recording was cut off before you import it: `rosbag reindex` (ROS 1), `mcap recover` (MCAP).
 """
 
 import contextlib
+import re
 from array import array
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -33,11 +33,13 @@ from functools import partial
 from itertools import chain
 from pathlib import Path
 from string import ascii_lowercase
-from typing import Any, NamedTuple, Self
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
+from _touch_retrieval.documents import NonNegative, typed
 from robot.errors import ImporterError
 from robot.grasping.gates import ContactAreaGate, GraspFrames
 from robot.importers.importing import (
@@ -49,7 +51,7 @@ from robot.importers.importing import (
     Source,
     import_extra,
     import_items,
-    natural_sort_key,
+    numbered_files,
     safe_name,
 )
 from robot.recording.folder import Recording
@@ -70,6 +72,7 @@ DATA_SET = DataSet(
         "Times are those at which the bag recorded the messages: a slow topic gets older images.",
     ),
 )
+_Contact = Annotated[float, Meta(gt=0, le=1)]
 _SUFFIXES = (".bag", ".mcap", ".db3")
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1}
@@ -94,27 +97,12 @@ def import_rosbag(
 ) -> Recording:
     """Import the grasps of the bag `src`, or of the bags in the folder `src`.
 
-    Args:
-        src: A bag, or a folder of bags.
-        out: Recording folder to write or continue.
-        progress: Called with (done, total) after each grasp.
-        touch_a: Topic of the first finger's gel images.
-        touch_b: Topic of the second finger's gel images; empty for one finger.
-        photo: Topic of the camera images.
-        gripper: Topic of the gripper's JointState; empty for none.
-        grasp: Topic that marks the grasps; empty to find them by contact.
-        object: Topic with the name of the object; empty for the bag's name.
-        contact: Smallest fraction of a gel's area that changes in a grasp.
-        settle_s: Shortest grasp and shortest time between two grasps, in seconds.
-        sensor: Tactile sensor.
-        licence: Licence of the data.
-
     Raises:
         ImporterError: There is no bag, rosbags is missing, or no bag can be read.
     """
     src = Path(src)
-    if not 0 < contact <= 1:
-        raise ImporterError(f"contact must be above 0 and at most 1, got {contact}")
+    typed(contact, _Contact, "contact", error=ImporterError)
+    typed(settle_s, NonNegative, "settle_s", error=ImporterError)
     paths = _bag_paths(src)
     if not paths:
         raise DATA_SET.mismatch_error(src, "there is no such bag")
@@ -145,9 +133,6 @@ def import_rosbag(
     return import_items(facts, chain(skips, items), out, total=total, progress=progress)
 
 
-# Bags --------------------------------------------------------------------------------------------------------
-
-
 def _bag_paths(source: Path) -> list[Path]:
     """Return the bags of a source, in natural order: the source itself, or those in the folder.
 
@@ -155,29 +140,19 @@ def _bag_paths(source: Path) -> list[Path]:
     """
     if source.is_file() or (source / "metadata.yaml").is_file():
         return [source]
-    inside = _sorted(source) if source.is_dir() else []
-    return [path for path in inside if (path.suffix in _SUFFIXES if path.is_file() else bool(_storage_files(path)))]
-
-
-def _sorted(folder: Path) -> list[Path]:
-    return sorted(folder.iterdir(), key=lambda path: natural_sort_key(path.name))
+    inside = numbered_files(source, re.compile(".*"))
+    return [path for _, path in inside if (path.suffix in _SUFFIXES if path.is_file() else bool(_storage_files(path)))]
 
 
 def _storage_files(path: Path) -> list[Path]:
     """Return the files of a bag with messages, in natural order."""
     if path.is_file():
         return [path]
-    return [file for file in _sorted(path) if file.is_file() and file.suffix in _SUFFIXES[1:]]
+    return [file for _, file in numbered_files(path, re.compile(r".*\.(mcap|db3)", re.DOTALL)) if file.is_file()]
 
 
 class BagMessage(NamedTuple):
-    """A message that is not yet decoded.
-
-    Attributes:
-        topic: Its topic.
-        time_ns: When the bag recorded it.
-        decode: Returns the message.
-    """
+    """A message that is not yet decoded: its topic, when the bag recorded it, and a function that decodes it."""
 
     topic: str
     time_ns: int
@@ -185,22 +160,17 @@ class BagMessage(NamedTuple):
 
 
 class Bag(contextlib.AbstractContextManager["Bag"]):
-    """An open bag.
+    """An open bag: a .bag, .mcap or .db3 file, or the folder of a ROS 2 bag.
 
     Attributes:
         name: File name without its suffix.
         topics: Topic -> message type, such as "std_msgs/msg/Bool".
+
+    Raises:
+        ImporterError: The package rosbags is missing, or the bag is damaged.
     """
 
     def __init__(self, path: Path) -> None:
-        """Open the bag.
-
-        Args:
-            path: .bag, .mcap or .db3 file, or folder of a ROS 2 bag.
-
-        Raises:
-            ImporterError: The package rosbags is missing, or the bag is damaged.
-        """
         self.name = path.stem if path.is_file() else path.name
         reader = import_extra("rosbags.highlevel", "a ROS bag").AnyReader
         types = import_extra("rosbags.typesys", "a ROS bag")
@@ -214,11 +184,7 @@ class Bag(contextlib.AbstractContextManager["Bag"]):
         self.topics = {connection.topic: connection.msgtype for connection in self._reader.connections}
 
     def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
-        """Yield the messages of some topics in the order in which they were recorded.
-
-        Raises:
-            ImporterError: The bag is damaged.
-        """
+        """Yield the messages of some topics in the order in which they were recorded."""
         connections = [connection for connection in self._reader.connections if connection.topic in topics]
         messages = self._reader.messages(connections)
         while True:
@@ -244,13 +210,7 @@ class Bag(contextlib.AbstractContextManager["Bag"]):
 
 
 def picture_of(message: Any) -> NDArray[np.uint8] | bytes:
-    """Return the picture of an image message.
-
-    Args:
-        message: A sensor_msgs/Image or sensor_msgs/CompressedImage, as rosbags or rclpy returns it.
-
-    Returns:
-        (H, W, 3) red first, or the content of the PNG or JPEG file.
+    """Return (H, W, 3) RGB of a sensor_msgs/Image, or the file in a CompressedImage, of rosbags or rclpy.
 
     Raises:
         ImporterError: The encoding is not supported, or bytes are missing.
@@ -272,9 +232,6 @@ def picture_of(message: Any) -> NDArray[np.uint8] | bytes:
     return pixels if message.encoding == "rgb8" else pixels[..., ::-1]
 
 
-# The first pass: times and numbers ---------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _Topics:
     """Topics of the options; `touch` has one per finger, the others are empty if not used."""
@@ -287,23 +244,11 @@ class _Topics:
 
     def types(self) -> dict[str, tuple[str, ...]]:
         """Return the accepted message types of each topic in use."""
-        images = dict.fromkeys((*self.touch, self.photo), _IMAGES)
-        others = {
-            self.gripper: ("sensor_msgs/msg/JointState",),
-            self.grasp: ("std_msgs/msg/Bool",),
-            self.object: ("std_msgs/msg/String",),
+        kinds = {self.gripper: "sensor_msgs/msg/JointState", self.grasp: "std_msgs/msg/Bool"}
+        kinds[self.object] = "std_msgs/msg/String"
+        return dict.fromkeys((*self.touch, self.photo), _IMAGES) | {
+            topic: (kind,) for topic, kind in kinds.items() if topic
         }
-        return images | {topic: types for topic, types in others.items() if topic}
-
-    def check(self, bag: Bag) -> None:
-        """Raise ImporterError if a topic is missing in the bag, or of another type."""
-        for topic, types in self.types().items():
-            if bag.topics.get(topic) not in types:
-                known = ", ".join(f"{name} ({kind})" for name, kind in sorted(bag.topics.items()))
-                raise ImporterError(
-                    f"its bag must have the topic {topic} of type {' or '.join(types)}; choose topics with --option "
-                    f"touch_a=... touch_b=... photo=... from: {known or 'none'}"
-                )
 
 
 @dataclass
@@ -316,7 +261,7 @@ class _Scan:
         openings_mm: Opening in each message of the gripper; NaN if it has no positions.
         forces_n: Force in each message of the gripper; NaN if it has no efforts.
         changes: Topic of a finger -> mean change of each gel image from the first one, in grey levels.
-        changed: The same as the fraction of the gel's area that changed; empty if a topic marks the grasps.
+        changed: The same as a fraction of the area; empty if a topic marks the grasps.
         unreadable: Number of gel images that cannot be decoded or have another size.
         first_ns: When the first message was recorded.
     """
@@ -343,7 +288,13 @@ class _Scan:
 
 def _scan_bag(bag: Bag, topics: _Topics) -> _Scan:
     """Read all messages of the topics once; each gel image is compared with the first one of its topic."""
-    topics.check(bag)
+    for topic, types in topics.types().items():
+        if bag.topics.get(topic) not in types:
+            known = ", ".join(f"{name} ({kind})" for name, kind in sorted(bag.topics.items()))
+            raise ImporterError(
+                f"its bag must have the topic {topic} of type {' or '.join(types)}; choose topics with --option "
+                f"touch_a=... touch_b=... photo=... from: {known or 'none'}"
+            )
     scan = _Scan()
     gate = None if topics.grasp else ContactAreaGate()
     first: dict[str, NDArray[np.uint8]] = {}
@@ -358,7 +309,7 @@ def _scan_bag(bag: Bag, topics: _Topics) -> _Scan:
                 continue
             scan.changes[topic].append(float(np.mean(np.abs(np.subtract(gel, first[topic], dtype=np.int16)))))
             if gate is not None:
-                scan.changed[topic].append(gate.changed_fractions({"": GraspFrames(first[topic], gel)})[""])
+                scan.changed[topic].append(gate.changed_fraction(GraspFrames(first[topic], gel)))
         elif topic == topics.photo:
             picture_of(message)  # its encoding is checked
         elif topic == topics.gripper:
@@ -430,9 +381,6 @@ def _intervals(times: NDArray[np.int64], is_held: NDArray[np.bool_], settle_ns: 
     return [(start, stop) for start, stop in joined if times[min(stop, len(times) - 1)] - times[start] >= settle_ns]
 
 
-# The second pass: images -------------------------------------------------------------------------------------
-
-
 def _items(
     path: Path, scan: _Scan, grasps: Sequence[_Grasp | str], topics: _Topics, start_ns: int
 ) -> Iterator[Item | Skip]:
@@ -460,7 +408,7 @@ def _items(
         images: dict[str, dict[str, Source]] = defaultdict(dict)
         for message in bag.messages((*topics.touch, topics.photo)):
             for name, column in places.pop((message.topic, message.time_ns), ()):
-                images[name][column] = partial(_picture, message)
+                images[name][column] = partial(lambda decode: picture_of(decode()), message.decode)
                 if len(images[name]) == 1 + 2 * len(topics.touch):
                     facts = fields.pop(name)
                     yield Item(name, str(facts.pop("object_id")), images.pop(name), facts)
@@ -473,7 +421,3 @@ def _fields(grasp: _Grasp, scan: _Scan, topics: _Topics) -> dict[str, float]:
     if number is not None:
         found |= {"opening_mm": scan.openings_mm[number], "force_n": scan.forces_n[number]}
     return {key: value for key, value in found.items() if not np.isnan(value)}
-
-
-def _picture(message: BagMessage) -> Any:
-    return picture_of(message.decode())

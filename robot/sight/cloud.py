@@ -46,11 +46,6 @@ class Rays:
     y: npt.NDArray[np.float32]
     pose: Array
 
-    @property
-    def pixel(self) -> float:
-        """Width of a pixel at depth 1."""
-        return float(self.x[1] - self.x[0])
-
     @classmethod
     def from_image(cls, image: RGBD, extrinsics: Array) -> "Rays":
         """Return the rays of the pixels of `image`; `extrinsics` (4, 4): camera frame to rig frame, mm."""
@@ -72,31 +67,14 @@ class Rays:
         return np.asarray(local @ self.pose[:3, :3].T + self.pose[:3, 3])
 
 
-@dataclass(frozen=True)
-class ObjectPoints:
-    """The object on the table.
-
-    Attributes:
-        points: (N, 3) in mm, z above the table.
-        table: The table.
-        is_cut_off: Whether the object touches the picture's border, so that a part of it is not visible.
-    """
-
-    points: Array
-    table: TablePlane
-    is_cut_off: bool
-
-
 def find_table(depth_mm: Depth, rays: Rays) -> TablePlane:
     """Fit the table near z = 0, its height by the calibration: RANSAC over three points, then least squares.
 
-    If too little of the table is visible, the result is z = 0 with a note.
-
-    Args:
-        depth_mm: (H, W) depth, NaN where unknown.
-        rays: Rays of the pixels.
+    If too little of the table is visible, the result is z = 0 with a note. `depth_mm` (H, W) is NaN where unknown.
     """
-    points = _sample(depth_mm, rays)
+    step = max(1, int(np.sqrt(depth_mm.size / _SAMPLES)))
+    rows, columns = np.nonzero(np.isfinite(depth_mm[::step, ::step]))
+    points = rays.points(depth_mm, rows * step, columns * step)
     near = points[np.abs(points[:, 2]) < _NEAR_TABLE_MM]
     if len(near) < 100:
         return TablePlane(0.0, 0.0, 0.0, 2.0, ("too little of the table is visible: z = 0 of the calibration is used",))
@@ -119,12 +97,6 @@ def _steepness(rays: Rays) -> float:
     return float(rays.pose[2, 2])
 
 
-def _sample(depth_mm: Depth, rays: Rays) -> Array:
-    step = max(1, int(np.sqrt(depth_mm.size / _SAMPLES)))
-    rows, columns = np.nonzero(np.isfinite(depth_mm[::step, ::step]))
-    return rays.points(depth_mm, rows * step, columns * step)
-
-
 def _best_plane(points: Array) -> Array:
     """Return (3,) a, b, c of the plane through three points, of limited slope, with the most inliers."""
     rng = np.random.default_rng(0)
@@ -143,14 +115,19 @@ def _heights(plane: Array, points: Array) -> Array:
     return np.asarray(plane[0] * points[:, 0] + plane[1] * points[:, 1] + plane[2])
 
 
-def find_object_points(depth_mm: Depth, rays: Rays, table: TablePlane, region: Region | None = None) -> ObjectPoints:
-    """Return the points of the largest connected object above the table.
+def find_object_points(
+    depth_mm: Depth, rays: Rays, table: TablePlane, region: Region | None = None
+) -> tuple[Array, bool]:
+    """Find the largest connected object above the table.
 
     Args:
         depth_mm: (H, W) depth, NaN where unknown.
         rays: Rays of the pixels.
         table: The table.
         region: Box in the rig's frame; its x and y limit the search. None for no limit.
+
+    Returns:
+        Its points (N, 3) in mm, z above the table, and whether it touches the picture's border.
 
     Raises:
         PlanError: There is no object.
@@ -177,11 +154,11 @@ def find_object_points(depth_mm: Depth, rays: Rays, table: TablePlane, region: R
     rows, columns = ((labels == best) & raised).nonzero()
     points = rays.points(depth_mm, rows, columns)
     points[:, 2] = above[rows, columns]
-    level = abs(_steepness(rays)) / (float(np.median(depth_mm[rows, columns])) * rays.pixel) ** 2
+    level = abs(_steepness(rays)) / (float(np.median(depth_mm[rows, columns])) * float(rays.x[1] - rays.x[0])) ** 2
     points = _remove_outliers(points, level)
     if len(points) > _MAX_POINTS:
         points = points[np.sort(np.random.default_rng(0).choice(len(points), _MAX_POINTS, replace=False))]
-    return ObjectPoints(points, table, is_cut_off)
+    return points, is_cut_off
 
 
 def _remove_outliers(points: Array, level: float, cell_mm: float = 6.0) -> Array:

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from robot.errors import PlanError, RobotConfigError
 from robot.readings import RGBD, Region
-from robot.sight.cloud import ObjectPoints, Rays, find_object_points, find_table
+from robot.sight.cloud import Rays, find_object_points, find_table
 from robot.sight.solids import (
     OUTLIER_CUT,
     Array,
@@ -80,20 +80,13 @@ class CylinderFit:
     arc_deg: float = 0.0
     notes: tuple[str, ...] = ()
 
-    @property
-    def is_round(self) -> bool:
-        """Whether the width is the same in all directions."""
-        return self.method not in ("box", "lying")
-
     def width_mm(self, yaw_rad: float, finger_mm: float) -> float:
-        """Return the smallest opening with which two fingers pass the object on both sides.
+        """Return the smallest opening with which two fingers, `finger_mm` wide and centred, pass the object.
 
-        Each finger is `finger_mm` wide and centred on the object.
-
-        For a rectangular footprint the opening is its extent along the closing direction `yaw_rad`, within the strip
-        that a finger sweeps, in closed form.
+        For a rectangular footprint this is its extent along the closing direction `yaw_rad`, within the strip that a
+        finger sweeps, in closed form.
         """
-        if self.is_round:
+        if self.method not in ("box", "lying"):
             return 2 * self.radius_mm
         (a, b), turn, strip = self.half_mm, yaw_rad - self.yaw_rad, finger_mm / 2
         c, s = abs(math.cos(turn)), abs(math.sin(turn))
@@ -105,7 +98,7 @@ class CylinderFit:
         return 2 * (c * a + s * b)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON, rounded to micrometres."""
+        """Return plain values for the attempt log, rounded to micrometres."""
         sizes = ("x_mm", "y_mm", "height_mm", "radius_mm", "error_mm")
         return {name: round(getattr(self, name), 3) for name in sizes} | {"method": self.method}
 
@@ -130,53 +123,17 @@ def fit_cylinder(image: RGBD, extrinsics: npt.ArrayLike, region: Region | None =
     depth = np.where(image.depth_m > 0, image.depth_m, np.nan) * np.float32(1000)
     rays = Rays.from_image(image, np.asarray(extrinsics, np.float64))
     table = find_table(depth, rays)
-    return _fit(find_object_points(depth, rays, table, region), rays)
-
-
-@dataclass(frozen=True)
-class _Candidate:
-    """A fitted solid, its method, and the standard error of its centre in mm."""
-
-    solid: Solid
-    method: str
-    error_mm: float
-    arc_deg: float = 0.0
-    note: str = ""
-
-
-def _fit(object_points: ObjectPoints, rays: Rays) -> CylinderFit:
-    noise = max(1.0, object_points.table.noise_mm)
-    top = _top(object_points.points, noise)
-    points = object_points.points[object_points.points[:, 2] < top + OUTLIER_CUT * noise]
-    eye = rays.pose[:2, 3]
-    box = fit_cuboid(points, top, eye)
-    lying = (fit_lying_cylinder(points, box, along, eye) for along in (True, False))
-    candidates = [
-        _upright_candidate(points, top, noise, rays, box),
-        _Candidate(box, "box", _CRUDE_MM)
-        if (np.abs(points[:, 2] - top) < 2 * noise).mean() > _MIN_TOP_FRACTION
-        else _Candidate(box, "box", _GUESS_MM, note="its top is not visible, so the place of its far side is a guess"),
-        *(_Candidate(solid, "lying", _CRUDE_MM) for solid in lying if solid is not None),
-    ]
-    best = min(candidates, key=lambda candidate: candidate.solid.misfit(points, noise, rays.pose[:3, 3]))
-    if best.method != "circle" and _loss(best.solid, points, noise) > _MAX_LOSS:
-        best = _enclosing_candidate(points, top, "no simple solid fits the visible points", _ROUGH_MM)
-    if object_points.is_cut_off and best.arc_deg < _MIN_CUT_OFF_ARC_DEG:
+    points, is_cut_off = find_object_points(depth, rays, table, region)
+    noise = max(1.0, table.noise_mm)
+    top = _top(points, noise)
+    points = points[points[:, 2] < top + OUTLIER_CUT * noise]
+    best = _best_candidate(points, top, noise, rays)
+    if is_cut_off and best.arc_deg < _MIN_CUT_OFF_ARC_DEG:
         raise PlanError("the object touches the border of the picture, and its visible part is too small to locate it")
-    return _to_fit(object_points, best, points, noise)
-
-
-def _loss(solid: Solid, points: Array, noise: float) -> float:
-    """Return the mean squared distance of the points from the surface, truncated for outliers and scaled to 0..1."""
-    return float((np.minimum(solid.distance(points) / (OUTLIER_CUT * noise), 1.0) ** 2).mean())
-
-
-def _to_fit(object_points: ObjectPoints, best: _Candidate, points: Array, noise: float) -> CylinderFit:
-    """Convert the candidate to an upright cylinder with the footprint of its solid."""
     solid = best.solid
     residual_mm = OUTLIER_CUT * noise * math.sqrt(_loss(solid, points, noise))
-    notes = [*object_points.table.notes, best.note]
-    if object_points.is_cut_off:
+    notes = [*table.notes, *filter(None, [best.note])]
+    if is_cut_off:
         notes.append("it touches the border of the picture: a part of it is not visible")
     if (solid.distance(points) > OUTLIER_CUT * noise).mean() > _MAX_OUTLIER_FRACTION:
         notes.append("it is not a simple solid: many points lie off the fitted surface")
@@ -191,8 +148,41 @@ def _to_fit(object_points: ObjectPoints, best: _Candidate, points: Array, noise:
         solid.yaw_rad,
         len(points),
         best.arc_deg,
-        tuple(note for note in notes if note),
+        tuple(notes),
     )
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A fitted solid, its method, and the standard error of its centre in mm."""
+
+    solid: Solid
+    method: str
+    error_mm: float
+    arc_deg: float = 0.0
+    note: str = ""
+
+
+def _best_candidate(points: Array, top: float, noise: float, rays: Rays) -> _Candidate:
+    eye = rays.pose[:2, 3]
+    box = fit_cuboid(points, top, eye)
+    lying = (fit_lying_cylinder(points, box, along, eye) for along in (True, False))
+    candidates = [
+        _upright_candidate(points, top, noise, rays, box),
+        _Candidate(box, "box", _CRUDE_MM)
+        if (np.abs(points[:, 2] - top) < 2 * noise).mean() > _MIN_TOP_FRACTION
+        else _Candidate(box, "box", _GUESS_MM, note="its top is not visible, so the place of its far side is a guess"),
+        *(_Candidate(solid, "lying", _CRUDE_MM) for solid in lying if solid is not None),
+    ]
+    best = min(candidates, key=lambda candidate: candidate.solid.misfit(points, noise, rays.pose[:3, 3]))
+    if best.method != "circle" and _loss(best.solid, points, noise) > _MAX_LOSS:
+        return _enclosing_candidate(points, top, "no simple solid fits the visible points", _ROUGH_MM)
+    return best
+
+
+def _loss(solid: Solid, points: Array, noise: float) -> float:
+    """Return the mean squared distance of the points from the surface, truncated for outliers and scaled to 0..1."""
+    return float((np.minimum(solid.distance(points) / (OUTLIER_CUT * noise), 1.0) ** 2).mean())
 
 
 def _top(points: Array, noise: float) -> float:
@@ -230,15 +220,14 @@ def _upright_candidate(points: Array, top: float, noise: float, rays: Rays, box:
         circle, side = whole, points[:, :2]
     if arc < MIN_ARC_DEG or circle.inliers.sum() < MIN_SIDE_POINTS:
         return _enclosing_candidate(points, top, f"its side shows an arc of only {arc:.0f} degrees")
-    solid = UprightCylinder(circle.x, circle.y, circle.radius, top)
+    solid = UprightCylinder(circle.x, circle.y, (circle.radius, circle.radius), top)
     return _Candidate(solid, "circle", _circle_error(circle, side, arc), arc)
 
 
 def _circle_error(circle: Circle, side: Array, arc_deg: float) -> float:
     """Return the standard error of the centre by the least-squares covariance.
 
-    Residuals of neighbouring points are correlated (relief, a body that is not quite round), so each sector of the arc
-    is treated as one measurement.
+    Residuals of neighbouring points are correlated, so each sector of the arc is treated as one measurement.
     """
     off = np.hypot(*(side[circle.inliers] - [circle.x, circle.y]).T) - circle.radius
     per_sector = circle.inliers.sum() / (arc_deg / _SECTOR_DEG)
@@ -259,5 +248,6 @@ def _enclosing_candidate(points: Array, top: float, reason: str, error_mm: float
     low, high = np.quantile(plan, [0.02, 0.98], axis=0)
     inner = plan[((plan > low - _OUTLIER_MM) & (plan < high + _OUTLIER_MM)).all(1)]
     (x, y), radius = cv2.minEnclosingCircle(inner.astype(np.float32))
+    solid = UprightCylinder(float(x), float(y), (float(radius), float(radius)), top)
     note = f"{reason}: the smallest circle around its points, without outliers, is used"
-    return _Candidate(UprightCylinder(float(x), float(y), float(radius), top), "enclosing circle", error_mm, 0.0, note)
+    return _Candidate(solid, "enclosing circle", error_mm, 0.0, note)

@@ -5,14 +5,11 @@ Points are (N, 3) in mm, in the camera frame of robot.devices and in the rig's f
 """
 
 import csv
-import io
 import json
 import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -107,43 +104,33 @@ def fit_hand_eye(camera_mm: npt.ArrayLike, rig_mm: npt.ArrayLike, *, written: da
 
 def read_pairs(path: Path) -> tuple[Points, Points]:
     """Read camera and rig points from a CSV file with the columns COLUMNS, in any order; or raise RobotConfigError."""
+    numbers, line = [], 1
     try:
-        with io.StringIO(read_content(path, RobotConfigError).decode("utf-8-sig"), newline="") as file:
-            rows = csv.DictReader(file, strict=True)
-            if sorted(rows.fieldnames or ()) != sorted(COLUMNS):
-                raise RobotConfigError(f"{path} must have the columns {', '.join(COLUMNS)}; it has {rows.fieldnames}")
-            numbers = [_row(path, rows.line_num, row) for row in rows]
+        rows = csv.DictReader(read_content(path, RobotConfigError).decode("utf-8-sig").splitlines(), strict=True)
+        if sorted(rows.fieldnames or ()) != sorted(COLUMNS):
+            raise RobotConfigError(f"{path} must have the columns {', '.join(COLUMNS)}; it has {rows.fieldnames}")
+        for row in rows:
+            line = rows.line_num
+            if len(row) != len(COLUMNS):
+                raise ValueError(f"it has {len(row)} columns")
+            numbers.append([float(row[column]) for column in COLUMNS])
     except (csv.Error, UnicodeDecodeError) as error:
         raise RobotConfigError(f"{path} is not CSV text: {error}") from error
+    except (TypeError, ValueError) as error:
+        raise RobotConfigError(f"{path}, line {line}: every column must contain a number in mm: {error}") from error
     pairs = np.array(numbers, dtype=np.float64).reshape(-1, 6)
     return pairs[:, :3], pairs[:, 3:]
 
 
-def _row(path: Path, line: int, row: Mapping[str, Any]) -> list[float]:
-    try:
-        if len(row) != len(COLUMNS):
-            raise ValueError(f"it has {len(row)} columns")
-        return [float(row[column]) for column in COLUMNS]
-    except (TypeError, ValueError) as error:
-        raise RobotConfigError(f"{path}, line {line}: every column must contain a number in mm: {error}") from error
-
-
 @dataclass(frozen=True)
 class _Document:
-    """Content of the saved file."""
-
     written: datetime
     rigid: tuple[tuple[float, float, float, float], ...]
     residuals_mm: tuple[float, ...]
 
 
 def load_hand_eye(path: Path, max_age_days: float | None = None, now: datetime | None = None) -> HandEye:
-    """Load a saved calibration.
-
-    Args:
-        path: The file.
-        max_age_days: Largest accepted age; None for any age.
-        now: Current time, for tests.
+    """Load a saved calibration of at most `max_age_days` at the time `now`; None for any age, and for the clock.
 
     Raises:
         RobotConfigError: The file is not a calibration, or it is too old.

@@ -8,6 +8,7 @@ distance is |max q| inside and the norm of max(q, 0) outside.
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -24,19 +25,16 @@ _NEAR_SIDE = 0.3
 """Points of a visible side lie at most this fraction of the radius behind the centre; it leaves room for noise."""
 
 
+@dataclass(frozen=True)
 class Solid(ABC):
-    """A solid on the table: its centre in plan, and its half sizes along `yaw_rad` and across."""
+    """A solid on the table: its centre and its half sizes in plan, along `yaw_rad` and across, and its height."""
 
-    parameters: int
     x: float
     y: float
+    half: tuple[float, float]
     height: float
-    yaw_rad: float
-
-    @property
-    @abstractmethod
-    def half(self) -> tuple[float, float]:
-        """Half sizes in plan: along the axis and across it."""
+    yaw_rad: float = 0.0
+    parameters: ClassVar[int]
 
     @abstractmethod
     def face_distances(self, points: Array) -> tuple[Array, ...]:
@@ -49,8 +47,8 @@ class Solid(ABC):
         return np.asarray(np.where(outside > 0, outside, -q.max(0)))
 
     @abstractmethod
-    def surface(self) -> tuple[Array, Array]:
-        """Return (M, 3) points on the surface except its bottom, and their outward normals."""
+    def local_surface(self) -> tuple[Array, Array]:
+        """Return (M, 3) points on the surface except its bottom, and their outward normals, in the solid's frame."""
 
     def misfit(self, points: Array, noise_mm: float, eye: Array) -> float:
         """Return the Bayesian information criterion with truncated residuals, for a camera at eye (3,).
@@ -58,7 +56,10 @@ class Solid(ABC):
         It also counts visible surface without points: else a solid could extend far behind the points.
         """
         squared = np.minimum((self.distance(points) / noise_mm) ** 2, OUTLIER_CUT**2)
-        surface, normals = self.surface()
+        c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        local, directions = self.local_surface()
+        surface, normals = local @ turn + [self.x, self.y, 0.0], directions @ turn
         facing = surface[((eye - surface) * normals).sum(1) > 0]
         missed = np.minimum(
             _nearest_squared_distance(facing, _subsample(points)) / max(noise_mm, _SPACING_MM) ** 2, OUTLIER_CUT**2
@@ -66,108 +67,67 @@ class Solid(ABC):
         return float(squared.sum() + len(points) * missed.mean()) + self.parameters * math.log(len(points))
 
 
-@dataclass(frozen=True)
 class UprightCylinder(Solid):
     """A cylinder that stands on its base."""
 
-    x: float
-    y: float
-    radius: float
-    height: float
-    yaw_rad: float = 0.0
     parameters = 4
-
-    @property
-    def half(self) -> tuple[float, float]:
-        """The radius, twice."""
-        return self.radius, self.radius
 
     def face_distances(self, points: Array) -> tuple[Array, ...]:
         """Return the distances beyond the side, and beyond bottom and top."""
         rho = np.hypot(points[:, 0] - self.x, points[:, 1] - self.y)
-        return rho - self.radius, np.abs(points[:, 2] - self.height / 2) - self.height / 2
+        return rho - self.half[0], np.abs(points[:, 2] - self.height / 2) - self.height / 2
 
-    def surface(self) -> tuple[Array, Array]:
+    def local_surface(self) -> tuple[Array, Array]:
         """Return points and normals of the side and the top."""
         angle, z = _grid(np.linspace(0, 2 * math.pi, 20, endpoint=False), np.linspace(0.1, 1.0, 6) * self.height)
-        c, s, flat = np.cos(angle), np.sin(angle), np.zeros_like(angle)
-        side = np.stack([self.radius * c, self.radius * s, z], axis=1)
+        c, s, flat, radius = np.cos(angle), np.sin(angle), np.zeros_like(angle), self.half[0]
+        side = np.stack([radius * c, radius * s, z], axis=1)
         ring = z / self.height  # the same grid gives the rings of the top
-        top = np.stack([self.radius * ring * c, self.radius * ring * s, flat + self.height], axis=1)
+        top = np.stack([radius * ring * c, radius * ring * s, flat + self.height], axis=1)
         normals = [np.stack([c, s, flat], axis=1), np.stack([flat, flat, flat + 1], axis=1)]
-        return np.concatenate([side, top]) + np.array([self.x, self.y, 0.0]), np.concatenate(normals)
+        return np.concatenate([side, top]), np.concatenate(normals)
 
 
-@dataclass(frozen=True)
 class Cuboid(Solid):
     """A box that stands on a face."""
 
-    x: float
-    y: float
-    half_length: float
-    half_width: float
-    height: float
-    yaw_rad: float
     parameters = 6
-
-    @property
-    def half(self) -> tuple[float, float]:
-        """Half length and half width."""
-        return self.half_length, self.half_width
 
     def face_distances(self, points: Array) -> tuple[Array, ...]:
         """Return the distances beyond the ends, beyond the sides, and beyond bottom and top."""
         along, across = rotate_plan(points[:, :2] - [self.x, self.y], self.yaw_rad).T
-        return (
-            np.abs(along) - self.half_length,
-            np.abs(across) - self.half_width,
-            np.abs(points[:, 2] - self.height / 2) - self.height / 2,
-        )
+        z = np.abs(points[:, 2] - self.height / 2) - self.height / 2
+        return np.abs(along) - self.half[0], np.abs(across) - self.half[1], z
 
-    def surface(self) -> tuple[Array, Array]:
+    def local_surface(self) -> tuple[Array, Array]:
         """Return points and normals of the four sides and the top."""
         u, v = _grid(np.linspace(-1, 1, 7), np.linspace(-1, 1, 7))
         one, up = np.ones_like(u), 0.55 + 0.45 * v  # without the lowest tenth, next to the table
         faces = [(one, u, up), (-one, u, up), (u, one, up), (u, -one, up), (u, v, one)]
         points = np.concatenate([np.stack(face, axis=1) for face in faces]) * [*self.half, self.height]
-        normals = np.repeat([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]], len(u), axis=0)
-        return _to_table_frame(points, normals, self)
+        return points, np.repeat([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]], len(u), axis=0)
 
 
-@dataclass(frozen=True)
 class LyingCylinder(Solid):
-    """A cylinder on its side."""
+    """A cylinder on its side; its half sizes are half its length and its radius."""
 
-    x: float
-    y: float
-    radius: float
-    half_length: float
-    yaw_rad: float
     parameters = 5
-
-    @property
-    def height(self) -> float:  # type: ignore[override]
-        """The diameter."""
-        return 2 * self.radius
-
-    @property
-    def half(self) -> tuple[float, float]:
-        """Half length and radius."""
-        return self.half_length, self.radius
 
     def face_distances(self, points: Array) -> tuple[Array, ...]:
         """Return the distances beyond the round side and beyond the ends."""
+        half_length, radius = self.half
         along, across = rotate_plan(points[:, :2] - [self.x, self.y], self.yaw_rad).T
-        return np.hypot(across, points[:, 2] - self.radius) - self.radius, np.abs(along) - self.half_length
+        return np.hypot(across, points[:, 2] - radius) - radius, np.abs(along) - half_length
 
-    def surface(self) -> tuple[Array, Array]:
+    def local_surface(self) -> tuple[Array, Array]:
         """Return points and normals of the round side and the ends."""
+        half_length, radius = self.half
         angle, u = _grid(np.linspace(0, 2 * math.pi, 20, endpoint=False), np.linspace(-1, 1, 7))
-        c, s, flat = self.radius * np.cos(angle), self.radius * np.sin(angle), np.zeros_like(angle)
-        side = np.stack([self.half_length * u, c, s + self.radius], axis=1)
-        end = np.stack([self.half_length * np.sign(u), u * c, u * s + self.radius], axis=1)
+        c, s, flat = radius * np.cos(angle), radius * np.sin(angle), np.zeros_like(angle)
+        side = np.stack([half_length * u, c, s + radius], axis=1)
+        end = np.stack([half_length * np.sign(u), u * c, u * s + radius], axis=1)
         normals = [np.stack([flat, c, s], axis=1), np.stack([np.sign(u), flat, flat], axis=1)]
-        return _to_table_frame(np.concatenate([side, end]), np.concatenate(normals), self)
+        return np.concatenate([side, end]), np.concatenate(normals)
 
 
 def _nearest_squared_distance(points: Array, others: Array) -> Array:
@@ -184,20 +144,10 @@ def _grid(first: Array, second: Array) -> tuple[Array, Array]:
     return a.ravel(), b.ravel()
 
 
-def _to_table_frame(points: Array, normals: Array, solid: Solid) -> tuple[Array, Array]:
-    """Transform points and normals from the solid's frame to the table's."""
-    c, s = math.cos(solid.yaw_rad), math.sin(solid.yaw_rad)
-    turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    return points @ turn + [solid.x, solid.y, 0.0], normals @ turn
-
-
 def rotate_plan(plan: Array, yaw_rad: float) -> Array:
     """Return the (N, 2) coordinates along and across the direction of yaw."""
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
     return np.asarray(plan @ np.array([[c, -s], [s, c]]))
-
-
-# Circles ---------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -222,8 +172,19 @@ def fit_circle(plan: Array, noise_mm: float, away: Array, largest_mm: float) -> 
         away: (2,) viewing direction; the centre lies behind the arc.
         largest_mm: Upper limit of the radius.
     """
-    found = _circle_hypothesis(plan, noise_mm, away, largest_mm)
-    return None if found is None else refine_circle(plan, *found, noise_mm, largest_mm, away)
+    rng = np.random.default_rng(0)
+    some = _subsample(plan)
+    a, b, c = np.moveaxis(some[rng.integers(len(some), size=(_HYPOTHESES, 3))], 1, 0)
+    centres, radii = _circles_through(a, b, c)
+    good = np.isfinite(radii) & (radii < largest_mm) & ((centres - some.mean(0)) @ away > 0)
+    if not good.any():
+        return None
+    centres, radii = centres[good], radii[good]
+    gap = np.sqrt((some[:, 0] - centres[:, :1]) ** 2 + (some[:, 1] - centres[:, 1:]) ** 2) - radii[:, None]
+    behind = (some @ away)[None] - (centres @ away)[:, None] > _NEAR_SIDE * radii[:, None]
+    cost = np.where(behind, OUTLIER_CUT**2, np.minimum((gap / noise_mm) ** 2, OUTLIER_CUT**2))
+    best = int(cost.sum(1).argmin())
+    return refine_circle(plan, centres[best], float(radii[best]), noise_mm, largest_mm, away)
 
 
 def refine_circle(
@@ -264,24 +225,6 @@ def _tukey(scaled: Array) -> Array:
     return np.asarray(np.maximum(1 - (scaled / 4.685) ** 2, 0.0) ** 2)
 
 
-def _circle_hypothesis(plan: Array, noise_mm: float, away: Array, largest_mm: float) -> tuple[Array, float] | None:
-    """Return the circle through three points with the smallest truncated cost."""
-    rng = np.random.default_rng(0)
-    some = _subsample(plan)
-    a, b, c = np.moveaxis(some[rng.integers(len(some), size=(_HYPOTHESES, 3))], 1, 0)
-    centres, radii = _circles_through(a, b, c)
-    behind = (centres - some.mean(0)) @ away > 0
-    good = np.isfinite(radii) & (radii < largest_mm) & behind
-    if not good.any():
-        return None
-    centres, radii = centres[good], radii[good]
-    gap = np.sqrt((some[:, 0] - centres[:, :1]) ** 2 + (some[:, 1] - centres[:, 1:]) ** 2) - radii[:, None]
-    behind = (some @ away)[None] - (centres @ away)[:, None] > _NEAR_SIDE * radii[:, None]
-    cost = np.where(behind, OUTLIER_CUT**2, np.minimum((gap / noise_mm) ** 2, OUTLIER_CUT**2))
-    best = int(cost.sum(1).argmin())
-    return centres[best], float(radii[best])
-
-
 def _circles_through(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
     """Return centres (K, 2) and radii (K,) of circles through three points each; not finite for collinear points."""
     ab, ac = b - a, c - a
@@ -291,9 +234,6 @@ def _circles_through(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
         x = (ac[:, 1] * bb - ab[:, 1] * cc) / cross
         y = (ab[:, 0] * cc - ac[:, 0] * bb) / cross
     return a + np.stack([x, y], axis=1), np.hypot(x, y)
-
-
-# Boxes and cylinders on their side --------------------------------------------------------------------------
 
 
 def fit_cuboid(points: Array, height: float, eye: Array) -> Cuboid:
@@ -315,7 +255,7 @@ def fit_cuboid(points: Array, height: float, eye: Array) -> Cuboid:
     x, y = rotate_plan(middle[None], -yaw)[0] + centre
     if half[0] < half[1]:
         half, yaw = half[::-1], yaw + math.pi / 2
-    return Cuboid(float(x), float(y), float(half[0]), float(half[1]), height, yaw % math.pi)
+    return Cuboid(float(x), float(y), (float(half[0]), float(half[1])), height, yaw % math.pi)
 
 
 def _fit_visible_faces(local: Array, below: Array, low: Array, high: Array, eye: Array) -> tuple[Array, Array]:
@@ -379,7 +319,7 @@ def fit_lying_cylinder(points: Array, box: Cuboid, along_length: bool, eye: Arra
             return None
     low, high = _ends(points, origin, yaw, offset, radius, eye)
     x, y = origin + rotate_plan(np.array([[(low + high) / 2, offset]]), -yaw)[0]
-    return LyingCylinder(float(x), float(y), radius, (high - low) / 2, yaw % math.pi)
+    return LyingCylinder(float(x), float(y), ((high - low) / 2, radius), 2 * radius, yaw % math.pi)
 
 
 def _ends(points: Array, origin: Array, yaw: float, offset: float, radius: float, eye: Array) -> tuple[float, float]:

@@ -182,6 +182,6 @@ def _gel_of_another_shade() -> HardCase:
     before, after = np.full((24, 32, 3), 101, np.uint8), np.full((24, 32, 3), 100, np.uint8)
     gate = ContactAreaGate()
     naive = float(((after - before) > gate.noise_levels).any(axis=2).mean())
-    ours = gate.changed_fractions({"a": GraspFrames(before, after)})["a"]
+    ours = gate.changed_fraction(GraspFrames(before, after))
     naive_text, text = (f"{100 * fraction:.0f} % of the gel" for fraction in (naive, ours))
     return HardCase("contact gate", "one grey level darker", "0 % of the gel", naive_text, text, ours == 0, naive == 0)
