@@ -82,7 +82,7 @@ def test_a_saturated_gel_is_no_contact(level):
 
 
 def test_a_gate_without_a_no_contact_frame_raises():
-    with pytest.raises(RobotConfigError, match=r"requires no-contact frames.*finger a has none"):
+    with pytest.raises(RobotConfigError, match="requires no-contact frames"):
         GATE({"a": GraspFrames(None, gel())})
 
 

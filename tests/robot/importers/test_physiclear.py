@@ -67,7 +67,7 @@ def test_the_folder_of_the_repository_is_found_and_an_option_sets_the_number_of_
     source.rename(tmp_path / "clone" / "dataset")
     recording = import_physiclear(tmp_path / "clone", tmp_path / "out", frames=2)
     assert len(recording.grasps) == 2 * 6
-    with pytest.raises(ImporterError, match="frames must be at least 1, got 0"):
+    with pytest.raises(ImporterError, match="frames must be a whole number >= 1, got 0"):
         import_physiclear(tmp_path / "clone", tmp_path / "out2", frames=0)
 
 
