@@ -31,8 +31,8 @@ from models.random_surfaces import RandomSurface, presses
 from retrieval.console.memory import keep_freed_memory
 from retrieval.console.output import say
 from retrieval.console.progress import Bar
-from retrieval.data.images import read_rgb, to_float
-from retrieval.data.resize import resize
+from retrieval.data.images import read_rgb
+from retrieval.data.resize import resize, to_float
 from retrieval.errors import JobInterrupted
 from retrieval.model.checkpoint import write_tensors
 from retrieval.model.encode import autocast, default_device

@@ -17,8 +17,8 @@ from torch.utils.data import DataLoader, Dataset
 
 from models.labels import LabelHead
 from models.pictures import FAMILIES, LabelledPicture
-from retrieval.data.images import to_float
 from retrieval.data.preprocessing import Preprocessing
+from retrieval.data.resize import to_float
 from retrieval.model.checkpoint import write_tensors
 from retrieval.model.config import Config
 from retrieval.model.encode import autocast, default_device, to_batch

@@ -6,12 +6,10 @@ Pillow reads and checks every file. (OpenCV fills the missing part of a truncate
 
 import io
 import struct
-import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -19,8 +17,8 @@ from PIL import Image, UnidentifiedImageError, features
 
 from _touch_retrieval.files import read_regular
 from retrieval.data.picture_structure import check_structure
-from retrieval.data.resize import RgbImage, Samples, to_unit
-from retrieval.errors import BadInput, ImageError
+from retrieval.data.resize import RgbImage, Samples, to_float
+from retrieval.errors import ImageError
 
 HEIC_EXTENSIONS = frozenset({".heic", ".heif", ".hif"})
 AVIF_EXTENSIONS = frozenset({".avif"})
@@ -35,42 +33,15 @@ MAX_SIDE, MAX_ASPECT = 65_535, 200
 """Largest side in pixels (the limit of JPEG), and largest ratio of the longer to the shorter side."""
 MAX_BYTES = 512 * 2**20
 
-_FORMATS = ("BMP", "JPEG", "PNG", "TIFF", "WEBP")
+_FORMATS: tuple[str, ...] = ("BMP", "JPEG", "PNG", "TIFF", "WEBP")
 _NO_IMAGE = "not a PNG, JPEG, BMP, TIFF, WebP, AVIF or HEIC picture, or its header is damaged or of an unsupported kind"
 _EIGHT_BIT_MODES = frozenset({"1", "L", "P", "RGB", "RGBX", "CMYK", "YCbCr", "LA", "PA", "RGBA", "RGBa"})
 _STRIP = 1 << 20  # pixels
 _ORIENTATION, _BITS, _PHOTOMETRIC = 274, 258, 262
 
 
-class _SuppressedWarnings:
-    """Context manager that suppresses warnings while any thread is inside.
-
-    Warning filters belong to the whole process. With `warnings.catch_warnings` in each thread, threads could restore
-    the filters in the wrong order. A lock around it would decode one picture at a time.
-    """
-
-    def __init__(self) -> None:
-        self._lock, self._inside, self._filters = threading.Lock(), 0, warnings.catch_warnings()
-
-    def __enter__(self) -> None:
-        with self._lock:
-            if self._inside == 0:
-                self._filters = warnings.catch_warnings()
-                self._filters.__enter__()
-                warnings.simplefilter("ignore")
-            self._inside += 1
-
-    def __exit__(self, *error: object) -> None:
-        with self._lock:
-            self._inside -= 1
-            if self._inside == 0:
-                self._filters.__exit__(None, None, None)
-
-
-_suppressed_warnings = _SuppressedWarnings()
-
-
-_DRAFT_SCALES = (8, 4, 2)
+# Pillow warns of sizes and damaged metadata. Filters belong to the process: a thread must not change them for a while.
+warnings.filterwarnings("ignore", module="PIL|pillow_heif")
 
 
 def read_rgb(path: str | Path) -> RgbImage:
@@ -106,7 +77,7 @@ def decode_rgb(data: bytes, name: str | Path, min_side: int | None = None) -> Rg
 
     Args:
         data: Bytes of the file.
-        name: Name of the picture in messages.
+        name: Name of the picture in messages; so everywhere in this module.
         min_side: A JPEG file is decoded at 1/8, 1/4 or 1/2 of its size by its cosine transform, as long as the shorter
             side keeps this many pixels; each pixel is then nearly the mean of its area. None to decode only pictures
             smaller that are too large.
@@ -114,18 +85,12 @@ def decode_rgb(data: bytes, name: str | Path, min_side: int | None = None) -> Rg
     Raises:
         ImageError: The bytes are not a picture that can be decoded.
     """
-    return to_unit(decode(data, name, min_side))
+    return to_float(decode(data, name, min_side))
 
 
 def decode(data: bytes, name: str | Path, min_side: int | None = None) -> Samples:
-    """Decode like `decode_rgb`, but return (H, W, 3) uint8 for an opaque picture of 8 bits.
-
-    Args:
-        data: Bytes of the file.
-        name: Name of the picture in messages.
-        min_side: As for `decode_rgb`.
-    """
-    with _open_image(data, name) as image:
+    """Decode like `decode_rgb`, but return (H, W, 3) uint8 for an opaque picture of 8 bits."""
+    with _image_errors(name), _open_image(data, name) as image:
         _apply_draft_mode(image, min_side)
         check_pixels(image.size, name)
         image.load()
@@ -134,52 +99,46 @@ def decode(data: bytes, name: str | Path, min_side: int | None = None) -> Sample
 
 
 def picture_size(data: bytes, name: str | Path) -> tuple[int, int]:
-    """Return (width, height) from a picture's header, without decoding.
-
-    Raises:
-        ImageError: As for `decode_rgb`.
-    """
+    """Return (width, height) from a picture's header, without decoding. Raises ImageError."""
     if (size := _webp_size(data)) != (1, 1):
         return size
-    with _open_image(data, name) as image:
+    with _image_errors(name), _open_image(data, name) as image:
         width, height = image.size
         return width, height
 
 
+def pillow_rgb(image: Image.Image, name: str | Path) -> RgbImage:
+    """Decode an opened Pillow image like `decode_rgb`; samples beyond 8 bits are lost, since Pillow drops them.
+
+    Raises:
+        ImageError: The image cannot be decoded.
+    """
+    with _image_errors(name):
+        check_pixels(image.size, name)
+        image.load()
+        return to_float(_apply_orientation(_eight_bit_rgb(image, name), _orientation(image)))
+
+
 @contextmanager
-def _open_image(data: bytes, name: str | Path) -> Iterator[Image.Image]:
-    """Open a picture and read its header; errors here and in the `with` block become ImageError."""
-    if not data:
-        raise ImageError(name, "the file is empty")
+def _image_errors(name: str | Path) -> Iterator[None]:
     try:
-        check_pixels(_webp_size(data), name)
-        check_structure(data, name)
-        decoder = _register_decoder(data, name)
-        with _suppressed_warnings:
-            try:
-                image = Image.open(io.BytesIO(data), formats=_FORMATS if decoder is None else (decoder,))
-            except Image.DecompressionBombError:
-                raise ImageError(name, _too_large("far more")) from None
-            with image:
-                yield image
+        yield
     except ImageError:
         raise
     except UnidentifiedImageError:
         raise ImageError(name, _NO_IMAGE) from None
-    except Exception as error:  # OSError, SyntaxError, struct.error, cv2.error, MemoryError, ...
+    except Image.DecompressionBombError:
+        raise ImageError(name, _too_large("far more")) from None
+    except Exception as error:  # OSError, SyntaxError, struct.error, MemoryError, a closed file, ...
         raise ImageError(name, f"damaged or truncated: {_reason(error)}") from error
 
 
-def to_float(image: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
-    """Scale uint8 or uint16 samples of any shape to float32 in 0..1.
-
-    Raises:
-        BadInput: The samples have another type.
-    """
-    if image.dtype not in (np.uint8, np.uint16):
-        raise BadInput(f"samples must be uint8 or uint16, got {image.dtype}")
-    scaled = np.divide(image, np.iinfo(image.dtype).max, dtype=np.float32)
-    return cast(npt.NDArray[np.float32], scaled)
+def _open_image(data: bytes, name: str | Path) -> Image.Image:
+    if not data:
+        raise ImageError(name, "the file is empty")
+    check_pixels(_webp_size(data), name)
+    check_structure(data, name)
+    return Image.open(io.BytesIO(data), formats=_decoders(data, name))
 
 
 def _reason(error: BaseException) -> str:
@@ -187,28 +146,25 @@ def _reason(error: BaseException) -> str:
     return f"{' '.join(text.split())} ({type(error).__name__})"
 
 
-def _register_decoder(data: bytes, name: str | Path) -> str | None:
-    """Register the decoder of HEIF or AVIF bytes with Pillow and return its name; None for any other picture.
+def _decoders(data: bytes, name: str | Path) -> tuple[str, ...]:
+    """Return the names of Pillow's decoders for a file. Raises ImageError if the decoder is not installed.
 
-    Both kinds of file begin with a box of type "ftyp" that lists their brands. Raises ImageError if the decoder is not
-    installed.
+    HEIC and AVIF files begin with a box of type "ftyp" that lists their brands; so do videos.
     """
-    if data[4:8] != b"ftyp":
-        return None
-    box = data[: min(int.from_bytes(data[:4], "big"), 256)]
+    box = data[: min(int.from_bytes(data[:4], "big"), 256)] if data[4:8] == b"ftyp" else b""
     brands = {box[at : at + 4] for at in range(8, len(box), 4)}
     if brands & _AVIF_BRANDS:
         if not features.check("avif"):
             raise ImageError(name, "an AVIF picture, and this Pillow was built without AVIF: pip install -U pillow")
-        return "AVIF"
+        return ("AVIF",)
     if not brands & _HEIC_BRANDS:
-        return None  # a video
+        return _FORMATS
     try:
         from pillow_heif import register_heif_opener
     except ImportError:
         raise ImageError(name, "a HEIC picture, which needs pillow-heif: pip install 'touch-retrieval[heif]'") from None
     register_heif_opener()
-    return "HEIF"
+    return ("HEIF",)
 
 
 def _apply_draft_mode(image: Image.Image, min_side: int | None) -> None:
@@ -223,45 +179,14 @@ def _apply_draft_mode(image: Image.Image, min_side: int | None) -> None:
     progressive = bool(image.info.get("progressive"))
     if progressive and width * height > MAX_PIXELS:
         return
-    by_side = next(
-        (each for each in _DRAFT_SCALES if min_side is not None and min(width, height) >= each * min_side), 1
-    )
-    by_pixels = next((each for each in (1, 2, 4, 8) if -(-width // each) * -(-height // each) <= MAX_PIXELS), None)
-    if by_pixels and (scale := max(by_side, by_pixels)) > 1:
+    by_side = [each for each in (1, 2, 4, 8) if min_side is not None and min(width, height) >= each * min_side]
+    by_pixels = [each for each in (1, 2, 4, 8) if -(-width // each) * -(-height // each) <= MAX_PIXELS]
+    if by_pixels and (scale := max(by_side[-1:] + by_pixels[:1])) > 1:
         image.draft(None, (width // scale, height // scale))
 
 
-def pillow_rgb(image: Image.Image, name: str | Path) -> RgbImage:
-    """Decode an opened Pillow image like `decode_rgb`; samples beyond 8 bits are lost, since Pillow drops them.
-
-    Args:
-        image: The opened image.
-        name: Name of the picture in messages.
-
-    Returns:
-        (H, W, 3) float32 RGB in 0..1.
-
-    Raises:
-        ImageError: The image cannot be decoded.
-    """
-    try:
-        check_pixels(image.size, name)
-        with _suppressed_warnings:
-            image.load()
-            rgb = _eight_bit_rgb(image, name)
-        return to_unit(_apply_orientation(rgb, _orientation(image)))
-    except ImageError:
-        raise
-    except Exception as error:  # its file is damaged or closed
-        raise ImageError(name, f"damaged or truncated: {_reason(error)}") from error
-
-
 def check_pixels(size: tuple[int, int], name: str | Path) -> None:
-    """Check a size from a header before anything of that size is allocated.
-
-    Args:
-        size: (width, height).
-        name: Name of the picture in messages.
+    """Check a size (width, height) from a header before anything of that size is allocated.
 
     Raises:
         ImageError: The size is empty, too large or too elongated.
@@ -299,11 +224,6 @@ def _webp_size(data: bytes) -> tuple[int, int]:
     return max(width & 0x3FFF, 1), max(height & 0x3FFF, 1)
 
 
-def _tiff_tag(image: Image.Image, tag: int, default: tuple[int, ...]) -> tuple[int, ...]:
-    value = getattr(image, "tag_v2", {}).get(tag, default)
-    return tuple(value) if isinstance(value, tuple | list) else (int(value),)
-
-
 def _eight_bit_rgb(image: Image.Image, name: str | Path) -> Samples:
     if image.mode not in _EIGHT_BIT_MODES:
         raise ImageError(name, f"pixel type {image.mode} is not supported; save it as 8 or 16-bit PNG")
@@ -333,7 +253,8 @@ def encode_image(pixels: npt.NDArray[np.uint8], ending: str = ".png") -> bytes:
 
 def _deep_grey(image: Image.Image, name: str | Path) -> RgbImage:
     """Decode 16-bit grey samples, which Pillow's conversion would clip."""
-    if _tiff_tag(image, _BITS, (16,)) != (16,) or _tiff_tag(image, _PHOTOMETRIC, (1,)) != (1,):
+    tags = getattr(image, "tag_v2", {})
+    if tags.get(_BITS, (16,)) != (16,) or tags.get(_PHOTOMETRIC, 1) != 1:
         raise ImageError(name, "samples of 9 to 15 bits, or inverted ones, are not supported; save it as PNG")
     samples = np.asarray(image)[..., None]
     rgb = to_float(samples.astype(np.uint16).repeat(3, axis=2))

@@ -15,58 +15,23 @@ from msgspec import Meta
 
 from _touch_retrieval.documents import check_fields
 from retrieval.data.images import decode, picture_size, read_bytes, read_rgb
-from retrieval.data.resize import RgbImage, check_rgb, resize
+from retrieval.data.resize import RgbImage, resize
 from retrieval.data.views import VIEWS, find_object, min_photo_side, min_photo_side_for_crop, tile_views
 from retrieval.errors import BadInput, ConfigError, NumericalError
 
 PREPROCESSING_VERSION = 2
 """Increase it when the same file gives different values, so that older indexes and checkpoints do not match."""
 
-_SUBTRACT: dict[str, Callable[[RgbImage, RgbImage], RgbImage]] = {
+BACKGROUNDS: dict[str, Callable[[RgbImage, RgbImage], RgbImage]] = {
+    "none": lambda touch, reference: touch,
     "difference": lambda touch, reference: touch - reference,
     "difference+0.5": lambda touch, reference: np.clip(touch - reference + np.float32(0.5), 0, 1),
     "abs": lambda touch, reference: np.abs(touch - reference),
 }
-BACKGROUNDS = ("none", *_SUBTRACT)
-"""Policies for a touch T and its no-contact frame R: T; T - R in -1..1; T - R + 0.5, clipped; |T - R|."""
+"""What a tower sees of a touch and its no-contact frame.
 
-
-def subtract_background(touch: RgbImage, reference: RgbImage | None, policy: str) -> RgbImage:
-    """Subtract the no-contact frame from a touch.
-
-    The arithmetic is float32: a uint8 subtraction wraps, and turns 1 grey level darker into 255 brighter.
-
-    Args:
-        touch: (H, W, 3) float32 in 0..1.
-        reference: The no-contact frame, of the same shape; may be None for "none".
-        policy: One of BACKGROUNDS; "none" returns `touch` itself.
-
-    Raises:
-        ConfigError: The policy is unknown, or the reference is missing.
-        BadInput: An image has the wrong shape or type.
-    """
-    _check_policy(policy)
-    check_rgb(touch, "touch")
-    if policy == "none":
-        return touch
-    if reference is None:
-        raise _missing_reference(policy)
-    check_rgb(reference, "reference")
-    if touch.shape != reference.shape:
-        raise BadInput(f"touch and reference must have the same shape, got {touch.shape} and {reference.shape}")
-    return _SUBTRACT[policy](touch, reference)
-
-
-def _check_policy(policy: object) -> None:
-    if policy not in BACKGROUNDS:
-        raise ConfigError(f"background must be one of {', '.join(BACKGROUNDS)}; got {policy!r}")
-
-
-def _missing_reference(policy: str) -> ConfigError:
-    return ConfigError(
-        f'background = "{policy}" needs a no-contact frame for each touch: give a reference, or set background = "none"'
-    )
-
+The arithmetic is float32: a uint8 subtraction wraps, and turns 1 grey level darker into 255 brighter.
+"""
 
 Side = Annotated[int, Meta(ge=1, le=4096)]
 """Side of a square in pixels."""
@@ -96,7 +61,8 @@ class Preprocessing:
             raise ConfigError(
                 f"preprocessing.views must be some of {', '.join(VIEWS)}, each once; got {list(self.views)}"
             )
-        _check_policy(self.background)
+        if self.background not in BACKGROUNDS:
+            raise ConfigError(f"background must be one of {', '.join(BACKGROUNDS)}; got {self.background!r}")
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as JSON types."""
@@ -118,8 +84,9 @@ class Preprocessing:
             BadInput: The photo has the wrong shape or type.
             NumericalError: A sample is not finite.
         """
-        check_rgb(image, "photo")
-        return tile_views(_finite(image, "photo"), self.views, self.photo_px)
+        _require_rgb(image, "photo")
+        _require_finite(image, "photo")
+        return tile_views(image, self.views, self.photo_px)
 
     def photo_from_bytes(self, data: bytes, name: str | Path) -> RgbImage:
         """Return the tiled views of the photo in the bytes of a file, called `name` in messages.
@@ -148,21 +115,26 @@ class Preprocessing:
             reference: Its no-contact frame; may be None for background "none".
 
         Raises:
+            ConfigError: The background policy requires a reference, and it is missing.
             BadInput: An image has the wrong shape or type.
             NumericalError: A sample is not finite.
         """
         size = (self.touch_px, self.touch_px)
-        if self.background == "none" or reference is None:
-            return _finite(subtract_background(resize(image, size), None, self.background), "touch")
-        touch = subtract_background(resize(image, size), resize(reference, size), self.background)
-        return _finite(touch, "touch")
+        _require_rgb(image, "touch")
+        touch = resize(image, size)
+        if self.background != "none":
+            if reference is None:
+                raise ConfigError(
+                    f'background = "{self.background}" needs a no-contact frame for each touch: give a reference, or '
+                    'set background = "none"'
+                )
+            _require_rgb(reference, "reference")
+            touch = BACKGROUNDS[self.background](touch, resize(reference, size))
+        _require_finite(touch, "touch")
+        return touch
 
     def load_photo(self, path: str | Path) -> RgbImage:
-        """Read a photo as (photo_px, views * photo_px, 3) float32.
-
-        Raises:
-            ImageError: The file cannot be read or decoded.
-        """
+        """Read a photo as (photo_px, views * photo_px, 3) float32. Raises ImageError."""
         return self.photo_from_bytes(read_bytes(path), path)
 
     def load_touch(self, path: str | Path, reference: str | Path | None = None) -> RgbImage:
@@ -176,14 +148,16 @@ class Preprocessing:
             ImageError: A file cannot be read or decoded.
             ConfigError: The background policy requires a reference, and it is missing.
         """
-        if self.background == "none":
-            return self.touch(read_rgb(path))
-        if reference is None:
-            raise _missing_reference(self.background)
-        return self.touch(read_rgb(path), read_rgb(reference))
+        no_contact = None if reference is None or self.background == "none" else read_rgb(reference)
+        return self.touch(read_rgb(path), no_contact)
 
 
-def _finite(image: RgbImage, what: str) -> RgbImage:
+def _require_rgb(image: RgbImage, what: str) -> None:
+    if image.ndim != 3 or image.shape[2] != 3 or image.size == 0 or image.dtype != np.float32:
+        shape = " x ".join(map(str, image.shape))
+        raise BadInput(f"{what} must be H x W x 3 float32 in 0..1, got {shape} {image.dtype}; see to_float")
+
+
+def _require_finite(image: RgbImage, what: str) -> None:
     if not np.isfinite(image).all():
         raise NumericalError(f"the {what} contains a NaN or infinite sample; every sample must be in 0..1")
-    return image

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.data.resize import RgbImage, Samples, resize_unchecked, to_unit
+from retrieval.data.resize import RgbImage, Samples, resize, to_float
 
 _CROP_MARGIN = 1.12
 _ZOOM_FRACTION = 7 / 16
@@ -54,7 +54,7 @@ def find_object(image: Samples) -> PixelBox:
     catalogue has none.
     """
     height, width = image.shape[:2]
-    linear = np.clip(resize_unchecked(image, (_SIDE, _SIDE)), 0, 1) ** np.float32(_GAMMA) + np.float32(1e-3)
+    linear = np.clip(resize(image, (_SIDE, _SIDE)), 0, 1) ** np.float32(_GAMMA) + np.float32(1e-3)
     channels = np.ascontiguousarray(linear.transpose(2, 0, 1))  # channels first: sums take a tenth of the time
     lightness = _channel_sum(channels) / 3
     (red, green, blue, lighter), scatter = _ground_residuals(np.stack([*(channels / lightness), np.log(lightness)]))
@@ -157,7 +157,7 @@ def _zoom(image: Samples, box: PixelBox) -> Samples:
 
 
 def _grey(image: Samples, box: PixelBox) -> Samples:
-    grey: RgbImage = _channel_sum(to_unit(_zoom(image, box)).transpose(2, 0, 1))[..., None] / np.float32(3)
+    grey: RgbImage = _channel_sum(to_float(_zoom(image, box)).transpose(2, 0, 1))[..., None] / np.float32(3)
     return grey
 
 
@@ -211,5 +211,5 @@ def tile_views(image: Samples, names: Sequence[str], px: int, box: PixelBox | No
         box = PixelBox(0, 0, 0, 0) if set(names) == {"whole"} else find_object(image)
     tiles = np.empty((px, len(names) * px, 3), np.float32)
     for number, name in enumerate(names):
-        tiles[:, number * px : (number + 1) * px] = resize_unchecked(VIEWS[name](image, box), (px, px))
+        tiles[:, number * px : (number + 1) * px] = resize(VIEWS[name](image, box), (px, px))
     return tiles

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from retrieval.data.images import check_pixels, decode_rgb, pillow_rgb, read_rgb, to_float
-from retrieval.data.resize import RgbImage
+from retrieval.data.images import check_pixels, decode_rgb, pillow_rgb, read_rgb
+from retrieval.data.resize import RgbImage, to_float
 from retrieval.errors import BadInput, ImageError
 
 

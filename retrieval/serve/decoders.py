@@ -25,7 +25,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from retrieval.data.images import MAX_PIXELS, check_pixels, decode, picture_size
-from retrieval.data.resize import RgbImage, resize_unchecked
+from retrieval.data.resize import RgbImage, resize
 from retrieval.errors import ImageError, RetrievalError
 from retrieval.model.touches import GelImage
 from retrieval.serve.settings import MAX_BODY_PIXELS
@@ -211,7 +211,7 @@ def read_gel_image(data: bytes, name: str, px: int, max_pixels: int) -> RgbImage
     """
     width, height = picture_size(data, name)
     check_pixels((width, height), name)
-    return resize_unchecked(decode(data, name), (px, px)) if width * height <= max_pixels else width * height
+    return resize(decode(data, name), (px, px)) if width * height <= max_pixels else width * height
 
 
 def _answer(requests: BinaryIO, text: int, content: int) -> bytes:

@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from retrieval.data.images import to_float
 from retrieval.data.preprocessing import Preprocessing
+from retrieval.data.resize import to_float
 from retrieval.errors import BadInput, CheckpointError, ConfigError, NumericalError
 from retrieval.model.checkpoint import load_weights, read_tensors
 from retrieval.model.encode import one_thread, touch_batch

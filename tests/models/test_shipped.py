@@ -11,7 +11,7 @@ import torch
 from models import shipped
 from models.labels import LabelHead
 from models.pictures import METADATA, ObjectLabels, collect_pictures
-from retrieval.data.images import to_float
+from retrieval.data.resize import to_float
 from retrieval.evaluation.protocols import recording
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import touch_features

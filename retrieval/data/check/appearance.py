@@ -1,8 +1,7 @@
 """Pictures of a recording that look exchanged, mirrored, or as if their red and blue were exchanged.
 
-The reference is the recording itself: a minority is suspect. Exchanges of two fingers with similar gels, or of a
-no-contact frame with a touch of little contact, cannot be found; notes report these cases (the second one only if it
-concerns most touches). Small pictures are (n, 6, 8, 3).
+The reference is the recording itself: a minority is suspect. Notes report what cannot be found: exchanges of two
+fingers with similar gels, and of no-contact frames with touches if most touches have little contact.
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.console.output import abbreviate_list
-from retrieval.data.check.pictures import Finding, ImageRecords, SmallImages, findings_for, small_images
+from retrieval.data.check.pictures import Finding, ImageRecords, SmallImages, findings_for, fingers_of, small_images
 from retrieval.data.dataset import Grasp
 
 Rows = NDArray[np.int64]
@@ -44,15 +43,8 @@ def _spread(images: SmallImages) -> float:
     return float(np.median(distance(images, np.median(images, axis=0))))
 
 
-def _fingers(grasps: Sequence[Grasp]) -> range:
-    return range(min((len(grasp.touches) for grasp in grasps), default=0))
-
-
 def _with_backgrounds(grasps: Sequence[Grasp]) -> list[Grasp]:
     return [grasp for grasp in grasps if grasp.backgrounds and len(grasp.backgrounds) == len(grasp.touches)]
-
-
-# Photos and touches ------------------------------------------------------------------------------------------
 
 
 def check_swapped_modalities(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
@@ -83,9 +75,6 @@ def check_swapped_modalities(grasps: Sequence[Grasp], records: ImageRecords) -> 
     yield from findings_for("error", "swapped", f"touch and photo look swapped{where}", names, grasps)
 
 
-# Fingers -----------------------------------------------------------------------------------------------------
-
-
 def swapped_fingers(a: SmallImages, b: SmallImages) -> Rows | None:
     """Return the grasps whose frames of fingers a and b look exchanged, or None if the gels are too similar.
 
@@ -107,7 +96,7 @@ def check_fingers(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Fi
         if len(selected) < _MIN_GRASPS:
             continue
         files = [one.touches if moment == "touch" else one.backgrounds for one in selected]
-        for a, b in combinations(_fingers(selected), 2):
+        for a, b in combinations(fingers_of(selected), 2):
             which = f"fingers {ascii_lowercase[a]} and {ascii_lowercase[b]} look"
             frames = (small_images(records, [paths[finger] for paths in files]) for finger in (a, b))
             found = swapped_fingers(*frames)
@@ -116,9 +105,6 @@ def check_fingers(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Fi
                 continue
             names = [selected[row].grasp_id for row in found]
             yield from findings_for("error", "swapped-fingers", f"{which} swapped ({moment})", names, selected)
-
-
-# Touches and no-contact frames -------------------------------------------------------------------------------
 
 
 def check_moments(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
@@ -131,7 +117,7 @@ def check_moments(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Fi
     if len(both) < _MIN_GRASPS:
         return
     suspects: set[str] = set()
-    for finger in _fingers(both):
+    for finger in fingers_of(both):
         before = small_images(records, [one.backgrounds[finger] for one in both])
         during = small_images(records, [one.touches[finger] for one in both])
         if _spread(before) > max(2 * _spread(during), _NOISE_TIMES * _MIN_NOISE):
@@ -156,9 +142,6 @@ def check_moments(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Fi
             yield Finding("note", "unchecked-moments", text)
     names = [grasp.grasp_id for grasp in both if grasp.grasp_id in suspects]
     yield from findings_for("error", "swapped-moments", "touch and no-contact frame look swapped", names, both)
-
-
-# Channels and mirrored images --------------------------------------------------------------------------------
 
 
 def changed_layout(images: SmallImages) -> tuple[str, Rows] | None:
@@ -191,7 +174,7 @@ def check_colour_layout(grasps: Sequence[Grasp], records: ImageRecords) -> Itera
 
     Touches and no-contact frames of a finger are compared together.
     """
-    for finger in _fingers(grasps):
+    for finger in fingers_of(grasps):
         frames = [(one, "no-contact frame", one.backgrounds[finger]) for one in _with_backgrounds(grasps)]
         frames += [(grasp, "touch", grasp.touches[finger]) for grasp in grasps]
         found = changed_layout(small_images(records, [path for _, _, path in frames]))

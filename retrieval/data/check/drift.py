@@ -26,12 +26,9 @@ _ADVICE = (
 def check_drift(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
     """Report how well the no-contact frame alone, and the order of capture alone, identify the object.
 
-    Grasps of one object with the same no-contact frame count once, since a common frame is no drift. Without different
-    frames only the order is reported: it does not show whether light changed.
-
-    Args:
-        grasps: Grasps in the order of capture.
-        records: Data of their pictures.
+    The grasps are in the order of capture. Those of one object with the same no-contact frame count once, since a
+    common frame is no drift. Without different frames only the order is reported: it does not show whether light
+    changed.
     """
     by_order = _by_order(grasps)
     if by_order is None:
@@ -120,7 +117,7 @@ def nearest_grasp_accuracy(
     Returns:
         The accuracy, or None if there is only one object, or no object has two grasps.
     """
-    others = np.bincount(objects)[objects] - 1
+    others = np.bincount(objects)[objects] - 1  # grasps of the same object
     if not others.any() or others.max() == len(objects) - 1:
         return None
     flat = values.reshape(len(values), -1).astype(np.float64)

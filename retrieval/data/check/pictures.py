@@ -81,6 +81,11 @@ def thumbnails(records: ImageRecords, paths: Sequence[Path]) -> list[Thumbnail]:
     return [one for path in paths if (one := records[path].thumbnail)]
 
 
+def fingers_of(grasps: Sequence[Grasp]) -> range:
+    """Return the numbers of the fingers that every grasp has."""
+    return range(min((len(grasp.touches) for grasp in grasps), default=0))
+
+
 def read_pictures(
     files: Collection[Path], copied: Collection[Path] = frozenset()
 ) -> tuple[ImageRecords, dict[Path, str]]:

@@ -14,8 +14,8 @@ import numpy as np
 from retrieval.console.output import abbreviate_list
 from retrieval.data.check import appearance
 from retrieval.data.check.drift import check_drift
-from retrieval.data.check.near_copies import PictureSet, is_copy
-from retrieval.data.check.pictures import Finding, ImageRecords, findings_for, read_pictures, thumbnails
+from retrieval.data.check.near_copies import is_copy, nearest_pictures
+from retrieval.data.check.pictures import Finding, ImageRecords, findings_for, fingers_of, read_pictures, thumbnails
 from retrieval.data.check.split import check_split
 from retrieval.data.dataset import Attempt, Grasp, Split, load_all_attempts, require_accepted
 
@@ -53,8 +53,7 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
     findings += _duplicates(folder, [attempt.grasp for attempt in attempts], records)
     readable = [attempt for attempt in attempts if not broken.keys() & set(_pictures(attempt))]
 
-    def unnamed(attempts: Sequence[Attempt], besides: str = "") -> list[Grasp]:
-        """Return the grasps that no finding names yet, but for findings of one kind."""
+    def unnamed(attempts: Sequence[Attempt], besides: str = "") -> list[Grasp]:  # by findings of other kinds
         named = {name for finding in findings if finding.kind != besides for name in finding.grasps}
         return [attempt.grasp for attempt in attempts if attempt.grasp.grasp_id not in named]
 
@@ -72,7 +71,9 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
     findings += _repeated_touches(unnamed(used), records)
     findings += _own_photos(unnamed(used), records)
     # A recording without photos has the touch in place of the photo; its no-contact frames are checked all the same.
-    findings += check_drift(unnamed(_in_order_of_capture(used), besides="same-modality"), records)
+    if all(attempt.time_s is not None for attempt in used):
+        used.sort(key=lambda attempt: attempt.time_s or 0.0)
+    findings += check_drift(unnamed(used, besides="same-modality"), records)
     # A mirrored image may be a near copy, too.
     findings += _near_copies(unnamed(used, besides=appearance.COLOUR_LAYOUT), records, accepted)
     if split:
@@ -101,13 +102,6 @@ def _pictures(attempt: Attempt) -> tuple[Path, ...]:
     return (grasp.photo, *grasp.touches, *grasp.backgrounds, *attempt.after)
 
 
-def _in_order_of_capture(attempts: Sequence[Attempt]) -> Sequence[Attempt]:
-    """Return the attempts by their times if all are recorded, else in the order of the lines."""
-    if all(attempt.time_s is not None for attempt in attempts):
-        return sorted(attempts, key=lambda attempt: attempt.time_s or 0.0)
-    return attempts
-
-
 def _single_grasps(grasps: Sequence[Grasp]) -> Iterator[Finding]:
     counts = Counter(grasp.object_id for grasp in grasps)
     if single := sorted(name for name, count in counts.items() if count == 1):
@@ -117,9 +111,6 @@ def _single_grasps(grasps: Sequence[Grasp]) -> Iterator[Finding]:
             f"{len(single)} of {len(counts)} object(s) have only one grasp, so photo and touch of a pair always come "
             f"from the same moment: {abbreviate_list(single)}",
         )
-
-
-# Files with the same bytes, or a single colour ---------------------------------------------------------------
 
 
 def _duplicates(folder: Path, grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
@@ -197,9 +188,6 @@ def _shared_backgrounds(grasps: Sequence[Grasp], records: ImageRecords) -> Itera
         )
 
 
-# Near copies -------------------------------------------------------------------------------------------------
-
-
 def _own_photos(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
     """Find touches whose picture is the photo of the same grasp, in any encoding or size."""
     names = []
@@ -219,8 +207,7 @@ def _near_copies(grasps: Sequence[Grasp], records: ImageRecords, accepted: Seque
     counts, low_contact, left_out = [], 0, 0
     for kind, every in _by_kind(accepted).items():
         items = list(_by_kind(grasps).get(kind, {}).items())
-        pictures = PictureSet(thumbnails(records, [path for path, _ in items]), [one.object_id for _, one in items])
-        found = pictures.nearest()
+        found = nearest_pictures(thumbnails(records, [path for path, _ in items]), [one.object_id for _, one in items])
         pairs: dict[tuple[int, ...], str] = {}
         for row in np.flatnonzero(found.copy).tolist():
             (path, grasp), (near, other) = items[row], items[found.row[row]]
@@ -246,6 +233,6 @@ def _near_copies(grasps: Sequence[Grasp], records: ImageRecords, accepted: Seque
 def _by_kind(grasps: Sequence[Grasp]) -> dict[str, dict[Path, Grasp]]:
     """Return, for photos and for the touches of each finger, one grasp for each picture file."""
     kinds = {"photo": {grasp.photo: grasp for grasp in grasps}}
-    for finger in range(min((len(grasp.touches) for grasp in grasps), default=0)):
+    for finger in fingers_of(grasps):
         kinds[f"touch {ascii_lowercase[finger]}"] = {grasp.touches[finger]: grasp for grasp in grasps}
     return kinds

@@ -4,9 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from retrieval.data.images import to_float
-from retrieval.data.preprocessing import Preprocessing, subtract_background
-from retrieval.data.resize import resize
+from retrieval.data.preprocessing import Preprocessing
+from retrieval.data.resize import resize, to_float
 from tests.hard_case import HardCase, error_of
 
 _BACKGROUND, _RESIZE = "background", "resize"
@@ -24,7 +23,8 @@ def _background_wraps() -> HardCase:
     """One grey level darker than the no-contact frame: -1/255."""
     touch, gel = np.full((1, 1, 3), 100, np.uint8), np.full((1, 1, 3), 101, np.uint8)
     naive = float(to_float(touch - gel)[0, 0, 0])
-    ours = float(subtract_background(to_float(touch), to_float(gel), "difference")[0, 0, 0])
+    settings = Preprocessing(touch_px=1, background="difference")
+    ours = float(settings.touch(to_float(touch), to_float(gel))[0, 0, 0])
     near = [abs(value + 1 / 255) < 1e-6 for value in (naive, ours)]
     expected, naive_text = f"{-1 / 255:.5f}", f"uint8 wraps to {naive:.5f}"
     return HardCase(_BACKGROUND, "one grey level darker", expected, naive_text, f"{ours:.5f}", near[1], near[0])

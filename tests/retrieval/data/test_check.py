@@ -305,7 +305,6 @@ COPIES = {
     "JPEG 20": lambda image: cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 20])[1], 1),
     "gain 1.1": lambda image: np.clip(np.rint(1.1 * image), 0, 255).astype(np.uint8),
     "2 px": lambda image: np.pad(image, ((2, 0), (0, 2), (0, 0)), "reflect")[:-2, 2:],
-    "6 px": lambda image: np.pad(image, ((6, 0), (6, 0), (0, 0)), "edge")[:-6, :-6],
     "mirrored": lambda image: image[:, ::-1],
     "upside down": lambda image: image[::-1],
 }

@@ -9,8 +9,8 @@ from retrieval.data.check.drift import nearest_grasp_accuracy
 from retrieval.data.check.near_copies import (
     DISTORTIONS,
     PX,
-    PictureSet,
     flip_thumbnails,
+    nearest_pictures,
     shapes,
     thumbnail,
 )
@@ -27,8 +27,8 @@ def scene(seed, size=(120, 160)):
     return np.clip(gel, 0, 255)[..., None].repeat(3, axis=2).astype(np.float32) / 255
 
 
-def pictures(images):
-    return PictureSet([thumbnail(image) for image in images], [f"object {row}" for row in range(len(images))])
+def nearest(images):
+    return nearest_pictures([thumbnail(image) for image in images], [f"object {row}" for row in range(len(images))])
 
 
 def test_a_shape_ignores_a_constant_and_any_multiple_of_the_common_picture():
@@ -42,13 +42,13 @@ def test_a_shape_ignores_a_constant_and_any_multiple_of_the_common_picture():
 
 def test_the_nearest_picture_of_another_object_equals_that_of_plain_loops():
     images = [scene(seed) for seed in range(7)]
-    all_of_them = pictures(images)
-    unit = [shapes(one[None], all_of_them.common)[0] for one in all_of_them.greys]
-    found = all_of_them.nearest()
+    greys = np.stack([thumbnail(image).grey for image in images])
+    common = np.median(greys, axis=0)
+    unit = [shapes(one[None], common)[0] for one in greys]
+    found = nearest(images)
     for query in range(7):
         turned = [
-            shapes(flip_thumbnails(all_of_them.greys[[query]], flip), all_of_them.common)[0]
-            for flip in ((1, 1), (1, -1), (-1, 1), (-1, -1))
+            shapes(flip_thumbnails(greys[[query]], flip), common)[0] for flip in ((1, 1), (1, -1), (-1, 1), (-1, -1))
         ]
         distances = {row: min(1 - float(turn @ unit[row]) for turn in turned) for row in range(7) if row != query}
         assert found.row[query] == min(distances, key=distances.get)
@@ -59,15 +59,15 @@ def test_the_nearest_picture_of_another_object_equals_that_of_plain_loops():
 def test_a_distorted_copy_is_within_its_limit_and_no_other_picture_is(change):
     images = [scene(seed) for seed in range(9)]
     copy = np.ascontiguousarray(change(np.rint(255 * images[2]).astype(np.uint8))).astype(np.float32) / 255
-    found = pictures([*images, copy]).nearest()
+    found = nearest([*images, copy])
     assert np.flatnonzero(found.copy).tolist() == [2, 9]
     assert found.row[[2, 9]].tolist() == [9, 2]
     assert found.checked.all()
 
 
 def test_without_pictures_nothing_is_found():
-    assert len(pictures([]).nearest().row) == 0
-    found = pictures([scene(0)]).nearest()
+    assert len(nearest([]).row) == 0
+    found = nearest([scene(0)])
     assert (found.distance.tolist(), found.copy.tolist()) == ([np.inf], [False])
 
 

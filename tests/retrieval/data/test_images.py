@@ -18,7 +18,8 @@ from hypothesis import strategies as st
 from PIL import Image, ImageFile
 
 from retrieval.data import images
-from retrieval.data.images import decode_rgb, read_rgb, to_float
+from retrieval.data.images import decode_rgb, read_rgb
+from retrieval.data.resize import to_float
 from retrieval.errors import BadInput, ImageError
 
 # Files made by hand ----------------------------------------------------------------------------------------

@@ -8,9 +8,8 @@ from PIL import Image
 
 from retrieval.data import images, preprocessing
 from retrieval.data import resize as resizing
-from retrieval.data.images import to_float
-from retrieval.data.preprocessing import BACKGROUNDS, Preprocessing, subtract_background
-from retrieval.data.resize import resize
+from retrieval.data.preprocessing import BACKGROUNDS, Preprocessing
+from retrieval.data.resize import resize, to_float
 from retrieval.errors import BadInput, ConfigError, NumericalError
 from tests.retrieval.data.test_images import sample_files, saved
 
@@ -104,24 +103,9 @@ def test_overlaps_that_opencv_drops_change_a_constant_by_less_than_a_thousandth_
 @pytest.mark.parametrize("shape", [(3000, 200), (200, 3000)])
 def test_a_picture_resized_in_bands_is_the_same_to_the_bit(shape, monkeypatch):
     samples = np.random.default_rng(0).integers(0, 256, (*shape, 3), dtype=np.uint8)
-    at_once = resizing.resize_unchecked(samples, (90, 70))
+    at_once = resize(samples, (90, 70))
     monkeypatch.setattr(resizing, "_BAND", 1 << 12)
-    np.testing.assert_array_equal(resizing.resize_unchecked(samples, (90, 70)), at_once)
-
-
-@pytest.mark.parametrize(
-    ("image", "size"),
-    [
-        (np.zeros((4, 4), np.float32), (2, 2)),
-        (np.zeros((4, 4, 4), np.float32), (2, 2)),
-        (np.zeros((0, 4, 3), np.float32), (2, 2)),
-        (np.zeros((4, 4, 3), np.uint8), (2, 2)),
-        (np.zeros((4, 4, 3), np.float32), (0, 2)),
-    ],
-)
-def test_arrays_that_cannot_be_resized_are_refused(image, size):
-    with pytest.raises(BadInput, match=r"must be (H x W x 3 float32|at least 1 x 1)"):
-        resize(image, size)
+    np.testing.assert_array_equal(resize(samples, (90, 70)), at_once)
 
 
 # Background ------------------------------------------------------------------------------------------------
@@ -131,33 +115,37 @@ def grey(level):
     return to_float(np.full((4, 4, 3), level, np.uint8))
 
 
-def test_every_policy_gives_values_computed_by_hand():
-    touch, reference = grey(51), grey(204)
-    expected = {"none": 0.2, "difference": -0.6, "difference+0.5": 0.0, "abs": 0.6}
-    assert set(expected) == set(BACKGROUNDS)
-    for policy, value in expected.items():
-        np.testing.assert_allclose(subtract_background(touch, reference, policy), value, atol=1e-6)
-    np.testing.assert_allclose(subtract_background(grey(204), grey(102), "difference+0.5"), 0.9, atol=1e-6)
-    np.testing.assert_allclose(subtract_background(grey(255), grey(0), "difference+0.5"), 1.0, atol=1e-6)
+@pytest.mark.parametrize(
+    ("policy", "touch", "reference", "expected"),
+    [
+        ("none", 51, 204, 0.2),
+        ("difference", 51, 204, -0.6),
+        ("difference+0.5", 51, 204, 0.0),
+        ("difference+0.5", 204, 102, 0.9),
+        ("difference+0.5", 255, 0, 1.0),
+        ("abs", 51, 204, 0.6),
+    ],
+)
+def test_every_policy_gives_values_computed_by_hand(policy, touch, reference, expected):
+    settings = Preprocessing(touch_px=4, background=policy)
+    np.testing.assert_allclose(settings.touch(grey(touch), grey(reference)), expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("policy", [policy for policy in BACKGROUNDS if policy != "none"])
-def test_a_missing_reference_is_an_error_that_says_what_to_do(policy, tmp_path):
+@pytest.mark.parametrize("policy", set(BACKGROUNDS) - {"none"})
+def test_a_missing_reference_is_an_error_that_says_what_to_do(policy):
     with pytest.raises(ConfigError, match='give a reference, or set background = "none"'):
-        subtract_background(grey(1), None, policy)
-    with pytest.raises(ConfigError, match="no-contact frame"):
         Preprocessing(background=policy).touch(grey(1))
-    with pytest.raises(ConfigError, match="no-contact frame"):  # before any file is read
-        Preprocessing(background=policy).load_touch(tmp_path / "none.png")
 
 
-def test_unknown_policies_and_different_shapes_are_refused():
-    with pytest.raises(ConfigError, match=r"background must be one of none, difference, difference\+0\.5, abs"):
-        subtract_background(grey(1), None, "minus")
-    with pytest.raises(BadInput, match="the same shape"):
-        subtract_background(grey(1), np.zeros((2, 4, 3), np.float32), "abs")
-    with pytest.raises(BadInput, match="uint8"):
-        subtract_background(np.zeros((2, 2, 3), np.uint8), None, "none")
+@pytest.mark.parametrize(
+    "image", [np.zeros((4, 4), np.float32), np.zeros((4, 4, 4), np.float32), np.zeros((4, 4, 3), np.uint8)]
+)
+def test_arrays_that_are_no_picture_in_float32_are_refused(image):
+    for prepare in (Preprocessing().touch, Preprocessing().photo):
+        with pytest.raises(BadInput, match="H x W x 3 float32"):
+            prepare(image)
+    with pytest.raises(BadInput, match="H x W x 3 float32"):
+        Preprocessing(background="abs").touch(grey(1), image)
 
 
 @pytest.mark.parametrize(("policy", "reads"), [("none", 1), ("difference", 2), ("abs", 2)])

@@ -17,7 +17,7 @@ from PIL import Image
 
 from benchmarks import attacks
 from retrieval.data.images import MAX_PIXELS, decode
-from retrieval.data.resize import resize_unchecked
+from retrieval.data.resize import resize
 from retrieval.errors import ImageError, RetrievalError
 from retrieval.serve import decoders
 from retrieval.serve.decoders import SMALL_PIXELS, Decoders, frame
@@ -62,7 +62,7 @@ def test_images_are_decoded_in_order_as_in_this_process():
     grey = saved(np.full((20, 40), 7, np.uint8))
     found = read(("a", LARGE), ("b", SMALL), ("c", grey))
     for image, data in zip(found, (LARGE, SMALL, grey), strict=True):
-        assert np.array_equal(image.touch, resize_unchecked(decode(data, "x"), (32, 32)))
+        assert np.array_equal(image.touch, resize(decode(data, "x"), (32, 32)))
 
 
 def test_the_first_bad_picture_is_reported():
