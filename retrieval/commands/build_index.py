@@ -51,7 +51,7 @@ def build_index(
         ),
     ] = None,
     preview: Annotated[
-        bool, typer.Option("--preview", help="write OUT-views.png: some photos as the model receives them")
+        bool, typer.Option("--preview", help="write OUT/views.png: some photos as the model receives them")
     ] = False,
     shards: Annotated[
         int | None,
@@ -78,7 +78,6 @@ def build_index(
     from retrieval.search.opening import find_model
 
     require_separate_folders(catalogue, out)
-    sheet = _preview_path(catalogue, out) if preview else None
     if shards is None and is_sharded(out):
         shards = read_sharded_manifest(out).of
     if shards is None and cluster:
@@ -101,8 +100,8 @@ def build_index(
         say(f"exported once, for queries without PyTorch: {exported}")
     for line in report.lines():
         say(line)
-    if sheet is not None:
-        _write_views(sheet, catalogue, out, report, checkpoint)
+    if preview:
+        _write_views(catalogue, out, report, checkpoint)
     if json:
         print_json(report.to_dict())
     if report.without_photo:
@@ -110,28 +109,12 @@ def build_index(
         raise RetrievalError(f"the index is written, but {count} object(s) have no readable photo; see above")
 
 
-def _preview_path(catalogue: Path, out: Path) -> Path:
-    """Return the path of the preview picture.
-
-    Raises:
-        BadInput: The preview cannot be written there.
-    """
-    folder = out.resolve()
-    sheet = folder.with_name(f"{folder.name}-views.png")
-    if catalogue.resolve() in sheet.parents:
-        raise BadInput(
-            f"{sheet} would become a photo of the catalogue {catalogue}; choose an --out outside it for --preview"
-        )
-    return sheet
-
-
-def _write_views(sheet: Path, catalogue: Path, index: Path, report: "BuildReport", checkpoint: "Checkpoint") -> None:
+def _write_views(catalogue: Path, index: Path, report: "BuildReport", checkpoint: "Checkpoint") -> None:
     """Write some photos of the index, or of its first shard, as the model receives them."""
     from indexes.store.folder import IndexStore
     from retrieval.report.pages import write_views
 
-    first = IndexStore(index / report.shards[0]["folder"] if report.shards else index)
-    rows = first.open(verify=False).rows
+    rows = IndexStore(index / report.shards[0]["folder"] if report.shards else index).open(verify=False).rows
     chosen = sorted({number * len(rows) // PREVIEW_PHOTOS for number in range(PREVIEW_PHOTOS)})
-    write_views([catalogue / rows[row].path for row in chosen], checkpoint.config.preprocessing, sheet)
-    say(f"views: {len(chosen)} photos in {sheet}")
+    write_views([catalogue / rows[row].path for row in chosen], checkpoint.config.preprocessing, index / "views.png")
+    say(f"views: {len(chosen)} photos in {index / 'views.png'}")

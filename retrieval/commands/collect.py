@@ -52,7 +52,13 @@ def collect(
     # "." and ".." have no name to extend, so they are resolved.
     folder = out if out.name not in ("", "..") else out.resolve()
     sheet = folder.with_name(f"{folder.name}-preview.png")
-    decide, gate_name = _load_gate(gate)
+    decide: Any = None
+    gate_name = None
+    if gate is not None:
+        from _touch_retrieval.files import file_digest
+        from retrieval.training.gate import load_gate
+
+        decide, gate_name = load_gate(gate), f"learned, sha256 {file_digest(gate)}"
     settings = CollectSettings(grasps=grasps, rounds=rounds)
     if rounds:
         say(
@@ -77,10 +83,8 @@ def collect(
     if accepted == 0:
         raise RetrievalError(f"no grasp was accepted; {out}/attempts.jsonl lists the reasons")
     skipped = sum(tally.skipped is not None for tally in tallies)
-    say(
-        f"{out}: {accepted} accepted grasps of {len(tallies) - skipped} objects"
-        + f", {skipped} skipped" * bool(skipped)
-    )
+    others = f", {skipped} skipped" * bool(skipped)
+    say(f"{out}: {accepted} accepted grasps of {len(tallies) - skipped} objects{others}")
     if preview:
         from robot.recording.preview import write_preview
 
@@ -88,7 +92,6 @@ def collect(
 
 
 def _print_motions(name: str, objects: int, seed: int) -> None:
-    """Run `--dry-run`: print the motions of one attempt per object. Nothing moves, nothing is recorded."""
     from robot.grasping.attempt import AttemptRunner
     from robot.grasping.dry_run import make_dry_run
     from robot.rig import load_rig
@@ -99,14 +102,3 @@ def _print_motions(name: str, objects: int, seed: int) -> None:
         for object_id in rig.object_ids(objects):
             attempt = runner.run(object_id, 0)
             say(f"{object_id}: {attempt.reason or 'nothing moved, nothing was recorded'}")
-
-
-def _load_gate(path: Path | None) -> tuple[Any, str | None]:
-    """Return a learned gate and a name that contains the digest of its weights; None, None for the default rule."""
-    if path is None:
-        return None, None
-    from _touch_retrieval.files import file_digest
-    from retrieval.training.gate import load_gate
-
-    gate = load_gate(path)
-    return gate, f"learned, sha256 {file_digest(path)}"

@@ -87,18 +87,11 @@ def _split(grasps: Sequence["Grasp"], catalogue: Path) -> "dict[str, list[Grasp]
 
 
 def example_object(queries: "Mapping[str, Sequence[Grasp]]") -> str:
-    """Return the object on the demo's page: the first by name among those with the most query grasps.
-
-    The choice does not depend on any score.
-
-    Args:
-        queries: Query grasps by object.
-    """
+    """Return the object on the demo's page, whatever its scores: the first by name of those with the most grasps."""
     return max(sorted(queries), key=lambda name: len(queries[name]))
 
 
 def _accuracy_summary(index: Path, queries: "dict[str, list[Grasp]]") -> str:
-    """Return a sentence with top-1 and top-5 accuracy, their chance levels, and the precision of the match verdict."""
     from retrieval.search.answer import MATCH
     from retrieval.search.searcher import Searcher
 

@@ -1,8 +1,8 @@
 """`retrieve evaluate`: compare methods on unseen objects, of a recording or by protocols of real data sets."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -124,58 +124,48 @@ def evaluate(
 def _data_sets(protocol: str, data: Path, imported: Path) -> tuple[list[str], dict[str | None, Path], dict[str, str]]:
     """Return the protocols to run, the recording of each data set, and the reason for each skipped protocol.
 
-    Raises:
-        BadInput: There is no data of any protocol.
-    """
-    requested = list(dict.fromkeys(protocol.split(",")))
-    if protocol == ALL:
-        requested = [name for name in PROTOCOLS.names() if PROTOCOLS.resolve(name).data_set]
-    data_set_of: dict[str, Any] = {name: PROTOCOLS.resolve(name).data_set for name in requested}
-    if None in data_set_of.values():
-        raise BadInput(f"{UNSEEN_OBJECTS} is for one recording; leave --protocol out, and give the recording")
-    recordings, missing = _recordings(data, data_set_of.values(), imported)
-    skipped = {name: missing[data_set] for name, data_set in data_set_of.items() if data_set in missing}
-    if len(skipped) == len(requested):
-        reasons = "; ".join(dict.fromkeys(missing.values()))
-        raise BadInput(f"{data} must contain data of at least one protocol; {reasons}")
-    for name, reason in skipped.items():
-        say(f"{name} is skipped: {reason}")
-    return [name for name in requested if name not in skipped], recordings, skipped
-
-
-def _recordings(data: Path, names: Iterable[str], imported: Path) -> tuple[dict[str | None, Path], dict[str, str]]:
-    """Return the recording of each data set, and the reason for each missing one.
-
     Args:
+        protocol: Names of protocols.
         data: Folder with data sets, with recordings of them, or a recording itself.
-        names: Data sets.
         imported: Folder for the recordings of data sets that must be imported first.
 
     Raises:
-        BadInput: `data` is not a folder.
+        BadInput: There is no data of any protocol.
     """
     from retrieval.data.dataset import recording_source
     from robot.importers import data_set_of
 
     if not data.is_dir():
         raise BadInput(f"{data} must be a folder that contains data sets, such as vt60/ or billets/")
+    requested = list(dict.fromkeys(protocol.split(",")))
+    if protocol == ALL:
+        requested = [name for name in PROTOCOLS.names() if PROTOCOLS.resolve(name).data_set]
+    elif not all(PROTOCOLS.resolve(name).data_set for name in requested):
+        raise BadInput(f"{UNSEEN_OBJECTS} is for one recording; leave --protocol out, and give the recording")
     folders = [path for path in (data, *sorted(data.iterdir())) if (path / "recording.json").is_file()]
     recorded = {recording_source(folder): folder for folder in reversed(folders)}
-    found: dict[str | None, Path] = {}
-    missing: dict[str, str] = {}
-    for name in dict.fromkeys(names):
-        about = data_set_of(name)
+    recordings: dict[str | None, Path] = {}
+    skipped: dict[str, str] = {}
+    for name in requested:
+        data_set = str(PROTOCOLS.resolve(name).data_set)
+        about = data_set_of(data_set)
         if about.source in recorded:
-            found[name] = recorded[about.source]
-        elif (data / name).is_dir():
-            found[name] = run_importer(name, data / name, imported / name).folder
+            recordings[data_set] = recorded[about.source]
+        elif (data / data_set).is_dir():
+            if data_set not in recordings:
+                recordings[data_set] = run_importer(data_set, data / data_set, imported / data_set).folder
         else:
-            missing[name] = f"no folder {name}/ with {about.expects.replace('`', '')} and no recording of it was found"
-    return found, missing
+            expected = about.expects.replace("`", "")
+            skipped[name] = f"no folder {data_set}/ with {expected} and no recording of it was found"
+            say(f"{name} is skipped: {skipped[name]}")
+    if not recordings:
+        raise BadInput(
+            f"{data} must contain data of at least one protocol; {'; '.join(dict.fromkeys(skipped.values()))}"
+        )
+    return [name for name in requested if name not in skipped], recordings, skipped
 
 
 def _named(word: str) -> tuple[str, str]:
-    """Return the name and the choice of NAME=CHOICE."""
     name, equals, choice = word.partition("=")
     if not equals or not name or "/" in name:
         raise BadInput(f"--compare must have the form NAME=CHOICE, got {word!r}")
@@ -183,7 +173,6 @@ def _named(word: str) -> tuple[str, str]:
 
 
 def _compared(choice: str, init: str | None) -> "Path | Config":
-    """Return the file of a checkpoint, or the configuration of a touch tower."""
     if choice in SHIPPED_NAMES:
         return shipped_model(SHIPPED_NAMES[choice])
     return Path(choice) if choice.endswith(".safetensors") else training_config(choice, None, init=init)

@@ -49,21 +49,9 @@ def recording_of(recording: Path | None, out: Path, quick: bool = False) -> Path
     """Return the folder of the recording, after a small one is collected under `out` if it is None."""
     if recording is not None:
         return recording
-    from retrieval.console.progress import Bar
-    from robot.collection import CollectSettings, collect
-    from robot.rig import load_rig
+    from retrieval.commands.collect import collect
 
-    objects, grasps = (6, 2) if quick else (30, 4)
-    folder = out / "recording"
-    say(f"collecting {grasps} grasps of each of {objects} simulated objects in {folder}")
-    with Bar("collect", 0, "grasps") as bar:
-        collect(
-            partial(load_rig, "sim", seed=SEED),
-            folder,
-            objects=objects,
-            seed=SEED,
-            settings=CollectSettings(grasps=grasps),
-            jobs=os.cpu_count() or 1,
-            progress=lambda now: bar.show(now.grasps_done, now.grasps_target, str(now)),
-        )
-    return folder
+    objects, grasps, jobs = (6, 2, 1) if quick else (30, 4, os.cpu_count() or 1)
+    say(f"collecting {grasps} grasps of each of {objects} simulated objects in {out / 'recording'}")
+    collect(objects=objects, grasps=grasps, out=out / "recording", seed=SEED, jobs=jobs)
+    return out / "recording"

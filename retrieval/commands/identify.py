@@ -13,7 +13,6 @@ from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput, RetrievalError
 
 if TYPE_CHECKING:
-    from retrieval.search.answer import QueryResult
     from retrieval.search.searcher import Searcher
     from robot.recording.grasp import RecordedGrasp
     from robot.rig import Rig
@@ -114,12 +113,7 @@ def identify(
 
 @dataclass
 class _Run:
-    """The grasps of one run, and the answer after the last of them.
-
-    Attributes:
-        heights_mm: Height of each grasp.
-        answer: `QueryResult`, or `Verification` with an expected object; None before the first grasp.
-    """
+    """The grasps of one run; `answer` is a `QueryResult`, with an expected object a `Verification`."""
 
     searcher: "Searcher"
     folder: Path
@@ -142,29 +136,17 @@ class _Run:
             self.answer = self.searcher.query(touches, background=background)
             none, results = self.answer.none_probability, self.answer.results
             is_final = none is not None and max(none, results[0].probability or 0.0) >= self.confidence
-            now = _first_object(self.answer)
         else:
             self.answer = self.searcher.verify(touches, self.expect, far=self.far, background=background)
-            is_final, now = self.answer.decision in (ACCEPT, REJECT), self.answer.decision
-        say(f"grasp {len(grasps)} of at most {self.grasps}: {now}")
+            is_final = self.answer.decision in (ACCEPT, REJECT)
+        say(f"grasp {len(grasps)} of at most {self.grasps}: {self.sentence}")
         return is_final or NOT_A_GEL in self.answer.grasps  # no further grasp would change it
 
     @property
     def sentence(self) -> str:
-        """The answer as a sentence."""
         from retrieval.search.answer import verdict_sentence
 
         return str(self.answer.sentence) if self.expect else verdict_sentence(self.answer)
 
     def _files(self, images: Mapping[str, str]) -> list[Path]:
         return [self.folder / images[finger] for finger in sorted(images)]
-
-
-def _first_object(answer: "QueryResult") -> str:
-    """Return the verdict if there are no results; else the first object, with its probability if the model has one."""
-    if not answer.results:
-        return answer.verdict
-    best = answer.results[0]
-    if answer.none_probability is None:
-        return f"{best.object_id} ranks first"
-    return f"{best.object_id} {best.probability:.2f}, none of these {answer.none_probability:.2f}"

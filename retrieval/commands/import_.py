@@ -54,17 +54,7 @@ def import_(
 
 
 def run_importer(name: str, source: Path, out: Path, **options: Any) -> "Recording":
-    """Import a data set with a progress bar on stderr.
-
-    Args:
-        name: Name of the importer.
-        source: Folder with the files of the data set.
-        out: Recording folder to write or continue.
-        **options: Options of the importer.
-
-    Raises:
-        RobotError: The importer failed.
-    """
+    """Import a data set from the folder `source` into the recording `out`, with a progress bar on stderr."""
     from robot.importers import load_importer
 
     with Bar(f"import {name}", 0, "grasps") as bar:

@@ -45,6 +45,7 @@ def application(names: Sequence[str] = COMMANDS) -> typer.Typer:
     app = typer.Typer(
         # Without markup, rich is not imported.
         rich_markup_mode=None,
+        add_completion=False,
         context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
     )
     app.callback()(retrieve)
@@ -59,7 +60,7 @@ def application(names: Sequence[str] = COMMANDS) -> typer.Typer:
 
 
 def named_commands(words: Sequence[str]) -> Sequence[str]:
-    """Return the command that the words name, or all commands for a help text, a wrong word or a completion.
+    """Return the command that the words name, or all commands for a help text or a wrong word.
 
     The other commands take a tenth of the time of a query to import.
     """
@@ -101,8 +102,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     prepare_streams()
     program = typer.main.get_command(application(names))
-    if os.environ.get("_RETRIEVE_COMPLETE"):  # set by a shell that completes a command
-        program(prog_name="retrieve")
     context: Any = None
     with record_interrupts() as interrupts:
         # Not program.main(): it handles Ctrl-C and closed pipes in its own way.

@@ -23,10 +23,7 @@ DEFAULT_MODEL = "that of the index, else the shipped one"
 SPLIT = "JSON file with train, validation and test objects"
 
 Json = Annotated[bool, typer.Option("--json", help="print one JSON document on stdout")]
-Index = Annotated[
-    str | None,
-    typer.Option(help="index folder (default: ./index)"),
-]
+Index = Annotated[str | None, typer.Option(help="index folder (default: ./index)")]
 IndexModel = Annotated[str | None, typer.Option(help="checkpoint (default: that of the index)")]
 Model = Annotated[
     str | None,
@@ -50,11 +47,7 @@ class OptionValues(tuple[str, ...]):
 
     @classmethod
     def parse(cls, joined: str) -> Self:
-        """Split the values that `Command.parse_args` joined.
-
-        Args:
-            joined: The values, with a null character between them.
-        """
+        """Split the values that `Command.parse_args` joined."""
         return cls(joined.split(_SEPARATOR))
 
 
@@ -77,13 +70,12 @@ Background = Annotated[
 
 
 class NumberParser:
-    """Parser of an option with a number, which rejects values out of range before a command starts.
+    """Parser of an option with a number that an annotation allows, such as `Annotated[int, Meta(ge=1)]`.
 
     The range types of typer accept nan, and print their limits in the help.
     """
 
     def __init__(self, annotation: Any) -> None:
-        """Make a parser of numbers that an annotation allows, such as `Annotated[int, Meta(ge=1)]`."""
         self._annotation, (self._kind, *_) = annotation, get_args(annotation)
         self.__name__ = self._kind.__name__  # the name of the type in the help
 
@@ -129,7 +121,7 @@ class Command(TyperCommand):
             option = options.get(word)
             if option is None or getattr(option, "is_flag", False):
                 continue
-            if (not args or args[0] in options) and not ctx.resilient_parsing:
+            if not args or args[0] in options:
                 ctx.fail(f"{word} needs a value")
             if (option.metavar or "").endswith("..."):
                 values = list(takewhile(lambda value: not value.startswith("-"), args))
@@ -147,15 +139,7 @@ class Command(TyperCommand):
 
 
 def refuse_options(reason: str, **options: object) -> None:
-    """Reject options that would be ignored.
-
-    Args:
-        reason: Text after the option's name in the message.
-        **options: Value of each option; None or False for an option that was left out.
-
-    Raises:
-        BadInput: An option was given.
-    """
+    """Raise BadInput for the given ones of options that would be ignored, with the reason after the option's name."""
     for name, value in options.items():
         if value is not None and value is not False:
             raise BadInput(f"--{name.replace('_', '-')} {reason}")
@@ -172,14 +156,7 @@ def resolve_index(index: str | None) -> Path:
 
 
 def read_split(path: Path | None) -> "Split | None":
-    """Read the split of objects from the file of `--split`; None without a file.
-
-    Args:
-        path: JSON file with train, validation and test objects.
-
-    Raises:
-        BadInput: The file is not readable or not a split.
-    """
+    """Read the split of objects from the file of `--split`; None without a file. Raises BadInput for another file."""
     if path is None:
         return None
     from retrieval.data.dataset import Split
@@ -191,16 +168,7 @@ def read_split(path: Path | None) -> "Split | None":
 
 
 def training_config(preset: str | None, iterations: int | None, **overrides: str | int | None) -> "Config":
-    """Return a configuration with the settings of training that options override.
-
-    Args:
-        preset: Name of a preset or path of a TOML file; None for the default preset.
-        iterations: Optimiser steps; None for those of the preset.
-        **overrides: Other settings of training; None for those of the preset.
-
-    Raises:
-        ConfigError: The preset is unknown, or a setting is invalid.
-    """
+    """Return the configuration of a preset or TOML file; options that are not None override settings of training."""
     from retrieval.model.config import load_config
 
     config = load_config(preset or DEFAULT_PRESET)

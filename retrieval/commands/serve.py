@@ -10,14 +10,14 @@ from msgspec import Meta
 
 from retrieval.commands.options import SECONDS, WORKERS, Index, IndexModel, NumberParser, refuse_options, resolve_index
 from retrieval.console.output import say
-from retrieval.errors import BadInput, ConfigError
+from retrieval.errors import BadInput
 
 if TYPE_CHECKING:
     from retrieval.search.opening import OpenShards
     from robot.recording.folder import RecordingWriter
 
 TOKEN_VARIABLE = "RETRIEVE_TOKEN"
-"""Environment variable with the token, if there is no token file."""
+"""Environment variable with the token that clients must send."""
 
 
 def serve(
@@ -25,17 +25,15 @@ def serve(
     index: Index = None,
     model: IndexModel = None,
     host: Annotated[
-        str, typer.Option(help="address to listen on; one that other machines can reach needs a token")
+        str,
+        typer.Option(
+            help="address to listen on; one that other machines can reach needs a token, which clients must send, in "
+            f"the environment variable {TOKEN_VARIABLE}"
+        ),
     ] = "127.0.0.1",
     port: Annotated[
         int, typer.Option(parser=NumberParser(Annotated[int, Meta(ge=0, lt=2**16)]), help="port; 0 chooses a free one")
     ] = 8000,
-    token_file: Annotated[
-        Path | None,
-        typer.Option(
-            help=f"file with the token that clients must send (default: environment variable {TOKEN_VARIABLE})"
-        ),
-    ] = None,
     rig: Annotated[
         str | None,
         typer.Option(
@@ -90,7 +88,7 @@ def serve(
         model=Path(model) if model else None,
         host=host,
         port=port,
-        token=_read_token(token_file),
+        token=os.environ.get(TOKEN_VARIABLE),
         workers=workers,
         deadline_s=deadline,
         history=None if no_history else history or local.with_name(f"{local.name}-history"),
@@ -107,13 +105,7 @@ def serve(
 
 
 def _ray_shards(index: Path, stack: ExitStack, replicas: int, wait_s: float) -> "OpenShards":
-    """Return the function that opens shards on Ray; join or start Ray first.
-
-    Args:
-        index: Folder of the index.
-        stack: Closes the session and the deployments.
-        replicas: Processes for each shard.
-        wait_s: Longest wait for a shard in seconds.
+    """Return the function that opens shards on Ray, in a session that the stack closes; join or start Ray first.
 
     Raises:
         BadInput: The index is not sharded.
@@ -131,12 +123,7 @@ def _ray_shards(index: Path, stack: ExitStack, replicas: int, wait_s: float) -> 
 
 
 def _feedback_writer(folder: Path, index: str | Path, stack: ExitStack) -> "RecordingWriter":
-    """Open the writer of the recording of people's feedback.
-
-    Raises:
-        BadInput: The history is a file.
-        RobotError: The recording cannot be written.
-    """
+    """Open the writer of the recording of people's feedback. Raises BadInput if the history is a file."""
     from retrieval.model.checkpoint_info import read_checkpoint_info
     from retrieval.search.opening import manifest_of, model_of
     from robot.recording.folder import RecordingWriter
@@ -147,14 +134,3 @@ def _feedback_writer(folder: Path, index: str | Path, stack: ExitStack) -> "Reco
     info = {"source": "feedback on queries", "sensor": f"as {stored.provenance.get('source', 'unknown')}"}
     say(f"queries and feedback are stored in {folder}")
     return stack.enter_context(RecordingWriter(folder / "recording", info))
-
-
-def _read_token(file: Path | None) -> str | None:
-    if file is None:
-        return os.environ.get(TOKEN_VARIABLE)
-    from _touch_retrieval.files import read_regular
-
-    try:
-        return read_regular(file).decode("ascii").strip()
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{file} must contain a token in ASCII: {error}") from error

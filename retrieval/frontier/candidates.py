@@ -39,7 +39,7 @@ NO_EMBEDDINGS = "this model has no trained embeddings and reranks every photo"
 
 def candidates(sample: Sample) -> ApproximationResult:
     """Measure numbers of candidates k: exact search by each embedding of the model, then reranking."""
-    if sample.search_embedding is None:
+    if not sample.embeddings:
         return ApproximationResult("Candidates", "", skipped=NO_EMBEDDINGS)
     photos, best, default = sample.catalogue["partial"], sample.exhaustive_top1, default_k(sample)
     points, works = list[Tradeoff](), list[Callable[[], object]]()
@@ -47,7 +47,7 @@ def candidates(sample: Sample) -> ApproximationResult:
         found = ranks(sample.queries[name], sample.catalogue[name], best)
         index = indexes.build(sample.catalogue[name], threads=1)
         for k in (*FEW, *candidate_steps(len(photos))[:-1]):
-            is_default = k == default and name == sample.search_embedding
+            is_default = k == default and name == sample.embeddings[0]
             points.append(miss_rate_point(name, f"k = {k:,}", found >= k, is_default))
             works.append(_rerank_work(sample, index, name, k))
     points.append(miss_rate_point("no candidates", "all", best < 0, default == len(photos)))
@@ -63,9 +63,9 @@ def candidates(sample: Sample) -> ApproximationResult:
 
 def index_kinds(sample: Sample) -> ApproximationResult:
     """Measure every kind with several settings on the blended catalogue, with the embedding that search uses."""
-    name = sample.search_embedding
-    if name is None:
+    if not sample.embeddings:
         return ApproximationResult("Kind of index", "", skipped=NO_EMBEDDINGS)
+    name = sample.embeddings[0]
     embeddings, queries = sample.catalogue[name], sample.queries[name]
     k = min(default_k(sample), len(embeddings) // 4)
     points, works = list[Tradeoff](), list[Callable[[], object]]()
@@ -93,7 +93,6 @@ def _panel(sample: Sample, title: str, time: str, points: list[Tradeoff], works:
 
 
 def _rerank_work(sample: Sample, index: VectorIndex, name: str, k: int) -> Callable[[], object]:
-    """Return a function that searches and reranks one touch after the other."""
     touches = cycle(zip(sample.queries["partial"], sample.queries[name], strict=True))
 
     def work() -> Array:
@@ -104,7 +103,6 @@ def _rerank_work(sample: Sample, index: VectorIndex, name: str, k: int) -> Calla
 
 
 def _search_work(index: VectorIndex, queries: Array, k: int) -> Callable[[], object]:
-    """Return a function that searches one query after the other; a single query uses one thread."""
     remaining = cycle(queries)
     return lambda: index.search(next(remaining)[None], k)
 
@@ -114,19 +112,16 @@ def default_k(sample: Sample) -> int:
 
     It is the first step of `build-index` whose candidates contain enough exhaustive top-1 photos.
     """
-    assert sample.search_embedding
-    embeddings = sample.catalogue[sample.search_embedding]
-    found = ranks(sample.queries[sample.search_embedding], embeddings, sample.exhaustive_top1)
+    name = sample.embeddings[0]
+    embeddings = sample.catalogue[name]
+    found = ranks(sample.queries[name], embeddings, sample.exhaustive_top1)
     return next(k for k in candidate_steps(len(embeddings)) if np.mean(found < k) >= TARGET)
 
 
 def ranks(queries: Array, embeddings: Array, exhaustive_top1: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return how many photos (Q,) are nearer to each query than its exhaustive top-1."""
-    found = []
-    for query, best in zip(queries, exhaustive_top1, strict=True):
-        similarity = embeddings @ query
-        found.append(int(np.count_nonzero(similarity > similarity[best])))
-    return np.array(found)
+    similarities = zip((embeddings @ query for query in queries), exhaustive_top1, strict=True)
+    return np.array([np.count_nonzero(similarity > similarity[best]) for similarity, best in similarities])
 
 
 def _indexes(embeddings: Array, quick: bool) -> Iterator[tuple[str, str, VectorIndex]]:

@@ -82,7 +82,6 @@ def encoders(checkpoint: Checkpoint) -> Iterator[tuple[str, Encode, bool]]:
 
 
 def _onnx(checkpoint: Checkpoint) -> Encode:
-    """Return the encoder that `retrieve export` writes, on one thread."""
     with TemporaryDirectory() as folder:
         path = Path(folder, "model.onnx")
         path.write_bytes(touch_encoder_to_onnx(checkpoint))

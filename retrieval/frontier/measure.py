@@ -3,8 +3,6 @@
 Each finished row is stored, so a stopped run continues with the missing rows.
 """
 
-import dataclasses
-import json
 from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from _touch_retrieval.cache import cache_key
-from _touch_retrieval.files import file_digest, write_atomically
+from _touch_retrieval.files import encoded, file_digest, write_atomically
 from retrieval.console.output import say
 from retrieval.data.dataset import AnyRecording, folder_of
 from retrieval.frontier import APPROXIMATIONS
@@ -26,7 +24,7 @@ from retrieval.version import __version__
 if TYPE_CHECKING:
     from retrieval.frontier import Approximations
 
-FORMAT = 3
+FORMAT = 4
 
 
 def measure_frontier(
@@ -84,34 +82,22 @@ def measure_frontier(
         if not quiet:
             for line in rows[name].lines():
                 say(f"{name}: {line}")
-    document = {
-        "software": __version__,
-        "machine": machine(),
-        "model": model_digest,
-        "scale": dataclasses.asdict(scale),
-        "rows": {name: row.to_dict() for name, row in rows.items()},
-    }
-    write_atomically(out / "frontier.json", f"{json.dumps(document, indent=1, allow_nan=False)}\n".encode())
-    write_frontier(out, document)
+    content = {"software": __version__, "machine": machine(), "model": model_digest, "scale": scale, "rows": rows}
+    document: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(content))
+    write_atomically(out / "frontier.json", encoded(document, indent=1))
+    write_frontier(out, rows, machine(), scale.quick)
     return document
 
 
 def _row(
     sample: Sample, name: str, work: Callable[[Sample], ApproximationResult], digests: Sequence[str]
 ) -> ApproximationResult:
-    """Return the stored result of an approximation, or measure and store it.
+    """Return the stored result of an approximation, or measure and store it."""
 
-    Args:
-        sample: What is measured on.
-        name: Name of the row.
-        work: Measures it.
-        digests: Digests of the model and the grasps, if the row depends on them.
-    """
-
-    def make() -> dict[str, Any]:
+    def make() -> Any:
         if not sample.quiet:
             say(f"frontier: measuring {name}")
-        return work(sample).to_dict()
+        return msgspec.to_builtins(work(sample))
 
-    key = cache_key("frontier", name, FORMAT, __version__, machine(), dataclasses.asdict(sample.scale), *digests)
+    key = cache_key("frontier", name, FORMAT, __version__, machine(), msgspec.to_builtins(sample.scale), *digests)
     return msgspec.convert(sample.stored(key, make), ApproximationResult)

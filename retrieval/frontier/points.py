@@ -3,9 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,14 +42,7 @@ class Tradeoff:
 def miss_rate_point(
     series: str, setting: str, wrong: Sequence[bool] | NDArray[np.bool_], is_default: bool = False
 ) -> Tradeoff:
-    """Return a point whose error is the percentage of wrong queries.
-
-    Args:
-        series: As in `Tradeoff`.
-        setting: As in `Tradeoff`.
-        wrong: Whether each query is wrong; the 95 % interval is exact for independent queries.
-        is_default: As in `Tradeoff`.
-    """
+    """Return a point whose error is the percentage of wrong queries, with its exact 95 % interval."""
     count, bad = len(wrong), int(np.count_nonzero(wrong))
     low, high = binomial_interval(bad, count)
     return Tradeoff(series, setting, 100 * bad / count, 100 * low, 100 * high, is_default)
@@ -100,13 +91,16 @@ class Panel:
 
     def line(self) -> str:
         """Return the panel as one line of text."""
-        best, used = self.recommended, self.default
-        within = f"within {self.tolerance:g}"
+        best, within = self.recommended, f"within {self.tolerance:g}"
         found = f"cheapest {within}" if best.error <= self.tolerance else f"none {within}, smallest error"
-        default = "no default" if used is None else f"default {self.describe(used)}"
-        if used == best:
-            default = "this is the default"
-        return f"{self.title} (against {self.reference}); {found}: {self.describe(best)}; {default}"
+        default = self.describe_default("this")
+        return f"{self.title} (against {self.reference}); {found}: {self.describe(best)}; default: {default}"
+
+    def describe_default(self, recommended: str) -> str:
+        """Return the default point as text; the word `recommended` if it is the recommended one."""
+        if self.default is None:
+            return "none"
+        return recommended if self.default == self.recommended else self.describe(self.default)
 
     def describe(self, point: Tradeoff) -> str:
         """Return name, error and time of a point as text."""
@@ -133,17 +127,8 @@ class ApproximationResult:
         """Return one line of text for each panel."""
         return [panel.line() for panel in self.panels] or [f"{self.title}: left out, {self.skipped}"]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON types: the fields, the lines, and marks of recommended points and of the Pareto front."""
-        found: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(self)) | {"lines": self.lines()}
-        for panel, entry in zip(self.panels, found["panels"], strict=True):
-            best, front = panel.recommended, panel.pareto()
-            for point, one in zip(panel.points, entry["points"], strict=True):
-                one |= {"recommended": point == best, "pareto": point in front}
-        return found
-
 
 def format_duration(seconds: float) -> str:
     """Format a duration in s, ms or us with three digits."""
-    unit, scale = next((one for one in (("s", 1.0), ("ms", 1e3)) if seconds * one[1] >= 1), ("us", 1e6))
+    scale, unit = (1, "s") if seconds >= 1 else (1e3, "ms") if seconds >= 1e-3 else (1e6, "us")
     return f"{format_number(seconds * scale)} {unit}"

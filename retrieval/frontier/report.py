@@ -4,9 +4,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import msgspec
-import numpy as np
-
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, format_duration
 from retrieval.report.canvas import MUTED_COLOUR, Axes, Figure, canvas, logarithmic
 from retrieval.report.document import (
@@ -25,8 +22,8 @@ from retrieval.report.numbers import format_number, interval
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6f4e37", "#222222", "#aa3377")
 _MARKERS = "o^sDvPX<>"
 _LABEL: Any = {"textcoords": "offset points", "fontsize": 7.5, "color": "#3a434c"}
-_ABOVE, _BELOW, _NEAR_PX = (7, 5), (7, -10), 20
-"""Label offsets above and below a point, in points; a label within `_NEAR_PX` of the previous one goes below."""
+_SIDES = (7, 5), (7, -10)
+"""Offsets of labels in points: above and below in turn, because neighbours may be near each other."""
 _FLOOR = 0.5
 """An error of 0 is drawn at this fraction of the smallest error above 0."""
 
@@ -37,33 +34,26 @@ LEGEND = (
 )
 
 
-def write_frontier(out: Path, document: Mapping[str, Any]) -> list[Path]:
-    """Write frontier.html, frontier.md and figures/.
-
-    Args:
-        out: Folder of the report.
-        document: The content of frontier.json.
-
-    Returns:
-        The files.
+def write_frontier(
+    out: Path, rows: Mapping[str, ApproximationResult], machine: Mapping[str, Any], quick: bool
+) -> list[Path]:
+    """Write frontier.md, frontier.html and figures/ of results by name; return the files.
 
     Raises:
         RetrievalError: matplotlib is missing.
     """
-    rows = msgspec.convert(document["rows"], dict[str, ApproximationResult])
-    sections = tuple(Section(row.title, tuple(_section(name, row))) for name, row in rows.items())
-    page = Document("Error against run time", (*_lead(document, rows), *sections))
+    sections = (Section(row.title, tuple(_section(name, row))) for name, row in rows.items())
+    page = Document("Error against run time", (*_lead(rows, machine, quick), *sections))
     return write_document(page, out, "frontier")
 
 
-def _lead(document: Mapping[str, Any], rows: Mapping[str, ApproximationResult]) -> Iterator[Block]:
-    machine = document["machine"]
+def _lead(rows: Mapping[str, ApproximationResult], machine: Mapping[str, Any], quick: bool) -> Iterator[Block]:
     yield Text(
         "The error of each approximation against its reference and its run time were measured in one run on this "
         f"machine: {machine['processor']}, {machine['cores']} core(s), {machine['system']}. Times are medians."
     )
     yield Text(LEGEND)
-    if document["scale"]["quick"]:
+    if quick:
         yield Text("A quick run: too few queries and repetitions for conclusions.", warn=True)
     yield Table(
         ("approximation", "error", "reference", "tolerance", "recommended", "default"),
@@ -73,9 +63,8 @@ def _lead(document: Mapping[str, Any], rows: Mapping[str, ApproximationResult]) 
 
 
 def _summary(title: str, panel: Panel) -> tuple[str, ...]:
-    best, used = panel.recommended, panel.default
-    default = "none" if used is None else "the same" if used == best else panel.describe(used)
-    return (title, panel.title, panel.reference, f"{panel.tolerance:g} {panel.unit}", panel.describe(best), default)
+    tolerance, best = f"{panel.tolerance:g} {panel.unit}", panel.describe(panel.recommended)
+    return (title, panel.title, panel.reference, tolerance, best, panel.describe_default("the same"))
 
 
 def _section(name: str, row: ApproximationResult) -> Iterator[Block]:
@@ -151,16 +140,10 @@ def _front(axes: Axes, panel: Panel, floor: float) -> None:
     star: Any = {"ms": 11, "color": "#c8382e", "mec": "white", "mew": 0.6, "clip_on": False, "label": "recommended"}
     axes.plot(*_place(best, floor), "*", **star)
     step = 1 if len(front) < 8 else 2  # a long front has a label at every second point
-    axes.get_xlim(), axes.get_ylim()  # fixes the limits, so that pixel positions are final
-    previous = np.full(2, np.inf)
-    for point in {id(one): one for one in (*front[::step], best)}.values():
-        place = _place(point, floor)
-        at = axes.transData.transform(place)
-        side = _BELOW if np.abs(at - previous).max() < _NEAR_PX else _ABOVE
-        axes.annotate(point.setting or point.series, place, xytext=side, **_LABEL).set_in_layout(False)
-        previous = at
+    for number, point in enumerate({id(one): one for one in (*front[::step], best)}.values()):
+        text = point.setting or point.series
+        axes.annotate(text, _place(point, floor), xytext=_SIDES[number % 2], **_LABEL).set_in_layout(False)
 
 
 def _place(point: Tradeoff, floor: float) -> tuple[float, float]:
-    """Return time in ms and error of a point, in the plot's coordinates."""
     return 1e3 * point.seconds, max(point.error, floor)

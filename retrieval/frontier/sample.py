@@ -74,11 +74,7 @@ class Sample:
 
     @cached_property
     def grasps(self) -> list[Grasp]:
-        """Grasps of unseen objects with at least two grasps, sorted by object.
-
-        Raises:
-            DatasetError: There are fewer than two such objects.
-        """
+        """Grasps of unseen objects with at least two grasps each, sorted by object; at least two objects."""
         folder, split = self.recording(), self.checkpoint.split
         trained = {*split.train, *split.validation} if split else set()
         unseen = [grasp for grasp in load_grasps(folder) if grasp.object_id not in trained]
@@ -99,10 +95,8 @@ class Sample:
     @cached_property
     def features(self) -> Features:
         """Tower features of `grasps`."""
-        checkpoint = self.checkpoint
-        return encode_recording(
-            self.grasps, checkpoint.matcher, checkpoint.config, self.folder / "features", quiet=self.quiet
-        )
+        model, folder = self.checkpoint, self.folder / "features"
+        return encode_recording(self.grasps, model.matcher, model.config, folder, quiet=self.quiet)
 
     @cached_property
     def _is_photo(self) -> NDArray[np.bool_]:
@@ -110,12 +104,12 @@ class Sample:
         place = np.arange(len(owner)) - np.searchsorted(owner, owner)  # among the grasps of its object
         return np.asarray(place < np.bincount(owner)[owner] // 2)
 
-    @cached_property
+    @property
     def photo_rows(self) -> NDArray[np.int64]:
         """Rows of `grasps` whose photos are in the catalogue."""
         return np.flatnonzero(self._is_photo)
 
-    @cached_property
+    @property
     def touch_rows(self) -> NDArray[np.int64]:
         """Rows of `grasps` whose touches are queries, in random order, so that the first n have many objects."""
         return np.random.default_rng([self.seed, 1]).permutation(np.flatnonzero(~self._is_photo))
@@ -161,25 +155,16 @@ class Sample:
 
     @property
     def embeddings(self) -> list[str]:
-        """Names of the model's embeddings, first that in which search finds its candidates."""
+        """Names of the model's embeddings, first that in which search finds its candidates; perhaps none."""
         return [name for name in self.queries if name != "partial"]
-
-    @property
-    def search_embedding(self) -> str | None:
-        """The embedding in which search finds its candidates; None for a model without trained embeddings."""
-        return next(iter(self.embeddings), None)
 
     # Logits ------------------------------------------------------------------------------------------------
 
     @cached_property
     def exhaustive_top1(self) -> NDArray[np.int64]:
-        """The photo of `catalogue` that the fusion head ranks first, for each of `queries`.
-
-        It is stored, because it takes the longest.
-        """
+        """The photo of `catalogue` that the fusion head ranks first, for each of `queries`; stored in the cache."""
         inputs = self.checkpoint.digest, self.digest, self.seed, self.scale.photos, self.scale.queries
-        key = cache_key("exhaustive-top1", *inputs)
-        return np.array(self.stored(key, self._find_exhaustive_top1), dtype=np.int64)
+        return np.array(self.stored(cache_key("exhaustive-top1", *inputs), self._find_exhaustive_top1), dtype=np.int64)
 
     def _find_exhaustive_top1(self) -> list[int]:
         partials, found = self.queries["partial"], list[int]()
@@ -190,13 +175,7 @@ class Sample:
         return found
 
     def logits(self, touch_partial: Array, photos: NDArray[Any], rows: NDArray[np.int64] | None = None) -> Array:
-        """Return match logits of one touch with photos.
-
-        Args:
-            touch_partial: (partial_width,) of the touch.
-            photos: (N, partial_width) of the photos.
-            rows: Rows of `photos` to score; None for all.
-        """
+        """Return match logits of a touch's partial activations (h,) with those of `rows` of photos (N, h)."""
         return self.checkpoint.matcher.head.scorer.logits(touch_partial[None], photos, rows)
 
     def stored(self, key: str, make: Callable[[], Any]) -> Any:

@@ -65,8 +65,8 @@ class ServiceSettings:
         check_fields(self, "", ConfigError)
         if self.token is None and not self.is_local:
             raise ConfigError(
-                f"Other machines can reach {self.host}, so a token is required. Write at least {MIN_TOKEN_CHARACTERS} "
-                "characters into a file and pass it with --token-file, or omit --host."
+                f"Other machines can reach {self.host}, so a token is required. Set RETRIEVE_TOKEN to at least "
+                f"{MIN_TOKEN_CHARACTERS} random characters, or omit --host."
             )
         if self.token is not None and not (len(self.token) >= MIN_TOKEN_CHARACTERS and self.token.isascii()):
             raise ConfigError(
