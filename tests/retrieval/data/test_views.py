@@ -189,7 +189,7 @@ def test_a_photos_features_are_those_of_its_views_side_by_side():
 def test_a_sheet_shows_the_views_of_a_catalogue(tmp_path, model, catalogue, capsys):
     words = ["build-index", str(catalogue), "--model", str(model), "--out", str(tmp_path / "index")]
     assert main([*words, "--preview"]) == 0
-    sheet = tmp_path / "index-views.png"
+    sheet = tmp_path / "index" / "views.png"
     assert f"in {sheet}" in capsys.readouterr().err
     with Image.open(sheet) as picture:
         assert picture.width == 2 * 48
