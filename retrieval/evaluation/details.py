@@ -1,24 +1,32 @@
 """Single objects and decisions of a method on one split: accuracy by object, confusions, calibration, rejection."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit, softmax
 
-from retrieval.evaluation.calibration import CALIBRATED_GRASPS, fit_posterior, reliability
+from retrieval.evaluation.queries import MethodScores, fit_posterior
 from retrieval.evaluation.reject import RejectionMeasures, reject
 from retrieval.evaluation.results import Confusion, Details, PairThreshold, Rejection
-from retrieval.evaluation.scoring import MethodScores
 from retrieval.evaluation.verification import ErrorsByImpostors, verification_errors, verification_rates
 from retrieval.methods.late_fusion import LateFusion
 from retrieval.methods.method import Method
 from retrieval.metrics.intervals import summarise
-from retrieval.metrics.registry import confusions, k_way
+from retrieval.metrics.pairs import reliability_bins
+from retrieval.metrics.registry import PHOTOS_PER_CANDIDATE, confusions, k_way
+from retrieval.metrics.table import ScoreTable, object_scores
+from retrieval.model.posterior import Posterior
 from retrieval.training.calibration.posterior import MIN_OBJECTS
 from retrieval.training.features import Features
 
+K_WAY_TESTS = {"k5": (5, 1, 1), "k10": (10, 1, 1), "k5_g5": (5, 5, PHOTOS_PER_CANDIDATE)}
+"""Tests of calibrated probabilities: candidates, grasps of a query, and photos of a candidate."""
 _CONFUSIONS = 12
+_PAIRS_OF_A_ROW = 8  # of each kind
+_TESTS_OF_A_ROW = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,10 +51,8 @@ def describe(method: Method, scores: MethodScores, features: Features) -> SeedDe
         features: Features of all grasps, as the method takes them.
     """
     seed, objects, test = scores.seed, scores.queries.objects, scores.touches("test", "test")
-    validation = scores.sets("validation")
-    posteriors = {1: scores.posterior} | {
-        grasps: fit_posterior(validation[grasps], seed) for grasps in CALIBRATED_GRASPS[1:] if grasps in validation
-    }
+    sets = scores.sets("validation")
+    posteriors = {1: scores.posterior, 5: fit_posterior(sets[5], seed) if 5 in sets else None}
     fitted = {grasps: posterior for grasps, posterior in posteriors.items() if posterior}
     accuracies = {
         "test_candidates": k_way(test, 5, seed=seed),
@@ -67,6 +73,67 @@ def describe(method: Method, scores: MethodScores, features: Features) -> SeedDe
         reject=reject(fitted[1], test, seed=seed) if fitted and len(test.objects) >= MIN_OBJECTS else None,
         verification=verification_errors(scores, features, method.checkpoint) if type(method) is LateFusion else None,
     )
+
+
+def draw_pairs(table: ScoreTable, seed: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return scores (P,) and labels (P,) of up to 8 true photos of each row and as many false ones.
+
+    The photo of the row's own grasp is never drawn. For a false pair first one of at least two objects is drawn
+    uniformly, then its photo, with replacement.
+    """
+    targets = table.with_targets
+    rng = np.random.default_rng([seed, 1])
+    keys = np.where(targets.relevant & ~targets.own, rng.random(targets.own.shape), np.inf)
+    true = np.argsort(keys, axis=1)[:, :_PAIRS_OF_A_ROW]
+    is_drawn = np.isfinite(np.take_along_axis(keys, true, 1))
+    objects, counts = np.unique(targets.photo_owner, return_counts=True)
+    order, start = np.argsort(targets.photo_owner, kind="stable"), np.cumsum(counts) - counts
+    other = rng.integers(len(objects) - 1, size=true.shape)
+    other += other >= np.searchsorted(objects, targets.touch_owner)[:, None]
+    false = order[start[other] + (rng.random(other.shape) * counts[other]).astype(np.int64)]
+    scores = [np.take_along_axis(targets.scores, columns, 1)[is_drawn] for columns in (true, false)]
+    return np.concatenate(scores).astype(np.float64), np.repeat([1, 0], is_drawn.sum())
+
+
+def draw_k_way_tests(table: ScoreTable, k: int, photos: int, seed: int, posterior: Posterior) -> NDArray[np.float64]:
+    """Return logits (Q, k) of K-way tests, the true candidate first: 4 tests for each row with uniformly drawn rivals.
+
+    The posterior combines the scores of a candidate's photos. There must be at least k objects.
+    """
+    targets = table.with_targets
+    scores = object_scores(targets, photos, _TESTS_OF_A_ROW, seed, posterior.object_logits)
+    # The true object gets the smallest key, so it always comes first.
+    true = targets.touch_owner[:, None] == targets.objects
+    keys = np.random.default_rng([seed, 2]).random(scores.shape) - true
+    return np.take_along_axis(scores, np.argsort(keys, axis=2)[..., :k], 2).reshape(-1, k)
+
+
+def reliability(
+    posteriors: Mapping[int, Posterior], test: Mapping[int, ScoreTable], *, seed: int = 0
+) -> dict[str, Any]:
+    """Return the reliability bins of calibrated probabilities on test objects.
+
+    Args:
+        posteriors: The fitted posteriors, by number of grasps.
+        test: Scores of test objects, by number of grasps.
+        seed: Seed of the drawn pairs and tests.
+
+    Returns:
+        "pairs": bins of match probabilities of single touches at even prior odds; and by name of `K_WAY_TESTS`:
+        probability of the top-1 candidate when one candidate is true (prior of none: 0) against its accuracy, where
+        tied candidates split the credit. Tests without a posterior or enough test objects are left out.
+    """
+    found = {}
+    if 1 in posteriors:
+        scores, labels = draw_pairs(test[1], seed)
+        found["pairs"] = reliability_bins(expit(posteriors[1].log_ratio(scores, 1)), labels)
+    for name, (k, grasps, photos) in K_WAY_TESTS.items():
+        if grasps in posteriors and grasps in test and len(test[grasps].objects) >= k:
+            logits = draw_k_way_tests(test[grasps], k, photos, seed, posteriors[grasps])
+            tied = logits == logits.max(1, keepdims=True)
+            confidences = softmax(posteriors[grasps].slope * logits, axis=1).max(1)
+            found[name] = reliability_bins(confidences, tied[:, 0] / tied.sum(1))
+    return found
 
 
 def combine(by_seed: Sequence[SeedDetails], seed: int) -> Details:

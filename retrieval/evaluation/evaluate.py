@@ -2,52 +2,29 @@
 
 import os
 import re
-import time
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
-import numpy as np
-
 from _touch_retrieval.cache import Cache
 from retrieval.console.interruption import resumable
-from retrieval.console.progress import Bar
 from retrieval.data.dataset import AnyRecording, Split, folder_of
 from retrieval.errors import BadInput
 from retrieval.evaluation import PROTOCOLS, UNSEEN_OBJECTS
-from retrieval.evaluation.aggregate import Aggregation, MeasuresBySeed, protocol_result
-from retrieval.evaluation.details import combine
-from retrieval.evaluation.experiment import Experiment, Outcome
+from retrieval.evaluation.experiment import ProtocolRun
 from retrieval.evaluation.inputs import Row, TowerEncoder
 from retrieval.evaluation.protocol import Protocol, RecordingFacts, read_recording_facts
 from retrieval.evaluation.protocols.recording import with_split
-from retrieval.evaluation.results import (
-    FeatureCounts,
-    MethodTimes,
-    ProtocolResult,
-    ProtocolTimes,
-    Results,
-    RowResult,
-    Setting,
-    Timings,
-    write_results,
-)
+from retrieval.evaluation.results import ProtocolResult, ProtocolTimes, Results, Setting, Timings, write_results
 from retrieval.evaluation.touch_to_touch import FROZEN, TouchToTouch, run_touch_to_touch
-from retrieval.methods import CHANCE, METHODS
+from retrieval.methods import METHODS
 from retrieval.methods.method import Method
-from retrieval.metrics.measure import pooled
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable
 from retrieval.model.config import Config, named_config
-from retrieval.model.encode import one_thread, photo_features, touch_features
-from retrieval.training.batches import BatchImages
 from retrieval.training.initial_weights import training_licences
 from retrieval.training.train import Trainer
 from retrieval.version import __version__
 
-Job = tuple[str, str]
-"""A row and a kind of inputs; the row of controls and ceilings is ""."""
 DATA_SET_CONFIG, DATA_SET_METHODS, DATA_SET_SEEDS = "real", ("cca_towers", "cca", "late_fusion", "chance"), 3
 """Defaults if protocols are named, which are those of real data sets."""
 
@@ -207,163 +184,3 @@ def _trained(facts: RecordingFacts, protocol: Protocol, towers: TowerEncoder, ou
     (split,) = protocol.folds(facts, towers.config.training.seed)
     licences = training_licences(facts.folder, towers.config.training)
     return Trainer(towers.config, split, facts.grasps, path, facts.source, licences=licences).run_or_reuse(quiet)
-
-
-@dataclass(frozen=True, eq=False)
-class ProtocolRun:
-    """One protocol on one recording.
-
-    Attributes:
-        name: Name of the protocol.
-        protocol: The protocol.
-        facts: The recording.
-        rows: The rows of the table; controls use the towers of the first one.
-        seeds: Seeds of folds and fits.
-        out: Folder of fits.
-        quiet: No progress on stderr.
-    """
-
-    name: str
-    protocol: Protocol
-    facts: RecordingFacts
-    rows: list[Row]
-    seeds: list[int]
-    out: Path
-    quiet: bool
-
-    def measure(self, cache: Cache) -> tuple[ProtocolResult, ProtocolTimes]:
-        """Run all experiments; return measures with intervals, and times."""
-        protocol, towers = self.protocol, self.rows[0].towers
-        jobs = {(row.name, "touch"): self._experiments(row, "touch") for row in self.rows}
-        if not protocol.in_depth:
-            trained = [row for row in self.rows if row.method != CHANCE]
-            jobs |= {(row.name, "low_pass"): self._experiments(row, "low_pass") for row in trained}
-        reasons = {}
-        for kind, method in {**protocol.controls, **protocol.ceilings}.items():
-            if reason := towers.missing_reason(kind):
-                reasons[kind] = reason
-            else:
-                jobs["", kind] = self._experiments(Row(kind, method, towers), kind, is_control=True)
-        outcomes = self._run(jobs, cache)
-        of_rows = {row.name: outcomes[row.name, "touch"] for row in self.rows}
-        rows = {
-            row.name: RowResult(
-                row.method,
-                row.towers.checkpoint.digest if row.towers.checkpoint else None,
-                best_params=[[one.best_params for one in by_fold] for by_fold in of_rows[row.name]],
-                details=combine([one.details for (one,) in of_rows[row.name] if one.details], self.seeds[0])
-                if protocol.in_depth
-                else None,
-            )
-            for row in self.rows
-        }
-        splits = [split for of_seed in self.folds.values() for split in of_seed]
-        ratio = sum(len(one.test) for one in splits) / sum(len(one.train + one.validation) for one in splits)
-        features = towers.inputs("touch")
-        result = protocol_result(
-            protocol,
-            self.facts,
-            self.folds.values(),
-            rows,
-            {job: self._by_seed(found) for job, found in outcomes.items()},
-            [(self.rows[0].name, other.name) for other in self.rows[1:]],
-            Aggregation(self.seeds[0], ratio if protocol.choices else None),
-            reasons,
-            FeatureCounts(features.touch.shape[2], features.photo.shape[1], features.touch.shape[1], features.digest),
-        )
-        return result, ProtocolTimes(*_tower_times(towers), _method_times(of_rows))
-
-    @cached_property
-    def folds(self) -> dict[int, list[Split]]:
-        """The splits of each seed that draws some."""
-        is_drawn_once = self.protocol.in_depth or self.protocol.choices
-        seeds = self.seeds[:1] if is_drawn_once else self.seeds
-        return {seed: self.protocol.folds(self.facts, seed) for seed in seeds}
-
-    def _experiments(self, row: Row, kind: str, is_control: bool = False) -> list[list[Experiment]]:
-        """Return the experiments of a row with one kind of inputs, by seed and fold."""
-        seeds = {seed: seed for seed in self.folds}  # of the fit, and of the draws
-        if self.protocol.in_depth:
-            is_one_fit = is_control or row.is_whole_model or not METHODS.load(row.method).is_seeded
-            seeds = dict.fromkeys(self.seeds[:1] if is_one_fit else self.seeds, self.seeds[0])
-        folder = self.out / "fits" / self.name
-        is_quiet = self.quiet or not self.protocol.in_depth  # a bar shows the progress
-        return [
-            [
-                Experiment(
-                    self.name,
-                    self.protocol,
-                    self.facts,
-                    row,
-                    kind,
-                    split,
-                    seed,
-                    draw_seed,
-                    folder / f"{kind}-{number}",
-                    is_control,
-                    is_quiet,
-                )
-                for number, split in enumerate(self.folds[draw_seed])
-            ]
-            for seed, draw_seed in seeds.items()
-        ]
-
-    def _run(self, jobs: Mapping[Job, list[list[Experiment]]], cache: Cache) -> dict[Job, list[list[Outcome]]]:
-        outcomes: dict[Job, list[list[Outcome]]] = {}
-        count = sum(len(by_fold) for by_seed in jobs.values() for by_fold in by_seed)
-        with Bar(self.name, count, "fits", quiet=self.quiet or self.protocol.in_depth) as bar:
-            for job, by_seed in jobs.items():
-                outcomes[job] = []
-                for experiments in by_seed:
-                    outcomes[job].append([])
-                    for experiment in experiments:
-                        outcomes[job][-1].append(experiment.run(cache))
-                        bar.advance(note=" ".join(filter(None, job)))
-        return outcomes
-
-    def _by_seed(self, outcomes: Iterable[Sequence[Outcome]]) -> MeasuresBySeed:
-        """Return the measures of each seed, over the queries of all folds; with `choices`, those of each fold."""
-        groups = [[one] for folds in outcomes for one in folds] if self.protocol.choices else outcomes
-        return [
-            {
-                name: pooled([one.measures[name] for one in folds])
-                for name in folds[0].measures
-                if all(name in one.measures for one in folds)
-            }
-            for folds in groups
-        ]
-
-
-def _method_times(outcomes: Mapping[str, list[list[Outcome]]]) -> dict[str, MethodTimes]:
-    """Return the median times of each row."""
-    found = {}
-    for name, by_seed in outcomes.items():
-        seconds = [one.seconds for by_fold in by_seed for one in by_fold]
-        medians = {key: float(np.median([one[key] for one in seconds])) for key in seconds[0]}
-        found[name] = MethodTimes(
-            fit_s=medians["fit"] or None,
-            encode_touch_ms=1e3 * medians["encode_touch"],
-            encode_photo_ms=1e3 * medians["encode_photo"],
-            score_us_per_photo=1e6 * medians["score"],
-            query_ms=1e3 * medians["query"],
-        )
-    if {"late_fusion", "retrieve_rerank"} <= set(found):  # both use one training run
-        found["retrieve_rerank"] = replace(found["retrieve_rerank"], fit_s=found["late_fusion"].fit_s)
-    return found
-
-
-@one_thread()
-def _tower_times(towers: TowerEncoder, count: int = 4, repeats: int = 3) -> tuple[float, float]:
-    """Return the median times (ms) of the towers for a touch and a photo, on one thread, without reading files."""
-    grasps = towers.grasps[:count]
-    images = BatchImages(towers.config.preprocessing)
-    touches, photos = [images.touch(grasp) for grasp in grasps], [images.photo(grasp.photo) for grasp in grasps]
-    touch_s, photo_s = [], []
-    for touch, photo in zip(touches * repeats, photos * repeats, strict=True):
-        start = time.perf_counter()
-        touch_features(towers.matcher, [touch])
-        middle = time.perf_counter()
-        photo_features(towers.matcher, [photo])
-        touch_s.append(middle - start)
-        photo_s.append(time.perf_counter() - middle)
-    return 1e3 * float(np.median(touch_s)), 1e3 * float(np.median(photo_s))

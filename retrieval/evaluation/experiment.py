@@ -2,7 +2,9 @@
 
 import shutil
 import time
-from dataclasses import asdict, dataclass
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,21 +16,24 @@ from numpy.typing import NDArray
 from _touch_retrieval.cache import Cache, cache_key
 from _touch_retrieval.registry import code_digest
 from retrieval.console.output import say
+from retrieval.console.progress import Bar
 from retrieval.data.dataset import Split
 from retrieval.errors import BadInput
-from retrieval.evaluation.details import SeedDetails, describe
-from retrieval.evaluation.inputs import Row, thin_grasps
+from retrieval.evaluation.aggregate import Aggregation, MeasuresBySeed, protocol_result
+from retrieval.evaluation.details import SeedDetails, combine, describe
+from retrieval.evaluation.inputs import Row, TowerEncoder, thin_grasps
 from retrieval.evaluation.protocol import Protocol, RecordingFacts
-from retrieval.evaluation.queries import Queries, draw_queries
-from retrieval.evaluation.scoring import MethodScores, score_queries
-from retrieval.methods import METHODS
+from retrieval.evaluation.queries import MethodScores, Queries, draw_queries, score_queries
+from retrieval.evaluation.results import FeatureCounts, MethodTimes, ProtocolResult, ProtocolTimes, RowResult
+from retrieval.methods import CHANCE, METHODS
 from retrieval.methods.late_fusion import LateFusion
 from retrieval.methods.method import Method, MethodSettings
 from retrieval.metrics.measure import Measure, pooled
 from retrieval.metrics.registry import MethodScoreTables
 from retrieval.metrics.table import ScoreTable
-from retrieval.model.encode import one_thread
+from retrieval.model.encode import one_thread, photo_features, touch_features
 from retrieval.model.losses import LOSSES
+from retrieval.training.batches import BatchImages
 from retrieval.training.features import Features
 from retrieval.version import __version__
 
@@ -59,30 +64,22 @@ class Experiment:
     """One row with one kind of inputs, in one fold, fitted with one seed.
 
     Attributes:
-        name: Name of the protocol.
-        protocol: The protocol.
-        facts: The recording.
+        of: The protocol and the recording.
         row: Method and towers.
         kind: Kind of inputs (`inputs.INPUTS`).
-        split: The split of the fold.
+        fold: Number of the fold.
         seed: Seed of the fit.
-        draw_seed: Seed of the queries, pairs and tests.
-        folder: Folder of fits; methods of the same towers, inputs and split have one in common.
+        draw_seed: Seed of folds, queries, pairs and tests.
         is_control: Whether the method is fitted in any case, also if the row's towers are those of a whole model.
-        quiet: No progress on stderr.
     """
 
-    name: str
-    protocol: Protocol
-    facts: RecordingFacts
+    of: "ProtocolRun"
     row: Row
     kind: str
-    split: Split
+    fold: int
     seed: int
     draw_seed: int
-    folder: Path
     is_control: bool = False
-    quiet: bool = True
 
     def run(self, cache: Cache) -> Outcome:
         """Return the stored outcome, or fit, score, measure and store it.
@@ -92,39 +89,33 @@ class Experiment:
         """
         if (stored := cache.get(self.key)) is not None:
             return msgspec.msgpack.decode(stored, type=Outcome, dec_hook=_decode_array)
-        model = self.row.towers.checkpoint
+        protocol, model = self.of.protocol, self.row.towers.checkpoint
         trained = {*model.split.train, *model.split.validation} if model and model.split else set()
         if shared := trained & set(self.split.test):
             raise BadInput(
-                f"The model of row {self.row.name} was trained on {len(shared)} test objects of {self.name}, such as "
-                f"{min(shared)}. Give a model that was not trained on them, or a split without them in its test part."
+                f"The model of row {self.row.name} was trained on {len(shared)} test objects of {self.of.name}, such "
+                f"as {min(shared)}. Give a model that was not trained on them, or a split without them in its test "
+                "part."
             )
         method, fit_s = self._fit()
-        scores = score_queries(
-            method,
-            self.features,
-            self.queries,
-            fit_s=fit_s,
-            seed=self.draw_seed,
-            allows_own_photos=self.protocol.allows_own_photos,
-        )
-        details = describe(method, scores, self.features) if self.protocol.in_depth and not self.is_control else None
+        scores = score_queries(method, self.features, self.queries, fit_s, self.draw_seed, protocol.allows_own_photos)
+        details = describe(method, scores, self.features) if protocol.in_depth and not self.is_control else None
         outcome = Outcome(self._measures(scores), scores.best_params, scores.seconds, details)
         cache.add({self.key: msgspec.msgpack.encode(outcome, enc_hook=_encode_array)})
-        if not self.protocol.in_depth:  # the fits of all folds take gigabytes
-            shutil.rmtree(self.folder, ignore_errors=True)
+        if not protocol.in_depth:  # the fits of all folds take gigabytes
+            shutil.rmtree(self._folder, ignore_errors=True)
         return outcome
 
     @cached_property
     def key(self) -> str:
         """Key of the outcome: all inputs that determine it."""
-        config, model, protocol = self.row.towers.config, self.row.towers.checkpoint, self.protocol
+        config, model, protocol = self.row.towers.config, self.row.towers.checkpoint, self.of.protocol
         losses = [LOSSES.load(loss) for loss, weight in config.training.weights.items() if weight > 0]
         return cache_key(
             "experiments",
             {
                 "format": _FORMAT,
-                "protocol": self.name,
+                "protocol": self.of.name,
                 "measures": self.measures,
                 "shown": [protocol.allows_own_photos, protocol.is_by_sequence, self._gallery_of],
                 "method": self.row.method,
@@ -132,7 +123,7 @@ class Experiment:
                 "is_control": self.is_control,
                 "seeds": [self.seed, self.draw_seed],
                 "features": self.features.digest,
-                "recording": self.facts.digest,
+                "recording": self.of.facts.digest,
                 "max_grasps": [self._max_grasps, dict(protocol.max_grasps)],
                 "split": asdict(self.split),
                 "config": config.without_paths(),
@@ -144,9 +135,19 @@ class Experiment:
         )
 
     @property
+    def split(self) -> Split:
+        """The split of the fold."""
+        return self.of.folds[self.draw_seed][self.fold]
+
+    @property
+    def _folder(self) -> Path:
+        """Folder of fits; methods of the same towers, inputs and split have one in common."""
+        return self.of.out / "fits" / self.of.name / f"{self.kind}-{self.fold}"
+
+    @property
     def measures(self) -> list[str]:
         """Names of the measures."""
-        return list((self.is_control and self.protocol.control_measures) or self.protocol.measures)
+        return list((self.is_control and self.of.protocol.control_measures) or self.of.protocol.measures)
 
     @property
     def features(self) -> Features:
@@ -156,30 +157,31 @@ class Experiment:
     @cached_property
     def queries(self) -> Queries:
         """Touches and photos to score."""
-        grasps = self.facts.grasps
+        grasps = self.of.facts.grasps
         grasps = thin_grasps(grasps, self._max_grasps) if self._max_grasps else grasps
-        return draw_queries(grasps, self.split, self.draw_seed, self.protocol.max_grasps)
+        return draw_queries(grasps, self.split, self.draw_seed, self.of.protocol.max_grasps)
 
     @property
     def _max_grasps(self) -> int | None:
-        return MAX_CONTROL_GRASPS if self.protocol.in_depth and self.kind in ("no_contact", "low_pass") else None
+        return MAX_CONTROL_GRASPS if self.of.protocol.in_depth and self.kind in ("no_contact", "low_pass") else None
 
     @cached_property
     def _gallery_of(self) -> dict[str, str]:
-        return dict(self.protocol.gallery_of(self.facts, self.split))
+        return dict(self.of.protocol.gallery_of(self.of.facts, self.split))
 
     def _fit(self) -> tuple[Method, float]:
-        if not self.quiet:
+        is_quiet = self.of.quiet or not self.of.protocol.in_depth  # a bar shows the progress
+        if not is_quiet:
             say(f"evaluate: {self.row.method}, seed {self.seed}" + (f" ({self.kind})" if self.is_control else ""))
         is_permuted, method = self.kind == "permuted", METHODS.load(self.row.method)
         config, checkpoint = self.row.towers.config, None if self.is_control else self.row.towers.checkpoint
         settings = MethodSettings(
             config.without_candidate_encoder() if is_permuted else config,  # there is no ranking to learn
             self.seed,
-            self.folder,
-            self.quiet,
-            fit_on_validation=not self.protocol.in_depth,
-            kind_of=self.facts.kind_of,
+            self._folder,
+            is_quiet,
+            fit_on_validation=not self.of.protocol.in_depth,
+            kind_of=self.of.facts.kind_of,
         )
         if checkpoint and issubclass(method, LateFusion):
             return method.of_checkpoint(checkpoint, settings), 0.0
@@ -193,22 +195,21 @@ class Experiment:
 
     def _measures(self, scores: MethodScores) -> dict[str, Measure]:
         """Return the measures of each gallery, pooled."""
-        objects, tables = self.queries.objects, scores.tables("pair_accuracy" in self.measures)
-        found: dict[str, list[Measure]] = {}
+        protocol, facts, objects = self.of.protocol, self.of.facts, self.queries.objects
+        tables, found = scores.tables("pair_accuracy" in self.measures), defaultdict(list)
         for gallery in sorted(set(self._gallery_of.values())):
             of_gallery = _of_gallery(tables, np.array([self._gallery_of.get(name) == gallery for name in objects]))
             for name in self.measures:
-                if (value := self.protocol.measures[name].compute(of_gallery)) is not None:
-                    found.setdefault(name, []).append(value)
-        if self.protocol.main not in found and not self.protocol.in_depth:
+                if (value := protocol.measures[name].compute(of_gallery)) is not None:
+                    found[name].append(value)
+        if protocol.main not in found and not protocol.in_depth:
             raise BadInput(
-                f"{self.protocol.title}: a gallery has {len(tables.test.objects)} objects, too few for "
-                f"{self.protocol.measures[self.protocol.main].label}. Give more of the data set."
+                f"{protocol.title}: a gallery has {len(tables.test.objects)} objects, too few for "
+                f"{protocol.measures[protocol.main].label}. Give more of the data set."
             )
-        unit_of = self.facts.sequence_of if self.protocol.is_by_sequence else {name: name for name in self.facts.names}
-        numbers = {unit: number for number, unit in enumerate(sorted(set(unit_of.values())))}
-        number_of = {place: numbers[unit_of[name]] for place, name in enumerate(objects)}
-        return {name: pooled(parts, number_of) for name, parts in found.items()}
+        units = sorted({facts.sequence_of[name] if protocol.is_by_sequence else name for name in facts.names})
+        unit_of = [units.index(facts.sequence_of[name] if protocol.is_by_sequence else name) for name in objects]
+        return {name: pooled(parts, dict(enumerate(unit_of))) for name, parts in found.items()}
 
 
 def _of_gallery(tables: MethodScoreTables, mine: NDArray[np.bool_]) -> MethodScoreTables:
@@ -237,3 +238,142 @@ def _encode_array(value: Any) -> Any:
 def _decode_array(kind: Any, value: Any) -> Any:
     dtype, shape, data = value
     return np.frombuffer(data, dtype).reshape(shape)
+
+
+Job = tuple[str, str]
+"""A row and a kind of inputs; the row of controls and ceilings is ""."""
+
+
+@dataclass(frozen=True, eq=False)
+class ProtocolRun:
+    """One protocol on one recording.
+
+    Attributes:
+        name: Name of the protocol.
+        protocol: The protocol.
+        facts: The recording.
+        rows: The rows of the table; controls use the towers of the first one.
+        seeds: Seeds of folds and fits.
+        out: Folder of fits.
+        quiet: No progress on stderr.
+    """
+
+    name: str
+    protocol: Protocol
+    facts: RecordingFacts
+    rows: list[Row]
+    seeds: list[int]
+    out: Path
+    quiet: bool
+
+    def measure(self, cache: Cache) -> tuple[ProtocolResult, ProtocolTimes]:
+        """Run all experiments; return measures with intervals, and times."""
+        protocol, towers = self.protocol, self.rows[0].towers
+        jobs = {(row.name, "touch"): self._experiments(row, "touch") for row in self.rows}
+        if not protocol.in_depth:
+            trained = [row for row in self.rows if row.method != CHANCE]
+            jobs |= {(row.name, "low_pass"): self._experiments(row, "low_pass") for row in trained}
+        reasons = {}
+        for kind, method in {**protocol.controls, **protocol.ceilings}.items():
+            if reason := towers.missing_reason(kind):
+                reasons[kind] = reason
+            else:
+                jobs["", kind] = self._experiments(Row(kind, method, towers), kind, is_control=True)
+        outcomes: dict[Job, list[list[Outcome]]] = {}
+        count = sum(len(by_fold) for by_seed in jobs.values() for by_fold in by_seed)
+        with Bar(self.name, count, "fits", quiet=self.quiet or protocol.in_depth) as bar:
+            for job, by_seed in jobs.items():
+                outcomes[job] = [[] for _ in by_seed]
+                for found, experiments in zip(outcomes[job], by_seed, strict=True):
+                    for experiment in experiments:
+                        found.append(experiment.run(cache))
+                        bar.advance(note=" ".join(filter(None, job)))
+        rows = {row.name: self._row(row, outcomes[row.name, "touch"]) for row in self.rows}
+        times = {row.name: _method_times(outcomes[row.name, "touch"]) for row in self.rows}
+        if {"late_fusion", "retrieve_rerank"} <= set(times):  # both use one training run
+            times["retrieve_rerank"] = replace(times["retrieve_rerank"], fit_s=times["late_fusion"].fit_s)
+        splits = [split for of_seed in self.folds.values() for split in of_seed]
+        ratio = sum(len(one.test) for one in splits) / sum(len(one.train + one.validation) for one in splits)
+        features = towers.inputs("touch")
+        result = protocol_result(
+            protocol,
+            self.facts,
+            self.folds.values(),
+            rows,
+            {job: self._by_seed(found) for job, found in outcomes.items()},
+            [(self.rows[0].name, other.name) for other in self.rows[1:]],
+            Aggregation(self.seeds[0], ratio if protocol.choices else None),
+            reasons,
+            FeatureCounts(features.touch.shape[2], features.photo.shape[1], features.touch.shape[1], features.digest),
+        )
+        return result, ProtocolTimes(*_tower_times(towers), times)
+
+    @cached_property
+    def folds(self) -> dict[int, list[Split]]:
+        """The splits of each seed that draws some."""
+        is_drawn_once = self.protocol.in_depth or self.protocol.choices
+        seeds = self.seeds[:1] if is_drawn_once else self.seeds
+        return {seed: self.protocol.folds(self.facts, seed) for seed in seeds}
+
+    def _experiments(self, row: Row, kind: str, is_control: bool = False) -> list[list[Experiment]]:
+        """Return the experiments of a row with one kind of inputs, by seed and fold."""
+        seeds = {seed: seed for seed in self.folds}  # of the fit, and of the draws
+        if self.protocol.in_depth:
+            method = METHODS.load(row.method)
+            is_whole_model = row.towers.checkpoint is not None and issubclass(method, LateFusion)
+            is_one_fit = is_control or is_whole_model or not method.is_seeded
+            seeds = dict.fromkeys(self.seeds[:1] if is_one_fit else self.seeds, self.seeds[0])
+        return [
+            [Experiment(self, row, kind, fold, seed, draw, is_control) for fold in range(len(self.folds[draw]))]
+            for seed, draw in seeds.items()
+        ]
+
+    def _row(self, row: Row, outcomes: Sequence[Sequence[Outcome]]) -> RowResult:
+        details = [one.details for by_fold in outcomes for one in by_fold if one.details]
+        return RowResult(
+            row.method,
+            row.towers.checkpoint.digest if row.towers.checkpoint else None,
+            best_params=[[one.best_params for one in by_fold] for by_fold in outcomes],
+            details=combine(details, self.seeds[0]) if details else None,
+        )
+
+    def _by_seed(self, outcomes: Iterable[Sequence[Outcome]]) -> MeasuresBySeed:
+        """Return the measures of each seed, over the queries of all folds; with `choices`, those of each fold."""
+        groups = [[one] for folds in outcomes for one in folds] if self.protocol.choices else outcomes
+        return [
+            {
+                name: pooled([one.measures[name] for one in folds])
+                for name in folds[0].measures
+                if all(name in one.measures for one in folds)
+            }
+            for folds in groups
+        ]
+
+
+def _method_times(outcomes: Sequence[Sequence[Outcome]]) -> MethodTimes:
+    """Return the median times of a row."""
+    seconds = [one.seconds for by_fold in outcomes for one in by_fold]
+    medians = {key: float(np.median([one[key] for one in seconds])) for key in seconds[0]}
+    return MethodTimes(
+        fit_s=medians["fit"] or None,
+        encode_touch_ms=1e3 * medians["encode_touch"],
+        encode_photo_ms=1e3 * medians["encode_photo"],
+        score_us_per_photo=1e6 * medians["score"],
+        query_ms=1e3 * medians["query"],
+    )
+
+
+@one_thread()
+def _tower_times(towers: TowerEncoder, count: int = 4, repeats: int = 3) -> tuple[float, float]:
+    """Return the median times (ms) of the towers for a touch and a photo, on one thread, without reading files."""
+    images, times = BatchImages(towers.config.preprocessing), []
+    for grasp in towers.grasps[:count]:
+        touch, photo = images.touch(grasp), images.photo(grasp.photo)
+        for _ in range(repeats):
+            start = time.perf_counter()
+            touch_features(towers.matcher, [touch])
+            middle = time.perf_counter()
+            photo_features(towers.matcher, [photo])
+            times.append((middle - start, time.perf_counter() - middle))
+    touch_s, photo_s = np.median(times, axis=0)
+    return 1e3 * float(touch_s), 1e3 * float(photo_s)

@@ -17,7 +17,7 @@ from retrieval.data.dataset import Grasp, finger_count
 from retrieval.errors import DatasetError
 from retrieval.methods import METHODS
 from retrieval.methods.cca import Cca
-from retrieval.methods.late_fusion import LateFusion, frozen_matcher
+from retrieval.methods.late_fusion import frozen_matcher
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
@@ -49,15 +49,10 @@ CONTROL_CCA = METHODS.name_of(ControlCca)
 
 @dataclass(frozen=True, eq=False)
 class TowerEncoder:
-    """Towers that encode a recording; each kind of inputs is encoded once.
+    """Towers that encode the grasps of a recording; each kind of inputs is encoded once.
 
-    Attributes:
-        grasps: The grasps of the recording.
-        config: Configuration of the towers, and of heads that are fitted on them.
-        matcher: Matcher with the towers.
-        checkpoint: The model of the towers, with which late fusion scores as it is; None if heads are fitted.
-        cache: Folder of the cache of features.
-        quiet: No progress on stderr.
+    Late fusion scores with `checkpoint` as it is; without one, heads are fitted with `config`. `cache` is the folder of
+    the cache of features.
     """
 
     grasps: list[Grasp]
@@ -72,14 +67,8 @@ class TowerEncoder:
     def of(cls, grasps: list[Grasp], source: Config | Checkpoint, iterations: int, cache: Path, quiet: bool) -> Self:
         """Return the frozen towers of a configuration, or the towers of a checkpoint.
 
-        If a checkpoint has two fingers and the recording one, both fingers get the same touch.
-
-        Args:
-            grasps: The grasps of the recording.
-            source: The configuration or the checkpoint.
-            iterations: Optimiser steps of heads that are fitted on the towers of a checkpoint.
-            cache: Folder of the cache of features.
-            quiet: No progress on stderr.
+        If a checkpoint has two fingers and the recording one, both fingers get the same touch. Heads on the towers of a
+        checkpoint are fitted with `iterations` steps.
 
         Raises:
             DatasetError: The recording has more fingers than the checkpoint.
@@ -106,13 +95,7 @@ class TowerEncoder:
         return cls(with_fingers(grasps, fingers), config, source.matcher, source, cache, quiet)
 
     def inputs(self, kind: str, with_cells: bool = True, max_grasps: int | None = None) -> Features:
-        """Return the features on which a method is fitted and scored.
-
-        Args:
-            kind: One of `INPUTS`.
-            with_cells: Whether features end with the cells of the towers, if these have cells.
-            max_grasps: Maximum number of grasps of an object (`thin_grasps`); None for all.
-        """
+        """Return the features of one of `INPUTS`, with or without the cells of the towers, of thinned grasps."""
         key = kind, with_cells, max_grasps
         if key not in self._encoded:
             self._encoded[key] = self._inputs(*key)
@@ -174,11 +157,6 @@ class Row:
     name: str
     method: str
     towers: TowerEncoder
-
-    @property
-    def is_whole_model(self) -> bool:
-        """Whether a checkpoint scores as it is, without a fit."""
-        return self.towers.checkpoint is not None and issubclass(METHODS.load(self.method), LateFusion)
 
 
 def with_fingers(grasps: Sequence[Grasp], fingers: int) -> list[Grasp]:

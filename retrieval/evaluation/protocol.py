@@ -4,12 +4,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from _touch_retrieval.files import read_json
-from retrieval.data.dataset import Grasp, Split, data_digest, load_grasps
+from retrieval.data.dataset import Grasp, Split, data_digest, load_grasps, object_kinds, recording_source
 from retrieval.errors import DatasetError
 from retrieval.evaluation.inputs import CONTROL_CCA
 from retrieval.metrics.registry import Metric, k_way
@@ -24,20 +23,12 @@ CONTROLS = ("permuted", "no_contact", "order", "background")
 
 @dataclass(frozen=True, eq=False)
 class RecordingFacts:
-    """A recording with the facts that protocols need.
-
-    Attributes:
-        folder: Its folder.
-        source: Source of the recording.
-        grasps: The grasps.
-        objects: object_id -> metadata of the data set.
-        splits: Name -> published split.
-    """
+    """A recording with the facts that protocols need: classes of objects by id, published splits by name."""
 
     folder: Path
     source: str
     grasps: list[Grasp]
-    objects: Mapping[str, Mapping[str, Any]]
+    class_of: Mapping[str, str]
     splits: Mapping[str, Split]
 
     @property
@@ -58,7 +49,7 @@ class RecordingFacts:
     @cached_property
     def kind_of(self) -> dict[str, str] | None:
         """The class of every object; None if the recording lacks the class of one."""
-        found = {name: str(self.objects[name]["class"]) for name in self.names if "class" in self.objects.get(name, {})}
+        found = {name: self.class_of[name] for name in self.names if name in self.class_of}
         return found if len(found) == len(self.names) else None
 
     @cached_property
@@ -77,17 +68,13 @@ def read_recording_facts(folder: Path) -> RecordingFacts:
         DatasetError: A file is missing or invalid.
     """
     grasps = load_grasps(folder)  # also checks recording.json
-    info = read_json(folder / "recording.json")
-    entries = info.get("objects")
-    entries = entries if isinstance(entries, dict) else {}
-    objects = {name: about for name, about in entries.items() if isinstance(about, dict)}
     splits = {}
     for path in sorted((folder / "splits").glob("*.json")):
         try:
             splits[path.stem] = Split.from_dict(read_json(path))
         except ValueError as error:
             raise DatasetError(f"{path} is not a JSON file: {error}") from error
-    return RecordingFacts(folder, str(info["source"]), grasps, objects, splits)
+    return RecordingFacts(folder, recording_source(folder), grasps, object_kinds(folder), splits)
 
 
 @dataclass(frozen=True)
@@ -115,13 +102,6 @@ class Protocol:
         in_depth: Whether single objects, calibrated probabilities and decisions of each row are reported. Then one
             split serves all seeds, which only repeat the training; no method is fitted on validation objects, and rows
             have no low-pass control of their own and no verdict.
-
-    >>> from retrieval.evaluation.protocol import topn_accuracy, folds
-    >>> def halves(facts, seed):
-    ...     return folds(facts.names, [facts.names[::2], facts.names[1::2]], seed)
-    >>> protocol = retrieval.Protocol("vt60", "Halves", "Objects are halved by name.", halves, topn_accuracy(10))
-    >>> protocol.main
-    'topn_k10'
     """
 
     data_set: str | None
@@ -155,13 +135,9 @@ class Protocol:
 def fold(
     rest: Sequence[str], test: Sequence[str], seed: Sequence[int], validation_objects: int = VALIDATION_OBJECTS
 ) -> Split:
-    """Return a split with the given test objects; the others are for training and validation.
+    """Return a split with these test objects, and `rest` for training and validation; `seed[0]` is that of the split.
 
-    Args:
-        rest: Objects for training and validation.
-        test: Test objects.
-        seed: Seeds of the draw; the first one is that of the split.
-        validation_objects: Number of validation objects; a quarter of `rest`, at least 2, if that is fewer.
+    A quarter of `rest`, at least 2, is for validation if that is fewer than `validation_objects`.
     """
     order = np.random.default_rng([*seed, 17]).permutation(len(rest))
     count = max(2, min(validation_objects, len(rest) // 4))
@@ -182,13 +158,7 @@ def folds(names: Sequence[str], tests: Sequence[Sequence[str]], seed: int) -> li
 
 
 def topn_accuracy(k: int, *, grasps: int = 1, photos: int = 1) -> dict[str, Metric]:
-    """Return the metric of top-1..top-k accuracy among k objects.
-
-    Args:
-        k: Number of candidate objects.
-        grasps: Touches of a query.
-        photos: Photos of a candidate.
-    """
+    """Return the metric of top-1..top-k accuracy among k objects, by touches of a query and photos of a candidate."""
     name = f"topn_k{k}" + (f"_g{grasps}" if grasps > 1 else "") + (f"_p{photos}" if photos > 1 else "")
     label = f"top-1 of {k}"
     label += f", {grasps} touches" if grasps > 1 else ""

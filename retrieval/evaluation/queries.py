@@ -1,15 +1,26 @@
-"""Queries of an evaluation: touches, sets of grasps and photos, drawn once for all methods."""
+"""Queries of an evaluation, drawn once for all methods, and the scores of a fitted method for them."""
 
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.data.dataset import Grasp, Split
 from retrieval.errors import DatasetError
-from retrieval.metrics.registry import PHOTOS_PER_CANDIDATE, SET_SIZES
+from retrieval.evaluation.results import PairThreshold
+from retrieval.methods.method import Method, sum_over_sets
+from retrieval.metrics.registry import PHOTOS_PER_CANDIDATE, SET_SIZES, MethodScoreTables
+from retrieval.metrics.table import ScoreTable
+from retrieval.model.encode import one_thread
+from retrieval.model.posterior import Posterior
+from retrieval.training.calibration.posterior import MIN_OBJECTS, IdentificationTrials, fit_posterior_to_trials
+from retrieval.training.calibration.touches import ScoredTouches
+from retrieval.training.features import Features
 
 PARTS = ("train", "validation", "test")
 SETS_OF_AN_OBJECT = 20
@@ -55,11 +66,7 @@ def draw_queries(grasps: Sequence[Grasp], split: Split, seed: int, max_grasps: M
     `PHOTOS_PER_CANDIDATE` photos of other grasps remain. With fewer photos than its rivals the true object would rank
     first more often than 1 in K by chance, because a mean of fewer scores varies more.
 
-    Args:
-        grasps: All grasps of the recording.
-        split: The objects of each part.
-        seed: Seed of the draw.
-        max_grasps: Maximum number of grasps of one object, by part; a part without an entry has no limit.
+    A part without an entry in `max_grasps`, the maximum number of grasps of one object, has no limit.
 
     Raises:
         DatasetError: A part has fewer than two objects.
@@ -106,3 +113,163 @@ def _draw_sets(touches_of: Sequence[Rows], size: int, rng: np.random.Generator) 
     enough = [places for places in touches_of if len(places) >= size + PHOTOS_PER_CANDIDATE]
     drawn = [rng.choice(places, size, replace=False) for places in enough for _ in range(SETS_OF_AN_OBJECT)]
     return np.array(drawn, dtype=np.int64).reshape(-1, size)
+
+
+# Scores ------------------------------------------------------------------------------------------------
+
+MIN_THRESHOLD_OBJECTS = 10
+"""Minimum number of validation objects of a fitted pair threshold."""
+_QUERY_REPEATS = 5
+
+
+def identification_trials(table: ScoreTable, seed: int = 0) -> IdentificationTrials:
+    """Return a trial for each of the rows `table.with_targets`, as if a row were one touch, of `table.objects`.
+
+    Raises:
+        BadInput: The table has fewer than three objects.
+    """
+    targets = table.with_targets
+    scored = ScoredTouches(targets.scores, targets.touch_owner, targets.photo_owner, targets.own)
+    return IdentificationTrials.of(scored, np.arange(len(targets.touch_owner))[:, None], seed)
+
+
+def fit_posterior(validation: ScoreTable, seed: int = 0) -> Posterior | None:
+    """Return the posterior (`retrieval.model.posterior`) of a table's rows; None for fewer than three objects.
+
+    A row may be a set of grasps: each method combines the scores of grasps in its own way.
+    """
+    if len(validation.objects) < MIN_OBJECTS:
+        return None
+    return fit_posterior_to_trials([identification_trials(validation, seed)])
+
+
+@dataclass(frozen=True, eq=False)
+class MethodScores:
+    """Scores of one fitted method.
+
+    Attributes:
+        queries: The queries.
+        scores: (Q, P) of touches with photos.
+        set_scores: By number of grasps, (S, P) of sets of grasps with photos.
+        best_params: Parameters that the method selected on validation objects.
+        seconds: Run times; no result depends on them.
+        seed: Seed of drawn tests and pairs.
+        allows_own_photos: Whether a touch is compared with the photo of its own grasp.
+    """
+
+    queries: Queries
+    scores: NDArray[np.float32]
+    set_scores: dict[int, NDArray[np.float32]]
+    best_params: dict[str, Any]
+    seconds: dict[str, float]
+    seed: int
+    allows_own_photos: bool = False
+
+    def touches(self, rows: str | None, columns: str | None) -> ScoreTable:
+        """Return the scores of the touches of one part of the objects with the photos of one part; None for all."""
+        queries = self.queries
+        touches, photos = queries.of_part(queries.touch_owner, rows), queries.of_part(queries.photo_owner, columns)
+        own = queries.own_photo[touches][:, None] == photos
+        words = f"{columns} objects" if columns else "objects of all parts"
+        return self._table(self.scores, touches, queries.touch_owner, photos, own, words, "touches")
+
+    def sets(self, part: str) -> dict[int, ScoreTable]:
+        """Return the scores of sets of grasps with photos of the same part, by number of grasps.
+
+        Sizes without a set that has a target photo are left out.
+        """
+        queries, found = self.queries, {}
+        photos = queries.of_part(queries.photo_owner, part)
+        for size, sets in queries.sets.items():
+            owner = queries.touch_owner[sets[:, 0]]
+            rows = queries.of_part(owner, part)
+            own = (queries.own_photo[sets[rows]][:, :, None] == photos).any(1)
+            if ((owner[rows][:, None] == queries.photo_owner[photos]) & ~own).any():
+                scores = self.set_scores[size]
+                found[size] = self._table(scores, rows, owner, photos, own, f"{part} objects", "sets of grasps")
+        return found
+
+    def _table(
+        self,
+        scores: NDArray[np.float32],
+        rows: NDArray[np.int64],
+        owner: NDArray[np.int64],
+        photos: NDArray[np.int64],
+        own: NDArray[np.bool_],
+        object_words: str,
+        row_words: str,
+    ) -> ScoreTable:
+        chosen, photo_owner = scores[np.ix_(rows, photos)], self.queries.photo_owner[photos]
+        table = ScoreTable(chosen, owner[rows], photo_owner, own, object_words, row_words)
+        return table.with_own() if self.allows_own_photos else table
+
+    def tables(self, with_threshold: bool) -> MethodScoreTables:
+        """Return the tables that metrics need; the pair threshold only if a metric uses it."""
+        return MethodScoreTables(
+            test=self.touches("test", "test"),
+            all_objects=self.touches("test", None),
+            sets=self.sets("test"),
+            threshold=self.pair_threshold.at if with_threshold else None,
+            seed=self.seed,
+        )
+
+    def scored_touches(self, part: str) -> ScoredTouches:
+        """Return the scores of the touches with the photos of one part, as posteriors and verification take them."""
+        table = self.touches(part, part)
+        return ScoredTouches(table.scores, table.touch_owner, table.photo_owner, table.own)
+
+    @cached_property
+    def posterior(self) -> Posterior | None:
+        """The posterior of single touches, fitted on validation objects; None for too few of them."""
+        return fit_posterior(self.touches("validation", "validation"), self.seed)
+
+    @cached_property
+    def pair_threshold(self) -> PairThreshold:
+        """The score at which a match and no match are equally likely, of the checkpoint or of `posterior`.
+
+        Fewer than `MIN_THRESHOLD_OBJECTS` validation objects give none, because one for so few objects is arbitrary.
+        """
+        if (own := self.best_params.get("pair_threshold")) is not None:
+            return PairThreshold(own, "the checkpoint")
+        count = len(self.touches("validation", "validation").with_targets.objects)
+        if count >= MIN_THRESHOLD_OBJECTS and self.posterior:
+            return PairThreshold(self.posterior.threshold, "validation objects")
+        needs = f"a threshold of the checkpoint, or one fitted on at least {MIN_THRESHOLD_OBJECTS} validation objects"
+        return PairThreshold(None, None, f"pair accuracy needs {needs}; the split has {count}")
+
+
+@one_thread()
+def score_queries(
+    method: Method,
+    features: Features,
+    queries: Queries,
+    fit_s: float = 0.0,
+    seed: int = 0,
+    allows_own_photos: bool = False,
+) -> MethodScores:
+    """Score all queries with a fitted method, on one thread; `features` are those of all grasps."""
+    touch, photo = features.touch[queries.touches], features.photo[queries.photos]
+    touch_encodings, touch_s = _timed(lambda: method.encode_touch(touch))
+    photo_encodings, photo_s = _timed(lambda: method.encode_photo(photo))
+    scores, score_s = _timed(lambda: method.score(touch_encodings, photo_encodings))
+    if type(method)._score_sets is Method._score_sets:  # the sum of single scores, which are computed
+        sets = {size: sum_over_sets(scores, rows) for size, rows in queries.sets.items()}
+    else:
+        sets = {size: method.score_sets(touch_encodings, photo_encodings, rows) for size, rows in queries.sets.items()}
+    query_s = [
+        _timed(lambda: method.score(method.encode_touch(touch[:1]), photo_encodings))[1] for _ in range(_QUERY_REPEATS)
+    ]
+    seconds = {
+        "fit": fit_s,
+        "encode_touch": touch_s / len(touch),
+        "encode_photo": photo_s / len(photo),
+        "score": score_s / scores.size,
+        "query": float(np.median(query_s)),  # of one touch against the whole gallery, from its features
+    }
+    return MethodScores(queries, scores, sets, method.best_params, seconds, seed, allows_own_photos)
+
+
+def _timed(work: Callable[[], NDArray[np.float32]]) -> tuple[NDArray[np.float32], float]:
+    start = time.perf_counter()
+    result = work()
+    return result, time.perf_counter() - start

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from retrieval.evaluation.calibration import identification_trials
+from retrieval.evaluation.queries import identification_trials
 from retrieval.metrics.measure import Measure, object_weights, weight_below
 from retrieval.metrics.table import ScoreTable
 from retrieval.model.posterior import Posterior
@@ -46,15 +46,10 @@ class RejectionMeasures:
 
 
 def galleries(ratios: Floats, true: Bools, seed: int = 0) -> tuple[Floats, Floats]:
-    """Return galleries of all objects but one: with a random rival dropped, and with the row's own object dropped.
+    """Return log-likelihood ratios (T, O) of the galleries with and without each row's object, -inf outside them.
 
-    Args:
-        ratios: (T, O) log-likelihood ratios.
-        true: (T, O) whether the object is the row's own.
-        seed: Seed of the dropped rivals.
-
-    Returns:
-        Ratios (T, O) of the galleries with and without each row's object, -inf outside the gallery.
+    `ratios` (T, O) are those of all objects; `true` (T, O) is whether the object is the row's own. Each gallery lacks
+    one object: a rival, drawn with `seed`, or the row's own.
     """
     keys = np.random.default_rng([seed, 3]).random(true.shape)
     dropped = np.where(true, -1, keys).argmax(1)[:, None] == np.arange(true.shape[1])
@@ -71,15 +66,9 @@ def statistic(gallery: Floats) -> Floats:
 
 
 def reject(posterior: Posterior, table: ScoreTable, *, seed: int = 0) -> RejectionMeasures:
-    """Measure the rejection performance of a posterior on objects that it was not fitted on.
+    """Measure the rejection performance of a posterior on the scores of objects that it was not fitted on.
 
-    Args:
-        posterior: The fitted posterior.
-        table: Scores of the other objects.
-        seed: Seed of the galleries.
-
-    Raises:
-        BadInput: The table has fewer than three objects.
+    `seed` draws the galleries. Raises BadInput for fewer than three objects.
     """
     targets = table.with_targets
     true = np.asarray(targets.touch_owner[:, None] == targets.objects)

@@ -65,15 +65,20 @@ class TouchToTouch(Protocol):
     )
 
 
+PHYSICLEAR = TouchToTouch(
+    "physiclear",
+    "PhysiCLeAR: touch to touch, one video left out",
+    "Each press video is the query once. The gallery contains the other videos of all parts; the nearest one gives "
+    "the part. Nothing is trained. A video is the mean of its frames of strongest contact. The videos of a part were "
+    "recorded one after the other. The order of capture is that of the file names, part by part, as no times are "
+    "published.",
+)
+
+
 def leave_one_out_scores(vectors: Vectors, components: int = COMPONENTS) -> NDArray[np.float32]:
-    """Return the cosine of each vector with every other one, after principal components fitted without it.
+    """Return the cosines (S, S) of vectors (S, F) after principal components, at most S - 2; 0 on the diagonal.
 
-    Args:
-        vectors: (S, F), a vector for each sequence.
-        components: Number of principal components, at most S - 2.
-
-    Returns:
-        (S, S) float32, 0 on the diagonal. Row q uses mean, standard deviation and components of all vectors but q.
+    Row q uses mean, standard deviation and components of all vectors but q.
     """
     count = len(vectors)
     scores = np.zeros((count, count), np.float32)
@@ -93,14 +98,7 @@ def leave_one_out_scores(vectors: Vectors, components: int = COMPONENTS) -> NDAr
 
 @dataclass(frozen=True, eq=False)
 class Sequences:
-    """The sequences of a recording, in the order of capture.
-
-    Attributes:
-        grasps: All grasps.
-        names: Name of each sequence.
-        objects: Object of each sequence.
-        rows: Places of the grasps of each sequence.
-    """
+    """The sequences of a recording in the order of capture: name, object, and places of the grasps of each."""
 
     grasps: Sequence[Grasp]
     names: tuple[str, ...]
@@ -152,17 +150,9 @@ class Sequences:
 
 
 def with_common_frame(grasps: Sequence[Grasp], folder: Path, *, quiet: bool = True) -> list[Grasp]:
-    """Add the contact difference of each grasp to one common no-contact frame; write the images to `folder`.
+    """Return the grasps with images of their contact differences on one common no-contact frame, that of the first.
 
-    The common frame is that of the first grasp. An image is common + touch - no-contact frame, clipped to 8 bits.
-
-    Args:
-        grasps: Grasps with no-contact frames.
-        folder: Folder of the images; existing images are reused.
-        quiet: No progress on stderr.
-
-    Returns:
-        The grasps with the new images as touches, and the common frame as no-contact frame.
+    An image is common + touch - no-contact frame, clipped to 8 bits. It is written to `folder`, unless it exists.
 
     Raises:
         DatasetError: The frames differ in size.
@@ -195,10 +185,7 @@ def _on_common_frame(touch: Path, before: Path, common: NDArray[np.float32]) -> 
 
 
 def _vectors(sequences: Sequences, towers: TowerEncoder, common: Sequence[Grasp], variant: str) -> dict[str, Vectors]:
-    """Return vectors (S, F) of each representation and of the no-contact frame.
-
-    `variant` is "touch" or, for the control, "low_pass".
-    """
+    """Return vectors (S, F) of each representation and of the no-contact frame, for "touch" or "low_pass" images."""
     first = [sequences.grasps[rows[0]] for rows in sequences.rows]
     frames = [dataclasses.replace(grasp, touches=grasp.backgrounds) for grasp in first]
     no_contact = towers.touches(frames, variant).astype(np.float64)
@@ -221,7 +208,7 @@ def run_touch_to_touch(
 
     Args:
         protocol: The protocol.
-        facts: The recording. Each touch must have a no-contact frame, and each object two sequences.
+        facts: The recording.
         towers_of: Towers by name of their row; the others are compared with the first.
         seeds: Seeds of the permutations of the objects.
         folder: Folder of images on the common frame.

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from retrieval.evaluation.queries import MethodScores
 from retrieval.evaluation.results import Rate, VerificationRates
-from retrieval.evaluation.scoring import MethodScores
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.verification import ERRORS_NEEDED, error_rate, objects_needed
 from retrieval.training.calibration.posterior import MIN_OBJECTS, fit_posterior

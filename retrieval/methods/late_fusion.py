@@ -60,11 +60,10 @@ class LateFusion(Method):
 
 
 def trained_checkpoint(settings: MethodSettings, train: Features, validation: Features) -> Checkpoint:
-    """Train on features and store the checkpoint in `settings.folder`.
+    """Train on features of the towers of `frozen_matcher`, and store the checkpoint in `settings.folder`.
 
     A checkpoint of the same fit in that folder is reused, an unfinished one is continued. The model has no candidate
-    encoder, because every photo is scored. The checkpoint has the towers of `frozen_matcher`. It works like any
-    other one if the features come from these towers.
+    encoder, because every photo is scored.
 
     Raises:
         BadInput: The features are not from such towers.
@@ -85,7 +84,7 @@ def trained_checkpoint(settings: MethodSettings, train: Features, validation: Fe
         training=dataclasses.replace(config.training, seed=settings.seed, freeze_towers=True),
     )
     with nullcontext(settings.folder) if settings.folder else tempfile.TemporaryDirectory() as folder:
-        path = checkpoint_path(Path(folder), settings.seed)
+        path = Path(folder) / f"late_fusion-{settings.seed}.safetensors"
         trainer = Trainer(config, split, grasps, path, SOURCE, known)
         expected, got = _feature_counts(trainer.matcher), (*known.touch.shape[1:], *known.photo.shape[1:])
         if expected != got:
@@ -97,11 +96,6 @@ def trained_checkpoint(settings: MethodSettings, train: Features, validation: Fe
         trainer.matcher.touch_tower.load_state_dict(towers.touch_tower.state_dict())
         trainer.matcher.photo_tower.load_state_dict(towers.photo_tower.state_dict())
         return trainer.run_or_reuse(settings.quiet)
-
-
-def checkpoint_path(folder: Path, seed: int) -> Path:
-    """Return the path of the checkpoint that late fusion trains with a seed."""
-    return folder / f"late_fusion-{seed}.safetensors"
 
 
 def frozen_matcher(config: Config) -> Matcher:

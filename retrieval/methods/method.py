@@ -93,34 +93,23 @@ class Method(ABC):
 
     def encode_touch(self, touch: NDArray[Any]) -> Array:
         """Return encodings (T, ...) of touch features (T, fingers, F). Raises BadInput unless shaped as in the fit."""
-        touch_shape, _ = self._fitted_shapes()
-        touch = _checked("touch features", touch, None, *touch_shape)
-        return _checked("encodings", self._encode_touch(touch), len(touch), ...)
+        return self._encode_touch(_checked("touch features", touch, None, *self._fitted_shapes()[0]))
 
     def encode_photo(self, photo: NDArray[Any]) -> Array:
         """Return encodings (N, ...) of photo features (N, F). Raises BadInput unless shaped as in the fit."""
-        _, photo_shape = self._fitted_shapes()
-        photo = _checked("photo features", photo, None, *photo_shape)
-        return _checked("encodings", self._encode_photo(photo), len(photo), ...)
+        return self._encode_photo(_checked("photo features", photo, None, *self._fitted_shapes()[1]))
 
     def score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
         """Return scores (T, N) of every touch with every photo. Raises NumericalError for one that is not finite."""
-        self._fitted_shapes()
         scores = self._score(touch_encodings, photo_encodings)
         return _checked("scores", scores, len(touch_encodings), len(photo_encodings))
 
     def score_sets(self, touch_encodings: Array, photo_encodings: Array, sets: NDArray[np.int64]) -> Array:
-        """Return scores (S, N) of sets of grasps of one object with every photo.
+        """Return scores (S, N) of sets (S, G) of touches of one object with every photo.
 
         By default this is the sum of `score` over the set: log-odds add for grasps that are independent given the
         object.
-
-        Args:
-            touch_encodings: (T, ...) encodings.
-            photo_encodings: (N, ...) encodings.
-            sets: (S, G) rows of `touch_encodings`.
         """
-        self._fitted_shapes()
         scores = self._score_sets(touch_encodings, photo_encodings, sets)
         return _checked("scores", scores, len(sets), len(photo_encodings))
 
@@ -155,17 +144,15 @@ def sum_over_sets(scores: Array, sets: NDArray[np.int64]) -> Array:
     return total.astype(np.float32)
 
 
-def _checked(name: str, array: NDArray[Any], *shape: Any) -> Array:
-    """Return the array as float32 of a shape, in which None is any length, and a last `...` any further axes.
+def _checked(name: str, array: NDArray[Any], *shape: int | None) -> Array:
+    """Return the array as float32 of a shape, in which None is any length.
 
     A NaN or infinite value is an error: sorting would rank a NaN first.
     """
     array = np.asarray(array, dtype=np.float32)
-    is_open = shape[-1] is ...
-    axes = shape[:-1] if is_open else shape
-    fits = array.ndim == len(axes) or (is_open and array.ndim > len(axes))
-    if not fits or any(wanted not in (None, got) for wanted, got in zip(axes, array.shape, strict=False)):
-        text = ", ".join("B" if wanted is None else "..." if wanted is ... else str(wanted) for wanted in shape)
+    expected = tuple(got if wanted is None else wanted for wanted, got in zip(shape, array.shape, strict=False))
+    if array.shape != expected or len(shape) != array.ndim:
+        text = ", ".join("B" if wanted is None else str(wanted) for wanted in shape)
         raise BadInput(f"{name} must be an array of shape ({text}); got {array.shape}")
     if not np.isfinite(array).all():
         place = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])

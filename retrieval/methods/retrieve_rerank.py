@@ -5,12 +5,10 @@ import torch
 from numpy.typing import NDArray
 
 from retrieval.methods.late_fusion import LateFusion, trained_checkpoint
-from retrieval.methods.method import Array, MethodSettings
+from retrieval.methods.method import Array
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.training.distil import feature_partials, with_candidate_encoder
 from retrieval.training.features import Features
-
-RERANKED_FRACTION = 0.25
 
 
 class RetrieveRerank(LateFusion):
@@ -21,15 +19,8 @@ class RetrieveRerank(LateFusion):
     followed by the embedding.
     """
 
-    def __init__(self, settings: MethodSettings, reranked_fraction: float = RERANKED_FRACTION) -> None:
-        """Make an unfitted method.
-
-        Args:
-            settings: Settings of the method.
-            reranked_fraction: Fraction of the gallery that is reranked.
-        """
-        super().__init__(settings)
-        self.reranked_fraction = reranked_fraction
+    reranked_fraction = 0.25
+    """Fraction of the gallery that is reranked."""
 
     def _fit(self, train: Features, validation: Features) -> None:
         checkpoint = trained_checkpoint(self.settings, train, validation)
@@ -84,13 +75,7 @@ class RetrieveRerank(LateFusion):
 
 
 def merge_scores(nearness: Array, rows: NDArray[np.int64], logits: Array) -> Array:
-    """Return scores (N,) of all photos: the reranked ones by logit, all others below them by mean cosine.
-
-    Args:
-        nearness: (G, N) cosines of each grasp's embedding with each photo's, at most 1.
-        rows: The reranked photos.
-        logits: Their match logits.
-    """
+    """Return scores (N,): the photos of `rows` by logit, all others below by mean cosine over the grasps."""
     scores = logits.min() - 1 - (1 - nearness.mean(0))
     scores[rows] = logits
     return np.asarray(scores)

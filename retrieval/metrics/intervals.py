@@ -80,14 +80,9 @@ class Difference:
 
 
 def summarise(measures: Sequence[Measure], *, seed: int = 0) -> Summary:
-    """Return the summary of a measure; intervals resample objects.
+    """Return the summary of a measure, given for each training seed; intervals resample objects.
 
-    Args:
-        measures: One measure per training seed, in the order of the seeds.
-        seed: Seed of the resamples.
-
-    Raises:
-        BadInput: There are no measures, or they have different queries.
+    `seed` is that of the resamples. Raises BadInput unless all measures have the same queries.
     """
     means = _object_means(measures)
     every = means.mean(0)
@@ -108,30 +103,20 @@ def summarise(measures: Sequence[Measure], *, seed: int = 0) -> Summary:
 
 
 def _object_means(measures: Sequence[Measure]) -> NDArray[np.float64]:
-    """Return object means (seeds, objects, m). Raises BadInput unless all measures have the same queries."""
-    if not measures:
-        raise BadInput("a summary needs the measure of at least one training seed; got none")
-    for measure in measures[1:]:
-        if measure.values.shape[1] != measures[0].values.shape[1] or not np.array_equal(
-            measure.owner, measures[0].owner
-        ):
-            raise BadInput("combined measures must have the same queries; score them on the same queries")
+    """Return object means (seeds, objects, m)."""
+    if any(not np.array_equal(measure.owner, measures[0].owner) for measure in measures):
+        raise BadInput("combined measures must have the same queries; score them on the same queries")
     return np.array([measure.by_object()[1] for measure in measures])
 
 
 def bootstrap_interval(
     means: NDArray[np.float64], *, draws: int = DRAWS, seed: int = 0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the ends (m,) of the interval of the mean of object means: the expanded percentile bootstrap.
+    """Return the ends (m,) of the interval of the mean of object means (R, m): the expanded percentile bootstrap.
 
     The ends are quantiles of the means of resamples, moved outward (Hesterberg 2015, arXiv 1411.5279) to
     Phi(-sqrt(n / (n - 1)) t), because n resampled objects vary less than n new ones. If all objects are equal, the
     interval is their value, however few they are. A single object gives (-inf, inf).
-
-    Args:
-        means: (R, m) object means.
-        draws: Bootstrap resamples.
-        seed: Seed of the resamples.
     """
     count = len(means)
     if count < 2:
@@ -148,17 +133,9 @@ def compare(a: Sequence[Measure], b: Sequence[Measure], *, seed: int = 0) -> Dif
 
     The p-value is that of a two-sided sign-flip permutation test on the objects' differences. Up to 18 objects it uses
     all flips, else random ones (Phipson and Smyth 2010: p is never 0). The p-value is 1 for one object or no
-    difference.
-
-    Args:
-        a: Measures of the first method, one per training seed.
-        b: Measures of the second.
-        seed: Seed of resamples and random flips.
-
-    Raises:
-        BadInput: The methods were scored on different queries.
+    difference. Each method has one measure per training seed. Raises BadInput unless all have the same queries.
     """
-    if not a or not b or not np.array_equal(a[0].owner, b[0].owner):
+    if not np.array_equal(a[0].owner, b[0].owner):
         raise BadInput("compared methods must have the same queries; score both on the same queries")
     differences = _object_means(a).mean(0)[:, 0] - _object_means(b).mean(0)[:, 0]
     low, high = bootstrap_interval(differences[:, None], seed=seed)
@@ -177,32 +154,19 @@ def sign_flip_p(differences: NDArray[np.float64], *, draws: int = DRAWS, seed: i
     # Sums of the same numbers in another order differ by rounding; they are treated as equal.
     threshold = observed - 1e-12 * np.abs(differences).sum()
     if len(differences) <= _EXACT_UP_TO:
-        return float((np.abs(_flipped_sums(differences)) >= threshold).mean())
+        sums = differences[:1]  # over every choice of signs, with the first sign fixed
+        for difference in differences[1:]:
+            sums = np.concatenate([sums + difference, sums - difference])
+        return float((np.abs(sums) >= threshold).mean())
     signs = np.random.default_rng(seed).choice((-1.0, 1.0), (draws, len(differences)))
     return float((1 + (np.abs(signs @ differences) >= threshold).sum()) / (1 + draws))
-
-
-def _flipped_sums(differences: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the sums (2 ** (R - 1),) over every choice of signs, with the first sign fixed."""
-    sums = differences[:1]
-    for difference in differences[1:]:
-        sums = np.concatenate([sums + difference, sums - difference])
-    return sums
 
 
 # Splits ----------------------------------------------------------------------------------------------------
 
 
 def summarise_splits(splits: Sequence[Measure], ratio: float) -> Summary:
-    """Return the summary of a measure over splits.
-
-    Args:
-        splits: One measure per split.
-        ratio: Test objects per training object of a split.
-
-    Raises:
-        BadInput: There are fewer than two splits.
-    """
+    """Return the summary of a measure over at least two splits; `ratio`: test objects per training object of one."""
     means = _means(splits)
     value, margin = means.mean(0), _margin(means, ratio)
     return Summary(
@@ -219,16 +183,7 @@ def summarise_splits(splits: Sequence[Measure], ratio: float) -> Summary:
 
 
 def compare_splits(a: Sequence[Measure], b: Sequence[Measure], ratio: float) -> Difference:
-    """Return the first value of `a` minus that of `b`, paired by split; p is that of the corrected t-test.
-
-    Args:
-        a: Measures of the first method, one per split.
-        b: Measures of the second.
-        ratio: Test objects per training object of a split.
-
-    Raises:
-        BadInput: There are fewer than two splits.
-    """
+    """Return the first value of `a` minus that of `b`, paired by split; p is that of the corrected t-test."""
     differences = (_means(a) - _means(b))[:, [0]]
     value, margin = float(differences.mean()), float(_margin(differences, ratio)[0])
     scale = margin / stdtrit(len(differences) - 1, (1 + LEVEL) / 2)

@@ -85,15 +85,10 @@ def object_weights(owner: NDArray[np.int64]) -> NDArray[np.float64]:
 def weight_below(
     values: NDArray[np.floating[Any]], others: NDArray[np.floating[Any]], weights: NDArray[np.float64] | None = None
 ) -> NDArray[np.float64]:
-    """Return the weight (V,) of the `others` below each of `values`; equal ones count half (Mann and Whitney).
+    """Return the weight (V,) of the `others` (O,) below each of `values` (V,); equal ones count half (Mann-Whitney).
 
-    With weights that sum to 1, or divided by the number of others, the mean over values is the AUC. Scores must be
-    finite: a NaN is sorted as the highest.
-
-    Args:
-        values: (V,) scores.
-        others: (O,) scores.
-        weights: (O,) weights of the others; 1 each if None.
+    With weights (O,) that sum to 1, or divided by the number of others, the mean over values is the AUC. Without
+    weights each counts 1. Scores must be finite: a NaN is sorted as the highest.
     """
     order = np.argsort(others)
     below = np.append(0.0, np.cumsum(np.ones(len(others)) if weights is None else weights[order]))

@@ -51,8 +51,7 @@ def fit_calibration(logits: ArrayLike, labels: ArrayLike) -> tuple[float, float]
         return np.asarray(weights * (expit(slope * z + intercept) - targets))
 
     def best_intercept(slope: float) -> float:
-        # At an intercept of -reach every probability is almost 0, and at +reach almost 1. Every target is between these
-        # values. So the sum of the slack changes its sign between -reach and +reach.
+        # Every probability is almost 0 at -reach, almost 1 at +reach; every target is between these values.
         reach = slope * float(np.abs(z).max()) + 50
         return float(brentq(lambda intercept: slack(slope, intercept).sum(), -reach, reach, maxiter=1000))
 
@@ -92,15 +91,14 @@ def pair_auc(logits: ArrayLike, labels: ArrayLike) -> float:
 
 
 def reliability_bins(probability: ArrayLike, outcomes: ArrayLike) -> dict[str, Any]:
-    """Return the expected calibration error and the means over 15 equal bins, empty ones left out.
+    """Return {"ece", "bins": [{"probability", "frequency", "count"}]} of 15 equal bins, empty ones left out.
+
+    Each prediction has the error |probability - frequency| of its bin. The expected calibration error is the mean over
+    all predictions.
 
     Args:
         probability: (P,) predicted probabilities.
         outcomes: (P,) 1 if the prediction is true, 0 if not; 1/n if n answers tie and one of them is right.
-
-    Returns:
-        {"ece", "bins": [{"probability", "frequency", "count"}]}. Each prediction has the error
-        |probability - frequency| of its bin. The expected calibration error is the mean over all predictions.
     """
     p, y = np.asarray(probability, dtype=np.float64), np.asarray(outcomes, dtype=np.float64)
     if p.shape != y.shape or p.ndim != 1 or not len(p) or not ((p >= 0) & (p <= 1)).all():

@@ -96,10 +96,8 @@ class ScoreTable:
 
     def transposed(self) -> "ScoreTable":
         """Return the table with photos as queries and touches as gallery."""
-        return ScoreTable(
-            self.scores.T, self.photo_owner, self.touch_owner, self.own.T,
-            self.object_words, self.column_words, self.row_words,
-        )  # fmt: skip
+        owners = self.photo_owner, self.touch_owner
+        return ScoreTable(self.scores.T, *owners, self.own.T, self.object_words, self.column_words, self.row_words)
 
     def with_own(self) -> "ScoreTable":
         """Return the table for a protocol whose galleries include a row's own photos."""
@@ -114,10 +112,11 @@ Pooling = Callable[[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]], 
 def object_scores(
     table: ScoreTable, photos: int, draws: int, seed: int, pool: Pooling | None = None
 ) -> NDArray[np.float64]:
-    """Return scores (draws, T, O) of rows with objects, each represented by photos drawn without replacement.
+    """Return scores (draws, T, O) of rows of `with_targets` with `table.objects`.
 
-    Own photos are never drawn; an object with fewer photos uses all of them. The draws depend on the seed and on the
-    owners, never on scores, so all methods get the same queries.
+    Each object is represented by photos that are drawn without replacement, never a row's own; an object with fewer
+    photos uses all of them. The draws depend on the seed and on the owners, never on scores, so all methods get the
+    same queries.
 
     Args:
         table: The scores.
@@ -126,15 +125,7 @@ def object_scores(
         seed: Seed of the draws.
         pool: Combines the scores of the photos, such as a posterior's logit of the object
             (`Posterior.object_logits`); None for their mean.
-
-    Returns:
-        Scores with the objects in the order of `table.objects`.
-
-    Raises:
-        BadInput: A row's own object has no photo left. Leave such rows out first.
     """
-    if not (table.has_target | ~table.relevant.any(1)).all():
-        raise BadInput("every row needs a photo of its object from another grasp; one has none: leave the row out")
     rng = np.random.default_rng([seed, photos])
     found = np.empty((draws, len(table.touch_owner), len(table.objects)))
     for draw in range(draws):

@@ -16,7 +16,7 @@ from retrieval.data.dataset import Grasp, Split, load_grasps
 from retrieval.errors import BadInput, ConfigError, DatasetError, JobInterrupted
 from retrieval.evaluation import PROTOCOLS, UNSEEN_OBJECTS
 from retrieval.evaluation.evaluate import evaluate
-from retrieval.evaluation.experiment import Experiment, permute_touches
+from retrieval.evaluation.experiment import Experiment, ProtocolRun, permute_touches
 from retrieval.evaluation.inputs import Row, TowerEncoder
 from retrieval.evaluation.protocol import RecordingFacts
 from retrieval.evaluation.results import Timings, read_results
@@ -304,13 +304,15 @@ def test_an_informative_modality_has_a_high_ceiling_and_noise_stays_at_chance(tm
     split = Split(0, tuple(names[:12]), tuple(names[12:16]), tuple(names[16:]))
     features = Features(tuple(map(str, range(144))), owners, touch, photo)
     encoded = {("touch", with_cells, None): features for with_cells in (True, False)}
-    row = Row("cca", "cca", TowerEncoder(grasps, CONFIG, None, None, tmp_path, True, encoded))
-    protocol, facts = PROTOCOLS.load(UNSEEN_OBJECTS), RecordingFacts(Path("drawn"), "drawn", grasps, {}, {})
-    found = {}
+    rows = [Row("cca", "cca", TowerEncoder(grasps, CONFIG, None, None, tmp_path, True, encoded))]
+    protocol = dataclasses.replace(PROTOCOLS.load(UNSEEN_OBJECTS), folds=lambda *_: [split])
+    facts = RecordingFacts(Path("drawn"), "drawn", grasps, {}, {})
+    facts.__dict__["digest"] = "drawn"  # there are no images
+    run, found = ProtocolRun("x", protocol, facts, rows, [0], tmp_path, True), {}
     with Cache(tmp_path / "cache.sqlite") as cache:
         for kind in protocol.ceilings:
-            experiment = Experiment("x", protocol, facts, row, kind, split, 0, 0, tmp_path / kind, is_control=True)
-            found[kind] = summarise([experiment.run(cache).measures["topn_k5"]]).value[0]
+            outcome = Experiment(run, rows[0], kind, 0, 0, 0, is_control=True).run(cache)
+            found[kind] = summarise([outcome.measures["topn_k5"]]).value[0]
     assert found["photo_to_photo"] > 0.99
     assert found["touch_to_touch"] < 0.4  # chance is .2
 

@@ -29,7 +29,7 @@ def facts(sequence_of, about=None, splits=None):
 
 def vt60(instances=4):
     classes = ["bottleempty", "ball", "bottlefull", *(f"kind{number}" for number in range(7))]
-    about = {f"{kind}-{n}": {"class": kind} for kind in classes for n in range(instances)}
+    about = {f"{kind}-{n}": kind for kind in classes for n in range(instances)}
     return facts(dict.fromkeys(about), about)
 
 

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from retrieval.evaluation.calibration import fit_posterior as fit
-from retrieval.evaluation.calibration import identification_trials
+from retrieval.evaluation.queries import fit_posterior as fit
+from retrieval.evaluation.queries import identification_trials
 from retrieval.evaluation.reject import false_accepts, galleries, reject, statistic
 from retrieval.metrics.intervals import summarise
 from retrieval.metrics.measure import object_means

@@ -5,9 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from retrieval.evaluation.queries import Queries
+from retrieval.evaluation.queries import MethodScores, Queries
 from retrieval.evaluation.results import Rate
-from retrieval.evaluation.scoring import MethodScores
 from retrieval.evaluation.verification import (
     equal_error_rate,
     false_rejects,

@@ -135,10 +135,6 @@ def test_a_method_must_be_fitted_before_use(name):
         method.encode_touch(TEST.touch)
     with pytest.raises(BadInput, match="fitted before"):
         method.encode_photo(TEST.photo)
-    with pytest.raises(BadInput, match="fitted before"):
-        method.score(np.zeros((1, 2), np.float32), np.zeros((1, 2), np.float32))
-    with pytest.raises(BadInput, match="fitted before"):
-        method.score_sets(np.zeros((1, 2), np.float32), np.zeros((1, 2), np.float32), np.zeros((1, 1), np.int64))
 
 
 @every_method

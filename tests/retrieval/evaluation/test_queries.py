@@ -8,9 +8,15 @@ import pytest
 
 from retrieval.data.dataset import Grasp, Split
 from retrieval.errors import DatasetError
-from retrieval.evaluation.queries import SET_SIZES, SETS_OF_AN_OBJECT, Queries, draw_queries
+from retrieval.evaluation.queries import (
+    SET_SIZES,
+    SETS_OF_AN_OBJECT,
+    MethodScores,
+    Queries,
+    draw_queries,
+    score_queries,
+)
 from retrieval.evaluation.results import PairThreshold
-from retrieval.evaluation.scoring import MethodScores, score_queries
 from retrieval.methods.chance import Chance
 from retrieval.methods.method import MethodSettings
 from retrieval.training.features import Features
