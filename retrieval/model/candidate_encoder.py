@@ -21,14 +21,10 @@ class CandidateEncoder(nn.Module):
     """
 
     def __init__(self, partial: int, width: int, embedding_dim: int, linear: int = 0) -> None:
-        """Make the networks, with random weights.
+        """Make the networks, `width` hidden units each, with random weights.
 
-        Args:
-            partial: Width of a pooled partial activation (without cells).
-            width: Hidden units of each network.
-            embedding_dim: Components of an embedding.
-            linear: Number of components that are linear in the last `embedding_dim` numbers of a pooled partial
-                activation. These numbers must then be the contrastive embedding.
+        They read pooled partial activations (without cells). `linear` components of an embedding are linear in the last
+        `embedding_dim` numbers of these, which must then be the contrastive embedding.
         """
         super().__init__()
         self.touch_network, self.photo_network = (
@@ -66,14 +62,10 @@ class CandidateEncoder(nn.Module):
 
     @torch.no_grad()
     def initialise_linear(self, partials: Tensor, touch: "PartialStatistics", photo: "PartialStatistics") -> None:
-        """Set the linear components to the principal axes of the contrastive embeddings.
+        """Set the linear components, if there are any, to the principal axes of the contrastive embeddings.
 
-        The networks must still read standardised partial activations. Without linear components this does nothing.
-
-        Args:
-            partials: Photo partial activations (N, partial) that end with their contrastive embeddings.
-            touch: Statistics of the touch partial activations.
-            photo: Statistics of the photo partial activations.
+        The networks must still read standardised partial activations. `partials` (N, partial) of photos end with their
+        contrastive embeddings.
         """
         if self.touch_linear is None or self.photo_linear is None:
             return
@@ -87,24 +79,14 @@ class CandidateEncoder(nn.Module):
 
 
 class PartialStatistics(NamedTuple):
-    """Statistics by which partial activations are standardised.
-
-    Attributes:
-        mean: (partial,) mean of each unit.
-        scale: (partial,) one standard deviation for the whole head's term, and one for the whole embedding.
-    """
+    """Mean (partial,) of each unit, and one standard deviation for the head's term and one for the embedding."""
 
     mean: Tensor
     scale: Tensor
 
     @classmethod
     def of(cls, partials: Tensor, embedding_dim: int = 0) -> Self:
-        """Return the statistics of partial activations; a part that does not vary has scale 1.
-
-        Args:
-            partials: (N, partial).
-            embedding_dim: Count of numbers at the end of each row that are an embedding.
-        """
+        """Return the statistics of (N, partial), whose rows end with an embedding; a constant part has scale 1."""
         end = partials.shape[1] - embedding_dim
         parts = [part for part in (partials[:, :end], partials[:, end:]) if part.shape[1]]
         scale = torch.cat([part.std(correction=0).expand(part.shape[1]) for part in parts])

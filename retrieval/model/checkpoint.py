@@ -69,11 +69,7 @@ class Checkpoint(CheckpointInfo):
 
 
 def store_checkpoint(checkpoint: Checkpoint, path: Path) -> None:
-    """Write a checkpoint and its model card (the same name with .md) atomically.
-
-    Args:
-        checkpoint: The checkpoint; the calibrations without late interaction are stored only if the model has cells.
-        path: A name that ends in .safetensors.
+    """Write a checkpoint to a name that ends in .safetensors, and its model card (.md), atomically.
 
     Raises:
         CheckpointError: The file cannot be written.
@@ -168,14 +164,10 @@ def write_tensors(path: Path, state: dict[str, Tensor], header: Mapping[str, Any
 
 
 def read_tensors(path: Path, *, check: bool = True) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read a file of `write_tensors`: its tensors and its header.
-
-    Args:
-        path: The .safetensors file.
-        check: Verify the checksum, and that every weight is finite.
+    """Read the tensors and the header of a file of `write_tensors`.
 
     Raises:
-        CheckpointError: The file is missing or damaged.
+        CheckpointError: The file is missing or, with `check`, its checksum is wrong or a weight is not finite.
     """
     header = read_header(path)
     try:

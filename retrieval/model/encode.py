@@ -42,11 +42,10 @@ TOWERS = ("touch_tower", "photo_tower")
 
 
 def for_inference(matcher: Matcher, towers: Sequence[str] = TOWERS) -> Matcher:
-    """Return a matcher with the same outputs that runs faster; for forward passes without gradients.
+    """Return a matcher that runs faster, for forward passes without gradients; the named towers are copies.
 
-    The named towers are copies; the rest is shared. Their features are as close to the exact ones as those of the plain
-    towers: on the shipped checkpoint the two differ by at most 3e-5 of the largest feature. A tower in training mode is
-    used unchanged, because its batch normalisation depends on the batch.
+    On the shipped checkpoint the features differ by at most 3e-5 of the largest one. A tower in training mode is used
+    unchanged, because its batch normalisation depends on the batch.
     """
     fast = copy.copy(matcher)
     fast._modules = dict(matcher._modules)
@@ -117,12 +116,7 @@ class TorchEncoder:
     name = "torch"
 
     def __init__(self, matcher: Matcher, threads: int | None = None) -> None:
-        """Prepare the towers.
-
-        Args:
-            matcher: The model.
-            threads: Threads that PyTorch computes with from then on, in the whole process; None for no change.
-        """
+        """Prepare the towers; PyTorch computes with `threads` from then on, in the whole process (None: no change)."""
         self._fast, self._threads = for_inference(matcher, ["touch_tower"]), threads
 
     @torch.inference_mode()

@@ -30,12 +30,7 @@ COSINE_SCALE_INIT = 4.0
 
 
 class ImageEncoding(NamedTuple):
-    """Encoding of images: partial activations and embeddings, float32.
-
-    Attributes:
-        partial: (B, partial) terms of the head's first layer.
-        embedding: (B, embedding_dim) unit embeddings, contrastive or for search.
-    """
+    """Partial activations (B, partial) and unit embeddings (B, embedding_dim) of images, float32."""
 
     partial: Tensor
     embedding: Tensor
@@ -86,7 +81,7 @@ class FusionHead(nn.Module):
         cosine_dim: int = 0,
         cell_dim: int = 0,
     ) -> None:
-        """Make the layers, with random weights.
+        """Make the layers, `hidden` wide, with random weights.
 
         Args:
             touch_features: Features of a touch.
@@ -176,12 +171,7 @@ class Matcher(nn.Module):
     """Maps touches and photos to partial activations and embeddings, and partial activations to match logits."""
 
     def __init__(self, config: MatcherConfig, views: int = 1) -> None:
-        """Build the layers with random weights.
-
-        Args:
-            config: Sizes and options.
-            views: Views of a photo, side by side in its image (`retrieval.data.views`).
-        """
+        """Build the layers with random weights; a photo is `views` views side by side (`retrieval.data.views`)."""
         super().__init__()
         self.views = views
         self.config = config

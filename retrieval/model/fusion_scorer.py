@@ -69,7 +69,7 @@ def to_stored(partials: NDArray[np.float32], pooled_width: int) -> dict[str, NDA
 
 
 def largest_rounding(partials: NDArray[np.float16]) -> float:
-    """Return the largest possible rounding error of stored partial activations (N, pooled): half a unit of float16."""
+    """Return the largest possible rounding error of stored partial activations (N, pooled): half a last place."""
     starts = range(0, len(partials), _BLOCK_ROWS)
     return max(float(np.abs(partials[start : start + _BLOCK_ROWS]).max()) for start in starts) * 2.0**-11
 

@@ -19,13 +19,9 @@ class CellEncoder(nn.Module):
     """Maps cells of one modality to vectors."""
 
     def __init__(self, channels: int, dim: int, norm: nn.Module, *, weighted: bool) -> None:
-        """Make the network, with random weights.
+        """Make the network from `channels` to vectors of length `dim`, with random weights.
 
-        Args:
-            channels: Channels of a cell.
-            dim: Length of a vector.
-            norm: Standardises (B, channels).
-            weighted: The length of a vector is a learned weight; otherwise it is 1.
+        norm: standardises cells (B, channels). weighted: the length of a vector is a learned weight; otherwise it is 1.
         """
         super().__init__()
         self.norm, self.channels, self.weighted = norm, channels, weighted
@@ -44,12 +40,7 @@ class CellEncoder(nn.Module):
 
 
 def cell_scores(touch_cells: Tensor, photo_cells: Tensor) -> Tensor:
-    """Return scores (T, N) of every touch with every photo.
-
-    Args:
-        touch_cells: (T, Q, d) vectors of the touches' cells.
-        photo_cells: (N, P, d) vectors of the photos' cells.
-    """
+    """Return scores (T, N) of every touch with every photo, from the vectors (T, Q, d) and (N, P, d) of their cells."""
     touches, each, _ = touch_cells.shape
     photos, places, _ = photo_cells.shape
     products = photo_cells.flatten(0, 1) @ touch_cells.flatten(0, 1).T

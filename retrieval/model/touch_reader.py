@@ -96,13 +96,7 @@ class TouchReader:
     """Reads and encodes touches for a model."""
 
     def __init__(self, config: Config, encoder: TouchEncoder, compares_contact: bool = False) -> None:
-        """Prepare a reader.
-
-        Args:
-            config: Settings of the model.
-            encoder: Its touch encoder.
-            compares_contact: Compare each touch with its no-contact frame to decide whether there is a contact.
-        """
+        """Prepare a reader for a model; `compares_contact`: each touch is compared with its no-contact frame."""
         self.encoder, self.fingers, self._preprocessing = encoder, config.matcher.fingers, config.preprocessing
         self.takes_background = compares_contact or self._preprocessing.background != "none"
 
@@ -129,13 +123,7 @@ class TouchReader:
     def encode(
         self, grasps: Sequence[Sequence[InputImage]], no_contact_frames: Sequence[RgbImage | None], clock: Stopwatch
     ) -> TouchEncodings:
-        """Encode grasps in batches.
-
-        Args:
-            grasps: The images of each grasp.
-            no_contact_frames: The no-contact frame of each finger, or None.
-            clock: Times the stages "decode" and "encode".
-        """
+        """Encode grasps in batches; `clock` times the stages "decode" and "encode"."""
         parts, levels = [], []
         for start in range(0, len(grasps), BATCH):
             with clock("decode"):

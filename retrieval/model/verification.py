@@ -10,8 +10,8 @@ sequential test between two bounds (Wald 1945). Wald's own bounds need exact rat
 for the fraction `far` of the impostors; fewer grasps give no higher rate. The bound `b` causes additional false
 rejects. They are at most a tenth of those that `a` causes, or MIN_EARLY_REJECTS if that is larger.
 
-An impostor is a false claim: the hand does not hold the expected object. Two kinds of false claims are measured. The
-expected object is any other object, or the object whose photos are most similar to those of the object in the hand.
+An impostor is a false claim: the expected object is any other object than that in the hand, or the one whose photos are
+most similar to it. Both kinds are measured.
 Terms follow ISO/IEC 19795-1: false-accept rate (FAR), false-reject rate (FRR), genuine, impostor.
 """
 

@@ -219,15 +219,16 @@ class HistoryStore:
             database.execute("INSERT INTO feedback VALUES (?, ?, ?, ?, ?)", row)
         return True
 
-    def recordable(self) -> list[tuple[str, str]]:
-        """Return query and object of all feedback whose object has a photo, in the order of the feedback."""
-        found = self._read("SELECT query, object_id FROM feedback WHERE photo IS NOT NULL ORDER BY time, query")
-        return [(name, object_id) for name, object_id in found]
+    def recordable(self) -> list[str]:
+        """Return the queries with feedback on an object that has a photo, in the order of the feedback."""
+        found = self._read("SELECT query FROM feedback WHERE photo IS NOT NULL ORDER BY time, query")
+        return [name for (name,) in found]
 
-    def photo(self, name: str) -> bytes | None:
-        """Return the photo of the object that the feedback names, or None."""
-        found = self._read("SELECT photo FROM feedback WHERE query = ?", [name])
-        return found[0][0] if found else None
+    def feedback(self, name: str) -> tuple[str, bytes, list[str]]:
+        """Return the object of a recordable query, its photo, and the gel check of each grasp."""
+        text = "SELECT object_id, photo, answer FROM feedback JOIN queries ON id = query WHERE query = ?"
+        ((object_id, photo, answer),) = self._read(text, [name])
+        return object_id, photo, json.loads(answer)["query"]["grasps"]
 
     # Trials -------------------------------------------------------------------------------------------------
 
@@ -300,10 +301,10 @@ class HistoryWriter:
         A failure is logged. The next call tries again, because the database contains the feedback.
         """
         with self._lock:
-            for query_id, object_id in self.store.recordable():
+            for query_id in self.store.recordable():
                 if not self.is_recorded(query_id):
                     try:
-                        self._record(query_id, object_id)
+                        self._record(query_id)
                     except Exception:
                         log.exception("The stored feedback on query %s cannot be recorded yet.", query_id)
 
@@ -311,12 +312,10 @@ class HistoryWriter:
         """Whether the grasps of a query are in the recording: checks the first one, which is recorded last."""
         return f"{query_id}-00" in self._recorder.grasp_ids
 
-    def _record(self, query_id: str, object_id: str) -> None:
+    def _record(self, query_id: str) -> None:
         """Record each grasp with contact; the first one last, because `is_recorded` checks only that one."""
-        stored, photo = self.store.query(query_id), self.store.photo(query_id)
-        assert stored is not None, "a foreign key protects queries with feedback"
-        assert photo is not None, "recordable feedback has a photo"
-        pictures, gel_checks = self.store.pictures(query_id), stored.answer["query"]["grasps"]
+        object_id, photo, gel_checks = self.store.feedback(query_id)
+        pictures = self.store.pictures(query_id)
         before = {finger: data for (grasp, finger), data in pictures.items() if grasp == BACKGROUND}
         contact_grasps = [number for number, gel_check in enumerate(gel_checks, start=1) if gel_check == CONTACT]
         for place, number in reversed(list(enumerate(contact_grasps))):

@@ -44,11 +44,10 @@ def contrastive_loss(
 ) -> Tensor:
     """Return the symmetric cross-entropy between unit embeddings of touches and of photos (InfoNCE).
 
-    Each touch must pick each photo of its own object out of that photo and the photos of OTHER objects: photos of the
-    same object are never negatives of each other (InfoNCE with several positives: Khosla et al., NeurIPS 2020, eq. 2,
-    with the other positives removed from the denominator). The loss is averaged over a touch's photos, then over the
-    touches that have a photo of their own object and one of another. The other direction does the same for each photo
-    among the touches, and the result is the mean of the two. A direction without such rows contributes zero.
+    Each touch must pick each photo of its own object out of that photo and the photos of OTHER objects (Khosla et al.,
+    NeurIPS 2020, eq. 2, with the other positives removed from the denominator). The loss is averaged over a touch's
+    photos, then over the touches that have a photo of their own object and one of another; a direction without such
+    touches contributes zero. The other direction does the same for each photo among the touches.
 
     Args:
         touch: (T, d) unit embeddings.

@@ -46,12 +46,7 @@ class Loss(nn.Module):
     """
 
     def __init__(self, embedding_dim: int, objects: int) -> None:
-        """Make the loss for a training run.
-
-        Args:
-            embedding_dim: Length of an embedding.
-            objects: Number of training objects.
-        """
+        """Make the loss for a training run with embeddings of this length and this number of training objects."""
         super().__init__()
 
     def forward(self, batch: EncodedBatch) -> Tensor:

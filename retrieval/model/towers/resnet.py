@@ -10,66 +10,44 @@ from torch import Tensor, nn
 
 from retrieval.model.towers.tower import Tower, stage_statistics
 
+BOTTLENECK_EXPANSION = 4
 
-class BasicBlock(nn.Module):
-    """Two 3 x 3 convolutions and a shortcut."""
 
-    expansion: ClassVar[int] = 1
+class Block(nn.Module):
+    """Convolutions and a shortcut: 3 x 3 twice, or as a bottleneck 1 x 1, 3 x 3, 1 x 1 with four times the outputs."""
 
-    def __init__(self, inputs: int, width: int, stride: int) -> None:
+    def __init__(self, inputs: int, width: int, stride: int, *, is_bottleneck: bool) -> None:
         super().__init__()
-        self.conv1 = nn.Conv2d(inputs, width, 3, stride, padding=1, bias=False)
-        self.bn1 = nn.BatchNorm2d(width)
-        self.conv2 = nn.Conv2d(width, width, 3, padding=1, bias=False)
-        self.bn2 = nn.BatchNorm2d(width)
+        outputs = BOTTLENECK_EXPANSION * width if is_bottleneck else width
+        kernels, counts = ((1, 3, 1), (width, width, outputs)) if is_bottleneck else ((3, 3), (width, outputs))
+        strided, self.depth, channels = kernels.index(3), len(kernels), inputs
+        for place, (kernel, count) in enumerate(zip(kernels, counts, strict=True)):
+            convolution = nn.Conv2d(
+                channels, count, kernel, stride if place == strided else 1, padding=kernel // 2, bias=False
+            )
+            self.add_module(f"conv{place + 1}", convolution)
+            self.add_module(f"bn{place + 1}", nn.BatchNorm2d(count))
+            channels = count
         self.relu = nn.ReLU(inplace=True)
-        self.downsample = _shortcut(inputs, width, stride)
+        self.downsample = None
+        if stride > 1 or inputs != outputs:
+            shortcut = nn.Conv2d(inputs, outputs, 1, stride, bias=False)
+            self.downsample = nn.Sequential(shortcut, nn.BatchNorm2d(outputs))
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the block's output (B, C', H', W') of maps (B, C, H, W)."""
-        y = self.relu(self.bn1(self.conv1(x)))
-        y = self.bn2(self.conv2(y))
-        shortcut = x if self.downsample is None else self.downsample(x)
-        return self.relu(y + shortcut)  # type: ignore[no-any-return]
-
-
-class Bottleneck(nn.Module):
-    """1 x 1 reduction, 3 x 3, 1 x 1 expansion by four, and a shortcut."""
-
-    expansion: ClassVar[int] = 4
-
-    def __init__(self, inputs: int, width: int, stride: int) -> None:
-        super().__init__()
-        outputs = width * self.expansion
-        self.conv1 = nn.Conv2d(inputs, width, 1, bias=False)
-        self.bn1 = nn.BatchNorm2d(width)
-        self.conv2 = nn.Conv2d(width, width, 3, stride, padding=1, bias=False)
-        self.bn2 = nn.BatchNorm2d(width)
-        self.conv3 = nn.Conv2d(width, outputs, 1, bias=False)
-        self.bn3 = nn.BatchNorm2d(outputs)
-        self.relu = nn.ReLU(inplace=True)
-        self.downsample = _shortcut(inputs, outputs, stride)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return the block's output (B, C', H', W') of maps (B, C, H, W)."""
-        y = self.relu(self.bn1(self.conv1(x)))
-        y = self.relu(self.bn2(self.conv2(y)))
-        y = self.bn3(self.conv3(y))
-        shortcut = x if self.downsample is None else self.downsample(x)
-        return self.relu(y + shortcut)  # type: ignore[no-any-return]
-
-
-def _shortcut(inputs: int, outputs: int, stride: int) -> nn.Sequential | None:
-    if stride == 1 and inputs == outputs:
-        return None
-    return nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs))
+        y = x
+        for place in range(1, self.depth + 1):
+            y = self.get_submodule(f"bn{place}")(self.get_submodule(f"conv{place}")(y))
+            y = self.relu(y) if place < self.depth else y
+        return self.relu(y + (x if self.downsample is None else self.downsample(x)))  # type: ignore[no-any-return]
 
 
 class ResNet(Tower):
     """Stem, four stages, global average, and the 1000-way layer for the output "classes"."""
 
     optional_prefixes = ("fc.",)
-    block: ClassVar[type[BasicBlock | Bottleneck]]
+    is_bottleneck: ClassVar[bool]
     depths: ClassVar[tuple[int, ...]]
     """Blocks of each stage."""
 
@@ -85,8 +63,8 @@ class ResNet(Tower):
             strides = [1 if stage == 0 else 2] + [1] * (depth - 1)
             blocks: list[nn.Module] = []
             for stride in strides:
-                blocks.append(self.block(inputs, width, stride))
-                inputs = width * self.block.expansion
+                blocks.append(Block(inputs, width, stride, is_bottleneck=self.is_bottleneck))
+                inputs = BOTTLENECK_EXPANSION * width if self.is_bottleneck else width
             self.add_module(f"layer{stage + 1}", nn.Sequential(*blocks))
         self.fc = nn.Linear(inputs, 1000) if output == "classes" else None
         # Stages 2 to 4, at strides 8, 16 and 32; each has twice the channels of the previous one.
@@ -112,12 +90,12 @@ class ResNet(Tower):
 class ResNet18(ResNet):
     """ResNet-18: 512 pooled features."""
 
-    block, depths = BasicBlock, (2, 2, 2, 2)
+    is_bottleneck, depths = False, (2, 2, 2, 2)
     url = "https://download.pytorch.org/models/resnet18-f37072fd.pth"
 
 
 class ResNet50(ResNet):
     """ResNet-50: 2048 pooled features; 25,557,032 parameters with its 1000-way layer."""
 
-    block, depths = Bottleneck, (3, 4, 6, 3)
+    is_bottleneck, depths = True, (3, 4, 6, 3)
     url = "https://download.pytorch.org/models/resnet50-0676ba61.pth"

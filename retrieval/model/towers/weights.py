@@ -1,9 +1,7 @@
 """State dicts of towers, from files or published ones."""
 
-import logging
 from importlib import resources
 from pathlib import Path
-from urllib.error import URLError
 
 import torch
 from torch import Tensor
@@ -15,7 +13,6 @@ SHIPPED = "shipped"
 """Value of init for the weights of the checkpoint in the package."""
 GEL = "gel"
 """Value of init for the touch tower of the package that was trained for real gels (`gel_tower`)."""
-log = logging.getLogger(__name__)
 
 
 def gel_tower() -> Path:
@@ -55,17 +52,10 @@ def download(url: str) -> State:
     Raises:
         CheckpointError: The download fails or is damaged.
     """
-    path = Path(torch.hub.get_dir()) / "checkpoints" / url.rsplit("/", 1)[1]
-    if path.is_file():
-        return read_state(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    log.warning("downloading %s to %s", url, path)
+    path = Path(torch.hub.get_dir(), "checkpoints", url.rsplit("/", 1)[1])
     try:
-        torch.hub.download_url_to_file(url, str(path), hash_prefix=path.stem.rsplit("-", 1)[1], progress=True)
-    except (URLError, OSError) as error:
+        return dict(torch.hub.load_state_dict_from_url(url, map_location="cpu", check_hash=True, weights_only=True))
+    except Exception as error:  # of the network, of the file or of its digest
         raise CheckpointError(
             f"ImageNet weights could not be downloaded ({error}); fetch {url} elsewhere and put it at {path}"
         ) from error
-    except RuntimeError as error:  # torch's error for a wrong hash
-        raise CheckpointError(f"the download of {url} is damaged ({error}); try again") from error
-    return read_state(path)

@@ -13,16 +13,6 @@ def random_candidate_encoder(hidden=6, width=8, dim=4, seed=0, linear=0):
     return CandidateEncoder(hidden, width, dim, linear), 3 + 5 * torch.randn(7, hidden), 2 * torch.randn(9, hidden) - 1
 
 
-def test_embeddings_order_photos_like_the_scores_although_they_drop_the_norm():
-    candidate_encoder, touches, photos = random_candidate_encoder()
-    nearness, scores = (
-        candidate_encoder.touch(touches) @ candidate_encoder.photo(photos).T,
-        candidate_encoder.scores(touches, photos),
-    )
-    assert torch.equal(nearness.argsort(1), scores.argsort(1))
-    assert not torch.allclose(nearness, scores)
-
-
 @pytest.mark.parametrize("linear", [0, 3])
 def test_folded_statistics_give_raw_partial_activations_the_scores_of_standardised_ones(linear):
     candidate_encoder, touches, photos = random_candidate_encoder(linear=linear)

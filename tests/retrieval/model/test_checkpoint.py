@@ -1,24 +1,27 @@
 """Checkpoints: round trips, one clear error for every kind of damage, and a crash that leaves the old file."""
 
 import ast
+import contextlib
 import dataclasses
 import hashlib
 import json
 import os
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 import safetensors.torch
 import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from safetensors import safe_open
 
 import indexes
 import retrieval
 import robot
-from _touch_retrieval.files import file_digest
 from retrieval.data.dataset import Split
-from retrieval.errors import CheckpointError
+from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.checkpoint import (
     Checkpoint,
     load_checkpoint,
@@ -30,6 +33,7 @@ from retrieval.model.checkpoint_info import FORMAT, read_checkpoint_info
 from retrieval.model.fusion import GelHead, Matcher
 from retrieval.model.gel_check import GelCheck
 from retrieval.model.posterior import Posterior
+from retrieval.training.gate import load_gate
 from tests.conftest import TINY
 
 SPLIT = Split(seed=3, train=("cup", "mug"), validation=("jar", "pan"), test=("red ball", "Töpfchen"))
@@ -70,45 +74,24 @@ def saved(tmp_path):
 # Round trip ------------------------------------------------------------------------------------------------
 
 
-def test_every_tensor_and_every_header_entry_comes_back(tmp_path):
-    matcher = save(tmp_path / "deep" / "er" / "m.safetensors")
-    loaded = load_checkpoint(tmp_path / "deep" / "er" / "m.safetensors")
-    before, after = matcher.state_dict(), loaded.matcher.state_dict()
+def test_every_tensor_and_every_header_entry_comes_back_and_makes_an_equal_file(tmp_path):
+    first, second = tmp_path / "deep" / "er" / "m.safetensors", tmp_path / "again.safetensors"
+    queries = np.ones((2, TINY.matcher.partial_width), np.float16)
+    before = save(first, gel_check=GEL_CHECK, queries=queries).state_dict()
+    loaded, info = load_checkpoint(first), read_checkpoint_info(first)
+    after = loaded.matcher.state_dict()
     assert before.keys() == after.keys()
     for name, tensor in before.items():
         assert torch.equal(tensor, after[name]), name
         assert tensor.dtype == after[name].dtype
-    assert loaded.config == TINY
-    assert loaded.split == SPLIT
-    assert loaded.posterior == POSTERIOR
-    assert loaded.gel_check is None
-    assert loaded.provenance == PROVENANCE
-    assert loaded.path == tmp_path / "deep" / "er" / "m.safetensors"
-
-
-def test_the_gel_check_comes_back_with_its_layer_and_is_readable_without_the_weights(tmp_path):
-    path = tmp_path / "m.safetensors"
-    layer = save(path, gel_check=GEL_CHECK).gel_head.classifier
-    loaded = load_checkpoint(path)
-    assert torch.equal(loaded.matcher.gel_head.classifier.weight, layer.weight)
-    assert torch.equal(loaded.matcher.gel_head.classifier.bias, layer.bias)
-    assert loaded.gel_check == read_checkpoint_info(path).gel_check == GEL_CHECK
-
-
-def test_storing_a_loaded_checkpoint_gives_the_same_file(tmp_path):
-    queries = np.ones((2, TINY.matcher.partial_width), np.float16)
-    save(tmp_path / "a.safetensors", gel_check=GEL_CHECK, queries=queries)
-    store_checkpoint(load_checkpoint(tmp_path / "a.safetensors"), tmp_path / "b.safetensors")
-    assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
-
-
-def test_the_digest_is_the_files_and_equal_content_makes_equal_files(tmp_path):
-    save(tmp_path / "a.safetensors")
-    save(tmp_path / "b.safetensors")
-    expected = hashlib.sha256((tmp_path / "a.safetensors").read_bytes()).hexdigest()
-    assert load_checkpoint(tmp_path / "a.safetensors").digest == expected == file_digest(tmp_path / "b.safetensors")
-    save(tmp_path / "b.safetensors", provenance=PROVENANCE | {"step": 5})
-    assert file_digest(tmp_path / "b.safetensors") != expected
+    assert (loaded.config, loaded.split, loaded.path, loaded.provenance) == (TINY, SPLIT, first, PROVENANCE)
+    for each in (loaded, info):
+        assert (each.posterior, each.gel_check, each.references) == (POSTERIOR, GEL_CHECK, None)
+    assert np.array_equal(loaded.queries, queries)
+    digest = hashlib.sha256(first.read_bytes()).hexdigest()
+    assert (loaded.digest, info.digest) == (digest, digest)
+    store_checkpoint(loaded, second)
+    assert first.read_bytes() == second.read_bytes()
 
 
 # Model card ------------------------------------------------------------------------------------------------
@@ -133,11 +116,15 @@ def test_the_model_card_describes_the_model(saved):
 # Damage ----------------------------------------------------------------------------------------------------
 
 
-def test_a_missing_file_and_a_folder_have_different_errors(tmp_path):
-    with pytest.raises(CheckpointError, match=r"no checkpoint at .*none\.safetensors; `retrieve train` makes one"):
-        load_checkpoint(tmp_path / "none.safetensors")
-    with pytest.raises(CheckpointError, match=r"is a folder, not a file\); give the \.safetensors file"):
-        load_checkpoint(tmp_path)
+def test_what_is_not_a_regular_file_is_refused_without_being_read(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "zero").symlink_to("/dev/zero")
+    for read in (load_checkpoint, read_checkpoint_info, load_gate):
+        for name in ("pipe", "zero", "."):
+            with pytest.raises(CheckpointError, match=r"not a regular file|is a folder, not a file"):
+                read(tmp_path / name)
+        with pytest.raises(CheckpointError, match=r"no .* at .*none\.safetensors"):
+            read(tmp_path / "none.safetensors")
 
 
 def small_file(folder):
@@ -189,47 +176,30 @@ def with_header(text):
 
 FOREIGN = r"contains weights but no header of ours; .*`retrieve train --init`"
 DEEP = f'{{"format": {FORMAT}, "a": ' + "[" * 900 + "]" * 900 + "}"
-OTHERS = {
-    "no header": (with_header(None), FOREIGN),
-    "no tensors": (b"\x08" + bytes(7) + b"{}      ", FOREIGN),
-    "another header": (safetensors.torch.save({"weight": torch.ones(2)}, {"format": "pt"}), FOREIGN),
-    **{
-        repr(content): (content, r"m\.safetensors is not a readable \.safetensors file .*truncated")
-        for content in (b"", b"\x80\x04\x95", b"PK\x03\x04", b"text\n" * 99)
-    },
-    **{
-        text: (with_header(text), r"header of .*m\.safetensors is damaged")
-        for text in (
-            "",
-            "{",
-            "[]",
-            "3",
-            '"format"',
-            "{}",
-            "null",
-            "[" * 100_000,
-            DEEP,
-        )
-    },
-    **{
-        f"format {version}": (
+OTHERS = [
+    (with_header(None), FOREIGN),
+    (safetensors.torch.save({"weight": torch.ones(2)}, {"format": "pt"}), FOREIGN),
+    (b"", r"m\.safetensors is not a readable \.safetensors file .*truncated"),
+    (b"PK\x03\x04", r"m\.safetensors is not a readable \.safetensors file .*truncated"),
+    *[(with_header(text), r"header of .*m\.safetensors is damaged") for text in ("{", "3", "{}", "[" * 100_000, DEEP)],
+    *[
+        (
             with_header(json.dumps({"format": version, "software": "9.9"})),
-            rf"has checkpoint format {version}, this version reads {FORMAT}; install the touch-retrieval that wrote it "
-            r"\(9\.9\)",
+            rf"has checkpoint format {version}, this version reads {FORMAT}; install the touch-retrieval .*9\.9",
         )
-        for version in (0, 1, str(FORMAT), FORMAT + 1, None)
-    },
-}
+        for version in (str(FORMAT), FORMAT + 1)
+    ],
+]
 
 
-@pytest.mark.parametrize(("content", "message"), OTHERS.values(), ids=[name[:20] for name in OTHERS])
+@pytest.mark.parametrize(("content", "message"), OTHERS, ids=map(str, range(len(OTHERS))))
 def test_a_file_that_is_not_a_checkpoint_of_this_version_gets_an_error_that_names_its_kind(tmp_path, content, message):
     (tmp_path / "m.safetensors").write_bytes(content)
     with pytest.raises(CheckpointError, match=message):
         load_checkpoint(tmp_path / "m.safetensors")
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("value", [float("nan"), -float("inf")])
 def test_a_weight_that_is_not_finite_is_refused(saved, value):
     weight = read_tensors(saved)[0]["head.second.weight"].clone()
     weight[3, 4] = value
@@ -241,29 +211,13 @@ def test_a_weight_that_is_not_finite_is_refused(saved, value):
 @pytest.mark.parametrize(
     ("entry", "message"),
     [
-        ({"config": {"matcher": {"colour": 1}}}, "matcher has no setting 'colour'; known settings:"),
+        ({"config": {"matcher": {"colour": 1}}}, "matcher has no setting 'colour'"),
         ({"config": {"matcher": {"tower": "vgg"}}}, "tower must be one of"),
         ({"config": [1]}, "it must be a table"),
-        ({"split": {"train": ["a"]}}, "split must have seed, train, validation, test; validation is missing"),
-        ({"split": []}, "split must be a table"),
-        (
-            {"posterior": {"slope": 1.0}},
-            "posterior must have formula, slope, offset, dependence, tests; formula is missing",
-        ),
-        (
-            {"posterior": POSTERIOR.to_dict() | {"formula": "another"}},
-            "posterior.formula is not the one of this version",
-        ),
-        ({"posterior": POSTERIOR.to_dict() | {"slope": None}}, "posterior.slope must be a number, got None"),
-        (
-            {"posterior": POSTERIOR.to_dict() | {"dependence": 1.5}},
-            "posterior.dependence must be a number <= 1.0, got 1.5",
-        ),
-        ({"gel_check": {"rates": {}}}, "gel_check must have foreign_above, contact_above, level_above"),
-        (
-            {"gel_check": dataclasses.asdict(GEL_CHECK) | {"level_above": "1"}},
-            "gel_check.level_above must be a number or nothing, got '1'",
-        ),
+        ({"split": {"train": ["a"]}}, "split must have .*; validation is missing"),
+        ({"posterior": {"slope": 1.0}}, "posterior must have .*; formula is missing"),
+        ({"posterior": POSTERIOR.to_dict() | {"formula": "another"}}, "posterior.formula"),
+        ({"gel_check": dataclasses.asdict(GEL_CHECK) | {"level_above": "1"}}, "gel_check.level_above must be a number"),
     ],
 )
 def test_a_header_of_another_version_is_refused_with_the_wrong_entry(saved, entry, message):
@@ -281,6 +235,24 @@ def test_weights_that_do_not_fit_the_configuration_give_a_one_line_error(saved):
         load_checkpoint(saved)
 
 
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=5,
+)
+
+
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(part=st.sampled_from(["config", "split", "posterior", "provenance", "format", "software", "task"]), value=JSON)
+def test_any_part_of_a_header_may_be_forged(saved, part, value):
+    forged = saved.with_name("forged.safetensors")
+    state, header = read_tensors(saved)
+    write_tensors(forged, state, header | {part: value})
+    for read in (load_checkpoint, read_checkpoint_info, load_gate):
+        with contextlib.suppress(BadInput):
+            read(forged)
+
+
 # Writing ---------------------------------------------------------------------------------------------------
 
 
@@ -291,8 +263,10 @@ def fail(error):
     return failing
 
 
-@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()], ids=["full", "Ctrl-C"])
-@pytest.mark.parametrize("where", ["os.fsync", "pathlib.Path.replace"])
+@pytest.mark.parametrize(
+    ("where", "error"),
+    [("os.fsync", OSError(28, "No space left on device")), ("pathlib.Path.replace", KeyboardInterrupt())],
+)
 def test_a_failed_write_leaves_the_old_checkpoint_and_no_other_file(saved, monkeypatch, where, error):
     before, files = saved.read_bytes(), sorted(os.listdir(saved.parent))
     with monkeypatch.context() as patch:
@@ -328,5 +302,7 @@ def unsafe_calls(source):
 
 def test_no_module_unpickles_anything():
     assert len(SOURCES) > 100
-    found = {str(path): list(unsafe_calls(path.read_text("utf-8"))) for path in SOURCES}
+    texts = {str(path): path.read_text("utf-8") for path in SOURCES}
+    suspects = {path: text for path, text in texts.items() if re.search(r"pickle|dill|joblib|shelve|\bload\(", text)}
+    found = {path: list(unsafe_calls(text)) for path, text in suspects.items()}
     assert {path: calls for path, calls in found.items() if calls} == {}

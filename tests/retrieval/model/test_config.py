@@ -91,16 +91,14 @@ def test_a_file_changes_its_settings_and_leaves_the_rest(tmp_path):
     assert type(config.training.learning_rate) is float
 
 
-@pytest.mark.parametrize("name", ["huge", "", ".", "paper.toml", "../paper", "configs"])
+@pytest.mark.parametrize("name", ["huge", ".", "../paper"])
 def test_an_unknown_name_lists_the_presets(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match=rf"one of {', '.join(preset_names())} or a TOML file; there is no '.*'"):
         load_config(name)
 
 
-@pytest.mark.parametrize(
-    "content", [b"[training\n", b"seed = \n", b"[training]\nseed = 1\nseed = 2\n", b"\xff\xfe", b"a = 1" * 2]
-)
+@pytest.mark.parametrize("content", [b"[training\n", b"\xff\xfe"])
 def test_a_file_that_is_not_toml_is_named(tmp_path, content):
     (tmp_path / "bad.toml").write_bytes(content)
     with pytest.raises(ConfigError, match=r"bad\.toml is not valid TOML: "):
@@ -117,36 +115,36 @@ def test_an_unknown_key_is_refused_with_the_known_ones(table):
         Config.from_dict({table: {"colour": 1}})
 
 
-OUT_OF_RANGE = [
-    *[("matcher", name, value) for name in ("fingers", "hidden", "embedding_dim") for value in (0, -1)],
-    *[("matcher", "dropout", value) for value in (-0.1, 1.0, 1.5, math.nan, math.inf)],
-    *[
-        ("training", name, value)
-        for name in ("iterations", "touches_per_batch", "positives_per_touch", "negatives_per_touch", "validate_every")
-        for value in (0, -3)
-    ],
-    *[("training", "learning_rate", value) for value in (0.0, -1e-4, math.nan, math.inf)],
-    *[("training", f"{loss}_weight", value) for loss in LOSSES for value in (-0.1, math.nan, math.inf)],
-    *[("training", name, "other") for name in ("schedule", "precision")],
-    *[
-        ("training", name, value)
-        for name in ("validation_fraction", "test_fraction")
-        for value in (-0.1, 1.0, 2.0, math.nan, math.inf)
-    ],
-    *[("training", "seed", value) for value in (-1, 2**32)],
-    *[("preprocessing", name, value) for name in ("touch_px", "photo_px") for value in (0, -1, 4097)],
+REFUSED = [
+    ("matcher", "fingers", 0),
+    ("matcher", "dropout", 1.0),
+    ("matcher", "dropout", math.nan),
+    ("matcher", "tower_output", "other"),
+    ("matcher", "candidate_linear", 3),  # without a cosine
+    ("training", "learning_rate", 0.0),
+    ("training", "contrastive_weight", -0.1),
+    ("training", "listwise_weight", math.inf),
+    *[("training", name, "other") for name in ("schedule", "negatives", "precision", "workers")],
+    ("training", "validation_fraction", 1.0),
+    ("training", "seed", 2**32),
+    ("preprocessing", "touch_px", 4097),
     ("preprocessing", "background", "green"),
 ]
 
 
-@pytest.mark.parametrize(("table", "name", "value"), OUT_OF_RANGE)
-def test_a_value_out_of_range_is_refused_and_named(table, name, value):
+@pytest.mark.parametrize(("table", "name", "value"), REFUSED)
+def test_a_refused_value_is_named(table, name, value):
     with pytest.raises(ConfigError, match=name) as caught:
         Config.from_dict({table: {name: value}})
     assert str(value) in str(caught.value)
     if not name.endswith("_weight"):
         with pytest.raises(ConfigError, match=re.escape(str(caught.value))):
             type(getattr(Config(), table))(**{name: value})
+
+
+def test_the_message_of_a_wrong_choice_lists_the_choices():
+    with pytest.raises(ConfigError, match=r"training\.precision must be one of 'auto', 'float32', 'bfloat16'"):
+        Config.from_dict({"training": {"precision": "other"}})
 
 
 def test_settings_from_python_are_checked_and_converted_like_those_of_a_file():

@@ -11,7 +11,6 @@ from retrieval.errors import NumericalError
 from retrieval.model import fusion_scorer
 from retrieval.model.config import MatcherConfig
 from retrieval.model.fusion import FusionHead, Matcher, Standardise
-from retrieval.model.towers import TOWERS
 
 
 def concatenated_forward(matcher, touches, photos):
@@ -25,8 +24,7 @@ def concatenated_forward(matcher, touches, photos):
     return head.out(hidden)[:, 0]
 
 
-@pytest.mark.parametrize("output", ["classes", "pooled"])
-@pytest.mark.parametrize("name", sorted(TOWERS))
+@pytest.mark.parametrize(("name", "output"), [("small", "classes"), ("resnet18", "pooled"), ("mobilenet_v2", "pooled")])
 def test_the_logit_from_partial_activations_equals_the_concatenated_forward(name, output):
     torch.manual_seed(0)
     matcher = Matcher(MatcherConfig(tower=name, tower_output=output, hidden=64)).eval()
@@ -76,16 +74,14 @@ def test_a_feature_that_hardly_varies_is_not_scaled_up_while_plain_scaling_ampli
 
 
 def test_the_paper_configuration_has_the_papers_layers():
-    matcher = Matcher(MatcherConfig())
+    with torch.device("meta"):
+        matcher = Matcher(MatcherConfig())
     assert matcher.head.touch_partial.weight.shape == (1024, 2000)
     assert matcher.head.photo_partial.weight.shape == (1024, 1000)
     assert matcher.head.photo_partial.bias is None
     assert matcher.head.second.weight.shape == (1024, 1024)
     assert matcher.head.out.weight.shape == (1, 1024)
-    towers = [
-        sum(value.numel() for value in tower.parameters()) for tower in (matcher.touch_tower, matcher.photo_tower)
-    ]
-    assert towers == [25_557_032, 25_557_032]
+    assert sum(value.numel() for value in matcher.touch_tower.parameters()) == 25_557_032
 
 
 def test_the_partial_activation_layers_start_like_one_layer_over_the_concatenation():
@@ -101,7 +97,7 @@ def small_head(hidden=32, seed=0):
     return FusionHead(10, 10, hidden, 0.5)
 
 
-@pytest.mark.parametrize("block", [1, 5, 37, 1000])
+@pytest.mark.parametrize("block", [5, 37])
 def test_scores_of_many_photos_are_the_logits_of_single_pairs_for_any_block_size(block, monkeypatch):
     monkeypatch.setattr(fusion_scorer, "BLOCK", block)
     head, photos = small_head().eval(), np.random.default_rng(0).normal(size=(37, 32)).astype(np.float32)

@@ -17,10 +17,6 @@ def names(touches, fingers=2):
     return [[image.name for image in grasp] for grasp in parse_grasps(touches, fingers)]
 
 
-def counts(touches, fingers=2):
-    return [len(grasp) for grasp in parse_grasps(touches, fingers)]
-
-
 @pytest.fixture
 def picture(tmp_path):
     """A PNG file of noise."""
@@ -32,31 +28,27 @@ def picture(tmp_path):
 # Nesting -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_list_of_images_is_one_grasp_and_a_list_of_lists_are_several():
-    assert names(["a.png", Path("b.png")]) == [["a.png", "b.png"]]
-    assert names([["a.png", "b.png"], ("c.png", "d.png")]) == [["a.png", "b.png"], ["c.png", "d.png"]]
-
-
-def test_for_one_finger_a_single_image_is_a_grasp():
-    for touches in ("a.png", ["a.png"], [["a.png"]]):
-        assert names(touches, 1) == [["a.png"]]
-    assert names([["a.png"], ["b.png"]], 1) == [["a.png"], ["b.png"]]
-
-
-def test_an_array_with_more_axes_is_a_list_of_its_entries():
-    assert counts(np.stack([GREY, GREY])) == [2]
-    assert counts(np.stack([[GREY, GREY], [GREY, GREY], [GREY, GREY]])) == [2, 2, 2]
-    assert counts(GREY, 1) == [1]
-
-
-def test_bytes_are_an_image_and_not_a_list():
-    assert names([b"12345", bytearray(b"678")]) == [["grasp 1, finger a", "grasp 1, finger b"]]
-
-
-def test_an_image_that_is_not_a_file_is_named_by_its_place():
-    touches = [[GREY, "b.png"], [Image.fromarray(GREY), GREY]]
-    assert names(touches)[0] == ["grasp 1, finger a", "b.png"]
-    assert names(touches)[1][0] == "grasp 2, finger a"
+@pytest.mark.parametrize(
+    ("touches", "fingers", "named"),
+    [
+        (["a.png", Path("b.png")], 2, [["a.png", "b.png"]]),
+        ([["a.png", "b.png"], ("c.png", "d.png")], 2, [["a.png", "b.png"], ["c.png", "d.png"]]),
+        ("a.png", 1, [["a.png"]]),
+        (["a.png"], 1, [["a.png"]]),
+        ([["a.png"], ["b.png"]], 1, [["a.png"], ["b.png"]]),
+        ([b"12345", bytearray(b"678")], 2, [["grasp 1, finger a", "grasp 1, finger b"]]),
+        (np.stack([GREY, GREY]), 2, [["grasp 1, finger a", "grasp 1, finger b"]]),
+        (np.stack([[GREY], [GREY]]), 1, [["grasp 1, finger a"], ["grasp 2, finger a"]]),
+        (GREY, 1, [["grasp 1, finger a"]]),
+        (
+            [[GREY, "b.png"], [Image.fromarray(GREY)] * 2],
+            2,
+            [["grasp 1, finger a", "b.png"], ["grasp 2, finger a", "grasp 2, finger b"]],
+        ),
+    ],
+)
+def test_the_nesting_of_images_gives_the_grasps_and_files_keep_their_names(touches, fingers, named):
+    assert names(touches, fingers) == named
 
 
 @pytest.mark.parametrize(
@@ -65,17 +57,13 @@ def test_an_image_that_is_not_a_file_is_named_by_its_place():
         ([], "give at least one touch"),
         ([[]], r"got 0: "),
         ("a.png", r"got 1: a\.png"),
-        (["a.png"], r"got 1: a\.png"),
         (["a.png", "b.png", "c.png"], "got 3"),
         ([["a.png", "b.png"], ["c.png"]], r"got 1: c\.png"),
         (["a.png", ["b.png", "c.png"]], "a list mixes images with lists of images"),
         ([[["a.png", "b.png"]]], "query several objects with query_many"),
         (None, "got NoneType"),
-        ([None, None], "got NoneType"),
-        ([[1.0, 2.0]], "got float"),
         ({"a": "a.png"}, "got dict"),
         ((image for image in ("a.png", "b.png")), "got generator"),
-        (np.float32(1), "got float32"),
     ],
 )
 def test_every_other_input_is_refused_with_one_sentence(touches, message):
@@ -96,7 +84,7 @@ def test_a_file_gives_the_same_numbers_in_every_form(picture):
         assert np.array_equal(read[0], other)
 
 
-@pytest.mark.parametrize("mode", ["1", "L", "P", "LA", "RGBA", "CMYK"])
+@pytest.mark.parametrize("mode", ["P", "LA", "CMYK"])
 def test_a_pillow_image_is_read_like_its_file(mode, picture):
     image, buffer = Image.open(picture).convert(mode), io.BytesIO()
     image.save(buffer, "TIFF" if mode == "CMYK" else "PNG")
@@ -124,16 +112,12 @@ def test_an_array_need_not_be_contiguous():
     ("array", "message"),
     [
         (GREY / 255, r"must contain uint8 samples in 0\.\.255, got float64; convert samples in 0\.\.1 with np\.rint"),
-        (GREY.astype(np.float32), "got float32"),
-        (GREY.astype(np.uint16), "got uint16"),
         (GREY > 0, "got bool"),
         (np.array(["a.png", "b.png"]), "got <U5"),
         (GREY[..., 0], r"must be \(height, width, 3\) in RGB order, got \(4, 6\); repeat a grey image"),
-        (GREY[..., :1], r"got \(4, 6, 1\)"),
         (np.concatenate([GREY, GREY[..., :1]], axis=2), r"got \(4, 6, 4\)"),
         (GREY.transpose(2, 0, 1), r"got \(3, 4, 6\).*put channels last"),
         (GREY[:0], "has no pixels"),
-        (GREY[:, :0], "has no pixels"),
     ],
 )
 def test_an_array_with_unclear_range_or_channels_is_refused(array, message):

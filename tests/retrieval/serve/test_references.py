@@ -52,9 +52,8 @@ def test_feedback_on_an_object_without_photos_adds_no_photo(index, touches, tmp_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("width", [1280, 390])
-def test_the_page_shows_the_nearest_reference_touch_next_to_photo_and_touch(browser, index, touches, width):
-    with address(index) as url, page(browser, url, width) as opened:
+def test_the_page_shows_the_nearest_reference_touch_next_to_photo_and_touch(browser, index, touches):
+    with address(index) as url, page(browser, url, 390) as opened:
         ask(opened, touches[NAMES[1]][1])
         card = opened.locator(".photo.object", has_text=NAMES[1])
         assert card.locator(".reference img").count() == 2
@@ -68,12 +67,7 @@ def test_the_page_shows_the_nearest_reference_touch_next_to_photo_and_touch(brow
         assert "cosine 1.00; references add" in dialog.inner_text()
         assert serious(opened) == []
         assert opened.evaluate("document.documentElement.scrollWidth <= innerWidth")
-
-
-@pytest.mark.slow
-def test_the_page_marks_an_object_without_photos(browser, index, touches):
     with address(index) as url, page(browser, url) as opened:
         ask(opened, touches[NAMES[2]][0])
         opened.locator(".photo.object", has_text=NAMES[2]).locator("button").click()
-        dialog = opened.get_by_role("dialog", name=NAMES[2])
-        dialog.get_by_text("no photo: scored by its touches only").wait_for()
+        opened.get_by_role("dialog", name=NAMES[2]).get_by_text("no photo: scored by its touches only").wait_for()
