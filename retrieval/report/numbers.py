@@ -1,13 +1,15 @@
 """How reports write numbers: one form for numbers, percentages, intervals, probabilities and p-values."""
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
-from retrieval.metrics.intervals import FEW_OBJECTS, Difference, Summary
+if TYPE_CHECKING:  # imports scipy, which the page of a query does not need
+    from retrieval.metrics.intervals import Difference, Summary
 
 MISSING_VALUE = "–"
 FEW_OBJECTS_MARK = " †"
 FEW_OBJECTS_NOTE = (
-    f"† Fewer than {FEW_OBJECTS} objects: the interval is too narrow. In simulated samples it contained the true value "
+    "† Fewer than 5 objects: the interval is too narrow. In simulated samples it contained the true value "
     "in 50 % of cases for 2 objects, 74 % for 3 and 87 % for 4, instead of 95 %."
 )
 
@@ -41,7 +43,7 @@ def interval(value: float, low: float, high: float, write: Callable[[float], str
     return f"{write(value)} [{write(low)}, {write(high)}]"
 
 
-def with_interval(summary: Summary | None) -> str:
+def with_interval(summary: "Summary | None") -> str:
     """Return value and interval of a measure in percent, with a mark if there are too few objects.
 
     Of a top-n curve, this is the top-1 accuracy.
@@ -52,7 +54,7 @@ def with_interval(summary: Summary | None) -> str:
     return interval(summary.value[0], summary.low[0], summary.high[0]) + mark
 
 
-def difference(found: Difference) -> str:
+def difference(found: "Difference") -> str:
     """Return a difference and its interval in percent points, with a mark if there are too few objects."""
     points = interval(found.value, found.low, found.high, lambda fraction: f"{100 * fraction:+.1f}")
     return points + FEW_OBJECTS_MARK * found.few_objects

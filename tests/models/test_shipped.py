@@ -80,23 +80,18 @@ def test_the_shipped_checkpoint_is_far_above_chance_on_unseen_objects(tmp_path, 
 
 
 @pytest.mark.parametrize("fingers", SHIPPED)
-def test_the_shipped_checkpoints_calibrate_reference_touches_with_and_without_photos(fingers):
-    made = load_checkpoint(shipped_model(fingers))
+def test_the_shipped_checkpoints_calibrate_references_and_take_no_photo_for_a_gel_image(fingers):
+    made, photos = load_checkpoint(shipped_model(fingers)), []
     references = made.references
     assert references.objects == len(made.split.validation) == 99
     apart, equal = references.touch_only.log_ratio([-0.2, 0.9], 1)
     assert apart < 0 < equal  # a dissimilar touch is evidence against the object
     assert references.weight * references.with_photos.slope > 1
-
-
-@pytest.mark.parametrize("fingers", SHIPPED)
-def test_the_shipped_checkpoints_do_not_take_a_photo_for_a_gel_image(fingers):
-    made, photos = load_checkpoint(shipped_model(fingers)), []
     with load_rig("sim", seed=990) as rig:
-        for name in rig.object_ids(20):
+        for name in rig.object_ids(10):
             rig.prepare(name, 0)
             photos.append(made.config.preprocessing.touch(to_float(rig.camera.read(depth=False).colour)))
     features = touch_features(made.matcher, [[photo] * fingers for photo in photos])
     with torch.inference_mode():
         verdicts = made.gel_check.classify(made.matcher.gel_readings(features).numpy())
-    assert verdicts.count(NOT_A_GEL) >= 17
+    assert verdicts.count(NOT_A_GEL) >= 8

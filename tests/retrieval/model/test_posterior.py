@@ -99,13 +99,10 @@ def test_where_none_rounds_to_one_the_probability_if_present_is_exact_and_the_qu
         # 1, 1.333, 1.5, 1.6 and 1.667 together.
         (0.5, 1.0, 1, 0.5, 2),
         (0.5, 1.1, 1, 0.5, 1),  # 1.1 * 1.333 = 1.467
-        (0.5, 0.85, 1, 0.5, 4),  # 0.85 * 1.6 = 1.36, * 1.667 = 1.417
         (0.5, 0.8, 1, 0.5, None),  # 0.8 * 1.667 = 1.333
         (0.5, 2.0, 2, 0.5, 1),  # a sum of two grasps of logit 1
         (0.5, 4.1, 5, 0.5, None),  # no estimate beyond five grasps
-        (0.5, -1.0, 1, 0.5, None),
         (0.0, 0.5, 1, 0.5, 2),  # three independent ones: 1.5
-        (1.0, 1.3, 1, 0.5, None),  # more of the same
         (0.5, 2.0, 1, 0.8, 2),  # log 4 + log (0.8 / 0.2) = 2.773; 2.667, 3
     ],
 )

@@ -10,14 +10,11 @@ from torch import nn
 from torch.nn import functional
 
 from retrieval.errors import BadInput, CheckpointError, ConfigError, NumericalError
-from retrieval.model.towers import TOWERS, tower_name
+from retrieval.model.towers import tower_name
 from retrieval.model.towers.mobilenet import InvertedResidual
 from retrieval.model.towers.tower import Tower, build_tower, stage_statistics
 from retrieval.model.towers.weights import read_state
 from tests.data import touch_data
-
-# ResNet-18 and -50 cover both kinds of block.
-every_tower = pytest.mark.parametrize("name", sorted(TOWERS))
 
 
 def transformers_resnet(name):
