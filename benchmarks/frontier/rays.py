@@ -15,9 +15,9 @@ from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff
 from retrieval.frontier.sample import Sample
 from robot.readings import Pose
 from robot.sim.camera import NOISE, PinholeCamera
-from robot.sim.objects.body import GEL_STEP_MM, ClippedRays, SdfBody, Vectors, clip_to_box
+from robot.sim.objects.body import GEL_STEP_MM, SdfBody, Vectors, clip_to_box
 from robot.sim.objects.draw import draw_object
-from robot.sim.objects.packets import MAX_STEPS, first_hits, hits
+from robot.sim.objects.packets import MAX_STEPS, Rays, first_hits, hits
 from robot.sim.scene import Grip, Scene
 
 _FAMILIES = ("knurl", "bumps", "weave")
@@ -58,36 +58,36 @@ class RayMarcher(SdfBody):
         self.stride, self.max_steps = stride, max_steps
         self.casts: list[Callable[[], NDArray[Any]]] = []
 
-    def _cast(self, rays: ClippedRays) -> Vectors:
-        return self._recorded(partial(self._by, first_hits, rays))
+    def _cast(self, rays: Rays, step_mm: float) -> Vectors:
+        return self._recorded(partial(self._by, first_hits, rays, step_mm))
 
-    def _hit(self, rays: ClippedRays) -> NDArray[np.bool_]:
-        return self._recorded(partial(self._by, hits, rays))
+    def _hit(self, rays: Rays, step_mm: float) -> NDArray[np.bool_]:
+        return self._recorded(partial(self._by, hits, rays, step_mm))
 
     def _recorded(self, cast: Callable[[], NDArray[Any]]) -> NDArray[Any]:
         self.casts.append(cast)
         return cast()
 
-    def _by(self, intersect: Callable[..., NDArray[Any]], rays: ClippedRays) -> NDArray[Any]:
-        return intersect(self.displaced_solid(rays.step_mm), rays.arrays, self.stride * rays.step_mm, self.max_steps)
+    def _by(self, intersect: Callable[..., NDArray[Any]], rays: Rays, step_mm: float) -> NDArray[Any]:
+        return intersect(self.displaced_solid(step_mm), rays, self.stride * step_mm, self.max_steps)
 
 
 class EqualStepMarcher(RayMarcher):
     """The same in equal steps of plain numpy, `stride` times the requested detail, without a limit."""
 
-    def _by(self, intersect: Callable[..., NDArray[Any]], rays: ClippedRays) -> NDArray[Any]:
-        found = by_equal_steps(self, rays, self.stride * rays.step_mm)
+    def _by(self, intersect: Callable[..., NDArray[Any]], rays: Rays, step_mm: float) -> NDArray[Any]:
+        found = by_equal_steps(self, rays, step_mm, self.stride * step_mm)
         return np.isfinite(found) if intersect is hits else found
 
 
-def by_equal_steps(body: SdfBody, rays: ClippedRays, step_mm: float) -> Vectors:
+def by_equal_steps(body: SdfBody, rays: Rays, detail_mm: float, step_mm: float) -> Vectors:
     """Return where the field in plain numpy first changes sign, refined by its chord; inf if it does not."""
     found, before, along = np.full(len(rays.near_mm), np.inf), np.zeros(len(rays.near_mm)), 0.0
     open_ = np.flatnonzero(rays.near_mm <= rays.far_mm)
     while len(open_):
         t = rays.near_mm[open_] + along
         x, y, z = (rays.origins[open_] + t[:, None] * rays.directions[open_]).astype(np.float32).T
-        f = body.field(x, y, z, rays.step_mm).astype(np.float64)
+        f = body.field(x, y, z, detail_mm).astype(np.float64)
         inside = f <= 0
         hit, fraction = open_[inside], f[inside] / (before[open_[inside]] - f[inside]) if along else 0.0
         found[hit] = t[inside] + step_mm * fraction
@@ -132,7 +132,7 @@ def _rays_onto(body: SdfBody, rows: int) -> tuple[Vectors, Vectors]:
 
 def _exact_depth(body: SdfBody, origins: Vectors, directions: Vectors) -> Vectors:
     near, far = clip_to_box(origins, directions, body.lower, body.upper)
-    return by_equal_steps(body, ClippedRays(origins, directions, near, far, GEL_STEP_MM), 0.01)
+    return by_equal_steps(body, Rays(origins, directions, near, far), GEL_STEP_MM, 0.01)
 
 
 def _cast(walls: Sequence[tuple[SdfBody, Vectors, Vectors]], step_mm: float) -> Vectors:

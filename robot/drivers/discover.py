@@ -10,6 +10,7 @@ import logging
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
+from typing import Literal
 
 log = logging.getLogger(__name__)
 DEV, SYS = Path("/dev"), Path("/sys")
@@ -19,16 +20,9 @@ _GEL_SENSORS = {"digit": "digit", "gelsight mini": "gelsight_mini", "gelsight": 
 
 @dataclass(frozen=True)
 class DiscoveredDevice:
-    """A connected device.
+    """A connected device: its stable name, its own name, and the lines for its table in a rig's file."""
 
-    Attributes:
-        kind: "camera", "serial port" or "realsense".
-        device: Stable name.
-        label: The device's own name.
-        toml: Lines for the device's table in a rig's file.
-    """
-
-    kind: str
+    kind: Literal["camera", "serial port", "realsense"]
     device: str
     label: str
     toml: str

@@ -15,11 +15,7 @@ NEAR_MM, NEAR_RAD = 1.0, math.radians(1.0)
 class ManualArm(Arm):
     """Asks a person to move the hand to each pose and assumes it reached.
 
-    Args:
-        workspace: Limits of the point between the fingertips.
-        max_speed_mm_s: Upper limit of requested speeds.
-        ask: Shows a request and returns when it is done.
-        clock: The rig's clock.
+    `ask` shows a request and returns when it is done.
     """
 
     is_manual = True
@@ -39,8 +35,7 @@ class ManualArm(Arm):
     def _connect(self) -> None:
         self._at = None
 
-    def _close(self) -> None:
-        self._at = None
+    def _close(self) -> None: ...
 
     def _stop(self) -> None:
         """Forget the pose: after an interruption, the next pose is requested again."""
@@ -54,7 +49,7 @@ class ManualArm(Arm):
                 return self._at
         self._at = None
         try:
-            self._ask(describe_pose(pose))
+            self._ask(_describe(pose))
         except EOFError as error:
             raise RobotConfigError("a person must move the hand of this rig: run it in a terminal") from error
         self._at = pose
@@ -66,7 +61,7 @@ class ManualArm(Arm):
         return self._at
 
 
-def describe_pose(pose: Pose) -> str:
+def _describe(pose: Pose) -> str:
     """Return the request for a pose; right and behind are as the camera on the -y side sees them."""
     sideways = f"{abs(pose.x_mm):.0f} mm to the {'right' if pose.x_mm >= 0 else 'left'} of the origin"
     along = f"{abs(pose.y_mm):.0f} mm {'behind' if pose.y_mm >= 0 else 'in front of'} it as the camera sees it"

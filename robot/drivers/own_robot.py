@@ -17,9 +17,8 @@ The object has these methods, with values in mm, rad, mm/s and N:
               disconnect()    optional: end the connection
 
 It is made when the rig connects; `settings` are its keyword arguments. Connecting asks for the pose or the state and
-moves nothing. The limits of the rig's file hold as for every arm and gripper: a pose outside the workspace, or a speed
-or a force above its limit, is refused before the program is called. Only `state_age_s` is not used. An arm that is not
-near its goal after `move_to` is an error.
+moves nothing. The limits of the rig's file hold as for every arm and gripper. An arm that is not near its goal after
+`move_to` is an error.
 """
 
 import math
@@ -47,10 +46,8 @@ ARRIVED_MM, ARRIVED_DEG = 5.0, 5.0
 class OwnDevice(Actuator):
     """The common part of an arm and a gripper that a user's program moves.
 
-    Args:
-        robot: Name in ROBOTS or "module:Class"; a class or a function that returns the object.
-        settings: Its keyword arguments.
-        others: Arguments of the base class.
+    `robot` is a name in ROBOTS or "module:Class": a class or a function that returns the object. `settings` are its
+    keyword arguments, `others` those of the base class.
     """
 
     _methods: ClassVar[tuple[str, ...]]
@@ -99,14 +96,7 @@ class OwnDevice(Actuator):
 
 
 class OwnArm(OwnDevice, Arm):
-    """An arm that a user's program moves.
-
-    Args:
-        workspace: Limits of the point between the fingertips.
-        robot, settings: See OwnDevice.
-        max_speed_mm_s: Upper limit of the speed.
-        clock: The rig's clock.
-    """
+    """An arm that a user's program moves; `robot` and `settings` are those of OwnDevice."""
 
     _methods = ("move_to", "pose", "stop")
 
@@ -119,7 +109,6 @@ class OwnArm(OwnDevice, Arm):
         max_speed_mm_s: float = 1000.0,
         clock: Clock = time.monotonic,
     ) -> None:
-        """Raise UnknownName for a class that cannot be imported."""
         limits = {"workspace": workspace, "max_speed_mm_s": max_speed_mm_s}
         super().__init__(robot=robot, settings=settings, clock=clock, **limits)
 
@@ -146,15 +135,9 @@ class OwnArm(OwnDevice, Arm):
 
 
 class OwnGripper(OwnDevice, Gripper):
-    """A gripper that a user's program moves. The jaws open at the largest allowed speed.
+    """A gripper that a user's program moves, at the largest allowed speed when it opens.
 
-    Args:
-        stroke_mm: Largest opening.
-        min_force_n: Smallest force on each finger.
-        robot, settings: See OwnDevice.
-        max_force_n: Upper limit of the force on each finger.
-        max_speed_mm_s: Upper limit of the speed of the jaws.
-        clock: The rig's clock.
+    `robot` and `settings` are those of OwnDevice. Forces are those on each finger.
     """
 
     _methods = ("open", "grasp", "state", "stop")

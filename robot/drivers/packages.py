@@ -9,13 +9,7 @@ from robot.errors import DeviceError
 
 
 def import_package(name: str, device: str, extra: str) -> Any:
-    """Import a driver's package; raise DeviceError if it or a system library is missing.
-
-    Args:
-        name: Module to import.
-        device: What requires it, for the message.
-        extra: The extra that installs it.
-    """
+    """Import the module `name`, which `device` requires and `extra` installs; raise DeviceError if it is missing."""
     try:
         return import_module(name)
     except ImportError as error:

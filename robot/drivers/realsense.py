@@ -27,13 +27,10 @@ from robot.settings import TypedSettings
 
 @dataclass(frozen=True, kw_only=True)
 class RealSenseSettings(TypedSettings):
-    """Settings of a RealSense.
+    """Settings of both streams of a RealSense.
 
     Attributes:
         serial: Serial number of the camera, required if several are connected.
-        width: Width of both streams in pixels.
-        height: Height of both streams in pixels.
-        fps: Frame rate of both streams.
         warmup_frames: Frames dropped after connecting.
         timeout_s: Longest wait for a picture.
     """

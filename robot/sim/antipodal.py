@@ -7,7 +7,7 @@ cone (Nguyen 1988). Fingers and hand are boxes; on their approach they must meet
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -74,22 +74,14 @@ def find_grasps(body: MeshBody, settings: GraspSettings, stroke_mm: float) -> An
     for yaw in _YAWS:
         profile = _JawProfile.of(body, float(yaw), settings.floor_mm)
         for tilt in (0.0, SIDEWAYS_RAD, -SIDEWAYS_RAD):
-            pads = profile.pads(tilt)
-            min_width_mm = min(min_width_mm, float(pads.width_mm[pads.opposite].min(initial=math.inf)))
-            clear, retreat_mm = profile.approach(tilt, pads, settings, stroke_mm)
-            at = np.nonzero(_interior(pads.opposite & clear))
+            opposite, width_mm, middle_mm = profile.pads(tilt)
+            min_width_mm = min(min_width_mm, float(width_mm[opposite].min(initial=math.inf)))
+            clear, retreat_mm = profile.approach(tilt, middle_mm, settings, stroke_mm)
+            at = np.nonzero(_interior(opposite & clear))
             angles = (np.full(len(at[0]), angle) for angle in (yaw, tilt))
-            parts.append((profile.points(at, pads.middle_mm), *angles, pads.width_mm[at], retreat_mm[at]))
+            parts.append((profile.points(at, middle_mm), *angles, width_mm[at], retreat_mm[at]))
     points, yaws, tilts, widths, backs = (np.concatenate(part) for part in zip(*parts, strict=True))
     return AntipodalGrasps(points, yaws, tilts, widths, backs, min_width_mm)
-
-
-class _PadContacts(NamedTuple):
-    """Contacts of two pads that close at each place (H, Z)."""
-
-    opposite: Mask  # whether the pads meet opposite sides
-    width_mm: Array  # distance between these sides
-    middle_mm: Array  # position of the middle between them along the closing direction
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,8 +122,12 @@ class _JawProfile:
         shape = len(across), len(up)
         return cls(yaw_rad, across, up, reach.reshape(2, *shape), slopes.reshape(2, 2, *shape), (low, high))
 
-    def pads(self, tilt_rad: float) -> _PadContacts:
-        """Return the contacts of two pads whose long side lies across the approach."""
+    def pads(self, tilt_rad: float) -> tuple[Mask, Array, Array]:
+        """Return the contacts of two pads that close at each place (H, Z), their long sides across the approach.
+
+        Returns:
+            Whether they meet opposite sides, the distance between these, and the middle along the closing direction.
+        """
         along, across = (2 * round(size / _PITCH_MM / 2 - 0.5) + 1 for size in PAD_MM)
         cells = (along, across) if tilt_rad else (across, along)
         reach = _windows(self.reach_mm, cells, -np.inf)
@@ -149,10 +145,10 @@ class _JawProfile:
                 & (np.hypot(*(centre[:, 0] - centre[:, 1])) <= FRICTION * width)
                 & (np.hypot(*slope) <= FRICTION).all(axis=0)
             )
-            return _PadContacts(opposite, width, (foremost[0] - foremost[1]) / 2)
+            return opposite, width, (foremost[0] - foremost[1]) / 2
 
     def approach(
-        self, tilt_rad: float, pads: _PadContacts, settings: GraspSettings, stroke_mm: float
+        self, tilt_rad: float, middle_mm: Array, settings: GraspSettings, stroke_mm: float
     ) -> tuple[Mask, Array]:
         """Return (H, Z) whether open jaws can reach each place, and the distance to withdraw clear of the object."""
         top = float(self.up_mm[-1])
@@ -160,7 +156,7 @@ class _JawProfile:
         if tilt_rad:
             lowest, highest = _HAND_MM / 2 + _TABLE_CLEARANCE_MM, top
         back, end = self._retreat_axis(tilt_rad)
-        reach, middle = _along_approach(self.reach_mm, tilt_rad), _along_approach(pads.middle_mm, tilt_rad)
+        reach, middle = _along_approach(self.reach_mm, tilt_rad), _along_approach(middle_mm, tilt_rad)
         clear = _clear_places(reach, middle, back, settings, stroke_mm)
         withdrawn = np.broadcast_to(end - back + settings.floor_mm + settings.clearance_mm, clear.shape)
         within = (self.up_mm >= lowest) & (self.up_mm <= highest)

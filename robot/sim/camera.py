@@ -41,13 +41,7 @@ _SHADOW_BIAS_MM = 0.4
 
 @dataclass(frozen=True)
 class Placement:
-    """Pose of the object on the table.
-
-    Attributes:
-        x_mm: x of the object's origin.
-        y_mm: y of the object's origin.
-        yaw_rad: rotation about the vertical.
-    """
+    """Pose of the object on the table: its origin, and its rotation about the vertical."""
 
     x_mm: float = 0.0
     y_mm: float = 0.0
@@ -135,12 +129,8 @@ class PinholeCamera:
 class Lighting:
     """One lamp and a sky, drawn independently of the object, so the light contains no information about it.
 
-    Attributes:
-        direction: unit vector towards the lamp.
-        lamp: RGB intensity of the lamp.
-        sky: RGB intensity of the sky.
-        exposure: factor for both.
-        table_seed: seed of the table's texture.
+    `direction` is the unit vector towards the lamp, `lamp` and `sky` are RGB intensities, `exposure` is their factor,
+    and `table_seed` is that of the table's texture.
     """
 
     direction: tuple[float, ...]
@@ -167,9 +157,6 @@ class CameraView:
     """Result of the geometry pass.
 
     Attributes:
-        obj: the object.
-        placement: its pose on the table.
-        camera: the camera.
         detail_mm: size of a pixel on the object.
         distance_mm: (px * px,) distance along each ray.
         points: (px * px, 3) first point on each ray, in the rig frame.

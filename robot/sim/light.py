@@ -38,14 +38,9 @@ class GBuffer(NamedTuple):
 
 
 class Lamps(NamedTuple):
-    """Light sources and highlights.
+    """Light: direction (3,) to the lamp; colours (3,) of lamp and sky with the exposure; highlights.
 
-    Attributes:
-        direction: (3,) unit vector towards the lamp.
-        lamp: (3,) colour of the lamp, with the exposure.
-        sky: (3,) colour of the sky, with the exposure.
-        gloss: strength of the highlight of the object and of the table.
-        sharpness: exponent of the highlight.
+    `gloss` is the strength of the highlight of the object and of the table, `sharpness` its exponent.
     """
 
     direction: Array

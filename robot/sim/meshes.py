@@ -17,25 +17,19 @@ _ENOUGH_GRASPS = 100
 
 
 class MeshFolder:
-    """The STL, OBJ and PLY files of a folder as objects of one seed; grasp settings decide their resting pose."""
+    """The STL, OBJ and PLY files of a folder as objects of one seed; grasp settings decide their resting pose.
+
+    `digest` is the SHA-256 of all mesh files and their names; a recording continues only with the same ones.
+    """
 
     def __init__(self, folder: str, seed: int, settings: GraspSettings) -> None:
         if not Path(folder).is_dir():
             raise RobotConfigError(f"meshes must be a folder of STL, OBJ or PLY files, got {folder!r}")
         self._folder, self._seed, self._settings = folder, seed, settings
-
-    @property
-    def _paths(self) -> list[Path]:
-        files = sorted(Path(self._folder).iterdir())
-        return [each for each in files if each.suffix.lower().lstrip(".") in FORMATS and each.name[0] != "."]
-
-    @property
-    def digest(self) -> str:
-        """SHA-256 of all mesh files and their names; a recording continues only with the same ones."""
-        digest = hashlib.sha256()
-        for path in self._paths:
-            digest.update(f"{path.name} {hashlib.sha256(path.read_bytes()).hexdigest()}\n".encode())
-        return digest.hexdigest()
+        files = sorted(Path(folder).iterdir())
+        self._paths = [each for each in files if each.suffix.lower().lstrip(".") in FORMATS and each.name[0] != "."]
+        lines = (f"{path.name} {hashlib.sha256(path.read_bytes()).hexdigest()}\n" for path in self._paths)
+        self.digest = hashlib.sha256("".join(lines).encode()).hexdigest()
 
     def object_ids(self, count: int) -> list[str]:
         """Return the names of the first `count` objects.
@@ -44,12 +38,11 @@ class MeshFolder:
             RobotConfigError: The folder has fewer meshes, or two meshes of one name.
             SceneError: A mesh file is not usable.
         """
-        paths = self._paths
-        if count > len(paths):
+        if count > len(self._paths):
             raise RobotConfigError(
-                f"{self._folder} must contain at least {count} STL, OBJ or PLY files, got {len(paths)}"
+                f"{self._folder} must contain at least {count} STL, OBJ or PLY files, got {len(self._paths)}"
             )
-        names = [mesh_object(path, read_mesh(path), self._seed).object_id for path in paths[:count]]
+        names = [mesh_object(path, read_mesh(path), self._seed).object_id for path in self._paths[:count]]
         if repeated := sorted(name for name, times in Counter(names).items() if times > 1):
             raise RobotConfigError(
                 f"{self._folder} must not contain two meshes of one name, got {repeated[0]!r}. Rename one"
@@ -62,10 +55,7 @@ class MeshFolder:
         return [_resting_object(path, self._seed, self._settings) for path in paths]
 
 
-# Caches: an object keeps its search tree and its grasps between attempts.
-
-
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=4)  # an object keeps its search tree and its grasps between attempts
 def _resting_object(path: Path, seed: int, settings: GraspSettings) -> SimObject:
     """Return the mesh in the first resting pose with enough grasps, or else in the pose with the most.
 

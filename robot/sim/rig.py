@@ -66,7 +66,7 @@ class SimState:
         self.opening_mm = STROKE_MM
 
     def current_scene(self) -> Scene:
-        """Return the scene of this attempt. Raise DeviceError if there is none."""
+        """Return the scene of this attempt; raise DeviceError if there is none."""
         if self.scene is None:
             raise DeviceError("the simulated table is empty. Call prepare(object_id, number) first")
         return self.scene
@@ -196,11 +196,7 @@ class SimRig(Rig):
         self.attempt.grasp.check(self.arm, self.gripper)
 
     def object_ids(self, count: int) -> list[str]:
-        """Return the first `count` objects of this seed.
-
-        Raises:
-            RobotConfigError: `count` exceeds 100000 or the number of meshes.
-        """
+        """Return the first `count` objects; raise RobotConfigError if it exceeds 100000 or the number of meshes."""
         if count > _MAX_OBJECTS:
             raise RobotConfigError(f"the simulated rig has at most {_MAX_OBJECTS} objects per seed, got {count}")
         if self.meshes is not None:
@@ -225,11 +221,7 @@ class SimRig(Rig):
         self.sim_state.clock.now_s = number * _ATTEMPT_S
 
     def labels(self, object_id: str) -> dict[str, float | bool | str]:
-        """Return `SimObject.labels` of an object of this rig.
-
-        Raises:
-            RobotConfigError: The rig has no object of this name.
-        """
+        """Return `SimObject.labels` of an object; raise RobotConfigError if the rig has none of this name."""
         return self._find_object(object_id).labels()
 
     def press(self, object_id: str, number: int) -> dict[str, npt.NDArray[np.uint8]]:
@@ -253,7 +245,6 @@ class SimRig(Rig):
         return {name: scene.image(name) for name in names}
 
     def _find_object(self, object_id: str) -> SimObject:
-        """Return the object of this name."""
         if self.meshes is not None:
             candidates = self.meshes.candidates(object_id)  # the name begins with `mesh.` and the name of the file
         else:

@@ -60,9 +60,8 @@ class Hand:
     Attributes:
         grid: rows and columns of the contact solver; `benchmarks.frontier` measures their effect on accuracy.
         tolerance: tolerance of the contact solver.
-        turns_about_grip: if true, closing jaws turn the object about the point between them, as for objects that are
-            grasped far from their middle; if false, about the object's own axis, near which procedural objects are
-            grasped.
+        turns_about_grip: whether closing jaws turn the object about the point between them, as if it were grasped far
+            from its middle, or else about its own axis.
     """
 
     grid: tuple[int, int] = (120, 160)
@@ -120,16 +119,20 @@ class Scene:
         if unknown := sorted(set(self.sensors) - set(SIDES)):
             raise SceneError(f"a parallel gripper has the fingers a and b, got {unknown[0]!r}")
         for name in sorted(self.outputs):
-            self._check(name)
+            self._parse(name)
 
-    def _check(self, name: str) -> None:
+    def _parse(self, name: str) -> tuple[str, str | None] | None:
+        """Return finger and moment of a touch, None for photo and depth; raise SceneError if it cannot be computed."""
+        if name in ("photo", "depth"):
+            return None
         touch = _TOUCH.fullmatch(name)
-        if touch is None and name not in ("photo", "depth"):
+        if touch is None:
             raise SceneError(f"outputs are photo, depth and touch_a, touch_a_before, touch_a_after, ...; got {name!r}")
-        if touch and touch[1] not in self.sensors:
+        if touch[1] not in self.sensors:
             raise SceneError(f"{name} needs a sensor on finger {touch[1]}; this scene has {sorted(self.sensors)}")
-        if touch and touch[2] != "_before" and self.grip is None:
+        if touch[2] != "_before" and self.grip is None:
             raise SceneError(f"{name} needs a grip; pass Scene(grip=Grip(pose, force_n))")
+        return touch[1], touch[2]
 
     def run(self) -> dict[str, npt.NDArray[Any]]:
         """Return the requested outputs by name."""
@@ -137,20 +140,12 @@ class Scene:
 
     def image(self, name: str) -> npt.NDArray[Any]:
         """Return one output: colour (H, W, 3) uint8, or `depth` (H, W) float32 in metres, NaN where unknown."""
-        self._check(name)
-        if name == "photo":
-            return self._photo()
+        if touch := self._parse(name):
+            return self._touch(*touch)
+        self.passes[name] += 1
         if name == "depth":
-            self.passes["depth"] += 1
             return cameras.depth(self._view, self._noise(0, 1))
-        touch = _TOUCH.fullmatch(name)
-        assert touch is not None
-        return self._touch(touch[1], touch[2])
-
-    def _photo(self) -> npt.NDArray[np.uint8]:
-        self.passes["photo"] += 1
-        lighting = Lighting.draw(np.random.default_rng([91, self.seed]))
-        return cameras.photo(self._view, lighting, self._noise(0, 0))
+        return cameras.photo(self._view, Lighting.draw(np.random.default_rng([91, self.seed])), self._noise(0, 0))
 
     @cached_property
     def _view(self) -> cameras.CameraView:

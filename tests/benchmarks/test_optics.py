@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from _touch_retrieval.documents import typed
 from benchmarks.optics import least_squares as pose_fit
 from benchmarks.optics import model_choice as press_model
 from benchmarks.optics import photometric
@@ -17,7 +18,7 @@ from benchmarks.optics.least_squares import OpticsSetting, aligned, columns_of, 
 from benchmarks.optics.model_choice import fit, held_out_error, picture_error, select, to_optics
 from benchmarks.optics.real_presses import PIXEL_MM, Presses, ball_table, find_presses, read_presses
 from robot.errors import BadRobotInput
-from robot.sim.gel.fitted_optics import fitted_document, fitted_names, load_fitted, optics_from_json
+from robot.sim.gel.fitted_optics import FITTED, FittedOptics, fitted_document, load_fitted
 from robot.sim.gel.surface import Field, Surface
 
 real = pytest.mark.skipif(find_spec("taxim") is None, reason="real presses come with taxim: pip install .[calibration]")
@@ -238,7 +239,7 @@ def test_the_command_fits_scores_and_writes_a_file_that_loads(tmp_path, monkeypa
     output = capsys.readouterr().out
     assert "background only" in output
     content = json.loads((tmp_path / "out" / "gelsight.json").read_text())
-    assert optics_from_json(content).weights
+    assert typed(content["model"], FittedOptics, "model").weights
     assert content["held_out"]["labels"]["mse"]["mean"] < 3
 
 
@@ -247,7 +248,7 @@ def test_the_command_fits_scores_and_writes_a_file_that_loads(tmp_path, monkeypa
 
 @pytest.fixture(scope="module")
 def packs():
-    return {name: read_presses(find_presses(), name) for name in fitted_names()}
+    return {name: read_presses(find_presses(), name) for name in FITTED}
 
 
 def shipped_setting(name):
@@ -257,7 +258,7 @@ def shipped_setting(name):
 
 @pytest.mark.slow
 @real
-@pytest.mark.parametrize("name", fitted_names())
+@pytest.mark.parametrize("name", FITTED)
 def test_the_shipped_fit_is_reproducible_from_the_presses(name, packs):
     again = to_optics(packs[name], fit(packs[name], range(len(packs[name])), shipped_setting(name), align=True))
     field = Field(60, 80, 0.25)

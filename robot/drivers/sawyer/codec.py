@@ -66,9 +66,9 @@ COMMAND_TIMEOUT = (f"{_LIMB}joint_command_timeout", "std_msgs/Float64")
 ENABLE = ("/robot/set_super_enable", "std_msgs/Bool")
 IK_SERVICE = "/ExternalTools/right/PositionKinematicsNode/IKService"
 
-POSITION_MODE = 1
-SEED_AUTO, SEED_USER = 0, 1
-IK_FAILURES = {
+_POSITION_MODE = 1
+_SEED_AUTO, _SEED_USER = 0, 1
+_IK_FAILURES = {
     -1: "no joint angles reach it",
     -2: "the arm would collide with itself",
     -3: "the robot has no such tip",
@@ -79,7 +79,6 @@ _SOURCE = {0: "nobody", 1: "the red button", 2: "an unknown source", 3: "a motor
 _MAX_LEAN_RAD = math.radians(10.0)
 STILL_RAD, STILL_S = 1e-3, 0.1
 """An arm is still if no joint moves by more than STILL_RAD within STILL_S."""
-
 
 _Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
 
@@ -197,7 +196,7 @@ def tip_of(message: Message, tip: str) -> Message:
 def joint_command(positions: Joints) -> dict[str, Any]:
     """Return an intera_core_msgs/JointCommand in position mode (rad)."""
     return {
-        "mode": POSITION_MODE,
+        "mode": _POSITION_MODE,
         "names": list(JOINTS),
         "position": positions.tolist(),
         "velocity": [],
@@ -212,7 +211,7 @@ def ik_request(tip_pose: Mapping[str, Any], tip: str, seed: Joints | None) -> di
     return {
         "pose_stamp": [{"header": {"frame_id": "base"}, "pose": dict(tip_pose)}],
         "seed_angles": seeds,
-        "seed_mode": SEED_AUTO if seed is None else SEED_USER,
+        "seed_mode": _SEED_AUTO if seed is None else _SEED_USER,
         "use_nullspace_goal": [],
         "nullspace_goal": [],
         "nullspace_gain": [],
@@ -226,7 +225,7 @@ def ik_answer(values: Message) -> Joints:
     kind = answer.result_type[0]
     found = _arm_joints(answer.joints[0]) if kind > 0 else None
     if found is None:
-        raise DeviceError(f"IKService: {IK_FAILURES.get(kind, f'no solution, result type {kind}')}")
+        raise DeviceError(f"IKService: {_IK_FAILURES.get(kind, f'no solution, result type {kind}')}")
     return found
 
 
@@ -235,14 +234,7 @@ def ik_answer(values: Message) -> Joints:
 
 @dataclass(frozen=True)
 class Mount:
-    """Pose of the rig frame in the robot's base frame, and of the gripper on the robot's tip.
-
-    Attributes:
-        base_xyz_mm: Origin of the rig frame in the base frame.
-        base_yaw_rad: Yaw of the rig frame in the base frame.
-        tool_mm: Distance from the tip's origin along its z axis to the point between the fingertips.
-        tool_yaw_rad: Angle about the tip's z axis, from its x axis to the closing direction of finger a.
-    """
+    """Pose of the rig frame in the robot's base frame, and of the gripper on the robot's tip, as in SawyerSettings."""
 
     base_xyz_mm: tuple[float, float, float]
     base_yaw_rad: float
@@ -310,12 +302,9 @@ def waypoints(start: Pose, goal: Pose) -> list[Pose]:
 
 @dataclass(frozen=True)
 class JointTrajectory:
-    """Joint angles over time, with constant acceleration at both ends.
+    """Joint angles (N, 7) in rad, accelerated to full speed within `ramp_s`, and decelerated.
 
-    Attributes:
-        joints: (N, 7) joint angles of the way-points, rad.
-        times: (N,) times in s at which full speed without ramps would reach them.
-        ramp_s: Duration of the acceleration to full speed, and of the deceleration.
+    `times` (N,) are those in s at which full speed without ramps would reach the way-points.
     """
 
     joints: Joints

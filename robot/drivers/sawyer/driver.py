@@ -12,11 +12,9 @@ old. A robot without a collision state can be used; `refused` then reports that 
 commands stop (the program or the network failed), the robot ends the motion after _COMMAND_TIMEOUT_S. This driver
 never resets an emergency stop.
 
-The link uses `websockets` instead of roslibpy, because a motion command must not arrive late, and a failure must raise
-an error. Observed with roslibpy 2.1: a message published during a connection loss raises nothing and is sent seconds
-later, after automatic reconnection; rosbridge's "status" errors are dropped; after `terminate`, the same process
-cannot connect again. Here nothing is sent twice and nothing is queued: a lost connection stays closed, and a new link
-must be opened.
+The link uses `websockets`, because roslibpy sends a message that was published during a connection loss seconds later,
+without an error, and drops rosbridge's errors. Here nothing is sent twice and nothing is queued: a lost connection
+stays closed, and a new link must be opened.
 """
 
 import contextlib
@@ -405,7 +403,10 @@ class Sawyer(Arm):
                 "bring it there by hand, or check base_xyz_mm and tool_mm"
             )
         poses = waypoints(here, pose)
-        joints = self._solve(poses, start)
+        solved = [start]
+        for waypoint in poses[1:]:
+            solved.append(self._solve(waypoint, solved[-1], start))
+        joints = np.array(solved)
         schedule = JointTrajectory.from_waypoints(poses, joints, speed_mm_s, self._options.joint_speed_rad_s, _RAMP_S)
         self._is_moving = True
         try:
@@ -415,15 +416,8 @@ class Sawyer(Arm):
             self._is_moving = False
         return self._pose_since(self.clock())
 
-    def _solve(self, poses: Sequence[Pose], start: Joints) -> Joints:
-        """Return the joint angles (N, 7) of way-points; the first is the arm's pose."""
-        solved = [start]
-        for pose in poses[1:]:
-            solved.append(self._solve_one(pose, solved[-1], start))
-        return np.array(solved)
-
-    def _solve_one(self, pose: Pose, before: Joints, start: Joints) -> Joints:
-        """Solve one way-point; after a failure, try another seed."""
+    def _solve(self, pose: Pose, before: Joints, start: Joints) -> Joints:
+        """Return the joint angles (7,) of one way-point; after a failure, try another seed."""
         tip = self._mount.tip_of(pose)
         for seed in (before, start, None):
             try:

@@ -251,17 +251,9 @@ def _connected_cameras() -> str:
 
 
 class FrameReader:
-    """Reads streams in a thread of its own, from `start` to `close`.
+    """Reads streams, each opened with `open_stream`, in a thread of its own, from `start` to `close`.
 
-    Args:
-        name: Name of the camera in messages.
-        open_stream: Opens the stream.
-        settings: Settings of the reader.
-        clock: Clock of the frames' times.
-
-    Attributes:
-        frame_count: Frames read, dropped ones included.
-        lost_count: Failures of the stream, failed reopenings included.
+    `lost_count` is the number of failures of the stream, failed reopenings included.
     """
 
     def __init__(
@@ -273,7 +265,7 @@ class FrameReader:
         clock: Clock = time.monotonic,
     ) -> None:
         self.name, self.settings, self.clock = name, settings, clock
-        self.frame_count = self.lost_count = 0
+        self.lost_count = 0
         self._open_stream = open_stream
         self._frames: deque[Frame] = deque(maxlen=settings.keep)
         self._changed = threading.Condition()
@@ -360,7 +352,6 @@ class FrameReader:
     def _store(self, frame: Frame) -> None:
         """Buffer a new frame; drop a repeat of the last frame, whose time stays unchanged."""
         with self._changed:
-            self.frame_count += 1
             if self._last is not None and np.array_equal(self._last.pixels, frame.pixels):
                 if (still_s := frame.time_s - self._last.time_s) > self.settings.frozen_s:
                     raise DeviceError(f"its stream is frozen: the same picture for {still_s:.1f} s")

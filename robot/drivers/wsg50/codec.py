@@ -9,6 +9,7 @@ use are left out. Lengths in mm, speeds in mm/s, accelerations in mm/s^2, forces
 WSG50Settings.to_finger_force). Invalid arguments and replies raise WireError.
 """
 
+import binascii
 import enum
 import math
 import struct
@@ -49,15 +50,8 @@ class Packet:
             raise WireError(f"a payload must be at most {MAX_PAYLOAD} bytes, got {len(self.payload)}")
 
 
-def _table_row(index: int) -> int:
-    """Return the remainder of a byte by the polynomial 0x1021, most significant bit first."""
-    row = index << 8
-    for _ in range(8):
-        row = (row << 1) ^ (0x1021 if row & 0x8000 else 0)
-    return row & 0xFFFF
-
-
-_TABLE = tuple(map(_table_row, range(256)))
+_TABLE = tuple(binascii.crc_hqx(bytes([byte]), 0) for byte in range(256))
+"""Remainder of each byte by the polynomial 0x1021, most significant bit first."""
 
 
 def checksum(data: bytes | bytearray) -> int:
@@ -117,7 +111,6 @@ class CommandId(enum.IntEnum):
     ACKNOWLEDGE = 0x24
     GRASP = 0x25
     RELEASE = 0x26
-    GET_ACCELERATION = 0x31
     SET_FORCE_LIMIT = 0x32
     GET_FORCE_LIMIT = 0x33
     SYSTEM_STATE = 0x40
@@ -139,7 +132,7 @@ def command_name(command_id: int) -> str:
 
 
 def command(command_id: CommandId, *numbers: float) -> Packet:
-    """Build a command with its lengths, speeds, forces or accelerations."""
+    """Build a command with its lengths, speeds or forces."""
     if not all(abs(number) < 1e30 for number in numbers):  # also refuses NaN
         raise WireError(f"numbers must be finite and fit 32 bits, got {numbers}")
     return Packet(command_id, struct.pack(f"<{len(numbers)}f", *numbers))
@@ -189,18 +182,10 @@ GraspingState = enum.IntEnum(
 
 
 class SystemState(enum.IntFlag):
-    """Bits of the system state; unknown bits are preserved."""
+    """Bits of the system state that the driver uses; other bits are preserved."""
 
     REFERENCED = 1 << 0
     MOVING = 1 << 1
-    BLOCKED_MINUS = 1 << 2
-    BLOCKED_PLUS = 1 << 3
-    SOFT_LIMIT_MINUS = 1 << 4
-    SOFT_LIMIT_PLUS = 1 << 5
-    AXIS_STOPPED = 1 << 6
-    TARGET_REACHED = 1 << 7
-    OVERDRIVE = 1 << 8
-    FORCE_CONTROL = 1 << 9
     FAST_STOP = 1 << 12
     TEMPERATURE_WARNING = 1 << 13
     TEMPERATURE_FAULT = 1 << 14
@@ -208,18 +193,15 @@ class SystemState(enum.IntFlag):
     CURRENT_FAULT = 1 << 16
     FINGER_FAULT = 1 << 17
     COMMAND_FAILURE = 1 << 18
-    SCRIPT_RUNNING = 1 << 19
     SCRIPT_FAILURE = 1 << 20
 
-
-@dataclass(frozen=True)
-class GripperInfo:
-    """Identity of the gripper; kind: the vendor's type number; firmware: one digit for each nibble."""
-
-    kind: int
-    hardware: int
-    firmware: int
-    serial: int
+    @property
+    def faults(self) -> str:
+        """The faults as text."""
+        other = SystemState.REFERENCED | SystemState.MOVING | SystemState.FAST_STOP
+        named = [bit.name or "" for bit in SystemState if bit & self & ~other]
+        text = ", ".join(named).lower().replace("_", " ")
+        return text or "no fault flag is set: a stop at the gripper, or a lost link"
 
 
 @dataclass(frozen=True)
@@ -246,7 +228,7 @@ def reply(packet: Packet) -> tuple[Status, bytes]:
 
 
 def number(parameters: bytes) -> float:
-    """Parse a length, speed, force or acceleration; raise WireError if it is not a finite number."""
+    """Parse a length, speed or force; raise WireError if it is not a finite number."""
     return float(_unpack("<f", parameters)[0])
 
 
@@ -255,9 +237,9 @@ def limits(parameters: bytes) -> GripperLimits:
     return GripperLimits(*_unpack("<8f", parameters))
 
 
-def info(parameters: bytes) -> GripperInfo:
-    """Parse the identity of the gripper."""
-    return GripperInfo(*_unpack("<BBHI", parameters))
+def info(parameters: bytes) -> dict[str, int]:
+    """Parse the identity of the gripper; kind: the vendor's type number; firmware: one digit for each nibble."""
+    return dict(zip(("kind", "hardware", "firmware", "serial"), _unpack("<BBHI", parameters), strict=True))
 
 
 def system_state(parameters: bytes) -> SystemState:

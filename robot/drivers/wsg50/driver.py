@@ -17,16 +17,15 @@ few milliseconds; without them the motion is stopped.
 There is no reader thread: the waiting caller reads, because updates matter only during a wait.
 """
 
+import contextlib
 import itertools
 import logging
 import math
 import os
 import select
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
-from functools import partial
-from operator import methodcaller
 from typing import Annotated, Any, TypeVar
 
 from msgspec import Meta
@@ -89,11 +88,7 @@ class CommandFailed(DeviceError):
 class Link:
     """The link to one gripper. Its methods raise LinkLost, NoReply, CommandFailed or WireError, all DeviceErrors.
 
-    Args:
-        name: Name of the port: a path, or a URL of pyserial such as socket://192.168.1.20:1000.
-        baud: Baud rate of a serial port.
-        stop_bits: Stop bits of a serial port.
-        timeout_s: Time-out of each answer and echo.
+    `name` is a path, or a URL of pyserial such as socket://192.168.1.20:1000. Each answer may take `timeout_s`.
 
     Attributes:
         updates: For each updating command, its last parameters and their time of arrival (s, time.monotonic).
@@ -242,29 +237,28 @@ class Link:
                 return
             wait_s = deadline - time.monotonic()
             is_last = wait_s <= 0
-            if self._use_port(partial(_has_bytes, wait_s)):
-                self._buffer += self._use_port(methodcaller("read", _CHUNK))  # its time-out is 0, so it does not wait
+            with self._open_port() as port:
+                if select.select([port.fileno()], [], [], max(0.0, wait_s))[0]:
+                    self._buffer += port.read(_CHUNK)  # its time-out is 0, so it does not wait
 
     def _write(self, data: bytes) -> None:
-        while data:
-            data = data[self._use_port(methodcaller("write", data)) :]
+        with self._open_port() as port:
+            while data:
+                data = data[port.write(data) :]
 
-    def _use_port(self, use: Callable[[Any], Any]) -> Any:
-        """Use the port; close it and raise LinkLost if it was lost."""
-        reason = "it is closed"
-        if self._port is not None:
-            try:
-                return use(self._port)
-            except (OSError, ValueError, TypeError) as error:  # select gets None from a closed port
-                reason = _first_line(error)
-                self.close()
-        raise LinkLost(
-            f"the gripper's port {self.name} was lost: {reason}; check its cable and power, recover() opens it again"
-        )
-
-
-def _has_bytes(wait_s: float, port: Any) -> bool:
-    return bool(select.select([port.fileno()], [], [], max(0.0, wait_s))[0])
+    @contextlib.contextmanager
+    def _open_port(self) -> Iterator[Any]:
+        """Give the port; if it was lost, close it and raise LinkLost."""
+        try:
+            if self._port is None:
+                raise OSError("it is closed")
+            yield self._port
+        except (OSError, ValueError, TypeError) as error:  # select gets None from a closed port
+            self.close()
+            raise LinkLost(
+                f"the gripper's port {self.name} was lost: {_first_line(error)}; check its cable and power, "
+                "recover() opens it again"
+            ) from error
 
 
 def _first_line(error: Exception) -> str:
@@ -288,15 +282,6 @@ _STATUS_OF: dict[GraspingState, GripperStatus] = {
 _CLOSED_STATES = {GraspingState.HOLDING, GraspingState.NO_PART, GraspingState.PART_LOST}
 """States that end only by RELEASE; in them, the gripper refuses GRASP."""
 
-_FAULTS = (
-    SystemState.TEMPERATURE_WARNING
-    | SystemState.TEMPERATURE_FAULT
-    | SystemState.POWER_FAULT
-    | SystemState.CURRENT_FAULT
-    | SystemState.FINGER_FAULT
-    | SystemState.COMMAND_FAILURE
-    | SystemState.SCRIPT_FAILURE
-)
 _UPDATED = (CommandId.SYSTEM_STATE, CommandId.GRASPING_STATE)
 _UPDATE_MS = 20
 """Period of the state updates during a motion: 25 bytes, two frames with a status and a state."""
@@ -360,15 +345,11 @@ class WSG50Settings(TypedSettings):
     def to_finger_force(self, gripper_n: float) -> float:
         """Convert the gripper's force (N) to the force on each finger (N).
 
-        The contract's force is the force on each finger (robot.devices). The gripper's force limit is the sum over
-        both. SCHUNK's manual of its fieldbus interface defines the register FORCELIMIT: "the grasping force is twice
-        the nominal force that is applied to the part to be grasped". SCHUNK also rates its grippers by the sum over the
-        jaws. So with a limit of 40 N each finger pushes with 20 N, the fraction 0.5. A user of the simulator Drake
-        found this factor in their own controller (its pull request 9950).
-
-        Two points are uncertain. We assume that the reported force (45h) is defined as the limit is. Without
-        force-measuring fingers, the gripper derives the force from its motor current only. With a force gauge, set
-        `finger_share` to the measured force on one finger divided by the limit.
+        The gripper's force limit is the sum over both fingers: SCHUNK's manual of its fieldbus interface defines the
+        register FORCELIMIT as "twice the nominal force that is applied to the part to be grasped". So the fraction is
+        0.5. We assume that the reported force (45h) is defined like the limit. Without force-measuring fingers, the
+        gripper derives the force from its motor current. With a force gauge, set `finger_share` to the measured force
+        on one finger divided by the limit.
         """
         return gripper_n * self.finger_share
 
@@ -379,13 +360,13 @@ class GripperReading:
 
     system: SystemState
     grasping: GraspingState
-    opening_mm: float
-    force_n: float
+    opening_mm: float = math.nan
+    force_n: float = math.nan
 
     @property
     def is_moving(self) -> bool:
         """Whether the jaws move or will move."""
-        return _is_moving(self.system, self.grasping)
+        return bool(self.system & SystemState.MOVING) or _STATUS_OF.get(self.grasping) == "moving"
 
 
 IsDone = Callable[[GripperReading], bool]
@@ -440,9 +421,8 @@ class WSG50(Gripper):
     def _settings(self) -> dict[str, Any]:
         force = self._query(CommandId.GET_FORCE_LIMIT, codec.number)
         return {
-            "info": asdict(self._query(CommandId.INFO, codec.info)),
+            "info": self._query(CommandId.INFO, codec.info),
             "limits": asdict(self._query(CommandId.LIMITS, codec.limits)),
-            "acceleration_mm_s2": self._query(CommandId.GET_ACCELERATION, codec.number),
             "force_limit_n": self._options.to_finger_force(force),
             "finger_share": self._options.finger_share,
         }
@@ -529,9 +509,7 @@ class WSG50(Gripper):
 
     def _check_fault(self, reading: GripperReading) -> None:
         if reading.system & SystemState.FAST_STOP or reading.grasping is GraspingState.ERROR:
-            raise DeviceError(
-                f"{self.name} is in FAST STOP or in an error state: {_fault_names(reading.system)}; {_ACTION}"
-            )
+            raise DeviceError(f"{self.name} is in FAST STOP or in an error state: {reading.system.faults}; {_ACTION}")
 
     def _as_state(self, reading: GripperReading) -> GripperState:
         self._check_fault(reading)
@@ -558,23 +536,14 @@ class WSG50(Gripper):
         return self._run(packet, seconds, done)
 
     def _run(self, packet: Packet, seconds: float, done: IsDone) -> GripperReading:
-        """Run a motion and return the gripper's state at its end.
-
-        Args:
-            packet: The motion command.
-            seconds: Longest duration.
-            done: Returns whether the motion was executed.
-
-        Raises:
-            DeviceError: The motion failed; the jaws may still move.
-        """
+        """Run a motion for at most `seconds` and return the state at its end; raise DeviceError unless it is `done`."""
         deadline = time.monotonic() + seconds
         status = self._watch(packet, deadline)
         reading = self._read_until_still(deadline)
         if done(reading):
             return reading
         answer = "nothing" if status is None else status.name
-        stop = f", FAST STOP: {_fault_names(reading.system)}" if reading.system & SystemState.FAST_STOP else ""
+        stop = f", FAST STOP: {reading.system.faults}" if reading.system & SystemState.FAST_STOP else ""
         raise DeviceError(
             f"the gripper answered {answer} to {command_name(packet.id)} and rests at "
             f"{reading.opening_mm:.1f} mm, {reading.grasping.name.lower()}{stop}; check it, then call recover()"
@@ -596,7 +565,7 @@ class WSG50(Gripper):
             self._check_updates(now)
             system, grasping = (link.updates[command][0] for command in _UPDATED)
             try:
-                is_moving = _is_moving(codec.system_state(system), codec.grasping_state(grasping))
+                is_moving = GripperReading(codec.system_state(system), codec.grasping_state(grasping)).is_moving
             except WireError:
                 is_moving = True  # unknown: read again
             if is_moving or status is Status.CMD_PENDING:
@@ -643,11 +612,11 @@ class WSG50(Gripper):
     def _stop_over_link(self) -> None:
         """Stop the jaws, by FAST STOP if STOP fails, and wait until they are still; raise DeviceError if they move."""
         limit_s = self._options.max_state_age_s + self._link.timeout_s
-        self._send_until_answered((CommandId.STOP, CommandId.STOP, CommandId.FAST_STOP, CommandId.FAST_STOP))
+        self._send_until_answered(CommandId.STOP, CommandId.STOP, CommandId.FAST_STOP, CommandId.FAST_STOP)
         try:
             self._read_until_still(time.monotonic() + limit_s)
         except StillMoving:
-            self._send_until_answered((CommandId.FAST_STOP, CommandId.FAST_STOP))
+            self._send_until_answered(CommandId.FAST_STOP, CommandId.FAST_STOP)
             self._read_until_still(time.monotonic() + limit_s)
         self._stop_updates()
 
@@ -655,7 +624,7 @@ class WSG50(Gripper):
         for command in _UPDATED:
             self._link.send(codec.query(command))
 
-    def _send_until_answered(self, commands: Sequence[CommandId]) -> None:
+    def _send_until_answered(self, *commands: CommandId) -> None:
         """Send commands one after the other until one is answered."""
         for number, command in enumerate(commands, start=1):
             if command is CommandId.FAST_STOP:
@@ -716,20 +685,15 @@ class WSG50(Gripper):
         system = self._query(CommandId.SYSTEM_STATE, codec.system_state)
         if not system & SystemState.FAST_STOP:
             return
-        _log.warning("%s is in FAST STOP: %s", self.name, _fault_names(system))
+        _log.warning("%s is in FAST STOP: %s", self.name, system.faults)
         if not self._options.acknowledge_faults:
-            raise DeviceError(
-                f"{self.name} is in FAST STOP: {_fault_names(system)}; remove the cause, then acknowledge it on the "
-                "gripper's web page, or set acknowledge_faults = true"
-            )
+            raise DeviceError(f"{self.name} is in FAST STOP: {system.faults}; {_ACTION}")
         try:
             self._link.send(codec.acknowledge())
         except CommandFailed as error:  # a repeated command has nothing to acknowledge
             _log.warning("%s: %s", self.name, error)
         if self._query(CommandId.SYSTEM_STATE, codec.system_state) & SystemState.FAST_STOP:
-            raise DeviceError(
-                f"{self.name} is still in FAST STOP after acknowledgement: {_fault_names(system)}; remove the cause"
-            )
+            raise DeviceError(f"{self.name} is still in FAST STOP after acknowledgement: {system.faults}")
         _log.warning("%s: FAST STOP acknowledged", self.name)
 
     # Settings.
@@ -750,16 +714,6 @@ class WSG50(Gripper):
                 f"{self.name}: the force limit (both fingers) must be {limit_n:g} N, but the gripper has "
                 f"{has:g} N; the jaws do not close"
             )
-
-
-def _is_moving(system: SystemState, grasping: GraspingState) -> bool:
-    return bool(system & SystemState.MOVING) or _STATUS_OF.get(grasping) == "moving"
-
-
-def _fault_names(system: SystemState) -> str:
-    """Return the faults in a system state as text."""
-    named = [bit.name or "" for bit in SystemState if bit & system & _FAULTS]
-    return ", ".join(named).lower().replace("_", " ") or "no fault flag is set: a stop at the gripper, or a lost link"
 
 
 def _is_at(width_mm: float) -> IsDone:

@@ -27,13 +27,7 @@ _SCALED_RANGE = (1e-100, 1e100)  # of force / (E* pixel^2) and depth / pixel, wi
 
 @dataclass(frozen=True)
 class Layer:
-    """Elastic gel bonded to a rigid base.
-
-    Attributes:
-        modulus_mpa: Young's modulus.
-        poisson: Poisson's ratio.
-        thickness_mm: thickness; infinite for a half-space.
-    """
+    """Elastic gel bonded to a rigid base; a half-space if its thickness is infinite."""
 
     modulus_mpa: float
     poisson: float = 0.48

@@ -28,13 +28,9 @@ _EVERYTHING: Window = (slice(None), slice(None))
 
 @dataclass(frozen=True)
 class ElasticSurface:
-    """An elastic layer under an elastic object.
+    """An elastic layer, `thickness` pixels thick, under an elastic object; products in float32 if `single_precision`.
 
-    Attributes:
-        thickness: thickness of the layer in pixels.
-        poisson: Poisson's ratio of the layer.
-        softness: E* of the layer over E* of the object; 0 for a rigid object.
-        single_precision: whether products are in float32.
+    `softness` is E* of the layer over E* of the object, 0 for a rigid object.
     """
 
     thickness: float
@@ -63,15 +59,9 @@ def _operator(grid: Quadrant, window: Quadrant, thickness: float, poisson: float
 
 @dataclass(frozen=True)
 class ScaledProblem:
-    """A press in scaled units.
+    """A press in scaled units; `gap`, `load` and `depth` are those of ContactProblem.
 
-    Attributes:
-        surface: the elastic layer and object.
-        gap: (rows, cols) distance of the undeformed object, inf where there is no object.
-        load: sum of pressures; None for a press to `depth`.
-        depth: approach for a press without load.
-        tolerance: upper bound on the residual.
-        max_iterations: maximum number of steps on the fine grid.
+    `tolerance` is an upper bound on the residual, `max_iterations` the maximum number of steps on the fine grid.
     """
 
     surface: ElasticSurface

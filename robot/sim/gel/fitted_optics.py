@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from _touch_retrieval.documents import typed
-from robot.errors import UnknownName
 from robot.sim.gel.optics import Optics
 from robot.sim.gel.surface import Array, Field, Surface, resized
 
@@ -38,12 +37,8 @@ class FittedLimits:
 
     Attributes:
         steepest: greatest |n|, the sine of the tilt.
-        left: least x of the presses.
-        right: greatest x of the presses.
-        top: least y of the presses.
-        bottom: greatest y of the presses.
-        lowest: least value of each smoothed map.
-        highest: greatest value of each smoothed map.
+        left, right, top, bottom: extent of the presses in x and y.
+        lowest, highest: least and greatest value of each smoothed map.
     """
 
     steepest: float
@@ -162,26 +157,17 @@ def _maps(optics: FittedOptics, field: Field) -> tuple[Array, list[Array]]:
 # Files -----------------------------------------------------------------------------------------------------
 
 
-def fitted_names() -> list[str]:
-    """Return the names of the sensors with a shipped fit."""
-    folder = resources.files("robot.sim.gel") / "fitted"
-    return sorted(item.name.removesuffix(".json") for item in folder.iterdir() if item.name.endswith(".json"))
+FITTED = "gelsight", "gelsight_mini"
+"""Sensors with a shipped fit."""
 
 
 def fitted_document(name: str) -> dict[str, Any]:
-    """Return the shipped file of this sensor: source, settings, held-out results, model. Raise UnknownName."""
-    if name not in (known := fitted_names()):
-        raise UnknownName(f"there is no fitted sensor {name!r}; known are {', '.join(known)}")
+    """Return the shipped file of a sensor of `FITTED`: source, settings, held-out results, model."""
     content: dict[str, Any] = json.loads((resources.files("robot.sim.gel") / "fitted" / f"{name}.json").read_text())
     return content
 
 
 @lru_cache(maxsize=8)
 def load_fitted(name: str) -> FittedOptics:
-    """Load the shipped fit of this sensor. Raise UnknownName with the known names."""
-    return optics_from_json(fitted_document(name))
-
-
-def optics_from_json(content: dict[str, Any]) -> FittedOptics:
-    """Build the optics from the content of a fitted file."""
-    return typed(content["model"], FittedOptics, "model")
+    """Load the shipped fit of a sensor of `FITTED`."""
+    return typed(fitted_document(name)["model"], FittedOptics, "model")

@@ -16,14 +16,9 @@ _SUBPIXEL = 4  # cv2 draws at 1/16 of a pixel
 
 @dataclass(frozen=True)
 class Flaws:
-    """Flaws of one gel, drawn once from `seed`.
+    """Flaws of one gel, placed and sized by `seed`: dark specks, hairs and scratches, grains (bumps) under the skin.
 
-    Attributes:
-        seed: seed of all places and sizes.
-        specks: number of dark dots.
-        hairs: number of hairs and scratches.
-        grains: number of bumps under the skin.
-        texture: rms slope of the skin's roughness.
+    `texture` is the rms slope of the skin's roughness.
     """
 
     seed: int
@@ -112,10 +107,7 @@ class Markers:
     A press spreads them: the shift is _SPREAD times sum u (x - x_i) exp(-|x - x_i|^2 / (2 _REACH_MM^2)), normalised,
     which is -_SPREAD * _REACH_MM * the slope of the smoothed displacement (the form of FOTS, RA-L 2024).
 
-    Attributes:
-        pitch_mm: distance between dots.
-        radius_mm: radius of a dot.
-        darkness: fraction of the light that a dot absorbs.
+    `darkness` is the fraction of the light that a dot absorbs.
     """
 
     pitch_mm: float = 1.5

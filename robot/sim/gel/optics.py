@@ -46,7 +46,6 @@ class LedBar:
         angle_rad: direction from the middle of the field, from the right of the image, counter-clockwise on screen.
         distance_mm: distance from the middle of the field.
         height_mm: height above the gel, on the camera's side.
-        length_mm: length of the bar.
         points: number of LEDs.
         order: Lambertian order of emission.
     """
@@ -167,13 +166,12 @@ def led_strengths(bar: LedBar, field: Field) -> Array:
 
     Strength times (normal . vector to the LED) is the LED's contribution to w / w_flat.
     """
-    middle = np.array([0.0, 0.0, 0.0])
     x, y = (axis.astype(np.float64) for axis in field.positions())
     strengths, flat = [], np.zeros((field.rows, field.cols))
     for led in bar.positions():
         away = (led[0] - x, led[1] - y, np.full((1, 1), led[2]))
         distance = np.sqrt(away[0] ** 2 + away[1] ** 2 + away[2] ** 2)
-        axis = (middle - led) / np.linalg.norm(middle - led)
+        axis = -led / np.linalg.norm(led)
         facing = np.maximum(0, -sum(a * b for a, b in zip(axis, away, strict=True)) / distance)
         strengths.append(facing**bar.order / distance**3)
         flat += strengths[-1] * led[2]

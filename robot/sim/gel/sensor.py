@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from robot.errors import RobotConfigError, UnknownName
+from robot.errors import UnknownName
 from robot.gel_settings import GelSettings
 from robot.sim.contact.layer import Layer
 from robot.sim.gel.fitted_optics import load_fitted
@@ -190,9 +190,7 @@ def _add_camera_noise(clean, tile, place, read, shot, out):  # type: ignore[no-u
 
 
 def draw_sensor(seed: int, finger: str, *, optics: str = "led", gel: GelSettings = _UNKNOWN_GEL) -> GelSensor:
-    """Draw a used sensor with its own gel, lamps, tint and dust.
-
-    The same arguments give the same sensor.
+    """Draw a used sensor with its own gel, lamps, tint and dust; the same arguments give the same sensor.
 
     Args:
         seed: seed of the sensor.
@@ -202,15 +200,12 @@ def draw_sensor(seed: int, finger: str, *, optics: str = "led", gel: GelSettings
 
     Raises:
         UnknownName: There are no optics of this name.
-        RobotConfigError: `finger` is empty.
 
     >>> robot.draw_sensor(seed=0, finger="a") == robot.draw_sensor(seed=0, finger="a")
     True
     """
     if optics not in OPTICS:
         raise UnknownName(f"there are no optics {optics!r}; known are {', '.join(sorted(OPTICS))}")
-    if not finger:
-        raise RobotConfigError("a finger must have a name, got an empty one; use a or b")
     rng = np.random.default_rng([seed, *finger.encode(), 0x6E1])
     layer = Layer(
         modulus_mpa=float(np.exp(rng.uniform(*np.log(MODULUS_MPA)))),
@@ -332,17 +327,17 @@ def _draw_bar(bar: LedBar, rng: np.random.Generator) -> LedBar:
 
 def _draw_backdrop(backdrop: GaussianBackdrop, gain: float, rng: np.random.Generator) -> GaussianBackdrop:
     """Return the backdrop of a lamp of `gain` times the power, moved, wider or narrower, and slightly slanted."""
-    x, y, slant_x, slant_y = rng.standard_normal(4) * (0.05, 0.05, 2.5, 2.5)
-    wide = np.exp(0.06 * rng.standard_normal(2))
+    x, y, slant_x, slant_y = (rng.standard_normal(4) * (0.05, 0.05, 2.5, 2.5)).tolist()
+    wide_x, wide_y = np.exp(0.06 * rng.standard_normal(2)).tolist()
     return GaussianBackdrop(
         backdrop.floor * gain,
         backdrop.span * gain,
-        float(backdrop.x0 + x),
-        float(backdrop.y0 + y),
-        float(backdrop.width_x * wide[0]),
-        float(backdrop.width_y * wide[1]),
-        float(backdrop.slant_x + slant_x),
-        float(backdrop.slant_y + slant_y),
+        backdrop.x0 + x,
+        backdrop.y0 + y,
+        backdrop.width_x * wide_x,
+        backdrop.width_y * wide_y,
+        backdrop.slant_x + slant_x,
+        backdrop.slant_y + slant_y,
     )
 
 

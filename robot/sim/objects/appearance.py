@@ -11,14 +11,9 @@ _WAVES = 8
 
 @dataclass(frozen=True)
 class Paint:
-    """A second colour where a random field in space is high.
+    """A second colour (linear RGB, 0 to 1) where a field of random waves is above `threshold`.
 
-    Attributes:
-        colour: linear RGB, 0 to 1.
-        waves_per_mm: wave vectors of the field.
-        phases: phase of each wave.
-        threshold: field value at the edge of the paint.
-        edge: width of the edge in units of the field.
+    `edge` is the width of the edge in units of the field.
     """
 
     colour: tuple[float, float, float]

@@ -5,7 +5,6 @@ Frame: the object's, in mm, z up, base at z = 0. Camera and gel use the same geo
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -22,30 +21,6 @@ Vectors = NDArray[np.float64]
 GEL_STEP_MM = 0.1
 
 
-@dataclass(frozen=True)
-class ClippedRays:
-    """Rays clipped to the bounding box; a ray that misses the box has near_mm > far_mm.
-
-    Attributes:
-        origins: (N, 3) start points.
-        directions: (N, 3) unit vectors.
-        near_mm: (N,) distance at which the ray enters the box.
-        far_mm: (N,) distance at which it leaves the box.
-        step_mm: finest detail of interest.
-    """
-
-    origins: Vectors
-    directions: Vectors
-    near_mm: Vectors
-    far_mm: Vectors
-    step_mm: float
-
-    @property
-    def arrays(self) -> Rays:
-        """The four arrays, for compiled code."""
-        return self.origins, self.directions, self.near_mm, self.far_mm
-
-
 class Body(ABC):
     """Base class of solids. Subclasses set the bounds and write `_cast` and `_normals`."""
 
@@ -60,16 +35,15 @@ class Body(ABC):
             directions: (N, 3) unit vectors.
             step_mm: finest detail of interest. A camera passes the size of its pixel on the object, which is faster.
         """
-        return self._cast(self._clip_rays(origins, directions, step_mm))
+        return self._cast(self._clip_rays(origins, directions), step_mm)
 
     def hit(self, origins: Points, directions: Points, step_mm: float = GEL_STEP_MM) -> NDArray[np.bool_]:
         """Return which rays hit, (N,), without the distance."""
-        return self._hit(self._clip_rays(origins, directions, step_mm))
+        return self._hit(self._clip_rays(origins, directions), step_mm)
 
-    def _clip_rays(self, origins: Points, directions: Points, step_mm: float) -> ClippedRays:
+    def _clip_rays(self, origins: Points, directions: Points) -> Rays:
         start, along = _contiguous(origins), _contiguous(directions)
-        near, far = clip_to_box(start, along, self.lower, self.upper)
-        return ClippedRays(start, along, near, far, step_mm)
+        return Rays(start, along, *clip_to_box(start, along, self.lower, self.upper))
 
     def normals(self, points: Points, step_mm: float = GEL_STEP_MM) -> Vectors:
         """Return the outward unit normals (N, 3) at surface points (N, 3), with relief, smoothed over `step_mm`."""
@@ -82,12 +56,12 @@ class Body(ABC):
         """Return the volume of the solid, and the volume of its outermost `shell_mm`."""
 
     @abstractmethod
-    def _cast(self, rays: ClippedRays) -> Vectors:
+    def _cast(self, rays: Rays, step_mm: float) -> Vectors:
         """Return distances from the rays' origins, (N,); inf for a miss."""
 
-    def _hit(self, rays: ClippedRays) -> NDArray[np.bool_]:
+    def _hit(self, rays: Rays, step_mm: float) -> NDArray[np.bool_]:
         """Return whether there is a hit, (N,); a subclass may find this without the distance."""
-        return np.isfinite(self._cast(rays))
+        return np.isfinite(self._cast(rays, step_mm))
 
     @abstractmethod
     def _normals(self, points: Vectors, step_mm: float) -> Vectors:
@@ -170,11 +144,11 @@ class SdfBody(Body):
     def _normals(self, points: Vectors, step_mm: float) -> Vectors:
         return gradients(self.displaced_solid(step_mm), points, step_mm)
 
-    def _cast(self, rays: ClippedRays) -> Vectors:
-        return first_hits(self.displaced_solid(rays.step_mm), rays.arrays, rays.step_mm)
+    def _cast(self, rays: Rays, step_mm: float) -> Vectors:
+        return first_hits(self.displaced_solid(step_mm), rays, step_mm)
 
-    def _hit(self, rays: ClippedRays) -> NDArray[np.bool_]:
-        return hits(self.displaced_solid(rays.step_mm), rays.arrays, rays.step_mm)
+    def _hit(self, rays: Rays, step_mm: float) -> NDArray[np.bool_]:
+        return hits(self.displaced_solid(step_mm), rays, step_mm)
 
 
 _NO_RELIEF = ReliefLevel(np.zeros((0, 0), np.float32), 1.0, 1.0, 0.0, 0.0, math.inf)

@@ -19,10 +19,10 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from robot.errors import SceneError
 from robot.sim.objects.appearance import draw_appearance
-from robot.sim.objects.body import Body, ClippedRays, Vectors
+from robot.sim.objects.body import Body, Vectors
 from robot.sim.objects.draw import SimObject
 from robot.sim.objects.materials import draw_material
-from robot.sim.objects.packets import ReliefLevel
+from robot.sim.objects.packets import Rays, ReliefLevel
 from robot.sim.objects.relief import RELIEFS, Relief, draw_relief
 from robot.sim.objects.resting import UP, rotation_to_up
 from robot.sim.objects.shapes.shape import CylindricalChart, Floats, relief_limit
@@ -38,12 +38,7 @@ Faces = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Mesh:
-    """A closed surface in mm.
-
-    Attributes:
-        vertices: (V, 3) points.
-        faces: (F, 3) vertex numbers, counter-clockwise from outside.
-    """
+    """A closed surface: vertices (V, 3) in mm, faces (F, 3) of vertex numbers, counter-clockwise from outside."""
 
     vertices: Vectors
     faces: Faces
@@ -146,7 +141,7 @@ class MeshBody(Body):
         """Return the exact volume; the shell's volume is area times thickness, at most the whole."""
         return self.mesh.solid.volume, min(self.mesh.solid.volume, float(self.mesh.areas.sum()) * shell_mm)
 
-    def _cast(self, rays: ClippedRays) -> Vectors:
+    def _cast(self, rays: Rays, step_mm: float) -> Vectors:
         ahead = np.flatnonzero(rays.near_mm <= rays.far_mm)
         origins, directions, near = rays.origins[ahead], rays.directions[ahead], rays.near_mm[ahead]
         # Rays that start on a face of the bounding box would miss it, so start earlier.
@@ -158,8 +153,7 @@ class MeshBody(Body):
         cosine = -np.einsum("ij,ij->i", directions[hit], self.mesh.face_normals[face[hit]])
         outside, inside = hit[cosine > 0], hit[(cosine <= 0) & (start[hit] == near[hit])]
         result[inside] = near[inside]
-        lift = self._lift(face[outside], origins[outside], directions[outside], result[outside], rays.step_mm)
-        result[outside] -= lift
+        result[outside] -= self._lift(face[outside], origins[outside], directions[outside], result[outside], step_mm)
         distances = np.full(len(rays.near_mm), np.inf)
         distances[ahead] = np.maximum(result, near)
         return distances

@@ -42,15 +42,9 @@ class Formula(NamedTuple):
 
 
 class ReliefLevel(NamedTuple):
-    """One height map of relief.
+    """One height map (rows, columns) of relief, empty for none.
 
-    Attributes:
-        height_mm: (rows, columns) heights; empty for none.
-        per_s: columns per mm along s.
-        per_t: rows per mm along t.
-        max_height_mm: greatest height.
-        slope: upper bound on the slope of the relief, mm per mm.
-        pixel_mm: size of a pixel.
+    It has `per_s` columns per mm along s and `per_t` rows per mm along t. `slope` is an upper bound on its slope.
     """
 
     height_mm: Floats
@@ -68,13 +62,7 @@ class ReliefLevel(NamedTuple):
 
 
 class DisplacedSolid(NamedTuple):
-    """A solid with relief: f = distance(x, y, z) - height(s, t) * mask, in mm.
-
-    Attributes:
-        distance: formula of (x, y, z).
-        place: formula of (x, y, z) to map coordinates s, t and the mask.
-        relief: the height map.
-    """
+    """A solid with relief: f = distance(x, y, z) - height(s, t) * mask, in mm; `place` gives (s, t, mask)."""
 
     distance: Formula
     place: Formula
@@ -178,16 +166,19 @@ def gradients(solid: DisplacedSolid, points: Vectors, step_mm: float) -> Vectors
     return out
 
 
-Rays = tuple[Vectors, Vectors, Vectors, Vectors]
-"""Origins and directions (n, 3), and the range along them in which a hit is searched, (n,) mm each."""
+class Rays(NamedTuple):
+    """Rays (n, 3) and the range along each, (n,) mm, in which a hit is searched; none if near_mm > far_mm."""
+
+    origins: Vectors
+    directions: Vectors
+    near_mm: Vectors
+    far_mm: Vectors
 
 
 def first_hits(solid: DisplacedSolid, rays: Rays, step_mm: float, max_steps: int = MAX_STEPS) -> Vectors:
     """Return the distance (n,) along each ray to the first zero of f; inf if there is none after `max_steps`."""
-    origins, directions, near, _ = rays
-    rows, found = _rows_of(solid), _find_crossings(solid, rays, step_mm, max_steps)
-    out = np.full(len(near), np.inf)
-    _refine(solid, rows, origins, directions, near, found, out)
+    found, out = _find_crossings(solid, rays, step_mm, max_steps), np.full(len(rays.near_mm), np.inf)
+    _refine(solid, _rows_of(solid), rays.origins, rays.directions, rays.near_mm, found, out)
     return out
 
 
@@ -198,7 +189,7 @@ def hits(solid: DisplacedSolid, rays: Rays, step_mm: float, max_steps: int = MAX
 
 def _find_crossings(solid: DisplacedSolid, rays: Rays, step_mm: float, max_steps: int) -> Floats:
     """Return the brackets of the zeros that `_march` finds, (4, n)."""
-    found = np.full((4, len(rays[0])), np.inf, np.float32)
+    found = np.full((4, len(rays.origins)), np.inf, np.float32)
     _march(solid, _rows_of(solid), *rays, np.float32(0.5 * step_mm), max_steps, found)
     return found
 

@@ -12,8 +12,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from robot.errors import UnknownName
-
 Floats = NDArray[np.float32]
 Rng = np.random.Generator
 
@@ -306,9 +304,7 @@ _RANGES = {pattern.__name__: ranges for pattern, ranges in _FAMILIES}
 
 
 def draw_relief(name: str, rng: Rng, limit_mm: float) -> Relief:
-    """Draw an instance of the family, no higher than the shape allows (`limit_mm`). Raise UnknownName."""
-    if name not in RELIEFS:
-        raise UnknownName(f"relief must be one of {', '.join(RELIEFS)}; got {name!r}")
+    """Draw an instance of the family, no higher than the shape allows (`limit_mm`)."""
     short, long, low, high, max_ratio, engraved_probability = _RANGES[name]
     pitch = float(np.exp(rng.uniform(np.log(short), np.log(long))))
     top = max(min(high, max_ratio * pitch, limit_mm), min(low, limit_mm))

@@ -2,13 +2,12 @@
 
 import json
 import math
-from dataclasses import asdict
 
 import numpy as np
 import pytest
 
 from robot.sim.gel import fitted_optics
-from robot.sim.gel.fitted_optics import FittedLimits, FittedOptics, fitted_names, load_fitted
+from robot.sim.gel.fitted_optics import FITTED, FittedLimits, FittedOptics, load_fitted
 from robot.sim.gel.surface import Field, Surface
 
 SMALL = Field(24, 32, 0.5)
@@ -71,15 +70,10 @@ def test_fitted_colours_are_clipped_to_the_limits_of_the_presses():
     assert fitted()._neighbourhood(steep)[0].max() > 1
 
 
-@pytest.mark.parametrize("name", fitted_names())
+@pytest.mark.parametrize("name", FITTED)
 def test_the_shipped_fits_name_their_source_and_licence_and_stay_small(name):
     content = fitted_optics.fitted_document(name)
     assert "taxim" in content["source"]
     assert "MIT" in content["source"]
     assert len(json.dumps(content)) < 12_000
     load_fitted(name)
-
-
-def test_fitted_optics_survive_their_file():
-    model = fitted()
-    assert fitted_optics.optics_from_json(json.loads(json.dumps({"model": asdict(model)}))) == model

@@ -12,7 +12,7 @@ from robot.gel_settings import GelSettings
 from robot.sim.contact.layer import Layer
 from robot.sim.gel import optics
 from robot.sim.gel import sensor as gel
-from robot.sim.gel.fitted_optics import fitted_names, load_fitted
+from robot.sim.gel.fitted_optics import FITTED
 from robot.sim.gel.marks import Flaws, Markers, flaw_maps, marker_positions
 from robot.sim.gel.optics import LedBar, LedOptics, cast_shadows
 from robot.sim.gel.sensor import OPTICS, GelSensor, Noise, draw_sensor
@@ -89,7 +89,7 @@ HARD = {
 
 
 @pytest.mark.parametrize("name", HARD)
-@pytest.mark.parametrize("kind", ["led", "grey", "varied", *fitted_names()])
+@pytest.mark.parametrize("kind", ["led", "grey", "varied", *FITTED])
 def test_hard_surfaces_give_pictures(name, kind):
     sensor = replace(draw_sensor(0, "a", optics=kind), field=Field(24, 32, 0.5), markers=Markers())
     clean = sensor._render_surface(Surface(HARD[name], sensor.field))
@@ -274,8 +274,6 @@ def test_varied_sensors_have_any_number_of_lamps_colours_markers_and_cameras():
 def test_an_unknown_optics_lists_the_known_ones():
     with pytest.raises(UnknownName, match="'lamp'; known are gelsight, gelsight_mini, grey, led, varied"):
         draw_sensor(0, "a", optics="lamp")
-    with pytest.raises(UnknownName, match="known are gelsight, gelsight_mini"):
-        load_fitted("../gelsight")
 
 
 # Flaws and markers -----------------------------------------------------------------------------------------

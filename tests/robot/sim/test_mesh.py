@@ -182,13 +182,13 @@ def test_corner_normals_are_smooth_on_a_ball_and_sharp_on_a_cube():
 def test_hidden_files_are_not_meshes_and_two_meshes_of_one_name_are_refused(tmp_path):
     stl(tmp_path / "cube.stl", 20 * CORNERS, CUBE)
     (tmp_path / "._cube.stl").write_bytes(b"Mac OS X")
-    rig = load_rig("sim", seed=0, meshes=str(tmp_path))
-    assert [name.split("-")[0] for name in rig.object_ids(1)] == ["mesh.cube"]
+    names = load_rig("sim", seed=0, meshes=str(tmp_path)).object_ids(1)
+    assert [name.split("-")[0] for name in names] == ["mesh.cube"]
     stl(tmp_path / "cube.STL", 25 * CORNERS, CUBE)
     with pytest.raises(
         RobotConfigError, match=r"must not contain two meshes of one name, got 'mesh\.cube-.*\. Rename one"
     ):
-        rig.object_ids(2)
+        load_rig("sim", seed=0, meshes=str(tmp_path)).object_ids(2)
 
 
 def test_a_rig_of_meshes_grasps_them_and_continues_only_with_the_same_files(tmp_path):

@@ -24,7 +24,7 @@ class Slanted(Body):
         self.slopes = math.tan(left_rad), math.tan(right_rad)
         self.lower, self.upper = np.array([-80.0, -half_y_mm, 0.0]), np.array([80.0, half_y_mm, 100.0])
 
-    def _cast(self, rays):
+    def _cast(self, rays, step_mm):
         """Rays come from outside, across the solid, like those of fingers: at a plane n.p = c, t = (c - n.o) / n.d."""
         distance = np.full(len(rays.origins), np.inf)
         for sign, slope in zip((-1.0, 1.0), self.slopes, strict=True):

@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 
-from robot.errors import UnknownName
 from robot.sim.objects.relief import RELIEFS, Relief, Sheet, draw_relief
 
 SHEET = Sheet(120.0, 60.0, 401, 800)
@@ -91,11 +90,6 @@ def test_glyphs_can_be_read_from_outside():
     start = np.flatnonzero(stem)[0]
     assert foot[start + 40]
     assert not stem[start + 40]
-
-
-def test_an_unknown_name_is_refused():
-    with pytest.raises(UnknownName, match="knurl"):
-        draw_relief("fur", np.random.default_rng(0), 2.0)
 
 
 @pytest.mark.parametrize("name", NOT_SMOOTH)
