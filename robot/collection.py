@@ -12,8 +12,6 @@ import atexit
 import functools
 import itertools
 import json
-import re
-import zlib
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -26,7 +24,14 @@ from robot.grasping.attempt import AttemptRunner, GraspAttempt
 from robot.grasping.gates import ContactAreaGate, Gate, apply_gate, recorded_touches
 from robot.grasping.settings import AttemptSettings
 from robot.recording.attempt_log import AttemptLog, LoggedAttempt, Tally, tally
-from robot.recording.folder import INFO_FILE, RecordingWriter, read_info, read_recording, software_version
+from robot.recording.folder import (
+    INFO_FILE,
+    RecordingWriter,
+    read_info,
+    read_recording,
+    safe_name,
+    software_version,
+)
 from robot.recording.grasp import RecordedGrasp, check_name
 from robot.rig import Rig
 from robot.workers import Work, WorkerPool
@@ -35,7 +40,6 @@ RigMaker = Callable[[], Rig]
 """Builds an unconnected rig. For several jobs it must be picklable, like functools.partial(load_rig, "sim", seed=0)."""
 
 _ATTEMPTS_PER_GRASP, _SPARE_ATTEMPTS = 4, 10
-_UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9._-]")
 
 
 @dataclass(frozen=True)
@@ -144,8 +148,6 @@ def collect(
     if jobs > 1 and not rig.can_run_jobs:
         raise RobotConfigError(f"{type(rig).__name__} can run in one process only, so jobs must be 1, got {jobs}")
     names = rig.object_ids(objects) if isinstance(objects, int) else list(objects)
-    if not names:
-        raise RobotConfigError("objects must name at least one object, got none")
     if len(set(names)) != len(names):
         raise RobotConfigError("objects must have different names, but one name occurs twice")
     for name in names:
@@ -304,7 +306,7 @@ class _Collection:
             self.log.append(logged)
         else:
             accepted, score = apply_gate(self.gate, recorded_touches(attempt.images))
-            grasp_id = grasp_id_of(name, number)
+            grasp_id = safe_name(name, f"{number:04}")
             logged = LoggedAttempt(name, number, outcome, accepted, self._seconds, grasp_id, score, attempt.fit)
             self.log.append(logged)
             grasp = self.writer.append(
@@ -350,11 +352,3 @@ class _Collection:
                 attempts=sum(counts.attempts for counts in tallies),
             )
         )
-
-
-def grasp_id_of(object_id: str, number: int) -> str:
-    """Return the grasp id: object and attempt number, in characters that are valid in file names."""
-    plain = _UNSAFE_CHARACTERS.sub("_", object_id)[:100]
-    if plain != object_id or not plain[0].isalnum():
-        plain = f"x{zlib.crc32(object_id.encode()):08x}_{plain}"
-    return f"{plain}-{number:04}"

@@ -5,15 +5,18 @@ Lengths in mm, forces in N, angles in rad, times in s; coordinate frames as in r
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Meta
 
+from _touch_retrieval.documents import check_fields
 from robot.errors import DeviceError, RobotConfigError
 
 GripperStatus = Literal["idle", "moving", "holding", "no_part", "part_lost"]
-_MAX_PX = 1e6
+_Focal = Annotated[float, Meta(gt=0, le=1e6)]
+_Centre = Annotated[float, Meta(ge=-1e6, le=1e6)]
 
 
 @dataclass(frozen=True)
@@ -80,18 +83,14 @@ class Frame:
 class Intrinsics:
     """A pinhole camera without distortion, in pixels; the centre of the first pixel is (0, 0)."""
 
-    fx: float
-    fy: float
-    cx: float
-    cy: float
+    fx: _Focal
+    fy: _Focal
+    cx: _Centre
+    cy: _Centre
 
     def __post_init__(self) -> None:
         """Raise DeviceError unless focal lengths are above 0 and all numbers are at most a million pixels."""
-        numbers = (self.fx, self.fy, self.cx, self.cy)
-        if not (min(self.fx, self.fy) > 0 and all(abs(each) <= _MAX_PX for each in numbers)):  # also rejects NaN
-            raise DeviceError(
-                f"intrinsics must be finite, up to a million pixels, with focal lengths above 0, got {self}"
-            )
+        check_fields(self, "intrinsics", DeviceError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +127,4 @@ class GripperState:
 
     def __post_init__(self) -> None:
         """Raise DeviceError for an unknown status or numbers that are not finite."""
-        if self.status not in (known := get_args(GripperStatus)):
-            raise DeviceError(f"a gripper's status must be one of {', '.join(known)}, got {self.status!r}")
-        if not (math.isfinite(self.opening_mm) and math.isfinite(self.force_n)):
-            raise DeviceError(f"a gripper must report finite numbers, got {self.opening_mm} mm, {self.force_n} N")
+        check_fields(self, "gripper", DeviceError)

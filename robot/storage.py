@@ -181,10 +181,8 @@ def parse_object(text: bytes, error_type: type[RobotError]) -> dict[str, Any]:
     """Parse the JSON object of a line or file; raise `error_type` for anything else, NaN and infinity included."""
     try:
         return msgspec.json.decode(text, type=dict[str, Any])
-    except msgspec.ValidationError as error:
-        raise error_type(f"must be one JSON object in braces, of finite numbers: {error}") from error
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise error_type(f"must be JSON in UTF-8, without NaN and Infinity: {error}") from error
+        raise error_type(f"must be one JSON object in UTF-8, without NaN and Infinity: {error}") from error
 
 
 def read_json_object(path: str | Path, error_type: type[RobotError]) -> dict[str, Any]:

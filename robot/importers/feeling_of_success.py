@@ -32,9 +32,8 @@ from robot.importers.importing import (
     import_items,
     natural_sort_key,
     numbered_files,
-    safe_name,
 )
-from robot.recording.folder import Recording
+from robot.recording.folder import Recording, safe_name
 
 DATA_SET = DataSet(
     source="The Feeling of Success",

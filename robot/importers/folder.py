@@ -34,9 +34,8 @@ from robot.importers.importing import (
     Skip,
     import_items,
     natural_sort_key,
-    safe_name,
 )
-from robot.recording.folder import Recording, SharedImage
+from robot.recording.folder import Recording, SharedImage, safe_name
 
 DATA_SET = DataSet(
     source="your own pictures",

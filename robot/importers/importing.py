@@ -14,14 +14,13 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from hashlib import sha256
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from _touch_retrieval.files import write_atomically
 from robot.errors import ImporterError, RecordingError
-from robot.recording.folder import GRASP_ID, Recording, RecordingWriter, SharedImage, read_recording
+from robot.recording.folder import Recording, RecordingWriter, SharedImage, read_recording
 from robot.storage import ImageSource, file_content, storage_errors
 
 Progress = Callable[[int, int], None]
@@ -216,20 +215,6 @@ def _write_split(out: Path, split: Mapping[str, Sequence[str]]) -> list[str]:
         document = json.dumps({"seed": 0, **parts}, indent=1).encode() + b"\n"
         write_atomically(out / SPLITS_FOLDER / "published.json", document)
     return []
-
-
-def safe_name(*parts: str) -> str:
-    """Return the parts as a grasp_id, joined by "-"; invalid characters are replaced and a digest is appended.
-
-    >>> safe_name("mug", "01"), safe_name("my mug", "01")
-    ('mug-01', 'my-mug-01-b68d33c2')
-    """
-    joined = "-".join(parts)
-    if GRASP_ID.fullmatch(joined):
-        return joined
-    plain = re.sub(r"[^A-Za-z0-9._-]", "-", joined)[:100].lstrip("._-") or "grasp"
-    # Names of unknown encoding and JSON escapes can contain surrogates.
-    return f"{plain}-{sha256('/'.join(parts).encode(errors='surrogatepass')).hexdigest()[:8]}"
 
 
 def numbered_files(folder: Path, pattern: re.Pattern[str]) -> list[tuple[re.Match[str], Path]]:

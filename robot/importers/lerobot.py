@@ -33,9 +33,8 @@ from robot.importers.importing import (
     Skip,
     import_extra,
     import_items,
-    safe_name,
 )
-from robot.recording.folder import Recording
+from robot.recording.folder import Recording, safe_name
 from robot.storage import decode_picture, read_content
 
 DATA_SET = DataSet(

@@ -27,10 +27,9 @@ from robot.importers.importing import (
     Skip,
     import_items,
     numbered_files,
-    safe_name,
     subfolders,
 )
-from robot.recording.folder import Recording, SharedImage
+from robot.recording.folder import Recording, SharedImage, safe_name
 from robot.storage import read_content, read_json_object
 
 DATA_SET = DataSet(

@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 from robot.errors import ImporterError
 from robot.importers.episodes import Step, episode_images
-from robot.importers.importing import NOT_STATED, DataSet, Item, Progress, import_extra, import_items, safe_name
-from robot.recording.folder import Recording
+from robot.importers.importing import NOT_STATED, DataSet, Item, Progress, import_extra, import_items
+from robot.recording.folder import Recording, safe_name
 
 DATA_SET = DataSet(
     source="Open-X-Tactile",

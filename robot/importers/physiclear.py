@@ -29,9 +29,8 @@ from robot.importers.importing import (
     import_extra,
     import_items,
     numbered_files,
-    safe_name,
 )
-from robot.recording.folder import Recording, SharedImage
+from robot.recording.folder import Recording, SharedImage, safe_name
 
 DATA_SET = DataSet(
     source="PhysiCLeAR",

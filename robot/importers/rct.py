@@ -17,8 +17,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from robot.errors import ImporterError
-from robot.importers.importing import NOT_STATED, DataSet, Item, Progress, Skip, import_items, safe_name
-from robot.recording.folder import Recording, SharedImage
+from robot.importers.importing import NOT_STATED, DataSet, Item, Progress, Skip, import_items
+from robot.recording.folder import Recording, SharedImage, safe_name
 
 DATA_SET = DataSet(
     source="RCT, arXiv 2606.31694",

@@ -52,9 +52,8 @@ from robot.importers.importing import (
     import_extra,
     import_items,
     numbered_files,
-    safe_name,
 )
-from robot.recording.folder import Recording
+from robot.recording.folder import Recording, safe_name
 from robot.storage import decode_picture
 
 DATA_SET = DataSet(

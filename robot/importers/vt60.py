@@ -14,10 +14,9 @@ sequence for both, so a split by sequence does not divide it.
 
 import filecmp
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from robot.importers.importing import (
     NOT_STATED,
@@ -28,10 +27,9 @@ from robot.importers.importing import (
     Skip,
     import_items,
     numbered_files,
-    safe_name,
     subfolders,
 )
-from robot.recording.folder import Recording, SharedImage
+from robot.recording.folder import Recording, SharedImage, safe_name
 
 DATA_SET = DataSet(
     source="github.com/Exhor/deep_visuotactile_classification",
@@ -61,14 +59,7 @@ _SAME_OBJECTS = {"bottleempty": "bottle", "bottlefull": "bottle"}
 """Classes that contain the same objects."""
 
 
-@dataclass(frozen=True)
-class _Instance:
-    """One object: its touches and its folder of photos."""
-
-    object_id: str
-    touches: list[tuple[re.Match[str], Path]]
-    vision: Path
-    metadata: dict[str, Any]
+_Files = list[tuple[re.Match[str], Path]]
 
 
 def import_vt60(src: Path, out: Path, progress: Progress | None = None) -> Recording:
@@ -82,49 +73,56 @@ def import_vt60(src: Path, out: Path, progress: Progress | None = None) -> Recor
         if not (src / part).is_dir():
             raise DATA_SET.mismatch_error(src, f"it has no {part}/ (the folder is code/data/vt60 of the repository)")
     classes = (folder for folder in subfolders(src / "touch") if _CLASS.fullmatch(folder.name))
-    folders = (folder for kind in classes for folder in subfolders(kind))
-    found = ((folder, numbered_files(folder, _TOUCH)) for folder in folders)
-    objects = [_read_instance(src, folder, touches) for folder, touches in found if touches]
-    if not objects:
+    folders = [folder for kind in classes for folder in subfolders(kind)]
+    touches = {folder: files for folder in folders if (files := numbered_files(folder, _TOUCH))}
+    if not touches:
         raise DATA_SET.mismatch_error(
             src, "it contains no touch_<id>_img_<k>_name_<class>_<nickname>_at_<x>_<y>_<z>.jpg"
         )
     no_contact = src / "touch" / "baselineForCalibration.jpg"
     has_frame = no_contact.is_file()
+    objects = {
+        _name(folder): {
+            "class": folder.parent.name.partition("_")[2],
+            "instance": folder.name,
+            "nickname": files[0][0]["nickname"],
+        }
+        for folder, files in touches.items()
+    }
     return import_items(
         DATA_SET if has_frame else replace(DATA_SET, background="none"),
-        _items(src, objects, no_contact if has_frame else None),
+        _items(src, touches, objects, no_contact if has_frame else None),
         out,
-        total=sum(len(instance.touches) for instance in objects),
+        total=sum(map(len, touches.values())),
         progress=progress,
-        objects={instance.object_id: instance.metadata for instance in objects},
+        objects=objects,
     )
 
 
-def _read_instance(src: Path, folder: Path, touches: list[tuple[re.Match[str], Path]]) -> _Instance:
-    kind, instance = folder.parent.name, folder.name
-    metadata = {"class": kind.partition("_")[2], "instance": instance, "nickname": touches[0][0]["nickname"]}
-    return _Instance(safe_name(kind, instance), touches, src / "vision" / kind / instance, metadata)
+def _name(folder: Path) -> str:
+    return safe_name(folder.parent.name, folder.name)
 
 
-def _items(src: Path, objects: list[_Instance], no_contact: Path | None) -> Iterator[Item | Skip]:
+def _items(
+    src: Path, touches: Mapping[Path, _Files], objects: Mapping[str, Mapping[str, str]], no_contact: Path | None
+) -> Iterator[Item | Skip]:
     background = {"touch_a_before": SharedImage("no_contact", no_contact)} if no_contact else {}
-    touched = {instance.vision for instance in objects}
     for photographed in (instance for kind in subfolders(src / "vision") for instance in subfolders(kind)):
-        if photographed not in touched:
+        if src / "touch" / photographed.parent.name / photographed.name not in touches:
             yield Skip("photos of an object without touches", f"{photographed.parent.name}/{photographed.name}")
-    for instance in objects:
-        photos = [path for _, path in numbered_files(instance.vision, _PHOTO)]
-        common = _SAME_OBJECTS.get(instance.metadata["class"])
-        sequence = f"{common}-{instance.metadata['nickname']}" if common else instance.object_id
-        for number, (match, touch) in enumerate(instance.touches):
-            name = safe_name(instance.object_id, match[2])
+    for folder, files in touches.items():
+        object_id = _name(folder)
+        photos = [path for _, path in numbered_files(src / "vision" / folder.parent.name / folder.name, _PHOTO)]
+        common = _SAME_OBJECTS.get(objects[object_id]["class"])
+        sequence = f"{common}-{objects[object_id]['nickname']}" if common else object_id
+        for number, (match, touch) in enumerate(files):
+            name = safe_name(object_id, match[2])
             if not photos:
                 yield Skip("its object has no photo", name)
             elif no_contact and touch.is_file() and filecmp.cmp(touch, no_contact, shallow=False):
                 yield Skip("its touch is the no-contact frame itself", name)
             else:
                 photo = photos[number % len(photos)]
-                shared = SharedImage(safe_name(instance.object_id, photo.stem), photo)
+                shared = SharedImage(safe_name(object_id, photo.stem), photo)
                 images: Images = {"photo": shared, "touch_a": touch, **background}
-                yield Item(name, instance.object_id, images, {"sequence_id": sequence})
+                yield Item(name, object_id, images, {"sequence_id": sequence})

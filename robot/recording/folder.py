@@ -20,6 +20,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -288,6 +289,20 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def safe_name(*parts: str) -> str:
+    """Return the parts as a grasp_id, joined by "-"; invalid characters are replaced and a digest is appended.
+
+    >>> safe_name("mug", "01"), safe_name("my mug", "01")
+    ('mug-01', 'my-mug-01-b68d33c2')
+    """
+    joined = "-".join(parts)
+    if GRASP_ID.fullmatch(joined):
+        return joined
+    plain = re.sub(r"[^A-Za-z0-9._-]", "-", joined)[:100].lstrip("._-") or "grasp"
+    # Names of unknown encoding and JSON escapes can contain surrogates.
+    return f"{plain}-{sha256('/'.join(parts).encode(errors='surrogatepass')).hexdigest()[:8]}"
 
 
 def _check_id(what: str, name: str) -> None:

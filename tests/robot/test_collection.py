@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from robot.collection import CollectSettings, Progress, collect, grasp_id_of
+from robot.collection import CollectSettings, Progress, collect
 from robot.errors import DeviceError, RecordingError, RobotConfigError, StorageError, UngraspableError
 from robot.grasping.attempt import AttemptRunner, depth_in_mm
 from robot.grasping.gates import ContactAreaGate, recorded_touches
@@ -16,7 +16,7 @@ from robot.grasping.planner import CylinderPlanner
 from robot.grasping.settings import AttemptSettings, GraspSettings
 from robot.readings import Pose
 from robot.recording.attempt_log import read_attempts
-from robot.recording.folder import RecordingWriter, read_recording
+from robot.recording.folder import RecordingWriter, read_recording, safe_name
 from robot.rig import GraspPlan, Rig
 from robot.sight.cylinder import CylinderFit
 from robot.storage import file_content
@@ -680,5 +680,5 @@ def test_a_grasp_has_an_id_that_a_recording_accepts(tmp_path, object_id):
     image = np.zeros((2, 2, 3), np.uint8)
     with RecordingWriter(tmp_path, {"source": "test", "sensor": "test"}) as writer:
         for number in (0, 12345):
-            writer.append(grasp_id_of(object_id, number), object_id, {"photo": image, "touch_a": image})
-    assert grasp_id_of("mug", 7) == "mug-0007"
+            writer.append(safe_name(object_id, f"{number:04}"), object_id, {"photo": image, "touch_a": image})
+    assert safe_name("mug", "0007") == "mug-0007"

@@ -21,9 +21,8 @@ from robot.importers.importing import (
     Skip,
     import_items,
     numbered_files,
-    safe_name,
 )
-from robot.recording.folder import RecordingWriter, SharedImage, read_recording
+from robot.recording.folder import RecordingWriter, SharedImage, read_recording, safe_name
 from robot.storage import parse_object
 from tests.documents import text_of
 from tests.miniatures import encoded, picture, pixels
