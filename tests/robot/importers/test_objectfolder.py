@@ -19,27 +19,26 @@ def pack(tmp_path):
     return tmp_path / "pack"
 
 
-def test_a_touch_of_a_pack_has_the_photo_of_its_own_number(pack, tmp_path):
+def test_a_touch_of_a_pack_has_the_photo_of_its_own_number_and_the_split_is_stored_by_objects(pack, tmp_path):
     recording = import_objectfolder(pack, tmp_path / "out")
     assert [grasp.grasp_id for grasp in recording.grasps][:4] == ["2-1", "2-2", "2-10", "10-1"]
     for grasp in recording.grasps:
         instance = grasp.grasp_id.split("-")[1]
         photo = pack / "vision" / grasp.object_id / f"{instance}.png"
         assert (tmp_path / "out" / grasp.photo).read_bytes() == photo.read_bytes()
-
-
-def test_the_published_split_is_stored_by_objects(pack, tmp_path):
-    import_objectfolder(pack, tmp_path / "out")
     split = parse_object((tmp_path / "out" / SPLITS_FOLDER / "published.json").read_bytes(), RecordingError)
     assert split == {"seed": 0, "train": ["2", "31"], "validation": ["10"], "test": ["100"]}
 
 
-def test_a_split_by_pictures_is_not_stored_and_gets_a_note(pack, tmp_path):
+def test_a_split_by_pictures_gets_a_note_and_touches_without_their_photo_get_another(pack, tmp_path):
     rows = {"train": [["2", 1], ["10", 1]], "val": [], "test": [["2", 2], ["100", 1]]}
     (pack / "split.json").write_text(json.dumps(rows))
+    (pack / "vision/31/2.png").unlink()
     recording = import_objectfolder(pack, tmp_path / "out")
     assert any("has objects in two parts" in note for note in recording.notes)
     assert not (tmp_path / "out" / SPLITS_FOLDER).exists()
+    photos = {grasp.grasp_id: grasp.photo for grasp in recording.grasps}
+    assert photos["31-2"] == photos["31-10"] != photos["31-1"]
 
 
 @pytest.mark.parametrize("content", ["[1]", "{", '{"train": 3}'])
@@ -54,10 +53,3 @@ def test_each_sample_of_real_is_an_object_with_its_name(tmp_path):
     recording = import_objectfolder(tmp_path / "src", tmp_path / "out")
     assert [(grasp.grasp_id, grasp.object_id) for grasp in recording.grasps] == [("3-0", "3"), ("20-0", "20")]
     assert recording.info["objects"]["20"] == {"name": "Ladle", "material": "Steel"}
-
-
-def test_touches_without_a_photo_of_their_number_are_assigned_to_the_others(pack, tmp_path):
-    (pack / "vision/31/2.png").unlink()
-    recording = import_objectfolder(pack, tmp_path / "out")
-    photos = {grasp.grasp_id: grasp.photo for grasp in recording.grasps}
-    assert photos["31-2"] == photos["31-10"] != photos["31-1"]

@@ -11,18 +11,9 @@ import pytest
 
 from robot.errors import ImporterError
 from robot.importers.open_x_tactile import import_open_x_tactile
-
-pytest.importorskip("zarr")
-
 from tests.miniatures import open_x_tactile
 
 pytestmark = pytest.mark.usefixtures("no_fsync")
-
-
-@pytest.fixture
-def source(tmp_path):
-    open_x_tactile.write(tmp_path / "src")
-    return tmp_path / "src"
 
 
 @pytest.fixture
@@ -36,17 +27,15 @@ def picture(recording, path):
     return cv2.imread(str(recording.folder / path))[..., ::-1]
 
 
-def test_a_task_is_an_object_an_episode_a_sequence_and_an_area_a_finger(source, tmp_path):
-    recording = import_open_x_tactile(source, tmp_path / "out")
+def test_a_task_is_an_object_an_episode_a_sequence_and_its_strongest_contact_the_touch(tmp_path):
+    """The first step of an episode is the no-contact frame; an area is a finger."""
+    open_x_tactile.write(tmp_path / "src")
+    recording = import_open_x_tactile(tmp_path / "src", tmp_path / "out")
     counts = {"insert_plug": 3, "wipe_board": 2}
     assert [grasp.object_id for grasp in recording.grasps] == [task for task, n in counts.items() for _ in range(n)]
     assert [grasp.sequence_id for grasp in recording.grasps][:2] == ["insert_plug-000000", "insert_plug-000001"]
     assert all(sorted(grasp.touches) == ["a", "b"] for grasp in recording.grasps)
     assert (recording.info["sensor"], recording.info["fingers"]) == ("GelSightMini", 2)
-
-
-def test_the_touch_is_the_step_of_strongest_contact_and_the_first_step_is_the_no_contact_frame(source, tmp_path):
-    recording = import_open_x_tactile(source, tmp_path / "out")
     steps = open_x_tactile.episode_steps(100, 5)  # the second episode of the first task
     grasp = recording.grasps[1]
     assert np.array_equal(picture(recording, grasp.photo), steps[0][0])
@@ -78,11 +67,6 @@ def test_an_episode_without_contact_is_not_a_grasp(store, tmp_path):
     }
 
 
-def forge(store, name, **changes):
-    metadata = json.loads((store / name / ".zarray").read_text())
-    (store / name / ".zarray").write_text(json.dumps(metadata | changes))
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -98,7 +82,8 @@ def forge(store, name, **changes):
     ],
 )
 def test_the_metadata_of_an_array_is_checked_before_zarr_reads_it(store, tmp_path, changes, message):
-    forge(store, "data/camera_main_rgb", **changes)
+    path = store / "data/camera_main_rgb/.zarray"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
     with pytest.raises(ImporterError, match=message):
         import_open_x_tactile(store, tmp_path / "out")
     assert not (tmp_path / "out").exists()
