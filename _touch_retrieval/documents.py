@@ -39,9 +39,7 @@ _WORDS = {
     "object": "a table",
     "null": "nothing",
 }
-_EXPECTED = re.compile(r"Expected (?P<kind>.*?)(?:, got (?P<got>.*))?")
-_PLACE = re.compile(r" - at `\$(?P<place>.*)`$")
-_STEP = re.compile(r"\.(\w+)|\[(\d+)\]|\[(\.\.\.)\]")
+_STEP = re.compile(r"\.(\w+)|\[(\d+)\]")
 
 
 def typed(
@@ -59,9 +57,6 @@ def typed(
         name: Name of the document in messages, such as the table of a file.
         complete: Require a key for each field of the dataclass; otherwise missing fields get their defaults.
         error: Exception type to raise instead of ValueError.
-
-    Returns:
-        The converted value.
 
     Raises:
         ValueError: A value does not fit. The message contains its name, its required type and its value.
@@ -81,15 +76,12 @@ def typed(
 
 
 def check_fields(instance: Any, name: str, error: type[Exception] = ValueError) -> None:
-    """Check and convert the fields of a dataclass in its `__post_init__`, by the rules of `typed`.
+    """Check the fields of a frozen dataclass in its `__post_init__` by the rules of `typed`, and replace them.
 
     Args:
-        instance: A frozen dataclass. Its fields are replaced with the converted values.
+        instance: The dataclass.
         name: Name of the instance in messages; empty: messages contain only the field's name.
-        error: Exception type to raise instead of ValueError.
-
-    Raises:
-        ValueError: A value does not fit.
+        error: Exception type to raise if a value does not fit.
     """
     for field, hint in _hints(instance.__class__).items():
         value = typed(getattr(instance, field), hint, f"{name}.{field}" if name else field, error=error)
@@ -139,37 +131,31 @@ def _require_finite(document: Any, name: str) -> None:
 
 
 def _error_message(message: str, document: Any, kind: Any, name: str) -> str:
-    place = _PLACE.search(message)
-    reason = message[: place.start()] if place else message
-    where = (name + place["place"].replace("[...]", "") if place else name).lstrip(".") or "it"
+    """Return msgspec's message in plain words: `name.key must be a number > 0, got -1`."""
+    reason, _, place = message.rstrip("`").partition(" - at `$")
+    where = f"{name}{place.replace('[...]', '')}".lstrip(".") or "it"
+    required, _, got = reason.removeprefix("Expected ").partition(", got ")
     if reason.startswith("Invalid enum value"):
-        path = place["place"] if place else ""
-        return f"{where} must be {_choices(kind, path)}, got {_got(document, path, None)}"
-    expected = _EXPECTED.fullmatch(reason)
-    if expected is None:  # such as a missing field
+        required = _choices(kind, place)
+    elif required == reason:  # such as a missing field
         return f"{where}: {reason[0].lower()}{reason[1:]}"
-    kind = re.sub("`([^`]*)`", _in_words, expected["kind"])
-    return f"{where} must be {kind}, got {_got(document, place['place'] if place else '', expected['got'])}"
-
-
-def _choices(kind: Any, place: str) -> str:
-    """Return what the `Literal` at a place of a type, or a union with one, accepts."""
-    for key, *_ in _STEP.findall(place):
-        kind = _hints(kind)[key] if is_dataclass(kind) and isinstance(kind, type) else str
-    kinds = (kind,) if get_origin(kind) is Literal else get_args(kind)
-    values = [repr(value) for each in kinds if get_origin(each) is Literal for value in get_args(each)]
-    return f"one of {', '.join(values)}" + (
-        " or a number" if any(get_origin(each) is Annotated for each in kinds) else ""
-    )
+    if "[...]" not in place:  # else a value of a table, without its key
+        for key, number in _STEP.findall(place):
+            document = document[key] if key else document[int(number)]
+        got = repr(document)[:80]
+    return f"{where} must be {re.sub('`([^`]*)`', _in_words, required)}, got {got or 'another'}"
 
 
 def _in_words(kinds: re.Match[str]) -> str:
     return " or ".join(_WORDS.get(kind, kind) for kind in kinds[1].split(" | "))
 
 
-def _got(document: Any, place: str, otherwise: str | None) -> str:
-    for key, number, several in _STEP.findall(place):
-        if several:
-            return otherwise or "another"
-        document = document[key] if key else document[int(number)]
-    return repr(document)[:80]
+def _choices(kind: Any, place: str) -> str:
+    """Return what the `Literal` at a place of a type, or a union with one, accepts."""
+    for key, _ in _STEP.findall(place):
+        kind = _hints(kind)[key] if is_dataclass(kind) and isinstance(kind, type) else str
+    kinds = (kind,) if get_origin(kind) is Literal else get_args(kind)
+    values = [repr(value) for each in kinds if get_origin(each) is Literal for value in get_args(each)]
+    return f"one of {', '.join(values)}" + (
+        " or a number" if any(get_origin(each) is Annotated for each in kinds) else ""
+    )

@@ -13,6 +13,7 @@ import os
 import secrets
 import shutil
 import stat
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BufferedReader
@@ -28,14 +29,8 @@ def durable_file(path: Path) -> Iterator[BinaryIO]:
     """Open a new file for writing, and flush it to the disk when the block ends."""
     with path.open("wb") as handle:
         yield handle
-        finish(handle)
-
-
-def finish(handle: BinaryIO) -> None:
-    """Flush a file to the disk and close it."""
-    handle.flush()
-    os.fsync(handle.fileno())
-    handle.close()
+        handle.flush()
+        os.fsync(handle.fileno())
 
 
 def sync(path: Path) -> None:
@@ -48,29 +43,26 @@ def sync(path: Path) -> None:
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Replace a file: after a power failure it has either all of `data` or its old content.
-
-    Args:
-        path: The file. If it is a link, its target is replaced.
-        data: The new content.
+    """Replace a file, or the target of a link: after a power failure it has either all of `data` or its old content.
 
     Raises:
         OSError: The file cannot be written. The error contains `path`.
     """
-    with named_write_errors(path), atomic_file(path) as file:
-        file.write(data)
+    try:
+        with atomic_file(path) as file:
+            file.write(data)
+    except OSError as error:  # it names the temporary file, or none
+        raise OSError(error.errno, f"cannot be written: {error.strerror}", str(path)) from error
 
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[BinaryIO]:
     """Open a file that replaces `path` when the block ends (`write_atomically`); after an error nothing changes."""
-    place = path.resolve() if path.is_symlink() else path
-    short = os.fsdecode(os.fsencode(place.name)[:200])  # for the longest names that disks allow
-    temporary = place.with_name(f".{short}.{secrets.token_hex(8)}.tmp")
+    place = Path(os.path.realpath(path))
+    temporary = place.with_name(f".{place.name[:50]}.{secrets.token_hex(8)}.tmp")
     try:
-        with temporary.open("xb") as file:
+        with durable_file(temporary) as file:
             yield file
-            finish(file)
         temporary.replace(place)
     finally:
         temporary.unlink(missing_ok=True)
@@ -79,17 +71,6 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
     except OSError as error:
         if error.errno not in _UNFLUSHED:
             raise
-
-
-@contextmanager
-def named_write_errors(path: Path) -> Iterator[None]:
-    """Add the name of the written file to errors of the block: a failed write does not contain it."""
-    try:
-        yield
-    except OSError as error:
-        raise OSError(error.errno, f"cannot be written: {error.strerror or error}", str(path)) from error
-    except RuntimeError as error:  # a link that leads to itself
-        raise OSError(errno.ELOOP, "cannot be written: its links form a circle", str(path)) from error
 
 
 def remove_folder(folder: Path) -> None:
@@ -151,16 +132,7 @@ def read_regular(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
 
 
 def read_json(path: str | Path, max_bytes: int = MAX_JSON_BYTES) -> Any:
-    """Return the JSON document in a regular file.
-
-    Args:
-        path: The file.
-        max_bytes: Largest size; a larger file is an error.
-
-    Raises:
-        OSError: The file is not regular, cannot be read or is too large.
-        ValueError: It is not a valid document (`parse_json`).
-    """
+    """Return the JSON document in a regular file of at most `max_bytes` bytes. Raises OSError, ValueError."""
     return parse_json(read_regular(path, max_bytes))
 
 
@@ -177,31 +149,25 @@ def parse_json(text: str | bytes, *, finite: bool = False) -> Any:
     number = _finite if finite else None
     try:
         document = json.loads(text, object_pairs_hook=_object, parse_constant=number, parse_float=number)
+        _require_depth(document, MAX_DEPTH)
     except RecursionError as error:
         raise ValueError(f"it is nested deeper than {MAX_DEPTH} levels") from error
-    if is_deep(document):
-        raise ValueError(f"it is nested deeper than {MAX_DEPTH} levels")
     return document
 
 
-def is_deep(document: Any) -> bool:
-    """Whether a document is nested deeper than `MAX_DEPTH` levels."""
-    level = [document]
-    for _ in range(MAX_DEPTH):
-        level = [
-            inner
-            for each in level
-            if isinstance(each, dict | list | tuple)
-            for inner in (each.values() if isinstance(each, dict) else each)
-        ]
-    return any(isinstance(each, dict | list | tuple) for each in level)
+def _require_depth(document: Any, depth: int) -> None:
+    if isinstance(document, dict | list):
+        if depth == 0:
+            raise RecursionError
+        for inner in document.values() if isinstance(document, dict) else document:
+            _require_depth(inner, depth - 1)
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     document = dict(pairs)
     if len(document) < len(pairs):
-        names = [name for name, _ in pairs]
-        raise ValueError(f"it has the key {next(name for name in names if names.count(name) > 1)!r} twice")
+        (name, _), *_ = (Counter(name for name, _ in pairs)).most_common(1)
+        raise ValueError(f"it has the key {name!r} twice")
     return document
 
 

@@ -60,7 +60,7 @@ class Registry(Collection[str], Generic[T]):
     def load(self, name: str) -> T:
         """Return the entry with this name. Raises the registry's error if it is unknown or unusable."""
         if name in self.table:
-            return cast(T, _attribute(import_module(self.table[name].partition(":")[0]), self.table[name]))
+            return cast(T, _imported(self.table[name]))
         installed = self._installed()
         place = installed.get(name, name)
         module, _, attribute = place.partition(":")
@@ -76,22 +76,21 @@ class Registry(Collection[str], Generic[T]):
                 f"{module} first, or install a package that adds it by an entry point of the group {self.group}"
             )
         try:
-            return self._checked(name, _attribute(import_module(module), place))
+            return self._checked(name, _imported(place))
         except (ImportError, AttributeError) as error:
             raise self._error(f"{self.noun} {name!r} cannot be imported: {error}") from error
 
     def name_of(self, choice: "str | T") -> str:
         """Return the name of a user's choice: a name, a `module:Class`, which is imported, or the object itself.
 
-        Raises the registry's error for an unknown name, and for an object that no name resolves to.
+        Raises the registry's error if it is unknown or unusable.
         """
         if isinstance(choice, str):
             if choice in self.table:
                 return choice
-            module, _, attribute = choice.partition(":")
-            if attribute and choice not in self.names():
+            if ":" in choice and choice not in self.names():
                 try:
-                    import_module(module)
+                    import_module(choice.partition(":")[0])
                 except ImportError as error:
                     raise self._error(
                         f"{self.noun} {choice!r} cannot be imported ({error}); install its package, or add its folder "
@@ -100,11 +99,17 @@ class Registry(Collection[str], Generic[T]):
             self.load(choice)
             return choice
         place = f"{getattr(choice, '__module__', None)}:{getattr(choice, '__qualname__', None)}"
-        names = [name for name, its in {**self._installed(), **self.table}.items() if its == place]
         self._checked(place, choice)
-        if not names and _attribute_or_none(place) is not choice:
+        for name, known in {**self._installed(), **self.table}.items():
+            if known == place:
+                return name
+        try:
+            found = _imported(place)
+        except (ImportError, AttributeError):
+            found = None
+        if found is not choice:
             raise self._error(f"{self.noun} {place!r} must be defined at the top level of its module")
-        return names[0] if names else place
+        return place
 
     def resolve(self, choice: "str | T") -> T:
         """Return the entry for a user's choice; raises as `name_of`."""
@@ -120,7 +125,7 @@ class Registry(Collection[str], Generic[T]):
         if self._base is None:
             fits, required = callable(thing), "a function"
         else:
-            base = _attribute(import_module(self._base.partition(":")[0]), self._base)
+            base = _imported(self._base)
             fits = isinstance(thing, base) or (isinstance(thing, type) and issubclass(thing, base))
             required = f"a {base.__name__}"
         if not fits:
@@ -128,16 +133,9 @@ class Registry(Collection[str], Generic[T]):
         return cast(T, thing)
 
 
-def _attribute(module: Any, place: str) -> Any:
-    return attrgetter(place.partition(":")[2])(module)
-
-
-def _attribute_or_none(place: str) -> Any:
-    module = sys.modules.get(place.partition(":")[0])
-    try:
-        return _attribute(module, place)
-    except AttributeError:
-        return None
+def _imported(place: str) -> Any:
+    module, _, attribute = place.partition(":")
+    return attrgetter(attribute)(import_module(module))
 
 
 def code_digest(*classes: type) -> dict[str, str]:

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from _touch_retrieval.files import named_write_errors, write_atomically
+from _touch_retrieval.files import write_atomically
 from retrieval.errors import BadInput
 
 
@@ -36,6 +36,5 @@ def write_output(path: Path, content: str | bytes) -> None:
     Raises:
         OSError: The file cannot be written. The error contains `path`.
     """
-    with named_write_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, content if isinstance(content, bytes) else content.encode("utf-8", "xmlcharrefreplace"))

@@ -13,7 +13,7 @@ Listing opens no photo.
 """
 
 import re
-from collections.abc import Iterable
+from collections import defaultdict
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -22,7 +22,7 @@ from _touch_retrieval.files import parse_json, read_regular
 from retrieval.data.folder_walk import SkippedPhoto, list_files
 from retrieval.data.images import EXTENSIONS, read_bytes
 from retrieval.data.naming import STEM, Naming
-from retrieval.data.text import require_utf8
+from retrieval.data.text import is_utf8
 from retrieval.errors import BadInput, DatasetError
 
 METADATA_FILE = "metadata.jsonl"
@@ -90,11 +90,7 @@ class Catalogue:
         return str(self.folder.resolve())
 
     def read(self, path: str) -> bytes:
-        """Return the bytes of a photo's file.
-
-        Raises:
-            ImageError: The file cannot be read.
-        """
+        """Return the bytes of a photo's file. Raises ImageError."""
         return read_bytes(self.folder / path)
 
     @property
@@ -109,13 +105,7 @@ class Catalogue:
 
 
 def require_separate_folders(catalogue: str | Path, index: str | Path) -> None:
-    """Check that an index folder contains no photos of the catalogue.
-
-    An index may be a folder below the catalogue that contains no photos, such as `./index` in the catalogue `.`.
-
-    Raises:
-        BadInput: The index folder is the catalogue folder, or a folder below it that contains photos.
-    """
+    """Raise BadInput if the index folder is the catalogue folder, or a folder below it that contains photos."""
     root, target = Path(catalogue).resolve(), Path(index).resolve()
     has_photos = root in target.parents and any(path.suffix.lower() in EXTENSIONS for path in target.rglob("*"))
     if target == root or has_photos:
@@ -137,84 +127,42 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
     if not root.is_dir():
         what = "is a file" if root.exists() else "does not exist"
         raise DatasetError(f"a catalogue must be a folder of photos, but {root} {what}: {_LAYOUT}")
-    names, unlisted = list_files(root)
-    metadata_file = root / METADATA_FILE
-    try:
-        lines = read_regular(metadata_file)
-    except FileNotFoundError:
-        lines = b""
-    except OSError as error:
-        raise DatasetError(f"{metadata_file} cannot be read: {error.strerror}") from error
-    found = _classify_files(names, naming)
-    found.skipped[:0] = unlisted
-    if not found.photos and not found.gels:
-        raise _no_photo_error(root, found, naming)
-    by_object, by_photo = _read_metadata(metadata_file, lines, naming)
-    touches = group_touches(found.gels, naming)
-    unknown = sorted(by_photo.keys() - [*found.photos, *(path for path, _ in found.gels)])
-    unknown += sorted(by_object.keys() - [*found.objects, *(touch.object_id for touch in touches)])
-    return Catalogue(
-        root,
-        tuple(
-            CataloguePhoto(path, name, {**by_object.get(name, {}), **by_photo.get(path, {})})
-            for path, name in zip(found.photos, found.objects, strict=True)
-        ),
-        tuple(found.ignored),
-        tuple(found.skipped),
-        tuple(f"{METADATA_FILE} names {name}, which is not in the catalogue" for name in unknown),
-        tuple(
-            replace(touch, metadata={**by_object.get(touch.object_id, {}), **by_photo.get(touch.paths[0], {})})
-            for touch in touches
-        ),
-    )
+    names, skipped = list_files(root)
+    by_object, by_photo = _read_metadata(root / METADATA_FILE, naming)
 
-
-@dataclass
-class _FileGroups:
-    """Files of a catalogue, classified by name.
-
-    Attributes:
-        photos: Paths of the photos.
-        objects: The object of each photo.
-        gels: (path, object) of each gel image.
-        ignored: Files that are not pictures.
-        skipped: Pictures that are left out, with reasons.
-        unfit: Paths among `skipped` that do not fit the naming.
-    """
-
-    photos: list[str] = field(default_factory=list)
-    objects: list[str] = field(default_factory=list)
-    gels: list[tuple[str, str]] = field(default_factory=list)
-    ignored: list[str] = field(default_factory=list)
-    skipped: list[SkippedPhoto] = field(default_factory=list)
-    unfit: list[str] = field(default_factory=list)
-
-
-def _classify_files(names: Iterable[str], naming: Naming) -> _FileGroups:
-    """Classify files by name and extension, in alphabetical order."""
-    found = _FileGroups()
+    photos: list[CataloguePhoto] = []
+    gels: dict[tuple[str, str], list[tuple[str, str]]] = defaultdict(list)  # (touch, object) -> (finger, path)
+    ignored: list[str] = []
+    unfit: list[SkippedPhoto] = []
     for path in sorted(names):
         dot = path.rfind(".")
         extension = path[dot:].lower() if dot > path.rfind("/") + 1 else ""
-        if extension not in EXTENSIONS and extension not in UNSUPPORTED_EXTENSIONS:
-            found.ignored += [path] if path != METADATA_FILE else []
-            continue
-        name = naming.object_of(path)
         if extension in UNSUPPORTED_EXTENSIONS:
-            found.skipped.append(SkippedPhoto(path, f"{extension} pictures are not read: save it as PNG or JPEG"))
-        elif name is None:
+            skipped.append(SkippedPhoto(path, f"{extension} pictures are not read: save it as PNG or JPEG"))
+        elif extension not in EXTENSIONS:
+            ignored += [path] if path != METADATA_FILE else []
+        elif (name := naming.object_of(path)) is None:
             why = ": the name is only a number" if naming.text == STEM else ""
-            found.skipped.append(SkippedPhoto(path, f"does not fit --objects-from {naming.text}{why}"))
-            found.unfit.append(path)
-        elif touch_name(path, naming) is None:
-            found.photos.append(path)
-            found.objects.append(name)
+            unfit.append(SkippedPhoto(path, f"does not fit --objects-from {naming.text}{why}"))
+        elif (touch := _touch_name(path, naming)) is None:
+            photos.append(CataloguePhoto(path, name, {**by_object.get(name, {}), **by_photo.get(path, {})}))
         else:
-            found.gels.append((path, name))
-    return found
+            gels[touch[0], name].append((touch[1], path))
+    if not photos and not gels:
+        raise _no_photo_error(root, ignored, skipped, unfit, naming)
+
+    touches = []
+    for (_, name), fingers in sorted(gels.items()):
+        paths = tuple(path for _, path in sorted(fingers))
+        touches.append(CatalogueTouch(name, paths, {**by_object.get(name, {}), **by_photo.get(paths[0], {})}))
+    catalogue = Catalogue(root, tuple(photos), tuple(ignored), (*skipped, *unfit), touches=tuple(touches))
+    unknown = [*sorted(by_photo.keys() - catalogue.paths), *sorted(by_object.keys() - catalogue.object_ids)]
+    return replace(
+        catalogue, notes=tuple(f"{METADATA_FILE} names {name}, which is not in the catalogue" for name in unknown)
+    )
 
 
-def touch_name(path: str, naming: Naming) -> tuple[str, str] | None:
+def _touch_name(path: str, naming: Naming) -> tuple[str, str] | None:
     """Return a gel image's touch name (with its folder) and finger ("" for one finger), or None for a photo.
 
     A picture outside every folder is a photo, and so is every picture if the file stem names the object.
@@ -226,49 +174,36 @@ def touch_name(path: str, naming: Naming) -> tuple[str, str] | None:
     return None if found is None else (f"{place.parent}/{found[1]}", found[2] or "")
 
 
-def group_touches(images: Iterable[tuple[str, str]], naming: Naming) -> tuple[CatalogueTouch, ...]:
-    """Group gel images, (path, object) each, into touches, sorted by name."""
-    groups: dict[tuple[str, str], list[tuple[str, str]]] = {}
-    for path, object_id in images:
-        name = touch_name(path, naming)
-        assert name is not None
-        groups.setdefault((name[0], object_id), []).append((name[1], path))
-    return tuple(
-        CatalogueTouch(owner, tuple(path for _, path in sorted(fingers)))
-        for (_, owner), fingers in sorted(groups.items())
-    )
-
-
-def _no_photo_error(where: Path, found: _FileGroups, naming: Naming) -> DatasetError:
-    """Return the error for a catalogue without photos and touches."""
-    if found.unfit:
+def _no_photo_error(
+    where: Path, ignored: list[str], skipped: list[SkippedPhoto], unfit: list[SkippedPhoto], naming: Naming
+) -> DatasetError:
+    if unfit:
         return DatasetError(
-            f"no photo in {where} fits --objects-from {naming.text}; the first of {len(found.unfit)}: "
-            f"{found.unfit[0]}. Use folder, stem, or a pattern for paths like this one"
+            f"no photo in {where} fits --objects-from {naming.text}; the first of {len(unfit)}: "
+            f"{unfit[0].path}. Use folder, stem, or a pattern for paths like this one"
         )
-    others = f", only {len(found.ignored)} other file(s) such as {found.ignored[0]}" if found.ignored else ""
-    if not found.ignored and not found.skipped:
+    others = f", only {len(ignored)} other file(s) such as {ignored[0]}" if ignored else ""
+    if not ignored and not skipped:
         others = ", and no other file"
-    left_out = "".join(f"; {item.path}: {item.reason}" for item in found.skipped[:1])
+    left_out = "".join(f"; {item.path}: {item.reason}" for item in skipped[:1])
     kinds = ", ".join(sorted(EXTENSIONS))
     return DatasetError(f"no photo ({kinds}) in the catalogue {where}{others}{left_out}: {_LAYOUT}")
-
-
-# The user's own metadata -----------------------------------------------------------------------------------
 
 
 _MetadataTable = dict[str, dict[str, Any]]
 
 
-def _read_metadata(where: Path, text: bytes, naming: Naming) -> tuple[_MetadataTable, _MetadataTable]:
-    """Return the user's keys by object_id, and by photo path.
-
-    Raises:
-        DatasetError: A line is invalid; the message gives its number.
-    """
+def _read_metadata(file: Path, naming: Naming) -> tuple[_MetadataTable, _MetadataTable]:
+    """Return the user's keys by object_id, and by photo path. Raises DatasetError with the number of a bad line."""
     by_object: _MetadataTable = {}
     by_photo: _MetadataTable = {}
-    for number, line in enumerate(text.split(b"\n"), start=1):
+    try:
+        lines = read_regular(file).split(b"\n")
+    except FileNotFoundError:
+        return by_object, by_photo
+    except OSError as error:
+        raise DatasetError(f"{file} cannot be read: {error.strerror}") from error
+    for number, line in enumerate(lines, start=1):
         if not line.strip():
             continue
         try:
@@ -277,7 +212,7 @@ def _read_metadata(where: Path, text: bytes, naming: Naming) -> tuple[_MetadataT
             if name in table:
                 raise ValueError(f"{name} has two lines; merge them")
         except ValueError as error:
-            raise DatasetError(f"{where}, line {number}: {error}") from error
+            raise DatasetError(f"{file}, line {number}: {error}") from error
         table[name] = metadata
     return by_object, by_photo
 
@@ -287,8 +222,8 @@ def _parse_line(line: bytes, naming: Naming) -> tuple[str, bool, dict[str, Any]]
     row = parse_json(line.decode(), finite=True)
     if not isinstance(row, dict):
         raise ValueError("must be one JSON object in braces")
-    if b"\\u" in line:
-        require_utf8(row)
+    if b"\\u" in line and not is_utf8(row):
+        raise ValueError("contains a lone surrogate such as \\ud83d; write the whole character")
     keys = [key for key in ("file_name", "object_id") if key in row]
     if not keys:
         raise ValueError("must name a photo (file_name) or an object (object_id)")

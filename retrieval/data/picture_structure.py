@@ -7,7 +7,6 @@ Every check here takes time in proportion to the file, most of it in C.
 
 import re
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 
 from retrieval.errors import ImageError
@@ -51,17 +50,6 @@ def check_structure(data: bytes, name: str | Path) -> None:
         _check_tiff(data, name)
 
 
-def png_chunks(data: bytes) -> Iterator[tuple[bytes, int]]:
-    """Yield kind and end of each chunk of a PNG file, up to IEND; a chunk may claim to end after the file."""
-    start = len(_PNG)
-    while start + 12 <= len(data):
-        kind = data[start + 4 : start + 8]
-        start += 12 + int.from_bytes(data[start : start + 4], "big")
-        yield kind, start
-        if kind == b"IEND":
-            return
-
-
 def _check_jpeg(data: bytes, name: str | Path) -> None:
     start, stray = len(_JPEG), 0
     for _ in range(MAX_SEGMENTS):
@@ -102,12 +90,15 @@ def _after_segment(data: bytes, start: int) -> int:
 
 
 def _check_png(data: bytes, name: str | Path) -> None:
-    max_chunks, pixels = MAX_SEGMENTS + len(data) // BYTES_PER_CHUNK, False
-    for number, (kind, _) in enumerate(png_chunks(data)):
-        pixels = pixels or kind == b"IDAT"
-        if number >= (max_chunks if pixels else MAX_SEGMENTS):
-            where = "" if pixels else " before its pixels"
-            raise ImageError(name, f"more than {number} PNG chunks{where}; save it again without metadata")
+    start, chunks, kind, most = len(_PNG), 0, b"", MAX_SEGMENTS
+    while start + 12 <= len(data) and kind != b"IEND":
+        kind = data[start + 4 : start + 8]
+        if kind == b"IDAT":
+            most = MAX_SEGMENTS + len(data) // BYTES_PER_CHUNK
+        if chunks == most:
+            raise ImageError(name, f"more than {most} PNG chunks; save it again without metadata")
+        start += 12 + int.from_bytes(data[start : start + 4], "big")
+        chunks += 1
 
 
 def _check_tiff(data: bytes, name: str | Path) -> None:

@@ -21,16 +21,6 @@ def is_utf8(document: Any) -> bool:
     return True
 
 
-def require_utf8(document: Any) -> None:
-    """Check that a JSON document can be encoded as UTF-8.
-
-    Raises:
-        ValueError: A text contains a lone surrogate.
-    """
-    if not is_utf8(document):
-        raise ValueError("contains a lone surrogate such as \\ud83d; write the whole character")
-
-
 def is_inside(path: object) -> bool:
     """Return whether `path` is a relative path that stays below its folder.
 

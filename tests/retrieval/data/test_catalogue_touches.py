@@ -1,10 +1,8 @@
 """Touches in a catalogue: their files, objects and finger order."""
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from retrieval.data.catalogue import CatalogueTouch, group_touches, list_catalogue, touch_name
+from retrieval.data.catalogue import CatalogueTouch, list_catalogue
 from retrieval.data.naming import Naming
 from retrieval.errors import DatasetError
 
@@ -31,19 +29,18 @@ def test_gel_images_next_to_photos_are_touches_and_not_photos(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("path", "name"),
+    ("paths", "touches"),
     [
-        ("mug/touch_7.png", ("mug/touch_7", "")),
-        ("mug/touch_7_b.png", ("mug/touch_7", "b")),
-        ("mug/second/touch_rim_left_a.jpg", ("mug/second/touch_rim_left", "a")),
-        ("mug/touch_a.png", ("mug/touch_a", "")),  # the name of a touch is never empty
-        ("touch_7.png", None),  # the only photo of an object of that name
-        ("mug/touched.png", None),
-        ("touch_1/view.png", None),
+        (["mug/touch_7.png", "mug/touch_7_b.png"], [("mug/touch_7.png", "mug/touch_7_b.png")]),
+        (["mug/second/touch_rim_left_a.jpg"], [("mug/second/touch_rim_left_a.jpg",)]),
+        (["mug/touch_a.png", "mug/touch_b.png"], [("mug/touch_a.png",), ("mug/touch_b.png",)]),  # names, not fingers
+        (["touch_7.png", "mug/touched.png", "touch_1/view.png"], []),  # photos
     ],
 )
-def test_the_file_name_gives_touch_and_finger(path, name):
-    assert touch_name(path, FOLDER) == name
+def test_the_file_name_gives_touch_and_finger(tmp_path, paths, touches):
+    found = listed(tmp_path, *paths)
+    assert [touch.paths for touch in found.touches] == touches
+    assert sorted(found.paths) == sorted(paths)
 
 
 def test_every_picture_is_a_photo_if_file_stems_name_the_objects(tmp_path):
@@ -67,9 +64,3 @@ def test_a_folder_without_photos_and_touches_is_refused(tmp_path):
     (tmp_path / "notes.txt").write_text("nothing")
     with pytest.raises(DatasetError, match="no photo"):
         list_catalogue(tmp_path)
-
-
-@given(st.lists(st.from_regex(r"[a-c]{1,2}/(touch_[0-9_a-c]{0,4})\.png", fullmatch=True), unique=True, max_size=20))
-def test_every_gel_image_belongs_to_exactly_one_touch(paths):
-    images = [(path, path.split("/")[0]) for path in paths]
-    assert sorted(path for touch in group_touches(images, FOLDER) for path in touch.paths) == sorted(paths)

@@ -28,7 +28,7 @@ HOSTILE = {
     "fill bytes": (lambda: b"\xff\xd8" + b"\xff" * 19 * MB, "more than 65536 stray bytes"),
     "escaped bytes": (lambda: b"\xff\xd8\xff\xfe\0\2" + b"\xff\0" * 9 * MB, "more than 65536 stray bytes"),
     "junk": (lambda: b"\xff\xd8\xff\xfe\0\2" + bytes(19 * MB), "more than 65536 stray bytes"),
-    "chunks before": (lambda: png_file(8, 8, png_chunk(b"teXt", b"") * MB), "more than 256 PNG chunks before"),
+    "chunks before": (lambda: png_file(8, 8, png_chunk(b"teXt", b"") * MB), "more than 256 PNG chunks"),
     "empty pixels": (lambda: png_file(8, 8, png_chunk(b"IDAT", b"") * MB), "more than 11974 PNG chunks"),
     "chunks after": (
         lambda: png_file(8, 8, samples=PIXELS)[:-12] + png_chunk(b"teXt", b"") * MB,

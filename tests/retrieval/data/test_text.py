@@ -78,7 +78,6 @@ def test_a_catalogue_in_a_folder_whose_name_is_not_utf8_is_served(catalogue, tou
     [
         ("/v1/feedback", rb'{"query": "x", "said": "object", "object_id": "mug\ud83d"}'),
         ("/v1/feedback", rb'{"query": "\ud83d", "said": "none"}'),
-        ("/v1/trials", rb'{"who": "\ud83d"}'),
         ("/v1/session", rb'{"token": "\ud83d"}'),
         ("/v1/query", rb'{"touches": [["\ud83d"]], "\ud83d": 1}'),
     ],
