@@ -12,7 +12,7 @@ from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, miss
 from retrieval.frontier.sample import Sample
 from retrieval.methods.cca import Cca
 from retrieval.methods.method import MethodSettings
-from retrieval.training.cca import canonical_correlations, cosine, decompose, unit_rows
+from retrieval.training.cca import canonical_correlations, decompose, unit_rows
 
 Matrix = NDArray[np.float64]
 Solver = Callable[["CcaProblem"], Matrix]
@@ -140,11 +140,11 @@ def cca_components(sample: Sample) -> ApproximationResult:
     photos_tiled = np.tile(photo, (1 + sample.scale.photos // len(photo), 1))[: sample.scale.photos]
     for count in sorted({*(min(size, len(weights)) for size in SIZES), method.best_params["components"]}):
         codes = unit_rows(touch[:, :count]), unit_rows(photo[:, :count])
-        scores = cosine(*codes)
+        scores = codes[0] @ codes[1].T
         np.fill_diagonal(scores, -np.inf)  # exclude the photo of the touch's own grasp
         wrong = test.owner[scores.argmax(1)] != test.owner
         points.append(miss_rate_point("", f"{count} components", wrong, count == method.best_params["components"]))
-        works.append(partial(cosine, codes[0][:1], unit_rows(photos_tiled[:, :count])))
+        works.append(partial(np.matmul, codes[0][:1], unit_rows(photos_tiled[:, :count]).T))
     points = list(time_points(points, works, sample.scale.repeats))
     panel = Panel(
         title="top-1 errors by number of canonical components",

@@ -56,7 +56,7 @@ def collect(
     gate_name = None
     if gate is not None:
         from _touch_retrieval.files import file_digest
-        from retrieval.training.gate import load_gate
+        from retrieval.model.gate import load_gate
 
         decide, gate_name = load_gate(gate), f"learned, sha256 {file_digest(gate)}"
     settings = CollectSettings(grasps=grasps, rounds=rounds)

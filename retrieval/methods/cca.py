@@ -6,7 +6,7 @@ Dimensions are weighted by rho^p (Gong et al., IJCV 2014: a plain cosine would g
 from typing import TYPE_CHECKING, ClassVar
 
 from retrieval.methods.method import Array, Method
-from retrieval.training.cca import CanonicalCorrelations, canonical_correlations, cosine, decompose, unit_rows
+from retrieval.training.cca import CanonicalCorrelations, canonical_correlations, decompose, unit_rows
 from retrieval.training.selection import ranking_auc, validation_rows
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class Cca(Method):
             for power in POWERS:
                 weights = found.correlations[:components] ** power
                 encodings = unit_rows(touch[:, :components] * weights), unit_rows(photo[:, :components] * weights)
-                aucs[components, power] = ranking_auc(cosine(*encodings), validation.owner)
+                aucs[components, power] = ranking_auc(encodings[0] @ encodings[1].T, validation.owner)
         return aucs
 
     def _encode_touch(self, touch: Array) -> Array:
@@ -74,4 +74,4 @@ class Cca(Method):
         return unit_rows(self._standardise[1](photo) @ self._maps[1])
 
     def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
-        return cosine(touch_encodings, photo_encodings)
+        return touch_encodings @ photo_encodings.T

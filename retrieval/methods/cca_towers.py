@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from retrieval.errors import BadInput
 from retrieval.methods.method import Array, Method
 from retrieval.training.calibration.posterior import fit_posterior
-from retrieval.training.cca import cosine, unit_rows
+from retrieval.training.cca import unit_rows
 from retrieval.training.cca_towers import fit_projections, select_settings, tower_widths
 from retrieval.training.selection import held_out_folds
 
@@ -45,4 +45,4 @@ class CcaTowers(Method):
         return unit_rows(self._projections.photo(photo))
 
     def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
-        return cosine(touch_encodings, photo_encodings)
+        return touch_encodings @ photo_encodings.T

@@ -38,7 +38,6 @@ from retrieval.data.licences import LICENCES
 from retrieval.errors import BadInput
 from retrieval.metrics.measure import Measure, pooled
 from retrieval.metrics.pairs import fit_calibration
-from retrieval.metrics.ranking import k_way_accuracies
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable, store_checkpoint
 from retrieval.model.config import Config, load_config
 from retrieval.model.encode import default_device, one_thread
@@ -258,11 +257,7 @@ def draw_folds(grasps: Sequence[Grasp], seed: int) -> list[tuple[str, ...]]:
 
 
 def fit_folds(
-    features: Features,
-    folds: Sequence[Sequence[str]],
-    fit: Callable[[Features], CcaSelection],
-    title: str,
-    quiet: bool,
+    features: Features, folds: Sequence[Sequence[str]], fit: Callable[[Features], CcaSelection], title: str, quiet: bool
 ) -> Iterator[CcaSelection]:
     """Yield the fit to the objects outside each fold. The settings are selected on the same objects."""
     everyone = {name for fold in folds for name in fold}
@@ -275,13 +270,12 @@ def fit_folds(
 def accuracies(scores: Sequence[NDArray[np.float32]], folds: Sequence[Features]) -> dict[str, Measure]:
     """Return the accuracy of each touch of each fold with one random photo of each object of the fold.
 
+    "top1" is whether the photo of the touched object ranks first; 1/m if m photos tie. "pair_accuracy" is the fraction
+    of the other objects' photos with a lower score; ties count 1/2.
+
     Args:
         scores: For each fold, (n, n) of every touch with every photo.
         folds: The grasps of each fold.
-
-    Returns:
-        "top1": whether the photo of the touched object ranks first; 1/m if m photos tie. "pair_accuracy": the fraction
-        of the other objects' photos with a lower score; ties count 1/2.
     """
     names = sorted({name for fold in folds for name in fold.object_ids})
     parts: dict[str, list[Measure]] = {"top1": [], "pair_accuracy": []}
@@ -293,11 +287,10 @@ def accuracies(scores: Sequence[NDArray[np.float32]], folds: Sequence[Features])
             drawn = np.array([rng.choice(mine[mine != touch] if len(mine) > 1 else mine) for mine in rows])
             own, others = table[touch, drawn[name]], np.delete(table[touch, drawn], name)
             higher[touch], equal[touch] = (others > own).sum(), (others == own).sum()
-        rivals, number = len(rows) - 1, np.array([names.index(each) for each in fold.object_ids])
-        top1 = k_way_accuracies(higher, equal, rivals, len(rows))
-        pairs = (1 - (higher + equal / 2) / rivals)[:, None]
-        for name, values, chance in (("top1", top1[:, :1], 1 / len(rows)), ("pair_accuracy", pairs, 0.5)):
-            parts[name].append(Measure(values, number, np.array([chance]), ""))
+        number = np.array([names.index(each) for each in fold.object_ids])
+        top1, pairs = np.where(higher == 0, 1 / (1 + equal), 0.0), 1 - (higher + equal / 2) / (len(rows) - 1)
+        for name, values, chance in (("top1", top1, 1 / len(rows)), ("pair_accuracy", pairs, 0.5)):
+            parts[name].append(Measure(values[:, None], number, np.array([chance]), ""))
     sizes = sorted({len(set(fold.object_ids)) for fold in folds})
     gallery = " or ".join(map(str, sizes)) + " held-out objects, one photo of each"
     return {name: dataclasses.replace(pooled(each), gallery=gallery) for name, each in parts.items()}

@@ -21,12 +21,8 @@ def augment(
     places. So a gel image is only flipped top to bottom (the same press with a turned finger), and its channels are
     scaled equally.
 
-    Args:
-        images: (B, 3, H, W) in 0..1.
-        kind: "photo" or "touch".
-        rng: The random choices.
-        flipped: (B,) the images that are flipped; default: each with probability 1/2.
-        visible: Fraction of a side that is kept.
+    `images` (B, 3, H, W) are in 0..1, `kind` is "photo" or "touch", `flipped` (B,) says which images are flipped
+    (default: each with probability 1/2), and `visible` is the fraction of a side that is kept.
     """
     count = len(images)
 

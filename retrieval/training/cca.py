@@ -29,13 +29,7 @@ MIN_RELATIVE_SPREAD = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Standardiser:
-    """`(x - mean) / scale` of the features that vary.
-
-    Attributes:
-        columns: (F',) indices of these features.
-        mean: (F',) their means.
-        scale: (F',) their standard deviations.
-    """
+    """`(x - mean) / scale` of the features that vary: their indices, means and standard deviations, (F',) each."""
 
     columns: NDArray[np.int64]
     mean: NDArray[np.float64]
@@ -65,14 +59,7 @@ def _flat(x: NDArray[Any]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class CcaView:
-    """One modality of n items, standardised and decomposed: `left * singular @ right` of rank r.
-
-    Attributes:
-        standardise: The standardisation of the features.
-        left: (n, r) left singular vectors.
-        singular: (r,) singular values, descending.
-        right: (r, F') right singular vectors.
-    """
+    """One modality of n items, standardised and decomposed: `left * singular @ right`, shaped (n, r), (r,), (r, F')."""
 
     standardise: Standardiser
     left: Matrix
@@ -87,14 +74,9 @@ class CcaView:
 
 @dataclass(frozen=True, eq=False)
 class CanonicalCorrelations:
-    """Result of a canonical correlation analysis.
+    """Correlations (k,) within 0..1, descending, and weights (F', k) from standardised features to variates.
 
     In each column the weight of largest absolute value, touch or photo, is positive.
-
-    Attributes:
-        correlations: (k,) within 0..1, descending.
-        touch_weights: (F', k) from standardised features to variates.
-        photo_weights: (F', k) the same for photos.
     """
 
     correlations: Matrix
@@ -103,14 +85,10 @@ class CanonicalCorrelations:
 
 
 def decompose(x: NDArray[Any], max_directions: int | None = None, standardise: Standardiser | None = None) -> CcaView:
-    """Standardise and decompose items.
+    """Standardise and decompose items x (n, ...), with their own standardisation by default.
 
-    Equal items, such as a photo of several grasps, are decomposed once, weighted by their number.
-
-    Args:
-        x: (n, ...) items.
-        max_directions: Number of the widest directions to keep; None for all.
-        standardise: The standardisation; None for that of the items.
+    Equal items, such as a photo of several grasps, are decomposed once, weighted by their number. At most
+    `max_directions` of the widest directions are kept.
 
     Raises:
         NumericalError: A feature is not finite.
@@ -119,22 +97,15 @@ def decompose(x: NDArray[Any], max_directions: int | None = None, standardise: S
     if not np.isfinite(x).all():
         raise NumericalError("features must be finite for a correlation; got a NaN or infinite one")
     standardise = standardise or Standardiser.fit(x)
-    first, place, counts = _distinct(x)
-    weight = np.sqrt(counts)[:, None]
+    index_of: dict[bytes, int] = {}
+    place = np.array([index_of.setdefault(row.tobytes(), len(index_of)) for row in np.ascontiguousarray(x)])
+    first, weight = np.unique(place, return_index=True)[1], np.sqrt(np.bincount(place))[:, None]
     scaled = standardise(x[first]) * weight
     exact = max_directions is None and len(x) <= MAX_ROWS
     left, singular, right = svd(scaled) if exact else leading_svd(scaled, max_directions or MAX_DIRECTIONS)
     rank = int((singular > (RANK_CUT if exact else LEADING_CUT) * singular[0]).sum())
     rank = min(rank, max_directions or len(singular))
     return CcaView(standardise, (left[:, :rank] / weight)[place], singular[:rank], right[:rank])
-
-
-def _distinct(x: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return the first row of each distinct item, the index of every item among these, and their counts."""
-    index_of: dict[bytes, int] = {}
-    place = np.array([index_of.setdefault(row.tobytes(), len(index_of)) for row in np.ascontiguousarray(x)])
-    first = np.unique(place, return_index=True)[1]
-    return first, place, np.bincount(place)
 
 
 def canonical_correlations(
@@ -146,12 +117,8 @@ def canonical_correlations(
     average B = E'E, E (objects, n) with 1/sqrt(m) at an object's grasps: the cross-covariance X'BY needs only object
     means, and its rank is below the number of objects. Its whitened form is factored by QR of both sides.
 
-    Args:
-        touch: Decomposed touches.
-        photo: Decomposed photos.
-        owner: (n,) object of each row, from 0; `arange(n)` pairs row with row.
-        ridge: Ridge, as a fraction of the mean variance.
-        photo_ridge: Ridge of the photos, if it differs from that of the touches.
+    `owner` (n,) is the object of each row, from 0; `arange(n)` pairs row with row. A ridge is a fraction of the mean
+    variance; `photo_ridge` is that of the photos, if it differs from that of the touches.
     """
     photo_ridge = ridge if photo_ridge is None else photo_ridge
     touch_q, touch_r = np.linalg.qr(_whitened_means(touch, owner, ridge))
@@ -162,7 +129,8 @@ def canonical_correlations(
         touch.right.T @ ((touch_q @ left)[:, :count] / touch.regularised_deviations(ridge)[:, None]),
         photo.right.T @ ((photo_q @ right.T)[:, :count] / photo.regularised_deviations(photo_ridge)[:, None]),
     )
-    signs = _signs(np.concatenate(weights))
+    both, columns = np.concatenate(weights), np.arange(count)
+    signs = np.where(both[np.abs(both).argmax(0), columns] < 0, -1.0, 1.0)
     return CanonicalCorrelations(np.clip(rho[:count], 0.0, 1.0), weights[0] * signs, weights[1] * signs)
 
 
@@ -202,17 +170,7 @@ def _whitened_means(view: CcaView, owner: NDArray[np.int64], ridge: float) -> Ma
     return np.asarray((sums / np.sqrt(counts)[:, None] * shrink).T)
 
 
-def _signs(weights: Matrix) -> Matrix:
-    largest = np.abs(weights).argmax(0)
-    return np.where(weights[largest, np.arange(weights.shape[1])] < 0, -1.0, 1.0)
-
-
 def unit_rows(x: Matrix) -> Array:
     """Return the rows at norm 1, float32; a row of zeros stays zero."""
     norms = np.linalg.norm(x, axis=1, keepdims=True)
     return np.asarray(x / np.where(norms > 0, norms, 1.0), dtype=np.float32)
-
-
-def cosine(touch_encodings: Array, photo_encodings: Array) -> Array:
-    """Return cosines (T, N) of unit encodings."""
-    return touch_encodings @ photo_encodings.T

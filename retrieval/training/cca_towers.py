@@ -36,13 +36,7 @@ MAX_CALIBRATION_TOUCHES = 60
 
 
 class TowerWidths(NamedTuple):
-    """Feature widths of concatenated towers.
-
-    Attributes:
-        touch: Of each touch tower for the first finger, then for the next one.
-        photo: Of each photo tower for the first view, then for the next one.
-        touch_towers: Number of touch towers.
-    """
+    """Feature widths of the touch towers, finger by finger, and of the photo towers, view by view."""
 
     touch: Sequence[int]
     photo: Sequence[int]
@@ -181,11 +175,9 @@ def fit_projections(
 
 @dataclass(frozen=True, eq=False)
 class CcaSelection:
-    """Settings that were chosen on held-out objects.
+    """Settings that were chosen on held-out objects, with their mean AUC over the folds.
 
     Attributes:
-        settings: The chosen settings.
-        auc: Their mean AUC over the folds.
         projections: The maps, fitted to all objects.
         held_out_touches: For each fold, the cosines of its touches with its photos by maps that were fitted without its
             objects, and the encodings of both: the input of the calibrations. Of each object at most
@@ -206,13 +198,8 @@ def select_settings(
 ) -> CcaSelection:
     """Choose the settings that rank photos of held-out objects best; among ties, the largest.
 
-    Only the reduction to the widest directions also sees the held-out grasps, but no object ids.
-
-    Args:
-        features: Features of grasps.
-        widths: Feature widths of the concatenated towers.
-        folds: Objects of `features` that are held out together; the fit uses the others.
-        settings: The settings to choose from. Default: `GRID`, and with several touch towers the same for the last one.
+    Only the reduction to the widest directions also sees the held-out grasps, but no object ids. The objects of each of
+    `folds` are held out together. Default settings: `GRID`, and with several touch towers the same for the last one.
     """
     if settings is None:
         settings = GRID if widths.touch_towers == 1 else (*GRID, *(one._replace(last_tower=True) for one in GRID))

@@ -9,13 +9,12 @@ large catalogue. The head's term is affine in the normalised features, so a blen
 blended features. The embedding part (`cosine`) is blended too, and is then shorter than that of a real image.
 
 In a large catalogue many photos score nearly as high as the exhaustive top-1; a few thousand photos contain few such
-hard negatives. Therefore, after a warm-up, up to three quarters of a batch's photos come from a large
-pool of blends: those nearest to its touches by the embeddings of the current student.
+hard negatives. Therefore, after a warm-up, up to three quarters of a batch's photos come from a large pool of blends:
+those nearest to its touches by the embeddings of the current student.
 """
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -62,10 +61,9 @@ def distil(
 
     The partial activations (N, P) and (M, P) are those of touches and photos of training objects; their cells are not
     used. `settings` have the sizes of the candidate encoder, the steps and the seed. The other weights do not change.
-    The matcher is unchanged if an error is raised.
 
     Raises:
-        NumericalError: The loss is not finite.
+        NumericalError: The loss is not finite; the matcher is unchanged.
     """
     seed, steps = settings.training.seed, settings.training.distil_steps
     sizes = {name: getattr(settings.matcher, name) for name in ("candidate_width", "candidate_linear")}
@@ -79,7 +77,7 @@ def distil(
     )
     candidate_encoder.initialise_linear(photo_partials, touch_statistics, photo_statistics)
     generator, head = torch.Generator().manual_seed(seed), matcher.head.eval()
-    sampler = _PhotoSampler(candidate_encoder, photo_partials, photo_statistics, generator)
+    sampler = PhotoSampler(candidate_encoder, photo_partials, photo_statistics, generator)
 
     def loss(step: int, _: int) -> Tensor:
         touches = blend(touch_partials, BATCH_TOUCHES, generator)
@@ -90,14 +88,20 @@ def distil(
             logits = head.all_logits(touches, photos)
         return distillation_loss(scores, logits)
 
-    optimizer, plan = torch.optim.Adam(candidate_encoder.parameters()), Plan(steps, LEARNING_RATE, validate_every=steps)
-    title = "distil candidate encoder"
-    train_loop(candidate_encoder, optimizer, plan, lambda left: left, loss, title=title, quiet=quiet)
+    train_loop(
+        candidate_encoder,
+        torch.optim.Adam(candidate_encoder.parameters()),
+        Plan(steps, LEARNING_RATE, validate_every=steps),
+        lambda left: left,
+        loss,
+        title="distil candidate encoder",
+        quiet=quiet,
+    )
     candidate_encoder.fold_statistics(touch_statistics, photo_statistics)
     matcher.config, matcher.candidate_encoder = config, candidate_encoder.eval()
 
 
-class _PhotoSampler:
+class PhotoSampler:
     """Sampler of photos for distillation: random blends, and the blends of a pool that are nearest to the touches."""
 
     def __init__(
@@ -109,7 +113,7 @@ class _PhotoSampler:
     ) -> None:
         self._encoder, self._partials, self._statistics = candidate_encoder, partials, statistics
         self._generator = generator
-        self._pool, self._embeddings = Blends.sample(partials, 0, generator), partials[:0]
+        self._pool, self._embeddings = partials[:0], partials[:0]
 
     @torch.no_grad()
     def photos(self, step: int, touches: Tensor) -> Tensor:
@@ -120,26 +124,20 @@ class _PhotoSampler:
         if step < 0:
             return blend(self._partials, BATCH_PHOTOS, self._generator)
         if step % POOL_RENEWAL_STEPS == 0:
-            self._pool = Blends.sample(self._partials, POOL_SIZE, self._generator)
-            rows = torch.arange(POOL_SIZE, device=self._partials.device)
-            partials = (
-                self._pool.of(self._partials, rows[start : start + BATCH_PHOTOS])
-                for start in range(0, POOL_SIZE, BATCH_PHOTOS)
-            )
-            self._embeddings = torch.cat([self._encoder.photo(self._statistics(part)) for part in partials])
+            self._pool = blend(self._partials, POOL_SIZE, self._generator)
+            parts = torch.split(self._pool, BATCH_PHOTOS)
+            self._embeddings = torch.cat([self._encoder.photo(self._statistics(part)) for part in parts])
         each = max(1, round(POOL_FRACTION * BATCH_PHOTOS / len(touches)))
-        near = (self._encoder.touch(touches) @ self._embeddings.T).topk(each).indices
-        near = torch.tensor(sorted(set(near.flatten().tolist())), device=near.device)
+        nearest = (self._encoder.touch(touches) @ self._embeddings.T).topk(each).indices
+        near: Tensor = nearest.unique()  # type: ignore[no-untyped-call]
         others = blend(self._partials, BATCH_PHOTOS - len(near), self._generator)
-        return torch.cat([self._pool.of(self._partials, near), others])
+        return torch.cat([self._pool[near], others])
 
 
 def distillation_loss(scores: Tensor, logits: Tensor) -> Tensor:
     """Return the mean of KL(softmax(logits) || softmax(scores)) over touches, plus a weighted squared error.
 
-    Args:
-        scores: (T, N) scores of the student; a constant added to a row has no effect.
-        logits: (T, N) match logits of the head; a constant added to a row has no effect.
+    `scores` (T, N) are those of the student, `logits` those of the head; a constant added to a row has no effect.
     """
     divergence = functional.kl_div(
         functional.log_softmax(scores, 1), functional.log_softmax(logits, 1), log_target=True, reduction="batchmean"
@@ -149,33 +147,11 @@ def distillation_loss(scores: Tensor, logits: Tensor) -> Tensor:
     return divergence + SQUARED_ERROR_WEIGHT * error
 
 
-class Blends(NamedTuple):
-    """Random choices for n blends of two rows.
-
-    Attributes:
-        pairs: (2, n) rows.
-        weight: (n, 1) weight of the first row of each pair.
-    """
-
-    pairs: Tensor
-    weight: Tensor
-
-    @classmethod
-    def sample(cls, partials: Tensor, count: int, generator: torch.Generator) -> Self:
-        """Draw `count` blends of rows of `partials` (N, P)."""
-        pairs = torch.randint(len(partials), (2, count), generator=generator).to(partials.device)
-        weight = MIN_WEIGHT + (1 - MIN_WEIGHT) * torch.rand(count, 1, generator=generator).to(partials.device)
-        return cls(pairs, weight)
-
-    def of(self, partials: Tensor, rows: Tensor) -> Tensor:
-        """Return the blends number `rows` of `partials`: (len(rows), P)."""
-        first, second = self.pairs[:, rows]
-        return torch.lerp(partials[second], partials[first], self.weight[rows])
-
-
 def blend(partials: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Return `count` random blends (count, P) of `partials` (N, P)."""
-    return Blends.sample(partials, count, generator).of(partials, torch.arange(count, device=partials.device))
+    """Return `count` random blends (count, P) of two rows each of `partials` (N, P)."""
+    first, second = torch.randint(len(partials), (2, count), generator=generator).to(partials.device)
+    weight = MIN_WEIGHT + (1 - MIN_WEIGHT) * torch.rand(count, 1, generator=generator).to(partials.device)
+    return torch.lerp(partials[second], partials[first], weight)
 
 
 def exhaustive_top1_ranks(matcher: Matcher, touch_partials: Tensor, photo_partials: Tensor) -> NDArray[np.int64]:
@@ -224,9 +200,6 @@ def with_candidate_encoder(
         train: Partial activations of touches (N, P) and of photos (M, P) of training objects.
         validation: The same of validation objects, if any. The metric ranks all photos by these touches.
         quiet: No progress on stderr.
-
-    Raises:
-        NumericalError: The loss is not finite.
     """
     matcher, metrics, seed = checkpoint.matcher, checkpoint.provenance["metrics"], config.training.seed
     distil(matcher, *train, config, quiet=quiet)

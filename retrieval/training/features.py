@@ -126,13 +126,10 @@ class Features:
 
 def features_by_image(grasps: Iterable[Grasp], features: Features, device: torch.device) -> dict[str | Path, Tensor]:
     """Return features on `device`: of touches (fingers concatenated) by grasp id, and of photos by file."""
-    touch, photo = (torch.from_numpy(part).flatten(1).to(device) for part in (features.touch, features.photo))
+    touch, photo = (torch.from_numpy(part).to(device) for part in (features.touch_rows, features.photo))
     row_of = {grasp_id: row for row, grasp_id in enumerate(features.grasp_ids)}
-    known: dict[str | Path, Tensor] = {}
-    for grasp in grasps:
-        row = row_of[grasp.grasp_id]
-        known |= {grasp.grasp_id: touch[row], grasp.photo: photo[row]}
-    return known
+    rows = [(grasp, row_of[grasp.grasp_id]) for grasp in grasps]
+    return {grasp.grasp_id: touch[row] for grasp, row in rows} | {grasp.photo: photo[row] for grasp, row in rows}
 
 
 def low_pass(image: RgbImage) -> RgbImage:
@@ -149,20 +146,12 @@ def low_pass(image: RgbImage) -> RgbImage:
 
 @lru_cache(maxsize=16)
 def _low_pass_matrix(old: int, new: int, sigma: float) -> NDArray[np.float32]:
-    """Return a matrix (new, old) that blurs and resizes one axis.
-
-    Blurring whole pictures this widely would take longer than a tower.
-    """
+    """Return a matrix (new, old) that blurs and resizes one axis: blurring whole pictures would take longer."""
     import cv2
 
     kernel = cv2.getGaussianKernel(round(8 * sigma) + 1 | 1, sigma, cv2.CV_32F)
     smooth = cv2.sepFilter2D(np.eye(old, dtype=np.float32), -1, np.ones(1, np.float32), kernel)
     return resize(np.repeat(smooth[..., None], 3, axis=2), (new, old))[..., 0]
-
-
-class _LowPassPreprocessing(Preprocessing):
-    def load_touch(self, path: str | Path, reference: str | Path | None = None) -> RgbImage:
-        return self.touch(low_pass(read_rgb(path)), None if reference is None else low_pass(read_rgb(reference)))
 
 
 def photo_margin(image: RgbImage) -> RgbImage:
@@ -171,6 +160,11 @@ def photo_margin(image: RgbImage) -> RgbImage:
     inside = np.zeros(image.shape[:2], dtype=np.bool_)
     inside[high:-high, wide:-wide] = True
     return np.where(inside[..., None], image[~inside].mean(0), image).astype(np.float32)
+
+
+class _LowPassPreprocessing(Preprocessing):
+    def load_touch(self, path: str | Path, reference: str | Path | None = None) -> RgbImage:
+        return self.touch(low_pass(read_rgb(path)), None if reference is None else low_pass(read_rgb(reference)))
 
 
 class _MarginPreprocessing(Preprocessing):
@@ -195,8 +189,8 @@ def encode_recording(
         grasps: The grasps.
         matcher: The matcher.
         config: The configuration, for preprocessing.
-        cache: Folder of the cache of features, so that a later or continued run reads them. A key is a digest of tower,
-            preprocessing, variant and image files. None to store nothing.
+        cache: Folder of the cache of features, whose keys are digests of tower, preprocessing, variant and image files.
+            None to store nothing.
         touch_variant: One of `TOUCH_VARIANTS`.
         photo_variant: One of `PHOTO_VARIANTS`; "margin" only with whole touches.
         photo_features_from: Features of at least these grasps; their photo features are used without encoding.
@@ -205,8 +199,15 @@ def encode_recording(
     Raises:
         DatasetError: A required no-contact frame is missing, or a file cannot be read.
     """
-    touched = [_with_no_contact_touch(grasp) for grasp in grasps] if touch_variant == "no_contact" else grasps
-    preprocessing = config.preprocessing
+    touched, preprocessing = grasps, config.preprocessing
+    if touch_variant == "no_contact":
+        for grasp in grasps:
+            if len(grasp.backgrounds) != len(grasp.touches):
+                raise DatasetError(
+                    f"each finger needs a no-contact frame; {grasp.grasp_id} has {len(grasp.backgrounds)} for "
+                    f"{len(grasp.touches)}; record them, or leave this control out"
+                )
+        touched = [dataclasses.replace(grasp, touches=grasp.backgrounds) for grasp in grasps]
     if kind := {"low_pass": _LowPassPreprocessing, "margin": _MarginPreprocessing}.get(
         touch_variant if photo_variant == "photo" else photo_variant
     ):
@@ -229,15 +230,6 @@ def encode_recording(
         touch.reshape(len(touch), config.matcher.fingers, -1),
         photo,
     )
-
-
-def _with_no_contact_touch(grasp: Grasp) -> Grasp:
-    if len(grasp.backgrounds) != len(grasp.touches):
-        raise DatasetError(
-            f"each finger needs a no-contact frame; {grasp.grasp_id} has {len(grasp.backgrounds)} for "
-            f"{len(grasp.touches)}; record them, or leave this control out"
-        )
-    return dataclasses.replace(grasp, touches=grasp.backgrounds)
 
 
 def _tower_digest(tower: Tower) -> str:

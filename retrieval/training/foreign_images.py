@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 
 from retrieval.data.resize import RgbImage
-from retrieval.errors import BadInput
 
 _Draw = Callable[[np.random.Generator, int], np.ndarray]
 
@@ -19,18 +18,9 @@ def draw_foreign(
 ) -> Iterator[tuple[str, RgbImage]]:
     """Yield `count` foreign pictures (px, px, 3) float32 in 0..1, each with the name of its kind; kinds alternate.
 
-    Args:
-        count: Number of pictures.
-        px: Side in pixels.
-        photos: Photos (H, W, 3) to resize, and to cut pieces from; may be empty.
-        gels: Gel images (H, W, 3) to recolour; may be empty.
-        seed: The same seed gives the same pictures.
-
-    Raises:
-        BadInput: `count` is below 1, or `px` below 8.
+    `photos` (H, W, 3) are resized and cut into pieces, `gels` (H, W, 3) recoloured; both may be empty. `px` is at
+    least 8.
     """
-    if count < 1 or px < 8:
-        raise BadInput(f"count must be at least 1 and px at least 8; got {count} and {px}")
     kinds: dict[str, _Draw] = dict(SYNTHETIC_KINDS)
     if len(photos):
         kinds |= {"photo": _of_one(photos, _whole), "piece of a photo": _of_one(photos, _piece)}

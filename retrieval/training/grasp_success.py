@@ -1,4 +1,4 @@
-"""Train the grasp-success gate (`retrieval.training.gate`), which classifies a grasp from its gel images.
+"""Train the grasp-success gate (`retrieval.model.gate`), which classifies a grasp from its gel images.
 
 Like the authors' classifier, it processes one finger at a time and combines the fingers. The differences and reasons:
 
@@ -16,7 +16,7 @@ A gate selects the touches that a matcher later trains on, so it makes them easi
 """
 
 import dataclasses
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,8 +41,8 @@ from retrieval.errors import DatasetError
 from retrieval.metrics.intervals import grouped_interval
 from retrieval.model.checkpoint import require_writable, write_tensors
 from retrieval.model.encode import batches, one_thread, touch_batch
+from retrieval.model.gate import TASK, GateSettings, GraspNet, GraspSuccessGate
 from retrieval.model.losses.loss import match_loss
-from retrieval.training.gate import TASK, GateSettings, GraspNet, GraspSuccessGate
 from retrieval.training.loop import Plan, train_loop
 
 BATCH = 32
@@ -51,19 +51,16 @@ VALIDATION = 0.25  # fraction of the objects, as the authors use
 BRIGHTNESS, CONTRAST = 20 / 255, 0.1  # largest change of the lamps between two frames
 _GREY_LEVEL = 1 / 255
 
-
 Differences = Callable[[Sequence[Attempt]], list[list[NDArray[np.float32]]]]
 
 
 @dataclass(frozen=True)
 class GateReport:
-    """Accuracy of a gate on validation objects.
-
-    The gate is the one of the last step, with a fixed threshold, so the validation objects have no other use.
+    """Accuracy of a gate, that of the last step, on validation objects, which have no other use.
 
     Attributes:
         path: File of the gate.
-        frame: The frame that it uses, one of `retrieval.training.gate.MOMENTS`.
+        frame: The frame that it uses, one of `retrieval.model.gate.MOMENTS`.
         train_grasps: Number of training grasps.
         train_held: Number of held grasps among them.
         validation_grasps: Number of validation grasps.
@@ -148,14 +145,32 @@ def train_gate(
             for attempt in attempts
         ]
 
+    logits: list[float] = []  # each grasp's highest logit
     with one_thread():
         gate = GraspSuccessGate(_train_net(train, differences, iterations, seed, quiet), settings)
         with Bar("validate", len(validation), "grasps", quiet=quiet) as bar:
-            logits: list[float] = []  # each grasp's highest logit
             for part in batches(validation, BATCH):
-                logits += [max(fingers) for fingers in gate.score(differences(part))]
+                logits += map(max, gate.score(differences(part)))
                 bar.advance(len(part))
-    report = _report(out, settings.frame, train, validation, np.array(logits))
+    held, accepted = np.array([attempt.held for attempt in validation]), np.array(logits) >= 0
+    is_correct, outcomes = accepted == held, [attempt.outcome for attempt in validation]
+    owner = np.array([attempt.grasp.object_id for attempt in validation])
+    by_object = [is_correct[owner == name].tolist() for name in np.unique(owner)]
+    report = GateReport(
+        path=str(out),
+        frame=settings.frame,
+        train_grasps=len(train),
+        train_held=sum(attempt.held for attempt in train),
+        validation_grasps=len(validation),
+        validation_objects=len(by_object),
+        accuracy=float(is_correct.mean()),
+        interval=grouped_interval(by_object),
+        chance=float(max(held.mean(), 1 - held.mean())),
+        accepted={
+            name: (sum(accepted[[each == name for each in outcomes]].tolist()), count)
+            for name, count in sorted(Counter(outcomes).items())
+        },
+    )
     provenance = {
         "iterations": iterations,
         "seed": seed,
@@ -240,29 +255,3 @@ def augment(images: Tensor, rng: np.random.Generator) -> Tensor:
         for bounds in ((1 - CONTRAST, 1 + CONTRAST), (-BRIGHTNESS, BRIGHTNESS))
     )
     return images * contrast + brightness
-
-
-def _report(
-    out: Path, frame: str, train: list[Attempt], validation: list[Attempt], logits: NDArray[np.float64]
-) -> GateReport:
-    accepted = logits >= 0
-    held = np.array([attempt.held for attempt in validation])
-    by_object: dict[str, list[bool]] = defaultdict(list)
-    by_outcome: dict[str, list[bool]] = defaultdict(list)
-    for attempt, is_accepted, is_correct in zip(
-        validation, accepted.tolist(), (accepted == held).tolist(), strict=True
-    ):
-        by_object[attempt.grasp.object_id].append(is_correct)
-        by_outcome[attempt.outcome].append(is_accepted)
-    return GateReport(
-        path=str(out),
-        frame=frame,
-        train_grasps=len(train),
-        train_held=sum(attempt.held for attempt in train),
-        validation_grasps=len(validation),
-        validation_objects=len(by_object),
-        accuracy=float((accepted == held).mean()),
-        interval=grouped_interval([by_object[name] for name in sorted(by_object)]),
-        chance=float(max(held.mean(), 1 - held.mean())),
-        accepted={name: (sum(part), len(part)) for name, part in sorted(by_outcome.items())},
-    )

@@ -15,21 +15,17 @@ MAX_VALIDATION_ROWS = 512
 
 def validation_rows(validation: Features, max_rows: int = MAX_VALIDATION_ROWS) -> NDArray[np.int64]:
     """Return rows for the choice: equally many per object, evenly spaced, about `max_rows` in all (at least 2 each)."""
-    each = max(max_rows // (int(validation.owner.max()) + 1), 2)
     parts = [np.flatnonzero(validation.owner == owner) for owner in range(int(validation.owner.max()) + 1)]
+    each = max(max_rows // len(parts), 2)
     return np.concatenate([part[np.linspace(0, len(part) - 1, min(each, len(part))).astype(int)] for part in parts])
 
 
 def ranking_auc(scores: NDArray[np.floating[Any]], owner: NDArray[np.int64]) -> float:
     """Return how often another photo of the touched object scores above one of another object; ties count half.
 
-    The mean is taken over the pairs of a touch, over the touches of an object, and over objects. A constant scorer has
-    exactly 0.5.
-
-    Args:
-        scores: (n, n) of the touch of every grasp with the photo of every grasp. The photo of a touch's own grasp is
-            ignored unless its object has no other.
-        owner: (n,) object of each grasp.
+    The mean is taken over the pairs of a touch, over the touches of an object, and over objects. `scores` (n, n) are of
+    the touch of every grasp with the photo of every grasp, `owner` (n,) is the object of each. The photo of a touch's
+    own grasp is ignored unless its object has no other.
 
     Raises:
         NumericalError: A score is not finite. A NaN would count as the higher one.
@@ -63,7 +59,7 @@ def held_out_folds(
 
     Args:
         features: Features of grasps.
-        kind_of: The kind of each object, if the recording names it; otherwise similar objects are of one kind
+        kind_of: The kind of each object, if the recording names it; else similar objects are of one kind
             (`appearance_order`).
         linked: Objects that stay together, such as those of one sequence.
         seed: Seed of the order within a kind.

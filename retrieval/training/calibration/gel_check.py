@@ -167,12 +167,9 @@ def _largest_level(images: Sequence[Path], frames: Sequence[Path]) -> float:
 
 @torch.inference_mode()
 def fit_gel_check(head: GelHead, test: GelCheckFeatures, levels: tuple[Sequence[float], Sequence[float]]) -> GelCheck:
-    """Return the check with thresholds from validation pictures, and the fractions that it rejects.
+    """Return the check with thresholds from validation pictures and `contact_levels`, and the fractions it rejects.
 
-    Args:
-        head: The linear layer.
-        test: Features of validation pictures. The logit of a grasp is the highest logit of its fingers.
-        levels: Result of `contact_levels`.
+    The logit of a grasp is the highest logit of its fingers.
     """
     touch, no_contact = head(test.touch).numpy(), head(test.no_contact).numpy()  # (G, fingers, 2)
     foreign: Readings = head(test.foreign[:, None]).numpy()
@@ -198,8 +195,8 @@ def fit_gel_check(head: GelHead, test: GelCheckFeatures, levels: tuple[Sequence[
 def contact_threshold(no_contact: ArrayLike, touch: ArrayLike) -> float:
     """Return the threshold between values of no-contact frames and of touches.
 
-    It is the higher of two values: at most `FALSE_ALARM_RATE` of the no-contact values lie above the first, and at most
-    `LOW_CONTACT_RATE` of the touches lie below the second.
+    At most `FALSE_ALARM_RATE` of the no-contact values lie above it; if it can be higher, until `LOW_CONTACT_RATE` of
+    the touches lie below it.
     """
     low, high = np.asarray(no_contact, dtype=np.float64), np.asarray(touch, dtype=np.float64)
     return float(max(np.quantile(low, 1 - FALSE_ALARM_RATE), np.quantile(high, LOW_CONTACT_RATE)))

@@ -49,12 +49,7 @@ def fit_references(*parts: ScoredTouches, seed: int = 0) -> ReferenceCalibration
     `MAX_REFERENCES`. The queries are the second half, so with enough touches no query neighbours a reference. All
     trials are repeated with one reference per object, because a fit to three references is overconfident for one.
 
-    Args:
-        parts: Touches of one matcher or several, as in `fit_posterior`.
-        seed: Seed of the trials.
-
-    Returns:
-        The calibration; None for fewer than three such objects, or for a model without embeddings.
+    None for fewer than three such objects, or for a model without embeddings.
     """
     encoded = [part for part in parts if part.touch_embeddings.shape[1]]
     many, one = (

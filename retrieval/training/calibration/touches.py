@@ -44,12 +44,9 @@ class ScoredTouches:
     photo_embeddings: Embeddings = field(default_factory=_no_embeddings)
 
     def draw_sets(self, grasps: int, draws: int | None, rng: np.random.Generator) -> Numbers:
-        """Return sets (S, grasps) of touches of one object, if it has so many, and a photo of another grasp.
+        """Return `draws` random sets (S, grasps) of each object that has so many touches and a photo of another grasp.
 
-        Args:
-            grasps: Touches of a set.
-            draws: Random sets of each object; None for each single touch.
-            rng: The random choices.
+        Without `draws`, the sets are each single touch.
         """
         sets = []
         for name in np.unique(self.touch_owner):
@@ -68,14 +65,9 @@ def score_touches(
     *,
     pooled: bool = False,
 ) -> ScoredTouches:
-    """Score touches with photos.
+    """Score touches with photos, given their features (T, fingers * F) and (N, F') and their objects (T,) and (N,).
 
-    Args:
-        matcher: The matcher.
-        features: Features of the touches (T, fingers * F) and of the photos (N, F').
-        owners: Objects of the touches (T,) and of the photos (N,).
-        own: As in `ScoredTouches`.
-        pooled: Score without late interaction, as an index without cells does.
+    `pooled`: without late interaction, as an index without cells does.
     """
     touch_partials = matcher.touch_encoding(features[0]).partial.cpu().numpy()
     photo_partials, photo_embeddings = (part.cpu().numpy() for part in matcher.photo_encoding(features[1]))
@@ -90,15 +82,7 @@ def score_touches(
 def score_grasps(
     matcher: Matcher, grasps: Sequence[Grasp], touches: Tensor, photos: dict[Path, Tensor], *, pooled: bool = False
 ) -> ScoredTouches | None:
-    """Score the touches of grasps with their photos; None if there are too few objects or photos.
-
-    Args:
-        matcher: The matcher.
-        grasps: G grasps.
-        touches: Touch features (G, fingers * F).
-        photos: Features of each photo by file.
-        pooled: Score without late interaction.
-    """
+    """Score the touches of grasps with their photos (`recorded_features`); None for too few objects or photos."""
     names, touch_owner = np.unique([grasp.object_id for grasp in grasps], return_inverse=True)
     owner_of = {grasp.photo: owner for grasp, owner in zip(grasps, touch_owner, strict=True)}
     photo_owner = np.array([owner_of[photo] for photo in photos])

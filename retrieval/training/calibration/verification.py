@@ -39,13 +39,8 @@ def verification_sequences(
 ) -> VerificationSequences | None:
     """Draw and score `SEQUENCES` sequences of each object that has `grasps` grasps and a photo of another grasp.
 
-    Returns None without any such object.
-
-    Args:
-        scored: Match logits of the touches with the photos, whose embeddings give the most similar object.
-        posterior: The posterior of the model.
-        seed: Seed of the sequences. Shorter sequences of the same seed are the first grasps of longer ones.
-        grasps: Number of grasps, G.
+    The embeddings of the photos give the most similar object. Shorter sequences of a seed are the first grasps of
+    longer ones. None without any such object.
     """
     sets = scored.draw_sets(grasps, SEQUENCES, np.random.default_rng([seed, 7]))
     if not len(sets):
@@ -70,16 +65,10 @@ def verification_sequences(
 def fit_verification(
     parts: Sequence[ScoredTouches], posterior: Posterior, seed: int = 0
 ) -> VerificationCalibration | None:
-    """Return the calibration from touches and photos of validation objects.
+    """Return the calibration from validation objects, which are compared only within a part.
 
-    Args:
-        parts: Touches and photos of one matcher or several. Objects are compared only within a part.
-        posterior: The posterior of the model.
-        seed: Seed of the sequences of grasps.
-
-    Returns:
-        The calibration; None if fewer than `MIN_OBJECTS` objects have sequences (`verification_sequences`), or if
-        their pairs do not support `CARD_FAR`.
+    None if fewer than `MIN_OBJECTS` objects have sequences (`verification_sequences`), or if their pairs do not support
+    `CARD_FAR`.
     """
     found = [each for part in parts if (each := verification_sequences(part, posterior, seed)) is not None]
     sizes = tuple(len(np.unique(each.owner)) for each in found)

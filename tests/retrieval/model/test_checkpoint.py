@@ -31,9 +31,9 @@ from retrieval.model.checkpoint import (
 )
 from retrieval.model.checkpoint_info import FORMAT, read_checkpoint_info
 from retrieval.model.fusion import GelHead, Matcher
+from retrieval.model.gate import load_gate
 from retrieval.model.gel_check import GelCheck
 from retrieval.model.posterior import Posterior
-from retrieval.training.gate import load_gate
 from tests.conftest import TINY
 
 SPLIT = Split(seed=3, train=("cup", "mug"), validation=("jar", "pan"), test=("red ball", "Töpfchen"))

@@ -15,7 +15,6 @@ from retrieval.training.cca import (
     CanonicalCorrelations,
     Standardiser,
     canonical_correlations,
-    cosine,
     decompose,
     unit_rows,
 )
@@ -177,7 +176,7 @@ def test_if_the_fast_decomposition_fails_the_slow_one_is_used(monkeypatch):
 
 
 def first_hits(touch, photo):
-    return np.mean(cosine(unit_rows(touch), unit_rows(photo)).argmax(1) == np.arange(len(touch)))
+    return np.mean((unit_rows(touch) @ unit_rows(photo).T).argmax(1) == np.arange(len(touch)))
 
 
 def test_cosine_needs_dimensions_weighted_by_their_correlation():

@@ -115,27 +115,20 @@ def _partial(matcher, features):
     return matcher.photo_encoding(features).partial
 
 
-def test_photos_of_the_pool_are_nearer_to_the_touches_than_random_blends(matcher, partials):
+def test_photos_of_the_pool_are_nearer_to_the_touches_than_random_blends_until_it_is_renewed(matcher, partials):
     distilled(matcher, partials)
-    sampler = distil._PhotoSampler(
-        matcher.candidate_encoder, partials[1], lambda rows: rows, torch.Generator().manual_seed(2)
+    encoder, touches = matcher.candidate_encoder, partials[0][:16]
+    sampler = distil.PhotoSampler(encoder, partials[1], lambda rows: rows, torch.Generator().manual_seed(2))
+    steps = (-1, 0, 1, distil.POOL_RENEWAL_STEPS)
+    random_only, pooled, again, renewed = (sampler.photos(step, touches) for step in steps)
+    assert random_only.shape == pooled.shape == (256, HIDDEN)
+    random_similarity, pooled_similarity = (
+        (encoder.touch(touches) @ encoder.photo(photos).T).topk(12).values.mean() for photos in (random_only, pooled)
     )
-    random_only = sampler.photos(-1, partials[0][:16])
-    with_pool = sampler.photos(0, partials[0][:16])
-    assert random_only.shape == with_pool.shape == (256, HIDDEN)
-    touches = matcher.candidate_encoder.touch(partials[0][:16])
-    similarity = [
-        (touches @ matcher.candidate_encoder.photo(photos).T).topk(12).values.mean().item()
-        for photos in (random_only, with_pool)
-    ]
-    assert similarity[1] > similarity[0]
-    pool = sampler._pool.of(partials[1], torch.arange(distil.POOL_SIZE))
-    nearest = (touches @ matcher.candidate_encoder.photo(pool).T).topk(12).values
-    assert similarity[1] >= nearest.mean().item() - 1e-6  # the pool's nearest photos are all included
-    sampler.photos(1, partials[0][:16])
-    assert torch.equal(sampler._pool.of(partials[1], torch.arange(distil.POOL_SIZE)), pool)
-    sampler.photos(distil.POOL_RENEWAL_STEPS, partials[0][:16])
-    assert not torch.equal(sampler._pool.of(partials[1], torch.arange(distil.POOL_SIZE)), pool)
+    assert pooled_similarity > random_similarity
+    rows, same_pool, other_pool = ({tuple(row.tolist()) for row in photos} for photos in (pooled, again, renewed))
+    assert rows & same_pool
+    assert not rows & other_pool
 
 
 # The distilled encoder -------------------------------------------------------------------------------------
@@ -163,25 +156,18 @@ def test_the_rank_of_the_exhaustive_top1_counts_the_photos_nearer_than_it(matche
         assert rank == sum(one > similarity[int(np.argmax(logits))] for one in similarity)
 
 
-def test_the_result_depends_on_the_seed_and_not_on_an_earlier_encoder_or_other_random_numbers(matcher, partials):
-    first = distilled(matcher, partials)
-    torch.manual_seed(99)
-    state = torch.get_rng_state()
-    assert same(distilled(matcher, partials), first)
-    assert torch.equal(torch.get_rng_state(), state)
-    assert not same(distilled(matcher, partials, seed=1), first)
-
-
-def test_nothing_but_the_candidate_encoder_changes(matcher, partials):
+def test_only_the_candidate_encoder_changes_and_depends_on_the_seed_alone(matcher, partials):
     before = {name: tensor.clone() for name, tensor in matcher.state_dict().items()}
-    distilled(matcher, partials)
-    after = matcher.state_dict()
+    first = distilled(matcher, partials)
+    after, state = matcher.state_dict(), torch.get_rng_state()
     assert same(before, after)
     assert {name.split(".")[0] for name in after.keys() - before.keys()} == {"candidate_encoder"}
     assert matcher.config == dataclasses.replace(WITHOUT_CANDIDATE_ENCODER, candidate_width=32)
-    assert all(
-        parameter.grad is None for name, parameter in matcher.named_parameters() if "candidate_encoder" not in name
-    )
+    others = [part.grad for name, part in matcher.named_parameters() if "candidate_encoder" not in name]
+    assert others == [None] * len(others)
+    assert same(distilled(matcher, partials), first)  # also after an earlier distillation
+    assert torch.equal(torch.get_rng_state(), state)
+    assert not same(distilled(matcher, partials, seed=1), first)
 
 
 def test_with_a_cosine_in_the_logit_linear_values_rank_the_exhaustive_top1_higher_than_a_network_alone(
@@ -224,7 +210,7 @@ def checkpoint(matcher, tmp_path):
     )
 
 
-def test_a_checkpoint_gets_a_candidate_encoder_queries_and_a_metric(checkpoint, partials):
+def test_a_checkpoint_gets_a_candidate_encoder_and_with_validation_objects_queries_and_a_metric(checkpoint, partials):
     held_out = drawn(30, 8, sign=1), drawn(50, 9, sign=-1)
     assert not checkpoint.config.has_embeddings
     path = checkpoint.path
@@ -241,12 +227,8 @@ def test_a_checkpoint_gets_a_candidate_encoder_queries_and_a_metric(checkpoint, 
     metrics = made.provenance["metrics"]
     assert metrics == {"validation_auc": 0.75, "candidate_agreement_at_1_percent": (ranks < 4).mean()}
     assert "candidate agreement at 1 percent" in path.with_suffix(".md").read_text()
-
-
-def test_without_validation_objects_there_are_neither_queries_nor_a_metric(checkpoint, partials):
-    made = distil.with_candidate_encoder(checkpoint, config_with_encoder(2), partials, quiet=True)
-    assert made.queries is None
-    assert made.provenance["metrics"] == {"validation_auc": 0.75}
+    without = distil.with_candidate_encoder(checkpoint, config_with_encoder(2), partials, quiet=True)
+    assert (without.queries, without.provenance["metrics"]) == (None, {"validation_auc": 0.75})
 
 
 def test_queries_are_limited_in_number_and_finite_in_float16():

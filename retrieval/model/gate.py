@@ -27,12 +27,7 @@ MOMENTS = ("after", "during")
 
 @dataclass(frozen=True)
 class GateSettings:
-    """Input of a gate.
-
-    Attributes:
-        touch_px: Side of the image in pixels.
-        frame: The frame that is compared with the no-contact frame, one of MOMENTS.
-    """
+    """Input of a gate: side of the image in pixels, and the frame, one of MOMENTS, that it compares with the first."""
 
     touch_px: int = 64
     frame: str = "after"
