@@ -210,8 +210,6 @@ def _controls(view: ProtocolView) -> Blocks:
             "above chance."
         )
         yield tables.controls(view, view.result.controls)
-    if table := tables.differences(view):
-        yield Section("Against the controls, all measures", (table,))
 
 
 def _ceilings(view: ProtocolView) -> Blocks:
@@ -262,8 +260,7 @@ def _reliability(view: ProtocolView, name: str, details: Details) -> Iterator[Bl
         yield Picture(
             view.figure_name(f"reliability-{name}"),
             f"Reliability diagrams, {label}. {'; '.join(descriptions)}.",
-            f"Fraction of right answers against the probability that {label} stated; a calibrated method is on the "
-            "diagonal. Below: number of answers (logarithmic).",
+            f"Right answers against the probability that {label} stated; a calibrated method is on the diagonal.",
             partial(plots.reliability, view, name),
         )
 
@@ -335,7 +332,7 @@ PARTS: dict[str, Callable[[ProtocolView], Blocks]] = {
     "Several grasps": _grasps,
     "Accuracy and time": _time,
     "Full gallery": _gallery,
-    "Differences between methods": lambda view: iter([tables.comparisons(view)]),
+    "Differences": lambda view: iter([tables.differences(view)]),
     "Controls": _controls,
     "Ceilings": _ceilings,
     "Accuracy by object": lambda view: _each(view, _objects),

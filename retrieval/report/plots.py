@@ -22,7 +22,6 @@ from retrieval.report.numbers import percent
 from retrieval.report.results import ProtocolView
 
 _LABELLED_OBJECTS = 130
-_LABEL_LENGTH = 24
 
 
 def overview(view: ProtocolView, keys: Sequence[str]) -> Figure:
@@ -62,8 +61,7 @@ def topn_curves(view: ProtocolView, keys: Sequence[str]) -> Figure:
             panel.plot(ranks, value, color=style.colour, marker=style.marker, ls=style.line)
             if name != CHANCE:
                 panel.fill_between(ranks, low, high, color=style.colour, alpha=0.13, lw=0)
-        panel.set_title(f"{key.removeprefix('topn_k')} candidate objects")
-        panel.set_xlabel("N")
+        panel.set(title=f"{key.removeprefix('topn_k')} candidate objects", xlabel="N")
         panel.xaxis.get_major_locator().set_params(integer=True)
         percent_axis(panel, "object among the first N answers, %")
     _legend(figure, view, view.rows)
@@ -115,20 +113,15 @@ def objects(view: ProtocolView, row: str, candidates: str, measure: str) -> Figu
         panel.text(len(bars) - 0.4, 100 * summary.chance[0], " chance", va="center", fontsize=8)
     if len(bars) <= _LABELLED_OBJECTS:
         size = float(np.clip(700 / len(bars), 5.5, 8))
-        panel.set_xticks(range(len(bars)), [_shortened(name) for name, _ in bars], rotation=90, fontsize=size)
+        # A long name is cut in its middle, because the ends distinguish objects.
+        names = [name if len(name) <= 24 else f"{name[:11]}…{name[-12:]}" for name, _ in bars]
+        panel.set_xticks(range(len(bars)), names, rotation=90, fontsize=size)
     else:
-        panel.set_xticks([])
-        panel.set_xlabel(f"{len(bars)} objects")
+        panel.set(xticks=[], xlabel=f"{len(bars)} objects")
     panel.set_xlim(-0.7, len(bars) - 0.3)
     panel.grid(axis="x", visible=False)
     percent_axis(panel, "top-1 accuracy, %")
     return figure
-
-
-def _shortened(name: str) -> str:
-    """Return the name, shortened in its middle, because the ends distinguish objects."""
-    head = (_LABEL_LENGTH - 1) // 2
-    return name if len(name) <= _LABEL_LENGTH else f"{name[:head]}…{name[len(name) - (_LABEL_LENGTH - 1 - head) :]}"
 
 
 # Decisions -------------------------------------------------------------------------------------------
@@ -142,26 +135,19 @@ RELIABILITIES = {
 
 
 def reliability(view: ProtocolView, row: str) -> Figure:
-    """Plot the fraction of right answers against the stated probability, on test objects, with counts below."""
+    """Plot the fraction of right answers against the stated probability, on test objects."""
     diagrams = view.details[row].reliability
     kinds = [kind for kind in RELIABILITIES if kind in diagrams]
-    figure = canvas(0.6 + 2.7 * len(kinds), 4.1)
-    grid = figure.subplots(2, len(kinds), sharex=True, sharey="row", squeeze=False, height_ratios=[4, 1])
-    colour = style_of(row).colour
-    for panel, counts, kind in zip(*grid, kinds, strict=True):
+    figure = canvas(0.6 + 2.7 * len(kinds), 3.5)
+    panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
+    for panel, kind in zip(panels, kinds, strict=True):
         bins = [found for found in diagrams[kind]["bins"] if found["count"]]
         stated, right = (100 * np.array([one[key] for one in bins]) for key in ("probability", "frequency"))
         panel.plot([0, 100], [0, 100], color=MUTED_COLOUR, ls="--", lw=1.2)
-        panel.vlines(stated, stated, right, color=colour, lw=1, alpha=0.5)
-        panel.plot(stated, right, "o-", color=colour, ms=5)
-        panel.set_xlim(-2, 102)
+        panel.plot(stated, right, "o-", color=style_of(row).colour, ms=5)
         panel.set_title(f"{RELIABILITIES[kind]}\nECE {percent(diagrams[kind]['ece'])} %", fontsize=9)
-        counts.bar(stated, [one["count"] for one in bins], width=6, color=colour, alpha=0.6)
-        counts.set_yscale("log")
-        logarithmic(counts.yaxis)
-        counts.set_xlabel("stated probability, %")
-    percent_axis(grid[0][0], "right answers, %")
-    grid[1][0].set_ylabel("answers")
+        panel.set(xlim=(-2, 102), xlabel="stated probability, %")
+    percent_axis(panels[0], "right answers, %")
     return figure
 
 
@@ -202,21 +188,17 @@ def accuracy_and_time(view: ProtocolView, key: str) -> Figure:
     for panel, (kind, title) in zip(panels, titles.items(), strict=True):
         points: list[tuple[float, float]] = []
         for name, summary in view.summaries(key).items():
-            times, style = view.times and view.times.rows.get(name), style_of(name)
-            if not (times and (time := getattr(times, kind))):
+            measured, style = view.times and view.times.rows.get(name), style_of(name)
+            if not (measured and (time := getattr(measured, kind))):
                 continue
             value, low, high = _first(summary)
             points.append((time, value))
             panel.errorbar(time, value, [[value - low], [high - value]], fmt=style.marker, color=style.colour)
             panel.axhline(100 * summary.chance[0], color=MUTED_COLOUR, ls="--", lw=1.2, zorder=0)
-        # The Pareto front of time and accuracy.
-        front = [
-            (time, value)
-            for time, value in sorted(points)
-            if not any(other != (time, value) and other[0] <= time and other[1] >= value for other in points)
-        ]
-        if front:
-            panel.step(*zip(*front, strict=True), where="post", color="#222222", lw=1, alpha=0.45, zorder=0)
+        if points:  # the Pareto front of time and accuracy
+            times, values = zip(*sorted(points), strict=True)
+            best = np.maximum.accumulate(values)
+            panel.step(times, best, where="post", color="#222222", lw=1, alpha=0.45, zorder=0)
         panel.set_xscale("log")
         logarithmic(panel.xaxis)
         panel.set_xlabel(title)

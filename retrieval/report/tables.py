@@ -123,30 +123,18 @@ def choices(view: ProtocolView) -> Table | None:
 # Differences and controls ----------------------------------------------------------------------------
 
 
-def comparisons(view: ProtocolView) -> Table | None:
-    """Return the paired differences between rows on the same queries."""
+def differences(view: ProtocolView) -> Table | None:
+    """Return the paired differences between rows, and between rows and their controls, on the same queries."""
+    found = [(view.label(one.b), one.a, one.measure, one.difference) for one in view.result.comparisons]
+    for name, row in view.result.rows.items():
+        for control, by_measure in row.differences.items():
+            found += [(CONTROL_NAMES[control], name, key, one) for key, one in by_measure.items()]
     rows = [
-        (
-            f"{view.label(one.a)} − {view.label(one.b)}",
-            view.measure_label(one.measure),
-            difference(one.difference),
-            p_value(one.difference.p),
-        )
-        for one in view.result.comparisons
+        (f"{view.label(name)} − {other}", view.measure_label(key), difference(one), p_value(one.p))
+        for other, name, key, one in found
     ]
     note = "Same queries for both. Interval: bootstrap over objects; p: two-sided sign-flip test over objects."
-    return _marked(("methods", "measure", "difference, points", "p"), rows, (note,), words=(1,))
-
-
-def differences(view: ProtocolView) -> Table | None:
-    """Return the paired differences between each row and its controls."""
-    rows = [
-        (view.label(name), view.measure_label(key), CONTROL_NAMES[control], difference(one), p_value(one.p))
-        for name, row in view.result.rows.items()
-        for control, found in row.differences.items()
-        for key, one in found.items()
-    ]
-    return _marked(("method", "measure", "control", "touch minus control, points", "p"), rows, words=(1, 2))
+    return _marked(("rows", "measure", "difference, points", "p"), rows, (note,), words=(1,))
 
 
 def verdicts(view: ProtocolView) -> list[str]:
