@@ -20,7 +20,6 @@ APPROXIMATIONS: "Approximations" = Registry(
         "reduced": "benchmarks.frontier.large_photos:reduced",
         "training_formats": "benchmarks.frontier.training:training_formats",
         "cca_solver": "benchmarks.frontier.correlation:cca_solver",
-        "cca_components": "benchmarks.frontier.correlation:cca_components",
         "rays": "benchmarks.frontier.rays:rays",
         "sky_occlusion": "benchmarks.frontier.light:sky",
         "contact": "benchmarks.frontier.contact:contact",

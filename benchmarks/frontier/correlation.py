@@ -1,4 +1,4 @@
-"""Canonical correlations: the solver, and the number of components in a score."""
+"""Canonical correlations: the solver."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,18 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.frontier.clock import time_points
-from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, miss_rate_point
+from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff
 from retrieval.frontier.sample import Sample
-from retrieval.methods.cca import Cca
-from retrieval.methods.method import MethodSettings
-from retrieval.training.cca import canonical_correlations, decompose, unit_rows
+from retrieval.training.cca import canonical_correlations, decompose
 
 Matrix = NDArray[np.float64]
 Solver = Callable[["CcaProblem"], Matrix]
 OURS = "SVD of the data, float64 (ours)"
-SIZES = (4, 8, 16, 32, 64, 128, 256)
-MIN_ROWS = 8
-"""Minimum number of objects: half of them fit, a quarter choose, a quarter test."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,49 +108,3 @@ def _by_sklearn(problem: CcaProblem) -> Matrix:
 
     found = CCA(n_components=8, max_iter=5000).fit_transform(problem.x, problem.y)
     return np.array([abs(np.corrcoef(a, b)[0, 1]) for a, b in zip(found[0].T, found[1].T, strict=True)])
-
-
-# Components ------------------------------------------------------------------------------------------------
-
-
-def cca_components(sample: Sample) -> ApproximationResult:
-    """Measure the top-1 error by number of canonical components, fitted on half of the sample's objects."""
-    title = "CCA: components"
-    names = [str(name) for name in np.unique(sample.features.object_ids)]
-    if len(names) < MIN_ROWS:
-        return ApproximationResult(
-            title, "", skipped=f"it needs {MIN_ROWS} objects or more; the recording has {len(names)}"
-        )
-    order = np.random.default_rng([sample.seed, 4]).permutation(names)
-    parts = np.split(order, [len(names) // 2, len(names) * 3 // 4])
-    train, validation, test = (sample.features.of_objects(part) for part in parts)
-    method = Cca(MethodSettings(sample.checkpoint.config))
-    method.fit(train, validation)
-    views = decompose(train.touch), decompose(train.photo)
-    found = canonical_correlations(*views, train.owner, method.best_params["ridge"])
-    weights = found.correlations ** method.best_params["power"]
-    touch = views[0].standardise(test.touch) @ found.touch_weights * weights
-    photo = views[1].standardise(test.photo) @ found.photo_weights * weights
-    points, works = list[Tradeoff](), list[Callable[[], object]]()
-    photos_tiled = np.tile(photo, (1 + sample.scale.photos // len(photo), 1))[: sample.scale.photos]
-    for count in sorted({*(min(size, len(weights)) for size in SIZES), method.best_params["components"]}):
-        codes = unit_rows(touch[:, :count]), unit_rows(photo[:, :count])
-        scores = codes[0] @ codes[1].T
-        np.fill_diagonal(scores, -np.inf)  # exclude the photo of the touch's own grasp
-        wrong = test.owner[scores.argmax(1)] != test.owner
-        points.append(miss_rate_point("", f"{count} components", wrong, count == method.best_params["components"]))
-        works.append(partial(np.matmul, codes[0][:1], unit_rows(photos_tiled[:, :count]).T))
-    points = list(time_points(points, works, sample.scale.repeats))
-    panel = Panel(
-        title="top-1 errors by number of canonical components",
-        time=f"scores of one touch with {sample.scale.photos:,} photos, one thread",
-        unit="% of queries",
-        reference=f"the object in the hand, one of {len(parts[2])}",
-        tolerance=round(min(point.error for point in points) + 2.0, 1),
-        points=tuple(points),
-    )
-    text = (
-        f"Fitted on {len(parts[0])} objects; ridge, power and the default number of components chosen on "
-        f"{len(parts[1])} others; tested on {len(parts[2])} that neither includes."
-    )
-    return ApproximationResult(title, text, (panel,))
