@@ -1,21 +1,16 @@
 """A rig with the real drivers and emulated devices that have one common state.
 
-    python -m tests.emulated_rig --grasps 500 --out faulty/       # with faults in 1 of 50 operations, counted
-
 The gripper's driver is connected to an emulated WSG-50 over TCP or a pseudo-terminal, the gels' driver to computed
 cameras through OpenCV's interface. The arm, which reaches its target at once, and the camera are from this file. Every
 device can have faults, counted by kind.
 """
 
-import argparse
 import contextlib
-import logging
 import math
 import time
 import zlib
 from collections import Counter
 from dataclasses import dataclass
-from pathlib import Path
 from unittest.mock import patch
 
 import cv2
@@ -71,7 +66,7 @@ class EmulatedRigState:
     @property
     def all_counts(self):
         """Counts of faults so far, by device and kind."""
-        return dict(self.counts) | {f"gripper's line: {kind}": count for kind, count in self.line.counts.items()}
+        return self.counts + self.line.counts
 
     @property
     def holding(self):
@@ -263,13 +258,6 @@ class Outcome:
     left_moving: int
     left_holding: int
 
-    def lines(self):
-        """Yield the printed lines."""
-        yield f"{self.grasps} complete grasps in {self.attempts} attempts; stopped {len(self.stops)} times"
-        yield from (f"  stopped: {reason}" for reason in self.stops)
-        yield f"jaws left moving: {self.left_moving} times; left closed on an object: {self.left_holding} times"
-        yield from (f"{count:6} {kind}" for kind, count in sorted(self.faults.items()))
-
 
 def collect_among_faults(out, grasps, *, rate=0.02, seed=0, port="tcp", objects=5):
     """Collect `grasps` accepted grasps with faults at every device; start again after each stop, as a person would."""
@@ -286,7 +274,7 @@ def collect_among_faults(out, grasps, *, rate=0.02, seed=0, port="tcp", objects=
                 outcome.stops.append(str(error))
             outcome.left_moving += rig.shared.left_moving
             outcome.left_holding += rig.shared.emulator.grasping == HOLDING
-            outcome.faults += Counter(rig.shared.all_counts)
+            outcome.faults += rig.shared.all_counts
     return outcome
 
 
@@ -294,23 +282,3 @@ def broken_images(folder):
     """Return the pictures of a recording that are missing or damaged."""
     paths = [folder / path for grasp in read_recording(folder).grasps for path in grasp.images().values()]
     return [path for path in paths if not path.is_file() or cv2.imread(str(path)) is None]
-
-
-def main():
-    """Collect with faults, print the result and all faults by kind, and check the recording."""
-    parser = argparse.ArgumentParser(prog="python -m tests.emulated_rig", description=main.__doc__)
-    parser.add_argument("--grasps", type=int, default=500)
-    parser.add_argument("--rate", type=float, default=0.02, help="fraction of operations with a fault")
-    parser.add_argument("--port", choices=sorted(SERVERS), default="tcp")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, required=True, help="recording folder")
-    options = parser.parse_args()
-    logging.disable(logging.WARNING)  # each fault logs a warning
-    outcome = collect_among_faults(options.out, options.grasps, rate=options.rate, seed=options.seed, port=options.port)
-    print("\n".join(outcome.lines()))
-    grasps = read_recording(options.out).grasps
-    print(f"{len(grasps)} grasps in {options.out}, {len(broken_images(options.out))} damaged pictures")
-
-
-if __name__ == "__main__":
-    main()

@@ -5,10 +5,6 @@ import subprocess
 import threading
 from contextlib import contextmanager
 
-STARTED = ([], ["sh", "-c", "trap '' INT; exec \"$@\"", "sh"])
-STARTED_IDS = ("from a terminal", "ignoring Ctrl-C")
-"""Prefixes of a command: none, or one that makes it ignore Ctrl-C like nohup and `&` in a script."""
-
 
 def wait_until(holds, limit_s=10.0):
     """Wait until `holds()` is true; fail after about `limit_s`.

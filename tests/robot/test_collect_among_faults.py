@@ -1,7 +1,4 @@
-"""Collection with real drivers over emulated devices that fail at random.
-
-`python -m tests.emulated_rig --grasps 500 --out faulty/` runs a long collection.
-"""
+"""Collection with real drivers over emulated devices that fail at random."""
 
 import pytest
 

@@ -5,54 +5,52 @@ A line is a stream: a late packet delays all packets behind it, and the order ne
 
 import random
 import threading
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections import Counter
 
-from robot.drivers.wsg50.codec import Packet, encode
+from robot.drivers.wsg50.codec import encode
 
-
-@dataclass(frozen=True)
-class Piece:
-    """Bytes for the line after a pause; None cuts the line."""
-
-    data: bytes | None
-    pause_s: float = 0.0
+DELAY_S = 0.05
+KINDS = ("dropped", "corrupted", "delayed", "split", "disconnect")
 
 
 class LineFaults:
-    """Damages a fraction `rate` of the packets, with uniformly drawn `kinds`; `counts` counts them. Thread-safe.
+    """Damages a fraction `rate` of the packets, and those of a plan; `counts` counts the kinds. Thread-safe."""
 
-    `delay_s` is the delay of a delayed packet, and the pause within a split one.
-    """
-
-    KINDS = ("dropped", "corrupted", "delayed", "split", "disconnect")
-
-    def __init__(
-        self, rate: float = 0.0, kinds: Sequence[str] | None = None, *, seed: int = 0, delay_s: float = 0.05
-    ) -> None:
-        self.rate, self.kinds, self.delay_s = rate, tuple(kinds or self.KINDS), delay_s
-        self.counts = dict.fromkeys(self.kinds, 0)
+    def __init__(self, rate=0.0, *, seed=0):
+        self.rate, self.counts = rate, Counter()
         self._random, self._lock = random.Random(seed), threading.Lock()
+        self.tell({})
 
-    def on(self, packet: Packet) -> Iterator[Piece]:
-        """Yield the pieces of a packet on the line."""
-        kind, data = None, encode(packet)
+    def tell(self, plan):
+        """Set the plan: (id, number of the packet with this id from now on) -> kind of damage, or id -> kind for all.
+
+        Commands and replies count together: 1 is the command, 2 its first reply.
+        """
+        self._plan, self._numbers = plan, Counter()
+
+    def on(self, packet):
+        """Return the pieces of a packet on the line, each with the pause in s before it; None cuts the line."""
         with self._lock:
-            if self._random.random() < self.rate:
-                kind = self._random.choice(self.kinds)
-                self.counts[kind] += 1
-        yield from self._damaged(kind, data) if kind else [Piece(data)]
+            self._numbers[packet.id] += 1
+            kind = self._plan.get((packet.id, self._numbers[packet.id])) or self._plan.get(packet.id)
+            if kind is None and self._random.random() < self.rate:
+                kind = self._random.choice(KINDS)
+            self.counts[kind] += kind is not None
+            return self._damaged(kind, encode(packet))
 
-    def _damaged(self, kind: str, data: bytes) -> Iterator[Piece]:
+    def _damaged(self, kind, data):
+        if kind == "dropped":
+            return []
         if kind == "corrupted":
-            damaged = bytearray(data)
-            damaged[self._random.randrange(len(data))] ^= 1 << self._random.randrange(8)
-            yield Piece(bytes(damaged))
-        elif kind == "delayed":
-            yield Piece(data, self.delay_s)
-        elif kind == "split":
+            number = self._random.randrange(8 * len(data))
+            return [(0, bytes(byte ^ (at == number // 8) << number % 8 for at, byte in enumerate(data)))]
+        if kind == "delayed":
+            return [(DELAY_S, data)]
+        if kind == "split":
             cut = self._random.randrange(1, len(data))
-            yield Piece(data[:cut])
-            yield Piece(data[cut:], self.delay_s)
-        elif kind == "disconnect":
-            yield Piece(None)
+            return [(0, data[:cut]), (DELAY_S, data[cut:])]
+        if kind == "disconnect":
+            return [(0, None)]
+        if kind == "long":  # claims 255 bytes, so the next packets are read as its payload
+            return [(0, data[:4] + b"\xff\x00" + data[6:])]
+        return [(0, data)]

