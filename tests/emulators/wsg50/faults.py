@@ -35,7 +35,8 @@ class LineFaults:
             kind = self._plan.get((packet.id, self._numbers[packet.id])) or self._plan.get(packet.id)
             if kind is None and self._random.random() < self.rate:
                 kind = self._random.choice(KINDS)
-            self.counts[kind] += kind is not None
+            if kind is not None:
+                self.counts[kind] += 1
             return self._damaged(kind, encode(packet))
 
     def _damaged(self, kind, data):
