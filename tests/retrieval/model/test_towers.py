@@ -211,44 +211,31 @@ def test_stage_statistics_are_those_of_each_map_concatenated():
     torch.testing.assert_close(stage_statistics([first, second]), expected)
 
 
-FIRST = {
-    "mobilenet_v2": ("features.2", "features.3.conv.0.0"),
-    "small": ("stages.2", "stages.3"),
-}
-
-
-@pytest.mark.parametrize("name", sorted(FIRST))
-def test_first_layers_of_a_tower_stay_in_float32_where_others_multiply_in_bfloat16(name):
+@pytest.mark.parametrize(
+    ("name", "first", "second"),
+    [("mobilenet_v2", "features.2", "features.3.conv.0.0"), ("small", "stages.2", "stages.3")],
+)
+def test_first_layers_of_a_tower_stay_in_float32_where_others_multiply_in_bfloat16(name, first, second):
     """An image rounded to bfloat16 has lost the differences between two gels."""
     tower, types = build_tower(name, "stages"), []
-    for place in FIRST[name]:
+    for place in (first, second):
         tower.get_submodule(place).register_forward_hook(lambda _, __, made: types.append(made.dtype))
     with torch.autocast("cpu", torch.bfloat16):
         tower(torch.rand(2, 3, 32, 32))
     assert types == [torch.float32, torch.bfloat16]
 
 
-def test_group_norms_of_the_small_tower_stay_in_float32_where_convolutions_do_not():
-    """PyTorch's own version rounds the result to bfloat16, and is slow."""
-    tower = build_tower("small", "pooled")
-    norm = next(module for module in tower.modules() if isinstance(module, nn.GroupNorm))
-    images = torch.rand(2, norm.num_channels, 8, 8, generator=torch.Generator().manual_seed(0)).bfloat16()
-    exact = nn.functional.group_norm(images.float(), norm.num_groups)
+def test_group_norms_and_strided_depthwise_convolutions_compute_in_float32_under_autocast():
+    """PyTorch's own versions round to bfloat16, and are slow."""
+    torch.manual_seed(0)
+    norm = next(module for module in build_tower("small").modules() if isinstance(module, nn.GroupNorm))
+    maps = torch.rand(2, norm.num_channels, 8, 8).bfloat16()
+    strided, image = InvertedResidual(8, 8, stride=2, expansion=2).conv[1][0], torch.rand(2, 16, 8, 8).bfloat16()
+    exact = functional.group_norm(maps.float(), norm.num_groups)
     with torch.autocast("cpu", torch.bfloat16):
-        ours, naive = norm(images), nn.functional.group_norm(images, norm.num_groups)
-        assert tower.stages[0](torch.zeros(1, 3, 8, 8)).dtype == torch.bfloat16
-    assert ours.dtype == torch.float32
+        ours, naive, got = norm(maps), functional.group_norm(maps, norm.num_groups), strided(image)
+    assert ours.dtype == got.dtype == torch.float32
     torch.testing.assert_close(ours, exact)
     assert (naive.float() - exact).abs().max() > 1e-3
-
-
-def test_strided_depthwise_convolutions_compute_in_float32_under_autocast():
-    torch.manual_seed(0)
-    block = InvertedResidual(8, 8, stride=2, expansion=2)
-    strided = block.conv[1][0]
-    image = torch.rand(2, 16, 8, 8)
-    with torch.autocast("cpu", torch.bfloat16):
-        got = strided(image.bfloat16())
-    assert got.dtype == torch.float32
-    expected = functional.conv2d(image.bfloat16().float(), strided.weight, stride=2, padding=1, groups=16)
+    expected = functional.conv2d(image.float(), strided.weight, stride=2, padding=1, groups=16)
     torch.testing.assert_close(got, expected)

@@ -44,27 +44,26 @@ def add_feedback(client, query, feedback, object_id=None):
     return client.post("/v1/feedback", json={"query": query, "feedback": feedback, "object_id": object_id})
 
 
-def test_history_stores_a_query_with_answer_and_gel_images(client, touches):
-    grasps = next(iter(touches.values()))
-    query, answer = ask(client, grasps)
-    entry = client.get(f"/v1/history/{query}").json()
-    assert entry["answer"] == answer
-    assert (entry["id"], entry["feedback"], entry["best"]) == (query, None, answer["results"][0]["object_id"])
-    assert [[client.get(path).content for path in paths] for paths in entry["touches"]] == grasps
-
-
-def test_the_history_is_paged_from_the_newest_and_searched(client, touches):
-    queries = [ask(client, grasps[:1])[0] for grasps in touches.values()]
+def test_the_history_stores_answers_and_gel_images_and_is_paged_from_the_newest_and_searched(client, touches):
+    asked = [ask(client, grasps) for grasps in touches.values()]
+    queries = [query for query, _ in asked]
+    for (query, answer), grasps in zip(asked, touches.values(), strict=True):
+        entry = client.get(f"/v1/history/{query}").json()
+        assert (entry["id"], entry["answer"], entry["feedback"]) == (query, answer, None)
+        assert entry["best"] == answer["results"][0]["object_id"]
+        assert [[client.get(path).content for path in paths] for paths in entry["touches"]] == grasps
     add_feedback(client, queries[0], "object", sorted(touches)[0])
     first = client.get("/v1/history", params={"limit": 2}).json()
     rest = client.get("/v1/history", params={"limit": 2, "offset": first["next"]}).json()
     assert [item["id"] for item in first["items"] + rest["items"]] == queries[::-1]
     assert (first["total"], rest["next"]) == (3, None)
-    words = {"search": f"object {sorted(touches)[0].upper()}"}
-    assert [item["id"] for item in client.get("/v1/history", params=words).json()["items"]] == queries[:1]
-    for feedback, found in (("missing", queries[:0:-1]), ("object", queries[:1]), ("none", [])):
-        items = client.get("/v1/history", params={"feedback": feedback}).json()["items"]
-        assert [item["id"] for item in items] == found
+    for filters, found in (
+        ({"search": f"object {sorted(touches)[0].upper()}"}, queries[:1]),
+        ({"feedback": "missing"}, queries[:0:-1]),
+        ({"feedback": "object"}, queries[:1]),
+        ({"feedback": "none"}, []),
+    ):
+        assert [item["id"] for item in client.get("/v1/history", params=filters).json()["items"]] == found
 
 
 def test_feedback_becomes_a_readable_recording(client, touches, folder, catalogue):
@@ -93,19 +92,20 @@ def test_feedback_right_records_the_found_object_once_and_is_not_changed(client,
     assert [grasp.object_id for grasp in load_grasps(folder / "recording")] == [best, best]
 
 
-def test_feedback_on_an_uncatalogued_object_is_stored_but_not_recorded(client, touches, folder):
+def test_feedback_on_an_uncatalogued_object_is_stored_but_not_recorded_and_invalid_feedback_refused(
+    client, touches, folder
+):
     query, _ = ask(client, next(iter(touches.values())))
+    problem(add_feedback(client, "no such query", "none"), 404, "unknown")
+    for feedback, object_id, words in (
+        ("object", None, "requires object_id"),
+        ("object", "nobody's", "The index has no object"),
+        ("right", "x", "takes no object_id"),
+    ):
+        assert words in problem(add_feedback(client, query, feedback, object_id), 422, "bad-input")
     assert add_feedback(client, query, "none", "a new mug").json()["recorded"] is False
     assert client.get(f"/v1/history/{query}").json()["object_id"] == "a new mug"
     assert (folder / "recording" / "metadata.jsonl").read_bytes() == b""
-
-
-def test_invalid_feedback_is_refused(client, touches):
-    query, _ = ask(client, next(iter(touches.values())))
-    problem(add_feedback(client, "no such query", "none"), 404, "unknown")
-    assert "requires object_id" in problem(add_feedback(client, query, "object"), 422, "bad-input")
-    assert "The index has no object" in problem(add_feedback(client, query, "object", "nobody's"), 422, "bad-input")
-    assert "takes no object_id" in problem(add_feedback(client, query, "right", "x"), 422, "bad-input")
 
 
 def test_unrecorded_feedback_is_recorded_at_the_next_start(index, touches, folder):
