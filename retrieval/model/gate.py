@@ -8,13 +8,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from _touch_retrieval.documents import check_fields
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import to_float
 from retrieval.errors import BadInput, CheckpointError, ConfigError, NumericalError
@@ -22,20 +23,18 @@ from retrieval.model.checkpoint import load_weights, read_tensors
 from retrieval.model.encode import one_thread, touch_batch
 
 TASK = "grasp-success"
-MOMENTS = ("after", "during")
 
 
 @dataclass(frozen=True)
 class GateSettings:
-    """Input of a gate: side of the image in pixels, and the frame, one of MOMENTS, that it compares with the first."""
+    """Input of a gate: side of the image in pixels, and the frame that it compares with the no-contact frame."""
 
     touch_px: int = 64
-    frame: str = "after"
+    frame: Literal["after", "during"] = "after"
 
     def __post_init__(self) -> None:
+        check_fields(self, "gate", ConfigError)
         self.preprocessing()
-        if self.frame not in MOMENTS:
-            raise ConfigError(f"the frame of a gate must be one of {', '.join(MOMENTS)}; got {self.frame!r}")
 
     def preprocessing(self) -> Preprocessing:
         """Return the preprocessing that makes float32 differences (touch_px, touch_px, 3) in -1..1."""

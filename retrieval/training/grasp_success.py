@@ -60,7 +60,7 @@ class GateReport:
 
     Attributes:
         path: File of the gate.
-        frame: The frame that it uses, one of `retrieval.model.gate.MOMENTS`.
+        frame: The frame that it uses, `retrieval.model.gate.GateSettings.frame`.
         train_grasps: Number of training grasps.
         train_held: Number of held grasps among them.
         validation_grasps: Number of validation grasps.

@@ -28,7 +28,7 @@ def concatenated_forward(matcher, touches, photos):
 def test_the_logit_from_partial_activations_equals_the_concatenated_forward(name, output):
     torch.manual_seed(0)
     matcher = Matcher(MatcherConfig(tower=name, tower_output=output, hidden=64)).eval()
-    touches, photos = torch.rand(3, 2, 3, 64, 64), torch.rand(3, 3, 64, 64)
+    touches, photos = torch.rand(3, 2, 3, 32, 32), torch.rand(3, 3, 32, 32)
     with torch.inference_mode():
         touch = matcher.touch_encoding(matcher.touch_features(touches))
         photo = matcher.photo_encoding(matcher.photo_features(photos))
@@ -42,7 +42,7 @@ def test_the_cosine_of_the_embeddings_adds_to_the_logit_and_is_part_of_the_parti
     torch.manual_seed(0)
     config = MatcherConfig(tower="small", tower_output="pooled", hidden=64, embedding_dim=16, cosine=True)
     matcher = Matcher(config).eval()
-    touches, photos = torch.rand(3, 2, 3, 64, 64), torch.rand(3, 3, 64, 64)
+    touches, photos = torch.rand(3, 2, 3, 32, 32), torch.rand(3, 3, 32, 32)
     with torch.inference_mode():
         touch = matcher.touch_encoding(matcher.touch_features(touches))
         photo = matcher.photo_encoding(matcher.photo_features(photos))
