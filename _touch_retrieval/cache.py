@@ -14,7 +14,6 @@ import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 _WAIT_S = 60.0
@@ -28,10 +27,10 @@ _SCHEMA = """
 
 
 def cache_key(group: str, *inputs: Any) -> str:
-    """Return a key, `group/digest`: equal for equal inputs.
+    """Return a key, `group/digest`, which is equal for equal inputs.
 
     Args:
-        group: Kind of the content, such as "features"; `Cache.keys` lists the entries of a group.
+        group: Kind of the content, such as "features".
         *inputs: All that determines the content, in JSON types: digests, settings, and a number that rises when the
             code gives other results.
 
@@ -73,9 +72,7 @@ class Cache:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._connection.close()
 
     def get(self, key: str) -> bytes | None:

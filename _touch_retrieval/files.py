@@ -88,14 +88,6 @@ def file_digest(path: Path) -> str:
         return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
-def encoded(document: Any, *, indent: int | None = None) -> bytes:
-    """Return JSON in UTF-8. Text that UTF-8 cannot represent (file names of unknown encoding) is escaped."""
-    try:
-        return json.dumps(document, ensure_ascii=False, allow_nan=False, indent=indent).encode()
-    except UnicodeEncodeError:
-        return json.dumps(document, allow_nan=False, indent=indent).encode()
-
-
 MAX_DEPTH = 64
 """Largest number of nested lists and objects. Recursive readers and writers of JSON fail at some larger depth."""
 MAX_FILE_BYTES = 512 * 2**20

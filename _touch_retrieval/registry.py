@@ -61,20 +61,19 @@ class Registry(Collection[str], Generic[T]):
         """Return the entry with this name. Raises the registry's error if it is unknown or unusable."""
         if name in self.table:
             return cast(T, _imported(self.table[name]))
-        installed = self._installed()
-        place = installed.get(name, name)
-        module, _, attribute = place.partition(":")
-        if not module or not attribute:
-            known = ", ".join(self.names())
-            raise self._error(
-                f"{self.noun} must be one of {known}; got {name!r}. Give module:Class for your own, or install a "
-                f"package that adds one by an entry point of the group {self.group}"
-            )
-        if name not in installed and module not in sys.modules:
-            raise self._error(
-                f"{self.noun} {name!r}: its module is not imported, and a name in a file cannot import it. Import "
-                f"{module} first, or install a package that adds it by an entry point of the group {self.group}"
-            )
+        place = self._installed().get(name)
+        if place is None:
+            place, (module, _, attribute) = name, name.partition(":")
+            if not module or not attribute:
+                raise self._error(
+                    f"{self.noun} must be one of {', '.join(self.names())}; got {name!r}. Give module:Class for your "
+                    f"own, or install a package that adds one by an entry point of the group {self.group}"
+                )
+            if module not in sys.modules:
+                raise self._error(
+                    f"{self.noun} {name!r}: its module is not imported, and a name in a file cannot import it. Import "
+                    f"{module} first, or install a package that adds it by an entry point of the group {self.group}"
+                )
         try:
             return self._checked(name, _imported(place))
         except (ImportError, AttributeError) as error:
@@ -85,31 +84,24 @@ class Registry(Collection[str], Generic[T]):
 
         Raises the registry's error if it is unknown or unusable.
         """
-        if isinstance(choice, str):
-            if choice in self.table:
-                return choice
-            if ":" in choice and choice not in self.names():
-                try:
-                    import_module(choice.partition(":")[0])
-                except ImportError as error:
-                    raise self._error(
-                        f"{self.noun} {choice!r} cannot be imported ({error}); install its package, or add its folder "
-                        "to PYTHONPATH"
-                    ) from error
+        if not isinstance(choice, str):
+            place = f"{getattr(choice, '__module__', None)}:{getattr(choice, '__qualname__', None)}"
+            self._checked(place, choice)
+            for name, known in {**self._installed(), **self.table}.items():
+                if known == place:
+                    return name
+            choice = place
+        elif ":" in choice and choice not in self.names():
+            try:
+                import_module(choice.partition(":")[0])
+            except ImportError as error:
+                raise self._error(
+                    f"{self.noun} {choice!r} cannot be imported ({error}); install its package, or add its folder to "
+                    "PYTHONPATH"
+                ) from error
+        if choice not in self.table:
             self.load(choice)
-            return choice
-        place = f"{getattr(choice, '__module__', None)}:{getattr(choice, '__qualname__', None)}"
-        self._checked(place, choice)
-        for name, known in {**self._installed(), **self.table}.items():
-            if known == place:
-                return name
-        try:
-            found = _imported(place)
-        except (ImportError, AttributeError):
-            found = None
-        if found is not choice:
-            raise self._error(f"{self.noun} {place!r} must be defined at the top level of its module")
-        return place
+        return choice
 
     def resolve(self, choice: "str | T") -> T:
         """Return the entry for a user's choice; raises as `name_of`."""

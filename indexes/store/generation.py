@@ -1,5 +1,6 @@
 """A generation of an index: its folder is written part by part, and opened for searching as a whole."""
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from datetime import UTC, datetime
@@ -161,7 +162,7 @@ class Draft:
                 if is_array:
                     np.save(file, value)
                 else:
-                    file.write(files.encoded(value, indent=2) + b"\n")
+                    file.write(json.dumps(value, allow_nan=False, indent=2).encode() + b"\n")
         self._documents = sorted(documents)
 
     def build_index(

@@ -11,7 +11,7 @@ from typing import Annotated, Any, TypeVar
 from msgspec import Meta
 
 from _touch_retrieval.documents import typed
-from _touch_retrieval.files import durable_file, encoded, file_digest, open_regular, read_json
+from _touch_retrieval.files import durable_file, file_digest, open_regular, read_json
 from indexes.errors import AGAIN, CorruptIndex, RowError, UnsupportedFormat
 
 FORMAT = 6
@@ -85,7 +85,8 @@ def read_manifest(folder: Path) -> Manifest:
 def encode_document(content: Any, version: int) -> bytes:
     """Return the JSON of a dataclass, with the format version first and the digest of the content last."""
     document = {"format": version} | asdict(content)
-    return encoded(document | {"sha256": content_digest(document)}, indent=2) + b"\n"
+    document["sha256"] = content_digest(document)
+    return json.dumps(document, allow_nan=False, indent=2).encode() + b"\n"
 
 
 def read_document(path: Path, version: int, kind: type[T]) -> T:

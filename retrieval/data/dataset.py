@@ -77,7 +77,8 @@ class Attempt:
     Attributes:
         outcome: "held", "missed", "slipped", "no_plan"; "failed" for another failure; "unknown" if not recorded.
         accepted: Whether a matcher is trained on it.
-        after: Frames after the lift, one file per finger in order, or empty. `time_s`: since the recording began.
+        after: Frames after the lift, one file per finger in order, or empty.
+        time_s: Time since the recording began.
     """
 
     grasp: Grasp
@@ -150,8 +151,10 @@ def recording_licence(folder: Path) -> DataLicence:
 def object_kinds(folder: Path) -> dict[str, str]:
     """Return the class of each object whose class a recording names in its recording.json."""
     objects = read_info(folder).get("objects")
-    entries = objects.items() if isinstance(objects, dict) else ()
-    return {name: str(about["class"]) for name, about in entries if isinstance(about, dict) and "class" in about}
+    entries = objects if isinstance(objects, dict) else {}
+    return {
+        name: str(about["class"]) for name, about in entries.items() if isinstance(about, dict) and "class" in about
+    }
 
 
 def finger_count(grasps: Sequence[Grasp]) -> int:
@@ -217,17 +220,15 @@ def make_split(grasps: Sequence[Grasp], *, validation: float, test: float, seed:
     groups = linked_objects(grasps)
     queue = [groups[index] for index in np.random.default_rng(seed).permutation(len(groups))]
     total = sum(len(group) for group in groups)
-    chosen = {
-        name: _take(queue, fraction * total) if fraction > 0 else ()
-        for name, fraction in (("test", test), ("validation", validation))
-    }
+    wanted = {"test": test, "validation": validation}
+    chosen = {name: _take(queue, fraction * total) if fraction > 0 else () for name, fraction in wanted.items()}
     train = tuple(sorted(name for group in queue for name in group))
-    parts = [train] + [chosen[name] for name, part in (("test", test), ("validation", validation)) if part > 0]
+    parts = [train, *(chosen[name] for name, fraction in wanted.items() if fraction > 0)]
     if min(map(len, parts)) < 2:
         raise DatasetError(
             f"a split into {len(parts)} parts needs two objects in each, and objects that share a sequence stay "
-            f"together; the recording has {total} objects in {len(groups)} such groups, and the fractions give parts "
-            f"of {' + '.join(str(len(part)) for part in parts)} objects; record more objects, or give your own split"
+            f"together; the recording has {total} objects in {len(groups)} such groups: record more objects, or give "
+            "your own split"
         )
     return Split(seed=seed, train=train, **chosen)
 

@@ -23,7 +23,6 @@ from retrieval.errors import BadInput
 
 FOLDER, STEM = "folder", "stem"
 OBJECT = "object"
-
 NOT_OBJECTS = frozenset(
     {"catalog", "catalogue", "data", "dataset", "dev", "gallery", "image", "images", "img", "imgs", "jpeg", "jpg"}
     | {"object", "objects", "photo", "photos", "pic", "pics", "picture", "pictures", "png", "raw", "rgb"}
@@ -94,12 +93,7 @@ def without_number(name: str) -> str:
 
 
 def naming_warnings(photos: Mapping[str, int], naming: Naming) -> list[str]:
-    """Return a warning sentence for each suspicious property of the object names.
-
-    Args:
-        photos: Number of photos by object.
-        naming: The rule that gave the names.
-    """
+    """Return a warning sentence for each suspicious property of the object names, given their numbers of photos."""
     names, warnings = sorted(photos), []
     if generic := [name for name in names if name.casefold() in NOT_OBJECTS]:
         warnings.append(

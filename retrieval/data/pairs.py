@@ -45,9 +45,8 @@ class PairSampler:
     random permutations. A negative is a uniformly drawn object of the SAME set, then a uniformly drawn photo of it.
 
     With `share_photos`, the negatives of a training batch are positives of its other objects. The probability of each
-    object and photo stays the same, since a batch draws both uniformly. But 6 touches need 24 encoded photos instead of
-    up to 48. The variance of the head's gradient over batches is 0.6 times that without `share_photos` at the start of
-    training and 1.06 times at its end (shipped checkpoint's features). Use it if training encodes photos with a tower.
+    object and photo stays the same, but 6 touches need 24 encoded photos instead of up to 48. The variance of the
+    head's gradient is 0.6 to 1.06 times that without it. Use it if training encodes photos with a tower.
     """
 
     def __init__(

@@ -96,11 +96,7 @@ def _ground_residuals(values: NDArray[np.float32]) -> tuple[NDArray[np.float32],
 
 @lru_cache(maxsize=1)
 def _border() -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the terms of the plane fit.
-
-    Indices (R,) of the border's pixels; the planes 1, x and y of all pixels (3, S * S); and the products (R, 9) of any
-    two planes at the border's pixels.
-    """
+    """Return the border's pixels (R,), the planes 1, x and y (3, S * S), and their products (R, 9) at the border."""
     inside = np.zeros((_SIDE, _SIDE), bool)
     inside[_RING:-_RING, _RING:-_RING] = True
     ring = np.flatnonzero(~inside)
@@ -179,21 +175,14 @@ _VIEW_FRACTIONS = {"whole": 1.0, "zoom": _ZOOM_FRACTION, "grey": _ZOOM_FRACTION}
 def min_photo_side(names: Sequence[str], px: int) -> int:
     """Return the smallest shorter side in pixels of a photo that is sufficient for these views and the object search.
 
-    Each pixel of a view then has OVERSAMPLING pixels of the photo along a side. The view `crop` is not considered,
-    since it depends on the object (`min_photo_side_for_crop`).
+    The view `crop` is not considered, since it depends on the object (`min_photo_side_for_crop`).
     """
     sides = [OVERSAMPLING * px / _VIEW_FRACTIONS[name] for name in names if name in _VIEW_FRACTIONS]
     return math.ceil(max([_SIDE, OVERSAMPLING * px, *sides]))
 
 
 def min_photo_side_for_crop(box: PixelBox, short: int, px: int) -> int:
-    """Return the smallest shorter side that is sufficient for the view `crop`.
-
-    Args:
-        box: The object's box in a reduced decoding of the photo.
-        short: Shorter side of that decoding in pixels.
-        px: Side of the view in pixels.
-    """
+    """Return the side that is sufficient for the view `crop`, from the object's box at the shorter side `short`."""
     fraction = _CROP_MARGIN * max(box.right - box.left, box.bottom - box.top, 1) / short
     return math.ceil(OVERSAMPLING * px / float(fraction))
 
@@ -201,11 +190,7 @@ def min_photo_side_for_crop(box: PixelBox, short: int, px: int) -> int:
 def tile_views(image: Samples, names: Sequence[str], px: int, box: PixelBox | None = None) -> RgbImage:
     """Return the views of a photo (H, W, 3), side by side: (px, len(names) * px, 3).
 
-    Args:
-        image: The photo.
-        names: Names of the views.
-        px: Side of each view in pixels.
-        box: The object's box; None to search for it.
+    The object's box is searched for if it is None and a view needs it.
     """
     if box is None:
         box = PixelBox(0, 0, 0, 0) if set(names) == {"whole"} else find_object(image)

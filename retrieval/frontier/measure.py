@@ -3,6 +3,7 @@
 Each finished row is stored, so a stopped run continues with the missing rows.
 """
 
+import json
 from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from _touch_retrieval.cache import cache_key
-from _touch_retrieval.files import encoded, file_digest, write_atomically
+from _touch_retrieval.files import file_digest, write_atomically
 from retrieval.console.output import say
 from retrieval.data.dataset import AnyRecording, folder_of
 from retrieval.frontier import APPROXIMATIONS
@@ -84,7 +85,7 @@ def measure_frontier(
                 say(f"{name}: {line}")
     content = {"software": __version__, "machine": machine(), "model": model_digest, "scale": scale, "rows": rows}
     document: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(content))
-    write_atomically(out / "frontier.json", encoded(document, indent=1))
+    write_atomically(out / "frontier.json", json.dumps(document, allow_nan=False, indent=1).encode())
     write_frontier(out, rows, machine(), scale.quick)
     return document
 

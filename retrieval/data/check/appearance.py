@@ -148,10 +148,9 @@ def changed_layout(images: SmallImages) -> tuple[str, Rows] | None:
     """Return the change in words, and the minority of images that have red and blue exchanged, or are mirrored, if any.
 
     The lamps of a gel give each sensor a layout of colours, which contact changes little. An image minus its changed
-    version is the same for all images of a sensor, up to contact; in a changed image it has the other sign, as in
-    `swapped_fingers`. Grey or symmetric layouts cannot be checked, and neither can images that are all changed. Of
-    several changes the one is returned that brings the minority nearest to the other images. If half of the images are
-    changed, they are the half without the first image. All images (n, h, w, 3) are of one sensor.
+    version is the same for all images (n, h, w, 3) of a sensor, up to contact; in a changed image it has the other
+    sign, as in `swapped_fingers`. Grey or symmetric layouts cannot be checked. Of several changes the one is returned
+    that brings the minority nearest to the other images. Of two halves, the one with the first image is right.
     """
     found: dict[float, tuple[str, Rows]] = {}
     for change, index in CHANGES.items() if len(images) >= _MIN_GRASPS else ():

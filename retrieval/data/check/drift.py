@@ -78,11 +78,9 @@ class NearestGraspAccuracy:
 
     Attributes:
         accuracy: Mean over objects of the fraction of grasps whose nearest other grasp has the same object.
-        low: Lower end of its 95 % interval, which resamples objects.
-        high: Upper end.
+        low, high: Its 95 % interval, which resamples objects.
         chance: Expected accuracy by chance.
-        queries: Number of grasps of objects with at least two.
-        objects: Number of these objects.
+        queries, objects: Numbers of grasps of objects with at least two, and of these objects.
     """
 
     accuracy: float
@@ -106,16 +104,9 @@ class NearestGraspAccuracy:
 def nearest_grasp_accuracy(
     values: NDArray[np.floating] | NDArray[np.integer], objects: NDArray[np.int64]
 ) -> NearestGraspAccuracy | None:
-    """Return how well values of grasps identify their objects by the nearest other grasp.
+    """Return how well values (n, ...) of grasps identify their objects (n,) by the nearest other grasp.
 
-    Equally near grasps count by expectation.
-
-    Args:
-        values: (n, ...) values of the grasps.
-        objects: (n,) object numbers.
-
-    Returns:
-        The accuracy, or None if there is only one object, or no object has two grasps.
+    Equally near grasps count by expectation. None if there is only one object, or no object has two grasps.
     """
     others = np.bincount(objects)[objects] - 1  # grasps of the same object
     if not others.any() or others.max() == len(objects) - 1:

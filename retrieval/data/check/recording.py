@@ -128,43 +128,33 @@ def _duplicates(folder: Path, grasps: Sequence[Grasp], records: ImageRecords) ->
 
 def _same_or_flat_images(attempts: Sequence[Attempt], records: ImageRecords) -> Iterator[Finding]:
     """Find grasps with the same bytes for two of their images, or with an image of a single colour."""
-    names: dict[tuple[str, str, str], list[str]] = {
-        ("error", "same-modality", "photo and touch are the same image"): [],
-        ("warning", "same-fingers", "two fingers have the same image"): [],
-        ("error", "frozen-frame", "touch and no-contact frame are the same image"): [],
-        ("error", "dead-frame", "the photo has a single colour (a dead frame)"): [],
-        ("error", "dead-frame", "a touch has a single colour (a dead frame)"): [],
-        ("error", "dead-frame", "a no-contact frame has a single colour (a dead frame)"): [],
-    }
+    names: dict[tuple[str, str, str], list[str]] = defaultdict(list)
     for attempt in attempts:
         grasp = attempt.grasp
         photo, touches = records[grasp.photo], [records[path] for path in grasp.touches]
         backgrounds = [records[path] for path in grasp.backgrounds]
         digests = {touch.digest for touch in touches}
-        faults = (
-            photo.digest in digests,
-            len(digests) < len(touches),
-            # A grasp that missed may leave the gel untouched.
-            attempt.accepted and bool(digests & {frame.digest for frame in backgrounds}),
-            photo.is_flat,
-            any(touch.is_flat for touch in touches),
-            any(frame.is_flat for frame in backgrounds),
-        )
-        for is_faulty, grasp_ids in zip(faults, names.values(), strict=True):
+        # A grasp that missed may leave the gel untouched.
+        is_frozen = attempt.accepted and digests & {frame.digest for frame in backgrounds}
+        for is_faulty, severity, kind, text in (
+            (photo.digest in digests, "error", "same-modality", "photo and touch are the same image"),
+            (len(digests) < len(touches), "warning", "same-fingers", "two fingers have the same image"),
+            (is_frozen, "error", "frozen-frame", "touch and no-contact frame are the same image"),
+            (photo.is_flat, "error", "dead-frame", "the photo has a single colour"),
+            (any(one.is_flat for one in touches), "error", "dead-frame", "a touch has a single colour"),
+            (any(one.is_flat for one in backgrounds), "error", "dead-frame", "a no-contact frame has a single colour"),
+        ):
             if is_faulty:
-                grasp_ids.append(grasp.grasp_id)
+                names[severity, kind, text].append(grasp.grasp_id)
     for finding, grasp_ids in names.items():
         yield from findings_for(*finding, grasp_ids, [attempt.grasp for attempt in attempts])
 
 
 def _repeated_touches(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
     """Find touches that several grasps of one object share byte for byte."""
-    users: dict[tuple[str, str], set[str]] = defaultdict(set)
-    for grasp in grasps:
-        for path in grasp.touches:
-            users[grasp.object_id, records[path].digest].add(grasp.grasp_id)
-    repeated = set().union(*(names for names in users.values() if len(names) > 1))
-    names = [grasp.grasp_id for grasp in grasps if grasp.grasp_id in repeated]
+    keys = {one.grasp_id: {(one.object_id, records[path].digest) for path in one.touches} for one in grasps}
+    counts = Counter(key for its in keys.values() for key in its)
+    names = [name for name, its in keys.items() if any(counts[key] > 1 for key in its)]
     yield from findings_for(
         "warning", "repeated-touch", "another grasp of the object has the same touch", names, grasps
     )

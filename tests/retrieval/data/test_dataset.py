@@ -230,9 +230,7 @@ def test_a_part_with_fraction_zero_is_empty_and_the_error_counts_too_few_objects
 
 
 def test_fractions_and_sequences_that_leave_too_few_training_objects_are_an_error_with_counts():
-    with pytest.raises(
-        DatasetError, match=r"has 7 objects in 7 such groups, and the fractions give parts of 1 \+ 3 \+ 3 objects"
-    ):
+    with pytest.raises(DatasetError, match=r"has 7 objects in 7 such groups"):
         make_split(grasps_of(*[1] * 7), validation=0.4, test=0.4, seed=0)
     one_take = [grasp(f"object-{i}", 0, "one long take") for i in range(9)]
     with pytest.raises(DatasetError, match="has 9 objects in 1 such groups"):
