@@ -1,5 +1,6 @@
 """Routes of the human baseline (`retrieval.serve.trials`)."""
 
+from collections import defaultdict
 from collections.abc import Sequence
 from string import ascii_lowercase
 from typing import Annotated, Any
@@ -48,13 +49,8 @@ def _trial(parts: Service, number: int) -> Trial:
 def _accuracy(right: Sequence[bool]) -> dict[str, float]:
     """Return the accuracy of choices with its exact 95 % confidence interval (Clopper and Pearson 1934)."""
     low, high = binomial_interval(sum(right), len(right))
-    return {
-        "right": sum(right),
-        "trials": len(right),
-        "accuracy": sum(right) / len(right),
-        "low": low,
-        "high": high,
-    }
+    accuracy = sum(right) / len(right)
+    return {"right": sum(right), "trials": len(right), "accuracy": accuracy, "low": low, "high": high}
 
 
 @router.get("/v1/trials")
@@ -64,10 +60,9 @@ def trials(parts: Parts) -> dict[str, Any]:
     next: the number of the person's next trial.
     """
     known, store = _require_trials(parts)
-    choices = store.choices(known.folder.name)
-    groups = [
-        [one for one in choices if one.participant == name] for name in dict.fromkeys(c.participant for c in choices)
-    ]
+    choices = defaultdict(list)
+    for one in store.choices(known.folder.name):
+        choices[one.participant].append(one)
     return {
         "recording": known.folder.name,
         "objects": len(known.unseen(parts.generations.current)),
@@ -75,12 +70,12 @@ def trials(parts: Parts) -> dict[str, Any]:
         "chance": 1 / CHOICES,
         "participants": [
             {
-                "participant": group[0].participant,
-                "next": 1 + max(one.number for one in group),
-                "human_baseline": _accuracy([one.choice == one.truth for one in group]),
-                "model": _accuracy([one.model == one.truth for one in group]),
+                "participant": name,
+                "next": 1 + max(one.number for one in done),
+                "human_baseline": _accuracy([one.choice == one.truth for one in done]),
+                "model": _accuracy([one.model == one.truth for one in done]),
             }
-            for group in groups
+            for name, done in choices.items()
         ],
     }
 

@@ -231,7 +231,7 @@ def test_a_recording_that_cannot_train_a_gate_is_refused(tmp_path, case):
 
 
 def test_settings_and_an_output_that_are_impossible_are_refused(attempts, tmp_path):
-    with pytest.raises(ConfigError, match="gate.frame must be one of 'after', 'during'"):
+    with pytest.raises(ConfigError, match=r"gate\.frame must be one of 'after', 'during'"):
         GateSettings(frame="later")
     with pytest.raises(ConfigError, match="touch_px"):
         GateSettings(touch_px=0)
