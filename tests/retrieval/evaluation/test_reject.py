@@ -1,7 +1,5 @@
 """Open-set rejection: plain loops, perfect and uninformative scorers, and hard scores."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -77,36 +75,22 @@ def test_a_larger_gallery_with_the_object_makes_an_uninformative_scorer_seem_bet
 def test_area_and_balanced_accuracy_equal_plain_loops():
     posterior, table = fit(planted(gap=1.5, seed=1)), planted(gap=1.5, seed=2)
     found = reject(posterior, table)
-    present, absent = by_hand(posterior, table)
+    ratios = []
+    for row, scores in enumerate(table.scores):
+        others = [(table.photo_owner == name) & (np.arange(len(scores)) != row) for name in table.objects]
+        likelihoods = [np.mean([np.exp(posterior.slope * float(score)) for score in scores[mine]]) for mine in others]
+        ratios.append(np.log(likelihoods) + posterior.offset)
+    present, absent = statistics(np.array(ratios), table.touch_owner[:, None] == table.objects)
     won = [1.0 if a > b else 0.5 if a == b else 0.0 for a in present for b in absent]
     assert value(found.auroc) == pytest.approx(np.mean(won))
     accepted = [np.mean([each >= 0 for each in part]) for part in (present, absent)]
     assert value(found.balanced_accuracy) == pytest.approx((accepted[0] + 1 - accepted[1]) / 2)
 
 
-def by_hand(posterior, table):
-    """Return the statistics of every row, one at a time; the module itself drops the rival."""
-    ratios, true = [], []
-    for row, mine in enumerate(table.touch_owner):
-        logs = []
-        for name in np.unique(table.photo_owner):
-            scores = [
-                float(table.scores[row, c])
-                for c in range(len(table.photo_owner))
-                if table.photo_owner[c] == name and c != row
-            ]
-            likelihood = np.mean([np.exp(posterior.slope * score) for score in scores])
-            logs.append(np.log(likelihood) + posterior.offset)
-        ratios.append(logs)
-        true.append([name == mine for name in np.unique(table.photo_owner)])
-    return statistics(np.array(ratios), np.array(true))
-
-
 def test_the_decision_is_that_of_a_query_at_even_prior():
     posterior, table = fit(planted(gap=1.5, seed=1)), planted(gap=1.5, seed=2, objects=5, grasps=2)
     ratios = identification_trials(table).log_ratios(posterior)
-    true = table.touch_owner[:, None] == table.objects
-    for gallery in galleries(ratios, true):
+    for gallery in galleries(ratios, table.touch_owner[:, None] == table.objects):
         for row, log_odds in zip(gallery, statistic(gallery), strict=True):
             logits = (row[np.isfinite(row)] - posterior.offset) / posterior.slope
             none = posterior.probabilities_given(logits, posterior.mass(logits)).none
@@ -149,14 +133,13 @@ def test_the_roc_runs_from_corner_to_corner_and_has_the_reported_area():
     assert (np.diff(hits) >= 0).all()
     assert len(found.roc) <= 200
     assert np.trapezoid(hits, alarms) == pytest.approx(value(found.auroc), abs=1e-9)
-    json.dumps(found.roc)
 
 
 def test_values_vary_over_objects_as_the_area_varies_over_draws_of_objects():
     """Naive: half of P(present > absent) + P(present > absent) has the right mean but half the spread."""
     areas, errors, naive = [], [], []
     rng, posterior = np.random.default_rng(0), fit(planted())
-    for trial in range(60):
+    for trial in range(40):
         skill = rng.normal(1.0, 1.0, 14)
         owner = np.repeat(np.arange(14), 6)
         noise = rng.normal(size=(84, 84))
@@ -166,7 +149,7 @@ def test_values_vary_over_objects_as_the_area_varies_over_draws_of_objects():
         areas.append(means.mean())
         errors.append(means.std(ddof=1) / np.sqrt(14))
         naive.append(((means + means.mean()) / 2).std(ddof=1) / np.sqrt(14))
-    assert np.mean(errors) == pytest.approx(np.std(areas, ddof=1), rel=0.3)  # 60 trials measure a deviation to 10 %
+    assert np.mean(errors) == pytest.approx(np.std(areas, ddof=1), rel=0.35)  # 40 trials measure a deviation to 12 %
     assert np.mean(naive) < 0.7 * np.std(areas, ddof=1)
 
 
@@ -174,7 +157,7 @@ def test_the_false_accept_rate_varies_over_objects_as_over_draws_of_objects():
     """Naive: with a fixed threshold the spread is far too small."""
     rates, errors, naive = [], [], []
     rng = np.random.default_rng(0)
-    for _ in range(200):
+    for _ in range(120):
         owner = np.repeat(np.arange(18), 12)
         present = (2 + rng.normal(size=18))[owner] + rng.normal(size=len(owner))
         absent = rng.normal(size=18)[owner] + rng.normal(size=len(owner))
@@ -183,5 +166,5 @@ def test_the_false_accept_rate_varies_over_objects_as_over_draws_of_objects():
         errors.append(means.std(ddof=1) / np.sqrt(18))
         accepted = (absent >= np.quantile(present, 0.05))[:, None].astype(float)
         naive.append(object_means(accepted, owner)[1].std(ddof=1) / np.sqrt(18))
-    assert np.mean(errors) == pytest.approx(np.std(rates, ddof=1), rel=0.2)
+    assert np.mean(errors) == pytest.approx(np.std(rates, ddof=1), rel=0.25)
     assert np.mean(naive) < 0.75 * np.std(rates, ddof=1)

@@ -12,7 +12,7 @@ from retrieval.methods.late_fusion import LateFusion
 from retrieval.methods.method import MethodSettings
 from retrieval.methods.retrieve_rerank import RetrieveRerank
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.training.features import Features, encode_recording
+from retrieval.training.features import encode_recording
 from retrieval.training.initial_weights import build_matcher
 from retrieval.training.loop import state_path
 from retrieval.training.train import Trainer, train
@@ -95,37 +95,30 @@ def test_a_finished_fit_is_not_trained_again(fitted, parts, monkeypatch):
     assert fit(RetrieveRerank, parts, fitted.settings.folder).best_params["step"] == fitted.best_params["step"]
 
 
-def test_another_setting_or_other_features_are_trained_again(parts, tmp_path):
+def test_another_setting_or_other_features_are_trained_again(parts, tmp_path, monkeypatch):
+    monkeypatch.setattr("retrieval.training.batches.touch_features", lambda *_: pytest.fail("read an image"))
     first = fit(LateFusion, parts, tmp_path)
     slower = with_training(FROZEN, learning_rate=1e-4)
     assert fit(LateFusion, parts, tmp_path, slower).best_params != first.best_params
-    back = fit(LateFusion, parts, tmp_path)
-    assert back.best_params == first.best_params
+    assert fit(LateFusion, parts, tmp_path).best_params == first.best_params
     moved = dataclasses.replace(parts[0], touch=parts[0].touch + 1)
     assert fit(LateFusion, (moved, *parts[1:]), tmp_path).best_params != first.best_params
 
 
-def stopped(parts, folder, monkeypatch, config=FROZEN):
-    """Interrupt a fit in its fourth step, after the state of the third is on disk."""
-    loss = Trainer.loss
+def test_an_interrupted_fit_continues_and_ends_bit_for_bit_the_same(fitted, parts, tmp_path, monkeypatch):
+    loss, path = Trainer.loss, tmp_path / "late_fusion-0.safetensors"
 
     def failing(self, step, loaded):
-        if step == 3:
+        if step == 3:  # the state of the third step is on disk
             raise JobInterrupted("power cut")
         return loss(self, step, loaded)
 
     with monkeypatch.context() as during:
         during.setattr(Trainer, "loss", failing)
         with pytest.raises(JobInterrupted):
-            fit(LateFusion, parts, folder, config)
-    assert state_path(folder / "late_fusion-0.safetensors").is_file()
-    assert not (folder / "late_fusion-0.safetensors").exists()
-
-
-def test_an_interrupted_fit_continues_and_ends_bit_for_bit_the_same(fitted, parts, tmp_path, monkeypatch):
-    stopped(parts, tmp_path, monkeypatch)
+            fit(LateFusion, parts, tmp_path)
+    assert (state_path(path).is_file(), path.exists()) == (True, False)
     fit(LateFusion, parts, tmp_path)
-    path = tmp_path / "late_fusion-0.safetensors"
     assert path.read_bytes() == (fitted.settings.folder / path.name).read_bytes()
     assert not state_path(path).exists()
 
@@ -149,12 +142,6 @@ def test_features_of_other_towers_are_refused(parts):
         fit(LateFusion, cut, None)
 
 
-def test_a_fit_on_features_reads_no_image(parts, tmp_path, monkeypatch):
-    monkeypatch.setattr("retrieval.training.batches.touch_features", lambda *_: pytest.fail("read an image"))
-    monkeypatch.setattr("retrieval.training.batches.photo_features", lambda *_: pytest.fail("read an image"))
-    fit(LateFusion, parts, tmp_path)
-
-
 def expected_order(logits, nearness, count):
     """Return the photos nearest to all grasps of the set by their summed logit, then the others by nearness."""
     mean = nearness.mean(0)
@@ -164,12 +151,7 @@ def expected_order(logits, nearness, count):
 
 @pytest.mark.parametrize("grasps", [1, 2, 3])
 def test_reranking_orders_candidates_by_logit_and_the_rest_after_them_by_embedding(grasps, fitted, parts):
-    every = Features(
-        parts[0].grasp_ids + parts[2].grasp_ids,
-        parts[0].object_ids + parts[2].object_ids,
-        np.concatenate([parts[0].touch, parts[2].touch]),
-        np.concatenate([parts[0].photo, parts[2].photo]),
-    )
+    every = parts[0].concatenate(parts[2])
     method = fit(RetrieveRerank, parts, fitted.settings.folder)
     matcher = load_checkpoint(fitted.settings.folder / "late_fusion-0.safetensors").matcher
     with torch.inference_mode():

@@ -73,33 +73,19 @@ def values_of(measure):
 # Pairs -----------------------------------------------------------------------------------------------------
 
 
-def test_pair_accuracy_equals_that_of_two_loops():
+def test_pair_accuracy_and_auc_equal_those_of_two_loops():
     table = uneven()
-    found = values_of(pair_accuracy(table, 1.0))
+    accuracy, area = values_of(pair_accuracy(table, 1.0)), values_of(pair_auc(table))
     for row in range(14):
-        true = np.mean([correctness(2 * table.scores[row, column] - 2) for column in mine_of(table, row)])
-        false = np.mean(
-            [
-                np.mean([1 - correctness(2 * table.scores[row, column] - 2) for column in columns])
-                for columns in others_of(table, row).values()
-            ]
-        )
-        assert found[row] == pytest.approx((true + false) / 2, abs=1e-12)
-
-
-def correctness(log_odds):
-    return 0.5 if log_odds == 0 else float(log_odds > 0)
-
-
-def test_pair_auc_equals_that_of_two_loops():
-    table = uneven()
-    found = values_of(pair_auc(table))
-    for row in range(14):
+        above = [0.5 if score == 1 else float(score > 1) for score in table.scores[row]]
+        mine, others = mine_of(table, row), others_of(table, row).values()
+        false = np.mean([np.mean([1 - above[column] for column in columns]) for columns in others])
+        assert accuracy[row] == pytest.approx((np.mean([above[column] for column in mine]) + false) / 2, abs=1e-12)
         wins = []
-        for columns in others_of(table, row).values():
-            pairs = [(table.scores[row, a], table.scores[row, b]) for a in mine_of(table, row) for b in columns]
+        for columns in others:
+            pairs = [(table.scores[row, a], table.scores[row, b]) for a in mine for b in columns]
             wins.append(np.mean([1.0 if a > b else 0.5 if a == b else 0.0 for a, b in pairs]))
-        assert found[row] == pytest.approx(np.mean(wins), abs=1e-12)
+        assert area[row] == pytest.approx(np.mean(wins), abs=1e-12)
 
 
 def test_an_object_with_many_photos_is_a_rival_as_often_as_one_with_few():
@@ -128,13 +114,13 @@ def k_way_by_enumeration(table, row, k, photos):
     return curve / cases
 
 
-@pytest.mark.parametrize(("k", "photos"), [(3, 1), (2, 2), (4, 3)])
+@pytest.mark.parametrize(("k", "photos"), [(3, 1), (4, 3)])
 def test_k_way_curves_converge_to_those_over_every_draw(k, photos):
     table = uneven(values=2)
-    found = k_way(table, k, photos=photos, draws=1500)
+    found = k_way(table, k, photos=photos, draws=600)
     for row in range(14):
         exact = k_way_by_enumeration(table, row, k, photos)
-        np.testing.assert_allclose(found.values[row], exact, atol=0.065)  # five standard errors of 1,500 draws
+        np.testing.assert_allclose(found.values[row], exact, atol=0.1)  # five standard errors of 600 draws
 
 
 def test_there_is_no_test_of_more_candidates_than_objects():
@@ -153,10 +139,10 @@ def ranked_places(table, row, own_shown, order):
 
 
 def full_by_loops(table, row, own_shown=False):
-    """Return means over 2,000 random orders of ties."""
+    """Return means over 600 random orders of ties."""
     rng = np.random.default_rng(row)
     columns = len(table.photo_owner)
-    cases = [ranked_places(table, row, own_shown, rng.permutation(columns)) for _ in range(2000)]
+    cases = [ranked_places(table, row, own_shown, rng.permutation(columns)) for _ in range(600)]
     return {
         "recall_1": np.mean([places[0] <= 1 for places in cases]),
         "recall_5": np.mean([places[0] <= 5 for places in cases]),
@@ -173,7 +159,7 @@ def test_measures_of_the_full_gallery_equal_those_of_two_loops(transposed):
     for row in range(14):
         expected = full_by_loops(table, row)
         for name in ("recall_1", "recall_5", "recall_10", "map"):
-            assert found[name].values[row, 0] == pytest.approx(expected[name], abs=0.055), name
+            assert found[name].values[row, 0] == pytest.approx(expected[name], abs=0.1), name
 
 
 def test_with_the_own_photo_a_scorer_that_only_recognises_each_grasps_lighting_would_beat_chance():
@@ -219,8 +205,8 @@ def every_measure(table):
     }
 
 
-@pytest.mark.parametrize("value", [0.0, 4.0, -3e38])
-def test_a_constant_scorer_is_exactly_at_chance_in_every_protocol(value):
+@pytest.mark.parametrize("value", [0.0, -3e38])
+def test_a_constant_scorer_is_exactly_at_chance_in_every_measure(value):
     table = uneven()
     table = table_of(np.full((14, 14), value), table.touch_owner)
     for name, measure in every_measure(table).items():
@@ -228,7 +214,7 @@ def test_a_constant_scorer_is_exactly_at_chance_in_every_protocol(value):
         np.testing.assert_allclose(means.mean(0), measure.chance, atol=1e-12, err_msg=name)
 
 
-def test_a_perfect_scorer_is_right_in_every_protocol():
+def test_a_perfect_scorer_is_right_in_every_measure():
     for name, measure in every_measure(perfect()).items():
         np.testing.assert_allclose(measure.values, 1, atol=1e-12, err_msg=name)
 
@@ -238,16 +224,11 @@ def test_a_perfect_scorer_is_right_in_every_protocol():
 
 def test_rows_without_another_photo_of_their_object_are_counted_and_neither_hidden_nor_scored_0():
     table = table_of(np.arange(16).reshape(4, 4), [0, 0, 1, 2])
-    measures = {**every_measure_of_few(table), "auc": pair_auc(table)}
-    for name, measure in measures.items():
-        assert measure.owner.tolist() == [0, 0], name
-        assert measure.gallery.endswith("; 2 touches left out, which have no other"), name
+    for measure in (pair_accuracy(table, 0.0), pair_auc(table), k_way(table, 2), *full_gallery(table).values()):
+        assert measure.owner.tolist() == [0, 0]
+        assert measure.gallery.endswith("; 2 touches left out, which have no other")
     with pytest.raises(BadInput, match="from another grasp; none has"):
         pair_auc(table_of(np.zeros((2, 2)), [0, 1]))
-
-
-def every_measure_of_few(table):
-    return {"accuracy": pair_accuracy(table, 0.0), "k2": k_way(table, 2), **full_gallery(table)}
 
 
 # By object -------------------------------------------------------------------------------------------------

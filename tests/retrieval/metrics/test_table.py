@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from retrieval.errors import BadInput, NumericalError
-from retrieval.metrics.measure import Measure
+from retrieval.metrics.measure import Measure, pooled
 from retrieval.metrics.table import ScoreTable, object_scores
 from tests.retrieval.metrics.test_registry import table_of, uneven
 
@@ -62,12 +62,21 @@ def bits(value):
 def test_every_photo_is_drawn_equally_often():
     owner = np.repeat([0, 1], 4)
     table = table_of(np.tile(2.0 ** np.arange(8), (8, 1)), owner)
-    drawn = np.rint(object_scores(table, 2, 4000, seed=0) * 2).astype(int)
+    drawn = np.rint(object_scores(table, 2, 1500, seed=0) * 2).astype(int)
     for row, name in product(range(8), (0, 1)):
         allowed = [column for column in range(4 * name, 4 * name + 4) if column != row]
         for column in allowed:
             frequency = np.mean(drawn[:, row, name] >> column & 1)
-            assert frequency == pytest.approx(2 / len(allowed), abs=0.05)  # six standard errors
+            assert frequency == pytest.approx(2 / len(allowed), abs=0.08)  # six standard errors
+
+
+def test_queries_of_several_galleries_are_pooled_under_their_units():
+    one = Measure(np.array([[0.5], [1.0]]), np.array([3, 7]), np.array([0.25]), "four")
+    two = Measure(np.array([[0.0]]), np.array([3]), np.array([0.5]), "two")
+    whole = pooled([one, two], {3: 1, 7: 0})
+    assert whole.owner.tolist() == [0, 1, 1]
+    assert whole.values.ravel().tolist() == [1.0, 0.5, 0.0]
+    assert whole.chance.tolist() == [pytest.approx((0.25 + (0.25 + 0.5) / 2) / 2)]  # equal unit weights
 
 
 def test_the_draws_depend_on_the_seed_and_not_on_the_scores():

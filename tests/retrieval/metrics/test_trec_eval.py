@@ -43,7 +43,7 @@ def random_table(rng, queries, items):
     return relevant
 
 
-@pytest.mark.parametrize("items", [1, 2, 7, 60, 300])
+@pytest.mark.parametrize("items", [1, 7, 60])
 def test_without_ties_the_measures_equal_those_of_trec_eval(items):
     rng = np.random.default_rng(items)
     relevant = random_table(rng, 40, items)
@@ -61,15 +61,6 @@ def test_with_ties_the_measures_are_the_mean_of_trec_eval_over_all_names_of_item
     every = np.ones_like(relevant)
     by_name = [theirs(scores, relevant, every, list(names)) for names in permutations("abcde")]
     assert_equal(ours(scores, relevant, every), {key: np.mean([one[key] for one in by_name], axis=0) for key in NAMES})
-
-
-def test_a_name_decides_the_value_of_trec_eval_for_a_constant_scorer():
-    """By hand: of two items with equal scores one is relevant. trec_eval puts the later name first."""
-    scores, every = np.zeros((1, 2), np.float32), np.ones((1, 2), bool)
-    relevant = np.array([[True, False]])
-    assert theirs(scores, relevant, every, ["a", "b"])["map"] == 0.5
-    assert theirs(scores, relevant, every, ["b", "a"])["map"] == 1
-    assert ours(scores, relevant, every)["map"] == 0.75
 
 
 def test_a_query_without_a_relevant_item_is_0_for_trec_eval_and_no_query_for_us():
