@@ -40,24 +40,15 @@ MAX_GRASPS = {"train": 8, "validation": 12}
 QUERIES = draw_queries(GRASPS, SPLIT, 0, MAX_GRASPS)
 
 
-def test_queries_hold_all_test_grasps_and_some_of_the_others():
+def test_queries_are_all_test_grasps_and_some_of_the_others_with_each_photo_file_once():
     names, counts = np.unique([GRASPS[row].object_id for row in QUERIES.touches], return_counts=True)
     assert dict(zip(names.tolist(), counts.tolist(), strict=True)) == {
         "a": MAX_GRASPS["train"], "b": 3, "c": MAX_GRASPS["validation"], "d": 6, "e": 24, "f": 2,
     }  # fmt: skip
     assert len(set(QUERIES.touches.tolist())) == len(QUERIES.touches)
-
-
-def test_touches_and_photos_have_the_right_objects_and_parts():
     assert QUERIES.objects == ("a", "b", "c", "d", "e", "f")
     for rows, owner in ((QUERIES.touches, QUERIES.touch_owner), (QUERIES.photos, QUERIES.photo_owner)):
         assert [GRASPS[row].object_id for row in rows] == [QUERIES.objects[number] for number in owner]
-    for part in ("train", "validation", "test"):
-        places = QUERIES.of_part(QUERIES.touch_owner, part)
-        assert {GRASPS[row].object_id for row in QUERIES.touches[places]} == set(getattr(SPLIT, part))
-
-
-def test_a_shared_photo_file_is_listed_once():
     files = [GRASPS[row].photo for row in QUERIES.photos]
     assert len(set(files)) == len(files) < len(QUERIES.touches)
     assert [files[column] for column in QUERIES.own_photo] == [GRASPS[row].photo for row in QUERIES.touches]

@@ -72,25 +72,16 @@ def found():
     return evaluated(50, gap=4.0)
 
 
-def test_each_kind_of_impostor_and_number_of_grasps_has_its_rates(found):
+def test_each_kind_of_impostor_has_rates_or_the_number_of_objects_that_would_be_enough(found):
     assert set(found) == {"random", "similar"}
-    for by_grasps in found.values():
-        assert list(by_grasps) == ["1", "2", "3", "5"]
-        for one in by_grasps.values():
+    for kind, needed in (("random", [25, 78, 246]), ("similar", [300, 3000, 30000])):  # 300 pairs of 25: 30 errors
+        assert list(found[kind]) == ["1", "2", "3", "5"]
+        for one in found[kind].values():
             assert (one.objects, one.sequences) == (50, 400)
             assert list(one.frr) == ["0.1", "0.01", "0.001"]
-
-
-def test_a_rate_is_refused_with_the_number_of_objects_that_would_be_enough(found):
-    for by_grasps in found["random"].values():
-        rates = by_grasps.frr
-        assert rates["0.1"].value is not None
-        assert rates["0.1"].objects_needed == 25  # 300 pairs, 30 errors
-        assert rates["0.01"] == Rate(None, None, None, 78)  # 3,003 pairs
-        assert rates["0.001"].objects_needed == 246  # 30,135 pairs
-    similar = found["similar"]["1"].frr  # each object has one most similar object
-    assert [rate.objects_needed for rate in similar.values()] == [300, 3000, 30000]
-    assert {rate.value for rate in similar.values()} == {None}
+            assert [rate.objects_needed for rate in one.frr.values()] == needed
+            assert [rate.value is not None for rate in one.frr.values()] == [kind == "random", False, False]
+    assert found["random"]["1"].frr["0.01"] == Rate(None, None, None, 78)
 
 
 def test_a_rate_has_the_binomial_interval_with_each_object_as_one_trial():
