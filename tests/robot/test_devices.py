@@ -64,9 +64,6 @@ def picture(depth=True, shape=(4, 6)):
     return RGBD(np.zeros((4, 6, 3), np.uint8), depth_m, Intrinsics(1, 1, 0, 0), 3.0)
 
 
-# Connecting -------------------------------------------------------------------------------------------------
-
-
 def test_a_device_is_connected_once_and_closed_once():
     plug = Plug()
     with plug:
@@ -78,20 +75,17 @@ def test_a_device_is_connected_once_and_closed_once():
     assert not plug.is_connected
 
 
-def test_a_device_that_fails_to_connect_is_closed_and_can_be_tried_again():
-    plug = Plug(connects=False)
-    with pytest.raises(DeviceError, match="plug cannot be connected: Connection timed out"):
+@pytest.mark.parametrize("closes", [True, False])
+def test_a_device_that_fails_to_connect_is_closed_and_can_be_tried_again(closes):
+    plug = Plug(connects=False, closes=closes)
+    with pytest.raises(DeviceError, match="plug cannot be connected: Connection timed out") as caught:
         plug.connect()
+    assert hasattr(caught.value, "__notes__") is not closes
     assert plug.calls == ["connect", "close"]
     plug.close()
     plug.connects = True
     plug.connect()
     assert plug.is_connected
-
-
-def test_a_failure_to_close_after_a_failed_connection_does_not_hide_the_first_error():
-    with pytest.raises(DeviceError, match="Connection timed out"):
-        Plug(connects=False, closes=False).connect()
 
 
 def test_a_device_that_fails_to_close_raises_once_and_counts_as_closed():
@@ -121,9 +115,6 @@ def test_no_device_can_be_used_before_it_is_connected(use):
         use()
 
 
-# Arm and gripper --------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "pose",
     [Pose(151, 0, 100, 0), Pose(0, -151, 100, 0), Pose(0, 0, 7.9, 0), Pose(0, 0, math.nan, 0), Pose(0, 0, 9, math.inf)],
@@ -140,68 +131,54 @@ def test_a_pose_out_of_the_workspace_never_reaches_the_arm(pose):
         assert arm.pose() == Pose(150, -150, 8, 0)
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_a_pose_that_is_not_finite_is_never_returned(bad, monkeypatch):
-    for place in range(4):
-        lost = Pose(*(bad if axis == place else 9.0 for axis in range(4)))
-        monkeypatch.setattr(FakeArm, "_pose", lambda arm, lost=lost: lost)
-        monkeypatch.setattr(FakeArm, "_move_to", lambda arm, pose, speed, lost=lost: lost)
-        with FakeArm(FakeRigState(0)) as arm:
-            for read in (arm.pose, lambda arm=arm: arm.move_to(Pose(0, 0, 100, 0), 100)):
-                with pytest.raises(DeviceError, match="fake arm: the reported pose must be finite"):
-                    read()
+@pytest.mark.parametrize("lost", [Pose(9, math.nan, 9, 9), Pose(9, 9, 9, math.inf)])
+def test_a_pose_that_is_not_finite_is_never_returned(lost, monkeypatch):
+    monkeypatch.setattr(FakeArm, "_pose", lambda arm: lost)
+    monkeypatch.setattr(FakeArm, "_move_to", lambda arm, pose, speed: lost)
+    with FakeArm(FakeRigState(0)) as arm:
+        for read in (arm.pose, lambda: arm.move_to(Pose(0, 0, 100, 0), 100)):
+            with pytest.raises(DeviceError, match="fake arm: the reported pose must be finite"):
+                read()
 
 
-@pytest.mark.parametrize("lens", [(math.nan, 1, 0, 0), (1, 0, 0, 0), (1, math.inf, 0, 0), (1, 1, math.nan, 0)])
-def test_invalid_intrinsics_are_refused(lens):
-    with pytest.raises(DeviceError, match="intrinsics"):
-        Intrinsics(*lens)
-
-
-@pytest.mark.parametrize("force", [FORCE_N[0] - 0.01, FORCE_N[1] + 0.01, math.nan])
-def test_a_force_out_of_range_never_reaches_the_gripper(force):
+@pytest.mark.parametrize("outside", [-0.01, 0.01, math.nan])
+def test_a_force_or_an_opening_out_of_range_never_reaches_the_gripper(outside):
+    force, opening = (FORCE_N[0], 0.0) if outside < 0 else (FORCE_N[1], STROKE_MM)
     with FakeGripper(FakeRigState(0)) as gripper:
         with pytest.raises(DeviceError, match="fake gripper: force must be from 5 to 80 N, got"):
-            gripper.grasp(force)
-        assert "grasp" not in gripper.shared.calls
-
-
-@pytest.mark.parametrize("opening", [-0.1, STROKE_MM + 0.1, math.nan])
-def test_an_opening_beyond_the_stroke_never_reaches_the_gripper(opening):
-    with FakeGripper(FakeRigState(0)) as gripper:
+            gripper.grasp(force + outside)
         with pytest.raises(DeviceError, match="opening must be from 0 to 110 mm"):
-            gripper.open(opening)
-        assert "open" not in gripper.shared.calls
+            gripper.open(opening + outside)
+        assert {"grasp", "open"}.isdisjoint(gripper.shared.calls)
         assert gripper.open(STROKE_MM) == GripperState(STROKE_MM, 0.0, "idle")
 
 
-def test_a_gripper_state_outside_the_contract_is_refused():
-    with pytest.raises(DeviceError, match="status"):
-        GripperState(1.0, 0.0, "lost")
-    with pytest.raises(DeviceError, match="finite"):
-        GripperState(math.nan, 0.0, "idle")
-
-
-@pytest.mark.parametrize("corners", [((0, 0, 0), (1, 1, 0)), ((0, 0, 0), (1, 1, math.nan)), ((0, 0), (1, 1))])
-def test_a_region_without_volume_is_refused(corners):
-    with pytest.raises(RobotConfigError, match="lower < upper"):
-        Region(*corners)
-
-
-# Frames -----------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Intrinsics(math.nan, 1, 0, 0), "intrinsics"),
+        (lambda: Intrinsics(1, 0, 0, 0), "intrinsics"),
+        (lambda: Intrinsics(1, 1, math.inf, 0), "intrinsics"),
+        (lambda: GripperState(1.0, 0.0, "lost"), "status"),
+        (lambda: GripperState(math.nan, 0.0, "idle"), "finite"),
+        (lambda: Region((0, 0, 0), (1, 1, 0)), "lower < upper"),
+        (lambda: Region((0, 0, 0), (1, 1, math.nan)), "lower < upper"),
+        (lambda: Region((0, 0), (1, 1)), "lower < upper"),
+    ],
+)
+def test_a_reading_outside_the_contract_is_refused(make, message):
+    with pytest.raises((DeviceError, RobotConfigError), match=message):
+        make()
 
 
 def frame(age=0.0, now=100.0, pixels=None):
     return Frame(np.zeros((2, 3, 3), np.uint8) if pixels is None else pixels, now - age)
 
 
-@pytest.mark.parametrize("age", [0.51, 1e6, -0.06, math.nan])
-def test_a_stale_frame_and_one_from_the_future_are_refused(age):
+@pytest.mark.parametrize("age", [0.51, -0.06, math.nan])
+def test_a_stale_frame_and_one_from_the_future_are_refused_and_the_caller_sets_the_largest_age(age):
     with Gel(frame(age)) as gel, pytest.raises(DeviceError, match=r"gel: the frame's age .* -0\.05 to 0\.5 s"):
         gel.read()
-
-
-def test_the_caller_sets_the_largest_age_of_a_frame():
     with Gel(frame(0.3)) as gel:
         gel.read(max_age_s=0.3 + 1e-9)
         with pytest.raises(DeviceError, match=r"to 0\.2 s, got 0\.3 s"):

@@ -2,7 +2,6 @@
 
 import json
 import os
-import resource
 import shutil
 import subprocess
 import sys
@@ -52,10 +51,7 @@ def ids(folder):
     return [grasp.grasp_id for grasp in read_recording(folder).grasps]
 
 
-# Round trip ------------------------------------------------------------------------------------------------
-
-
-def test_appended_grasps_are_read_back(tmp_path):
+def test_appended_grasps_are_read_back_and_a_line_has_the_documented_columns_without_missing_values(tmp_path):
     with RecordingWriter(tmp_path / "r", INFO) as writer:
         images = {**pictures(), "touch_a_before": pixels(7), "touch_b_after": pixels(8)}
         images["depth"] = np.array([[0, 1, 65535]], np.uint16)
@@ -91,12 +87,9 @@ def test_appended_grasps_are_read_back(tmp_path):
         time_s=0.25,
     )
     assert hash(written) == hash(recording.grasps[0])
-
-
-def test_the_columns_have_the_documented_names_without_missing_values(tmp_path):
-    with RecordingWriter(tmp_path, INFO) as writer:
+    with RecordingWriter(tmp_path / "s", INFO) as writer:
         writer.append("1", "mug", {"photo": pixels(), "touch_a": pixels(), "touch_a_before": pixels()}, force_n=2)
-    (line,) = (tmp_path / "metadata.jsonl").read_text().splitlines()
+    (line,) = (tmp_path / "s/metadata.jsonl").read_text().splitlines()
     assert json.loads(line) == {
         "grasp_id": "1",
         "object_id": "mug",
@@ -117,25 +110,23 @@ def test_datasets_opens_a_recording(tmp_path):
     np.testing.assert_array_equal(np.asarray(rows[1]["touch_b"]), pixels(4))
 
 
-def test_pixels_are_read_back_in_rgb_and_depth_with_16_bits(tmp_path):
-    depth = np.array([[0, 256, 65535]], np.uint16)
-    with RecordingWriter(tmp_path, INFO) as writer:
-        writer.append("1", "mug", {"photo": pixels(1), "touch_a": pixels(2)[:, ::-1], "depth": depth})
-    photo = cv2.cvtColor(cv2.imread(str(tmp_path / "images/1_photo.png")), cv2.COLOR_BGR2RGB)
-    np.testing.assert_array_equal(photo, pixels(1))
-    touch = cv2.cvtColor(cv2.imread(str(tmp_path / "images/1_touch_a.png")), cv2.COLOR_BGR2RGB)
-    np.testing.assert_array_equal(touch, pixels(2)[:, ::-1])
-    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "images/1_depth.png"), cv2.IMREAD_UNCHANGED), depth)
-
-
-def test_files_and_bytes_are_copied_unchanged(tmp_path):
-    jpeg, png = (cv2.imencode(kind, pixels())[1].tobytes() for kind in (".jpg", ".png"))
-    (tmp_path / "x.data").write_bytes(jpeg)
+def test_pixels_are_read_back_and_files_and_bytes_are_copied_unchanged(tmp_path):
+    """Pixels are RGB, depth has 16 bits."""
+    depth, (jpeg, png) = (
+        np.array([[0, 256, 65535]], np.uint16),
+        (cv2.imencode(k, pixels())[1] for k in (".jpg", ".png")),
+    )
+    (tmp_path / "x.data").write_bytes(jpeg.tobytes())
     with RecordingWriter(tmp_path / "r", INFO) as writer:
-        grasp = writer.append("1", "mug", {"photo": tmp_path / "x.data", "touch_a": png})
-    assert grasp.images() == {"photo": "images/1_photo.jpg", "touch_a": "images/1_touch_a.png"}
-    assert (tmp_path / "r" / grasp.photo).read_bytes() == jpeg
-    assert (tmp_path / "r" / grasp.touches["a"]).read_bytes() == png
+        writer.append("1", "mug", {"photo": pixels(1), "touch_a": pixels(2)[:, ::-1], "depth": depth})
+        grasp = writer.append("2", "mug", {"photo": tmp_path / "x.data", "touch_a": png.tobytes()})
+    stored = {path.name: cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in (tmp_path / "r/images").iterdir()}
+    np.testing.assert_array_equal(stored["1_photo.png"][..., ::-1], pixels(1))
+    np.testing.assert_array_equal(stored["1_touch_a.png"][..., ::-1], pixels(2)[:, ::-1])
+    np.testing.assert_array_equal(stored["1_depth.png"], depth)
+    assert grasp.images() == {"photo": "images/2_photo.jpg", "touch_a": "images/2_touch_a.png"}
+    assert (tmp_path / "r" / grasp.photo).read_bytes() == jpeg.tobytes()
+    assert (tmp_path / "r" / grasp.touches["a"]).read_bytes() == png.tobytes()
 
 
 def test_recording_json_has_defaults_and_other_keys(tmp_path):
@@ -150,7 +141,7 @@ def test_recording_json_has_defaults_and_other_keys(tmp_path):
     assert read_recording(tmp_path).grasps == ()
 
 
-@settings(max_examples=100)
+@settings(max_examples=40)
 @given(
     st.text(st.characters(categories=["L", "N", "P"]), min_size=1),
     st.floats(allow_nan=False, allow_infinity=False),
@@ -164,9 +155,6 @@ def test_any_grasp_survives_its_line(object_id, number, grasped, pose):
     assert RecordedGrasp.from_row(json.loads(json.dumps(grasp.to_row()))) == grasp
 
 
-# Reading ---------------------------------------------------------------------------------------------------
-
-
 def test_a_line_of_another_program_may_leave_keys_null_and_end_without_a_newline(tmp_path):
     write(tmp_path, {**ROW, "force_n": None, "touch_b_file_name": None}, "", "  ")
     with open(tmp_path / "metadata.jsonl", "a") as file:
@@ -178,7 +166,7 @@ def test_a_line_of_another_program_may_leave_keys_null_and_end_without_a_newline
 
 
 BAD_LINES = {
-    "{": "must be JSON",
+    "{": "must be one JSON object",
     "[]": "one JSON object",
     json.dumps({**ROW, "grasp_id": "0"}): "grasp_id must be unique, got '0' twice",
     json.dumps({**ROW, "object_id": None}): "object_id is missing",
@@ -188,10 +176,10 @@ BAD_LINES = {
     json.dumps({**ROW, "grasp_id": 5}): "grasp_id must be a text in quotes, got 5",
     json.dumps({**ROW, "object_id": "\ud800"}): "escaped utf-16 surrogate pair",
     json.dumps({**ROW, "force_n": "5"}): "force_n must be a number or nothing, got '5'",
-    json.dumps({**ROW, "force_n": float("nan")}): "must be JSON in UTF-8, without NaN",
-    json.dumps(ROW)[:-1] + ', "time_s": 1e999}': "of finite numbers: Number out of range",
+    json.dumps({**ROW, "force_n": float("nan")}): "without NaN",
+    json.dumps(ROW)[:-1] + ', "time_s": 1e999}': "Number out of range",
     json.dumps({**ROW, "grasped": 1}): "grasped must be true or false or nothing, got 1",
-    json.dumps({**ROW, "outcome": "lost"}): "outcome: invalid enum value 'lost'",
+    json.dumps({**ROW, "outcome": "lost"}): "outcome must be one of",
     json.dumps({**ROW, "pose": 5}): "pose must be a list",
     json.dumps({**ROW, "pose": [1, "2"]}): "pose[1] must be a number, got '2'",
     json.dumps({**ROW, "photo_file_name": 5}): "photo must be a text in quotes",
@@ -217,7 +205,7 @@ def test_a_bad_line_is_named_by_its_number(tmp_path, line):
 def test_an_incomplete_last_line_of_any_length_is_dropped_with_a_note(tmp_path):
     write(tmp_path, ROW)
     whole, line = (tmp_path / "metadata.jsonl").read_bytes(), json.dumps({**ROW, "grasp_id": "é"}).encode()
-    for length in range(1, len(line)):
+    for length in (1, 2, 20, len(line) - 3, len(line) - 1):  # also within the é
         (tmp_path / "metadata.jsonl").write_bytes(whole + line[:length])
         recording = read_recording(tmp_path)
         assert [grasp.grasp_id for grasp in recording.grasps] == ["1"]
@@ -226,20 +214,9 @@ def test_an_incomplete_last_line_of_any_length_is_dropped_with_a_note(tmp_path):
     assert ids(tmp_path) == ["1"]
 
 
-def test_an_incomplete_line_before_the_last_is_an_error(tmp_path):
-    write(tmp_path, json.dumps(ROW)[:30], {**ROW, "grasp_id": "2"})
-    with pytest.raises(RecordingError, match="line 1: must be JSON"):
-        read_recording(tmp_path)
-
-
-@pytest.mark.parametrize("version", [0, 2, "1", None])
-def test_another_schema_version_is_refused(tmp_path, version):
-    write(tmp_path, ROW, info={**INFO, "schema_version": version})
-    with pytest.raises(RecordingError, match=r"recording\.json: schema_version must be 1, got"):
-        read_recording(tmp_path)
-
-
-@pytest.mark.parametrize("text", ["", "[1]", "{", '{"schema_version": 1}', '{"schema_version": 1, "source": 3}'])
+@pytest.mark.parametrize(
+    "text", ["", "[1]", "{", '{"schema_version": 1}', '{"schema_version": 1, "source": 3}', '{"schema_version": 2}']
+)
 def test_a_bad_recording_json_is_an_error_that_names_it(tmp_path, text):
     (write(tmp_path, ROW) / "recording.json").write_text(text)
     with pytest.raises(RecordingError, match=r"recording\.json: "):
@@ -263,26 +240,15 @@ def test_reading_opens_no_image_and_imports_no_opencv(tmp_path):
     subprocess.run([sys.executable, "-c", code], check=True, cwd=root)
 
 
-# Writing ---------------------------------------------------------------------------------------------------
-
-
-def test_an_incomplete_last_line_is_removed_when_the_recording_is_opened_again(tmp_path):
-    two_grasps(tmp_path)
-    with open(tmp_path / "metadata.jsonl", "ab") as file:
-        file.write(b'{"grasp_id": "3", "obj')
-    with RecordingWriter(tmp_path, INFO) as writer:
-        writer.append("3", "cup", pictures())
-    assert ids(tmp_path) == ["1", "2", "3"]
-    assert read_recording(tmp_path).notes == ()
-    assert (tmp_path / "metadata.jsonl").read_bytes().count(b"\n") == 3
-
-
-def test_a_last_line_that_lacks_only_its_newline_is_valid(tmp_path):
+@pytest.mark.parametrize("cut", [-1, -30])
+def test_a_writer_removes_an_incomplete_last_line_and_adds_a_newline_that_lacks(tmp_path, cut):
     path = two_grasps(tmp_path) / "metadata.jsonl"
-    path.write_bytes(path.read_bytes().rstrip(b"\n"))
+    path.write_bytes(path.read_bytes()[:cut])
     with RecordingWriter(tmp_path, INFO) as writer:
         writer.append("3", "cup", pictures())
-    assert ids(tmp_path) == ["1", "2", "3"]
+    assert ids(tmp_path) == (["1", "2", "3"] if cut == -1 else ["1", "3"])
+    assert read_recording(tmp_path).notes == ()
+    assert path.read_bytes().count(b"\n") == len(ids(tmp_path))
 
 
 @pytest.mark.parametrize("key", ["source", "sensor", "units", "background"])
@@ -376,12 +342,6 @@ def test_a_shared_image_is_stored_once_and_later_ones_of_its_name_are_ignored(tm
     np.testing.assert_array_equal(stored, pixels(10))
 
 
-@pytest.mark.parametrize("name", ["", "../rest", "a/b", ".rest", "a" * 200])
-def test_the_name_of_a_shared_image_must_be_safe_in_a_file_name(tmp_path, name):
-    with RecordingWriter(tmp_path / "recording", INFO) as writer, pytest.raises(RecordingError, match="shared image"):
-        writer.append("1", "mug", {**pictures(), "touch_a_before": SharedImage(name, pixels())})
-
-
 def test_a_writer_updates_recording_json_except_its_fixed_values(tmp_path):
     with RecordingWriter(tmp_path / "recording", INFO) as writer:
         writer.update_info(skipped={"it is dark": 2})
@@ -393,10 +353,13 @@ def test_a_writer_updates_recording_json_except_its_fixed_values(tmp_path):
     assert (info["skipped"], info["sensor"], info["seed"]) == ({"it is dark": 2}, "GelSight", 3)
 
 
-@pytest.mark.parametrize("grasp_id", ["", "../x", "a/b", ".hidden", "x" * 129, 5, None])
-def test_a_grasp_id_must_be_safe_in_a_file_name(tmp_path, grasp_id):
-    with RecordingWriter(tmp_path, INFO) as writer, pytest.raises(RecordingError, match="grasp_id must have"):
-        writer.append(grasp_id, "mug", pictures())
+@pytest.mark.parametrize("name", ["", "../x", "a/b", ".hidden", "x" * 129, 5, None])
+def test_a_grasp_id_and_the_name_of_a_shared_image_must_be_safe_in_a_file_name(tmp_path, name):
+    with RecordingWriter(tmp_path, INFO) as writer:
+        with pytest.raises(RecordingError, match="grasp_id must have"):
+            writer.append(name, "mug", pictures())
+        with pytest.raises(RecordingError, match="shared image"):
+            writer.append("1", "mug", {**pictures(), "touch_a_before": SharedImage(name, pixels())})
 
 
 def test_a_grasp_is_not_appended_twice_nor_to_a_closed_writer(tmp_path):
@@ -430,16 +393,3 @@ def test_a_path_that_is_not_a_file_is_refused_without_being_read_or_written(tmp_
         with pytest.raises((RecordingError, StorageError)):
             RecordingWriter(tmp_path, INFO)
         path.rmdir() if path.is_dir() else path.unlink()
-
-
-def test_a_full_disk_error_names_the_file(tmp_path):
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    with RecordingWriter(tmp_path, INFO) as writer:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
-        try:
-            with pytest.raises(StorageError, match=r"1_photo\.png could not be written: File too large"):
-                writer.append("1", "mug", {**pictures(), "photo": pixels(height=40)})
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-        writer.append("1", "mug", pictures())
-    assert not list((tmp_path / "images").glob("*.part"))
