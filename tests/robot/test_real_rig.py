@@ -64,12 +64,8 @@ def test_a_file_becomes_a_rig_with_its_devices_under_its_limits(tmp_path):
     assert "licence" not in rig.info
     assert rig.info["rig_settings"]["gripper"]["driver"] == "wsg50"
     assert not any(device.is_connected for device in rig.devices)
-
-
-def test_default_attempt_settings_are_capped_by_the_limits(tmp_path):
-    attempt = load_rig(written(tmp_path), seed=0).attempt
-    assert attempt.grasp.force_n == (5.0, 15)
-    assert (attempt.travel_mm_s, attempt.approach_mm_s, attempt.closing_mm_s) == (90, 50, 40)
+    assert rig.attempt.grasp.force_n == (5.0, 15)  # the defaults, capped by the limits
+    assert (rig.attempt.travel_mm_s, rig.attempt.approach_mm_s, rig.attempt.closing_mm_s) == (90, 50, 40)
 
 
 def test_known_values_of_the_gels_are_recorded_and_the_others_are_unknown(tmp_path):
@@ -80,15 +76,9 @@ def test_known_values_of_the_gels_are_recorded_and_the_others_are_unknown(tmp_pa
 
 
 def test_a_given_object_replaces_the_fit_for_a_camera_without_depth(tmp_path):
-    object_fit = load_rig(written(tmp_path), seed=0).object_fit
-    assert (object_fit.x_mm, object_fit.y_mm, object_fit.height_mm, object_fit.radius_mm, object_fit.method) == (
-        0,
-        5,
-        100,
-        30,
-        "given",
-    )
-    assert object_fit.width_mm(1.0, 25.0) == 60
+    fit = load_rig(written(tmp_path), seed=0).object_fit
+    assert (fit.x_mm, fit.y_mm, fit.height_mm, fit.radius_mm, fit.method) == (0, 5, 100, 30, "given")
+    assert fit.width_mm(1.0, 25.0) == 60
     with pytest.raises(RobotConfigError, match="has no depth: give the position and size of every object"):
         load_rig(written(tmp_path, object=None), seed=0)
 
@@ -142,38 +132,23 @@ BAD = {
     "an unknown key": ({"gripper": 'driver = "wsg50"\nport = "a"\nbort = 1'}, r"\[gripper\] has no setting 'bort'"),
     "a key too few": ({"gripper": 'driver = "wsg50"'}, r"\[gripper\] requires 'port'"),
     "an unknown finger": ({"sensors.c": 'driver = "uvc"'}, r"\[sensors.b\] or both; got .*c"),
-    "a limit of zero": (
-        {"limits": TABLES["limits"] + "\nstate_age_s = 0"},
-        r"\[limits\]: state_age_s must be",
-    ),
+    "a limit of zero": ({"limits": TABLES["limits"] + "\nstate_age_s = 0"}, r"\[limits\]: state_age_s must be"),
     "a force above the limit": ({"grasp": "force_n = [5, 16]"}, "force_n must be at most 15"),
-    "a speed above the limit": (
-        {"attempt": "travel_mm_s = 91"},
-        r"travel_mm_s must be at most 90, as \[limits\] states, got 91",
-    ),
+    "a speed above the limit": ({"attempt": "travel_mm_s = 91"}, r"travel_mm_s must be at most 90"),
     "an unknown attempt setting": ({"attempt": "speed = 3"}, r"\[attempt\] has no setting 'speed'"),
     "an infinite speed": ({"attempt": "travel_mm_s = inf"}, r"attempt\.travel_mm_s must be a finite number"),
     "a gel of no finger": ({"gel.b": "thickness_mm = 4"}, r"a finger with a sensor: \[gel\.a\]; got 'b'"),
     "a gel of no thickness": ({"gel.a": "thickness_mm = 0"}, r"\[gel\.a\]: thickness_mm must be a number >= 0\.01"),
-    "an unknown planner": (
-        {"planner": 'name = "sphere"'},
-        r"\[planner\]: name must be one of cylinder, mesh; got 'sphere'. Give module:Class .* touch_retrieval.planners",
-    ),
-    "a planner without its setting": (
-        {"planner": 'name = "tests.robot.test_real_rig:Blind"'},
-        r"\[planner\] requires 'height_mm'",
-    ),
+    "an unknown planner": ({"planner": 'name = "sphere"'}, r"\[planner\]: name must be one of cylinder, mesh; .*Class"),
+    "a planner without its setting": ({"planner": BLIND.split("\n")[0]}, r"\[planner\] requires 'height_mm'"),
     "a planner with a negative margin": (
         {"planner": "search_margin_mm = -1"},
-        r"\[planner\]: search_margin_mm must be a number >= 0",
+        r"\[planner\]: search_margin_mm",
     ),
     "a planner that is another object": ({"planner": 'name = "json:dumps"'}, "'json:dumps' must be a GraspPlanner"),
     "meshes of a real rig": ({"planner": 'name = "mesh"'}, "plans for meshes of the simulated rig only"),
     "no time to settle": ({"attempt": "settle_s = 0"}, r"\[attempt\]: settle_s must be at least 0\.1 s"),
-    "an object of no size": (
-        {"object": "x_mm = 0\ny_mm = 0\nheight_mm = 0\nradius_mm = 3"},
-        r"\[object\]: height_mm must be a number > 0",
-    ),
+    "an object of no size": ({"object": "x_mm = 0\ny_mm = 0\nheight_mm = 0\nradius_mm = 3"}, r"\[object\]: height_mm"),
 }
 
 

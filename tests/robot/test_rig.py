@@ -13,10 +13,15 @@ def events(rig, what):
     return [call.removesuffix(f".{what}") for call in rig.shared.calls if call.endswith(f".{what}")]
 
 
-def test_all_devices_are_connected_in_order_and_closed_in_reverse():
-    with FakeRig() as rig:
+def test_all_devices_are_connected_in_order_and_closed_once_in_reverse():
+    rig = FakeRig()
+    rig.close()
+    with rig:
         assert events(rig, "connect") == ORDER
         assert all(device.is_connected for device in rig.devices)
+        assert rig.settings()["fake gripper"] == {"stroke_mm": 110.0}  # read back from the device
+        assert set(rig.settings()) == {device.name for device in rig.devices}
+    rig.close()
     assert events(rig, "close") == ORDER[::-1]
 
 
@@ -41,28 +46,13 @@ def test_closing_continues_when_one_device_fails():
     rig.close()
 
 
-def test_closing_twice_and_before_connecting_does_nothing():
-    rig = FakeRig()
-    rig.close()
-    with rig:
-        pass
-    rig.close()
-    assert events(rig, "close") == ORDER[::-1]
-
-
 def test_a_failure_to_close_does_not_hide_the_first_error():
     with pytest.raises(ZeroDivisionError) as caught, FakeRig(faults={"arm.close": {1}}):
         _ = 1 / 0
     assert "while the rig was closed: the fake arm.close fails on purpose" in caught.value.__notes__[0]
 
 
-def test_settings_are_read_back_from_every_device():
-    with FakeRig() as rig:
-        assert rig.settings()["fake gripper"] == {"stroke_mm": 110.0}
-        assert set(rig.settings()) == {device.name for device in rig.devices}
-
-
-def test_a_prompt_appears_only_when_the_object_changes():
+def test_a_prompt_appears_only_when_the_object_changes_and_needs_a_person():
     requests = []
     fake = FakeRig()
     rig = Rig(fake.arm, fake.gripper, fake.sensors, fake.camera, info={}, ask=requests.append)
@@ -71,25 +61,16 @@ def test_a_prompt_appears_only_when_the_object_changes():
     assert [text.split()[1] for text in requests] == ["mug", "cup", "mug"]
     assert rig.object_ids(2) == ["object-0001", "object-0002"]
 
-
-def test_a_rig_without_a_person_to_change_objects_raises():
     def nobody(text):
         raise EOFError
 
-    fake = FakeRig()
-    rig = Rig(fake.arm, fake.gripper, fake.sensors, fake.camera, info={}, ask=nobody)
+    rig.ask = nobody
     with pytest.raises(RobotConfigError, match="run it in a terminal"):
-        rig.prepare("mug", 0)
-
-
-# By name ----------------------------------------------------------------------------------------------------
-
-
-FAKE = "tests.fake_rig:FakeRig"
+        rig.prepare("cup", 0)
 
 
 def test_a_rig_is_built_by_its_name_and_its_info_rebuilds_it():
-    rig = load_rig(FAKE, seed=7, fingers=["a"])
+    rig = load_rig("tests.fake_rig:FakeRig", seed=7, fingers=["a"])
     assert isinstance(rig, FakeRig)
     assert rig.shared.seed == 7
     assert list(rig.sensors) == ["a"]
