@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import json
 import math
 
 import numpy as np
@@ -96,12 +97,6 @@ def test_a_failure_while_closing_leaves_still_jaws_that_can_be_opened(rig: Rig, 
     assert rig.gripper.open(rig.gripper.stroke_mm).status == "idle"
 
 
-def test_fingers_are_read_at_the_same_time(rig: Rig):
-    frames, skew_s = read_together(rig.sensors)
-    assert set(frames) == set(rig.sensors)
-    assert 0 <= skew_s < 0.1
-
-
 def test_the_arm_moves_to_its_target_and_refuses_poses_outside_the_workspace(rig: Rig):
     target = middle(rig)
     reached = rig.arm.move_to(target, 100.0)
@@ -135,7 +130,7 @@ def test_closing_on_nothing_is_no_part_and_opening_ends_it(rig: Rig):
     assert rig.gripper.open(rig.gripper.stroke_mm).status == "idle"
 
 
-def test_gel_frames_are_in_colour_and_fresh(rig: Rig):
+def test_frames_pictures_and_settings_are_fresh_and_of_the_stated_form(rig: Rig):
     for finger, sensor in rig.sensors.items():
         frame = sensor.read()
         assert sensor.finger == finger
@@ -143,32 +138,23 @@ def test_gel_frames_are_in_colour_and_fresh(rig: Rig):
         assert frame.pixels.shape[2] == 3
         assert abs(rig.clock() - frame.time_s) < 0.5
         assert frame.pixels.std() > 0
+    frames, skew_s = read_together(rig.sensors)
+    assert set(frames) == set(rig.sensors)
+    assert 0 <= skew_s < 0.1
+    assert set(json.loads(json.dumps(rig.settings()))) == {device.name for device in rig.devices}
 
 
-def test_the_camera_returns_colour_and_depth_of_one_size_from_above_the_table(rig: Rig):
-    image = rig.camera.read()
+def test_the_camera_returns_colour_and_depth_that_put_the_table_near_zero(rig: Rig):
+    image, pose = rig.camera.read(), rig.camera.extrinsics
     assert image.colour.shape[:2] == image.depth_m.shape
-    assert np.nanmedian(image.depth_m) > 0.1
     assert rig.camera.read(depth=False).depth_m is None
-    assert rig.camera.extrinsics[2, 3] > 0
-    columns = image.depth_m.shape[1]
-    ray = np.array([(columns / 2 - image.intrinsics.cx) / image.intrinsics.fx, 0, 1.0])
-    assert (rig.camera.extrinsics[:3, :3] @ ray)[2] < 0  # it points down
-
-
-def test_depth_and_extrinsics_put_the_table_near_zero(rig: Rig):
-    image = rig.camera.read()
+    assert pose[2, 3] > 0
     rows, columns = np.nonzero(np.isfinite(image.depth_m))
     depth, lens = image.depth_m[rows, columns] * 1000.0, image.intrinsics
+    assert np.median(depth) > 100
     local = np.stack([(columns - lens.cx) / lens.fx * depth, (rows - lens.cy) / lens.fy * depth, depth], 1)
-    height = (local @ rig.camera.extrinsics[:3, :3].T + rig.camera.extrinsics[:3, 3])[:, 2]
+    height = (local @ pose[:3, :3].T + pose[:3, 3])[:, 2]
     assert abs(np.median(height[height < 20])) < 10
-
-
-def test_settings_are_plain_json_of_every_device(rig: Rig):
-    import json
-
-    assert set(json.loads(json.dumps(rig.settings()))) == {device.name for device in rig.devices}
 
 
 def test_a_rig_that_can_run_jobs_prepares_from_seed_object_and_number_alone(unconnected: Rig):

@@ -37,7 +37,7 @@ KOLMOGOROV = 1.95
 """For n uniform values, n^(1/2) times the distance is below this in 999 of 1000 cases; the seeds are fixed."""
 
 
-def test_yaw_force_and_height_are_uniform():
+def test_yaw_force_and_height_are_uniform_and_independent():
     drawn = plans()
     bound = KOLMOGOROV / math.sqrt(len(drawn))
     assert farthest_from_uniform([p.pose.yaw_rad for p in drawn], 0, math.pi) < bound
@@ -45,13 +45,10 @@ def test_yaw_force_and_height_are_uniform():
     assert farthest_from_uniform([p.pose.z_mm for p in drawn], 10, 85) < bound  # floor, and 15 mm below the top
     assert farthest_from_uniform([p.pose.x_mm for p in drawn], 11, 13) < bound
     assert farthest_from_uniform([p.pose.y_mm for p in drawn], -8, -6) < bound
-
-
-def test_yaw_stays_within_the_half_turn_and_draws_are_independent():
-    drawn = np.array([[*p.pose.as_tuple(), p.force_n] for p in plans()])
-    assert drawn[:, 3].min() >= 0
-    assert drawn[:, 3].max() < math.pi
-    correlation = np.corrcoef(drawn.T) - np.eye(5)
+    table = np.array([[*p.pose.as_tuple(), p.force_n] for p in drawn])
+    assert table[:, 3].min() >= 0
+    assert table[:, 3].max() < math.pi
+    correlation = np.corrcoef(table.T) - np.eye(5)
     assert np.abs(correlation).max() < 4 / math.sqrt(len(drawn))  # 4 standard errors
 
 
@@ -66,36 +63,21 @@ def test_fingers_reach_at_most_reach_mm_below_the_top():
     assert min(p.pose.z_mm for p in plans(200, fit=tall)) >= 250 - 110
 
 
-@pytest.mark.parametrize(("height", "expected"), [(10.0, 10.0), (20.0, 10.0), (25.0, 10.0)])
-def test_a_low_object_is_grasped_at_the_floor(height, expected):
+@pytest.mark.parametrize("height", [10.0, 20.0, 25.0])
+def test_a_low_object_is_grasped_at_the_floor_also_that_of_the_workspace(height):
     """The authors' interval is inverted below 25 mm: its lower end lies above its upper end."""
     low = dataclasses.replace(FIT, height_mm=height)
-    assert {p.pose.z_mm for p in plans(20, fit=low)} == {expected}
-
-
-def test_the_floor_of_the_workspace_counts_as_well():
+    assert {p.pose.z_mm for p in plans(20, fit=low)} == {10.0}
     workspace = Region((-150.0, -150.0, 30.0), (150.0, 150.0, 500.0))
-    assert min(p.pose.z_mm for p in plans(200, workspace=workspace)) >= 30
+    assert min(p.pose.z_mm for p in plans(50, workspace=workspace)) >= 30
 
 
 REFUSED = {
-    "lower than the fingers reach": (
-        {"height_mm": 9.9},
-        {},
-        "10 mm high, but the lowest height of the fingers is 10 mm",
-    ),
-    "wider than the stroke": (
-        {"radius_mm": 50.1},
-        {},
-        "wider than the stroke: .* must open 110 mm, but they open only 110",
-    ),
+    "lower than the fingers reach": ({"height_mm": 9.9}, {}, "the lowest height of the fingers is 10 mm"),
+    "wider than the stroke": ({"radius_mm": 50.1}, {}, "wider than the stroke: .* must open 110 mm"),
     "a smaller stroke": ({}, {"stroke": 60.0}, "wider than the stroke"),
     "outside the workspace": ({"x_mm": 152.0}, {}, "out of the workspace"),
-    "too high for the arm": (
-        {"height_mm": 495.0},
-        {},
-        "too high: it is 495 mm high, and the fingertips rise to 500 mm, but they must rise to 10 mm above it",
-    ),
+    "too high for the arm": ({"height_mm": 495.0}, {}, "too high: it is 495 mm high"),
 }
 
 
@@ -123,8 +105,6 @@ def test_a_refused_plan_draws_as_many_numbers_as_any_other():
     plan_grasp(FIT, GraspSettings(), WORKSPACE, STROKE, other)
     assert rng.uniform() == other.uniform()
 
-
-# Settings ---------------------------------------------------------------------------------------------------
 
 WRONG = {
     "force_n": [(0.0, 5.0), (10.0, 5.0), (5.0, math.inf), (math.nan, 5.0)],

@@ -18,12 +18,12 @@ from tests import views
 from tests.views import DepthBall, DepthBlock, LyingCylinder, UprightCylinder, view
 
 X, Y = 12.0, -7.0
-SEEDS = range(3)
 NOISY = {"noise_mm": 3.0, "outliers": 0.1}
 
 
-def fits(solid, **how):
-    return [fit_cylinder(view(solid, seed=seed, **how), views.camera_pose()) for seed in SEEDS]
+def fits(solid, *hows):
+    """Return the fit to a picture of each kind, with different noise."""
+    return [fit_cylinder(view(solid, seed=seed, **how), views.camera_pose()) for seed, how in enumerate(hows)]
 
 
 def off_centre(fit):
@@ -48,8 +48,6 @@ def naive_fit(image, pose):
     return x, y, math.sqrt(np.percentile((points[:, 0] - x) ** 2 + (points[:, 1] - y) ** 2, 95))
 
 
-# Upright cylinders -------------------------------------------------------------------------------------------
-
 STANDING = {
     "R33 h120": (UprightCylinder(33, 120, X, Y), {}, 1.0),
     "R33 h120, 3 mm, 10 % outliers": (UprightCylinder(33, 120, X, Y), NOISY, 3.0),
@@ -64,7 +62,7 @@ STANDING = {
 @pytest.mark.parametrize("name", STANDING)
 def test_a_standing_cylinder_is_found(name):
     solid, how, bound = STANDING[name]
-    for fit in fits(solid, **how):
+    for fit in fits(solid, how, how):
         assert off_centre(fit) < bound
         assert off_centre(fit) < 3 * fit.error_mm
         assert fit.error_mm < 4.0
@@ -82,8 +80,6 @@ def test_the_naive_fit_fails_on_the_same_pictures():
     assert wild[2] > 33 + 50  # and outliers blow the radius up
 
 
-# Other shapes ------------------------------------------------------------------------------------------------
-
 BOXES = {
     "a flat packet": DepthBlock(180, 50, 220, X, Y, 0.2),
     "a packet viewed from its side": DepthBlock(180, 50, 220, X, Y, 1.5),
@@ -94,10 +90,9 @@ BOXES = {
 
 
 @pytest.mark.parametrize("name", BOXES)
-@pytest.mark.parametrize("how", [{}, {"outliers": 0.1}])
-def test_a_box_becomes_its_inscribed_cylinder(name, how):
+def test_a_box_becomes_its_inscribed_cylinder(name):
     box = BOXES[name]
-    for fit in fits(box, **how):
+    for fit in fits(box, {}, {"outliers": 0.1}):
         assert fit.method == "box"
         assert off_centre(fit) < 4.0
         assert off_centre(fit) < 3 * fit.error_mm
@@ -117,9 +112,8 @@ def test_without_a_bound_a_circle_through_a_plane_is_huge():
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.7, 1.5])
-@pytest.mark.parametrize("how", [{}, NOISY])
-def test_a_lying_cylinder_is_not_confused_with_an_upright_one_or_a_box(yaw, how):
-    for fit in fits(LyingCylinder(25, 120, X, Y, yaw), **how):
+def test_a_lying_cylinder_is_not_confused_with_an_upright_one_or_a_box(yaw):
+    for fit in fits(LyingCylinder(25, 120, X, Y, yaw), {}, NOISY):
         assert fit.method == "lying"
         assert off_centre(fit) < 3.5
         assert off_centre(fit) < 3 * fit.error_mm
@@ -130,9 +124,9 @@ def test_a_lying_cylinder_is_not_confused_with_an_upright_one_or_a_box(yaw, how)
 
 
 def test_a_ball_is_round():
-    for fit in fits(DepthBall(35, X, Y)):
-        assert off_centre(fit) < 3.0
-        assert fit.method not in ("box", "lying")
+    (fit,) = fits(DepthBall(35, X, Y), {})
+    assert off_centre(fit) < 3.0
+    assert fit.method not in ("box", "lying")
 
 
 def test_a_short_arc_gives_no_circle_and_a_large_error():
@@ -149,43 +143,30 @@ def test_a_short_arc_gives_no_circle_and_a_large_error():
     assert fit.error_mm >= 3.0
 
 
-# Difficult pictures ------------------------------------------------------------------------------------------
-
-
-def test_glass_on_the_table_is_a_clear_error():
-    with pytest.raises(PlanError, match="transparent"):
-        fit_cylinder(view(missing=[UprightCylinder(33, 120, X, Y)]), views.camera_pose())
-
-
-def test_an_empty_table_is_a_clear_error():
-    with pytest.raises(PlanError, match="no object in the depth picture"):
-        fit_cylinder(view(outliers=0.1), views.camera_pose())
-
-
-def test_a_picture_without_depth_is_a_clear_error():
+def test_glass_an_empty_table_and_a_picture_without_depth_are_clear_errors():
     image = view(UprightCylinder(33, 120))
-    with pytest.raises(PlanError, match="requires a picture with depth"):
-        fit_cylinder(RGBD(image.colour, None, image.intrinsics, 0.0), views.camera_pose())
-    blind = RGBD(image.colour, np.full_like(image.depth_m, np.nan), image.intrinsics, 0.0)
-    with pytest.raises(PlanError, match="no object in the depth picture"):
-        fit_cylinder(blind, views.camera_pose())
+    without = [(None, "requires a picture with depth"), (np.full_like(image.depth_m, np.nan), "no object in the depth")]
+    glass = view(missing=[UprightCylinder(33, 120, X, Y)])
+    pictures = [(RGBD(image.colour, depth, image.intrinsics, 0.0), message) for depth, message in without]
+    for picture, message in [*pictures, (glass, "transparent"), (view(outliers=0.1), "no object in the depth picture")]:
+        with pytest.raises(PlanError, match=message):
+            fit_cylinder(picture, views.camera_pose())
 
 
-@pytest.mark.parametrize("value", [0.0, -1.0, np.inf, -np.inf])
-def test_invalid_depths_are_unknown(value):
+def test_invalid_depths_are_unknown():
     """The authors' Kinect returns 0 for unknown depth."""
     image = view(UprightCylinder(33, 120, X, Y))
-    holes = image.depth_m.copy()
-    holes[np.random.default_rng(0).uniform(size=holes.shape) < 0.05] = value
+    holes, drawn = image.depth_m.copy(), np.random.default_rng(0).uniform(size=image.depth_m.shape)
+    for part, value in enumerate([0.0, -1.0, np.inf, -np.inf]):
+        holes[(drawn > 0.0125 * part) & (drawn < 0.0125 * (part + 1))] = value
     with np.errstate(all="raise"):
         fit = fit_cylinder(RGBD(image.colour, holes, image.intrinsics, 0.0), views.camera_pose())
     assert off_centre(fit) < 1.0
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_calibration_that_is_not_finite_is_a_configuration_error(value):
+def test_a_calibration_that_is_not_finite_is_a_configuration_error():
     pose = views.camera_pose()
-    pose[0, 3] = value
+    pose[0, 3] = np.nan
     with pytest.raises(RobotConfigError, match="extrinsics must be finite"):
         fit_cylinder(view(UprightCylinder(33, 120, X, Y)), pose)
 
@@ -193,7 +174,7 @@ def test_a_calibration_that_is_not_finite_is_a_configuration_error(value):
 def test_an_object_at_the_border_is_noted_or_refused():
     pose = views.camera_pose()
     noted = refused = 0
-    for x in range(580, 700, 20):
+    for x in (600, 640, 680):
         try:
             fit = fit_cylinder(view(UprightCylinder(33, 120, x, 0)), pose)
         except PlanError as error:
@@ -222,9 +203,6 @@ def test_a_table_at_another_height_than_calibrated_is_found_and_noted():
     assert fit.height_mm == pytest.approx(120, abs=2)
 
 
-# Width -------------------------------------------------------------------------------------------------------
-
-
 def width_by_points(fit, yaw, finger):
     """Return the width by search: the farthest point of the footprint within the finger's strip."""
     c, s = math.cos(yaw), math.sin(yaw)
@@ -239,7 +217,7 @@ def width_by_points(fit, yaw, finger):
 
 
 @pytest.mark.parametrize("half_mm", [(75.0, 10.0), (10.0, 75.0)])
-@pytest.mark.parametrize("yaw", [0.3, 0.8, 1.2, 2.0, 3.0])
+@pytest.mark.parametrize("yaw", [0.3, 1.2, 2.0])
 def test_the_width_of_a_box_is_its_extent_where_the_fingers_pass(yaw, half_mm):
     fit = CylinderFit(0, 0, 100, 10, 1, "box", half_mm, 0.3)
     assert fit.width_mm(yaw, 25.0) == pytest.approx(width_by_points(fit, yaw, 25.0), abs=1.0)
