@@ -10,21 +10,17 @@ import math
 import time
 import zlib
 from collections import Counter
-from dataclasses import dataclass
 from unittest.mock import patch
 
-import cv2
 import numpy as np
 
-from robot.collection import CollectSettings, collect
-from robot.devices import Arm, Camera
+from robot.devices import Arm, Camera, VirtualDevice
 from robot.drivers.usb_camera import stream as opencv_stream
 from robot.drivers.usb_camera.driver import OpencvTactile
 from robot.drivers.wsg50.driver import WSG50
 from robot.errors import DeviceError
 from robot.grasping.settings import AttemptSettings, GraspSettings
 from robot.readings import RGBD, Intrinsics, Pose, Region
-from robot.recording.folder import read_recording
 from robot.rig import Rig
 from tests import views
 from tests.emulators.wsg50.faults import LineFaults
@@ -64,11 +60,6 @@ class EmulatedRigState:
         return kind
 
     @property
-    def all_counts(self):
-        """Counts of faults so far, by device and kind."""
-        return self.counts + self.line.counts
-
-    @property
     def holding(self):
         return self.emulator.grasping == HOLDING and self.emulator.object_mm is not None
 
@@ -89,18 +80,12 @@ class EmulatedRigState:
         return 2 * math.sqrt(solid.radius**2 - across**2) if abs(across) < solid.radius else None
 
 
-class EmulatedArm(Arm):
+class EmulatedArm(VirtualDevice, Arm):
     """An arm that reaches its target at once, unless it fails."""
 
     def __init__(self, shared):
         super().__init__("emulated arm", WORKSPACE)
         self.shared = shared
-
-    def _connect(self): ...
-
-    def _close(self): ...
-
-    def _stop(self): ...
 
     def _move_to(self, pose, speed_mm_s):
         kind = self.shared.fault("arm", "did not arrive", "link lost")
@@ -122,36 +107,27 @@ class WatchedWSG50(WSG50):
         super().__init__(**settings)
         self.shared = shared
 
-    def open(self, opening_mm):
-        with self._watched():
-            return super().open(opening_mm)
-
-    def grasp(self, force_n, speed_mm_s=80.0):
-        with self._watched():
-            return super().grasp(force_n, speed_mm_s)
-
-    def close(self):
-        with self._watched():
-            super().close()
-
     @contextlib.contextmanager
-    def _watched(self):
+    def _moving(self, failure):
         try:
-            yield
+            with super()._moving(failure):
+                yield
+        finally:
+            self.shared.left_moving += self.shared.emulator.moves
+
+    def _close(self):
+        try:
+            super()._close()
         finally:
             self.shared.left_moving += self.shared.emulator.moves
 
 
-class EmulatedCamera(Camera):
+class EmulatedCamera(VirtualDevice, Camera):
     """A camera that shows the cylinder on the table."""
 
     def __init__(self, shared):
         super().__init__("emulated camera", views.camera_pose())
         self.shared = shared
-
-    def _connect(self): ...
-
-    def _close(self): ...
 
     def _read(self, depth):
         kind = self.shared.fault("camera", "unplugged", "stale", "blind")
@@ -245,40 +221,3 @@ def emulated_rig(seed=0, *, port="tcp", rate=0.0):
         patch.object(opencv_stream, "open_capture", lambda device: by_path[device].open(device)),
     ):
         yield EmulatedRig(url, shared, gels)
-
-
-@dataclass
-class Outcome:
-    """Result of a collection with faults."""
-
-    grasps: int
-    attempts: int
-    stops: list[str]
-    faults: Counter
-    left_moving: int
-    left_holding: int
-
-
-def collect_among_faults(out, grasps, *, rate=0.02, seed=0, port="tcp", objects=5):
-    """Collect `grasps` accepted grasps with faults at every device; start again after each stop, as a person would."""
-    outcome = Outcome(0, 0, [], Counter(), 0, 0)
-    names = [f"can-{number}" for number in range(objects)]
-    options = {"objects": names, "seed": seed, "settings": CollectSettings(grasps // objects)}
-    while not outcome.grasps:
-        with emulated_rig(seed + len(outcome.stops), port=port, rate=rate) as rig:
-            try:
-                tallies = collect(lambda rig=rig: rig, out, **options)
-                outcome.grasps = sum(tally.accepted for tally in tallies)
-                outcome.attempts = sum(tally.attempts for tally in tallies)
-            except DeviceError as error:
-                outcome.stops.append(str(error))
-            outcome.left_moving += rig.shared.left_moving
-            outcome.left_holding += rig.shared.emulator.grasping == HOLDING
-            outcome.faults += rig.shared.all_counts
-    return outcome
-
-
-def broken_images(folder):
-    """Return the pictures of a recording that are missing or damaged."""
-    paths = [folder / path for grasp in read_recording(folder).grasps for path in grasp.images().values()]
-    return [path for path in paths if not path.is_file() or cv2.imread(str(path)) is None]

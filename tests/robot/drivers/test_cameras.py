@@ -35,6 +35,7 @@ def realsense(**more):
 def test_a_realsense_returns_colour_and_depth_in_metres_with_its_intrinsics(install):
     rs = install(FakeRealSense())
     with realsense() as eye:
+        rs.waiting = 9  # a picture taken before the read, which is skipped
         image = eye.read()
         np.testing.assert_allclose(image.depth_m, [[np.nan, 0.5, 0.5, 1.0]] * 3, rtol=1e-6)
         assert image.depth_m.dtype == np.float32
@@ -48,13 +49,6 @@ def test_a_realsense_returns_colour_and_depth_in_metres_with_its_intrinsics(inst
     assert rs.stopped == 1
 
 
-def test_a_picture_taken_before_the_read_is_skipped(install):
-    rs = install(FakeRealSense())
-    with realsense() as eye:
-        rs.waiting = 9
-        assert eye.read().colour[0, 0, 2] == 0
-
-
 def test_a_realsense_with_a_distorted_lens_is_undistorted_by_the_vendors_model(install):
     """The lens shifts the picture by one pixel to the right, so all moves left and the last column is unknown."""
     install(FakeRealSense(distortion=(1.0, 0.0, 0.0, 0.0, 0.0)))
@@ -64,16 +58,11 @@ def test_a_realsense_with_a_distorted_lens_is_undistorted_by_the_vendors_model(i
         assert eye.settings()["distortion"][0] == 1.0
     assert image.colour[0, :3, 0].tolist() == [10, 20, 30]
     np.testing.assert_allclose(image.depth_m[0], [0.5, 0.5, 1.0, np.nan], rtol=1e-6)
-
-
-def test_undistorted_depth_is_never_a_mean_of_two_surfaces(install):
-    """With a shift of half a pixel, interpolation would invent a surface at 0.75 m."""
+    # With a shift of half a pixel, interpolated depth would be that of a surface at 0.75 m, which is not there.
     install(FakeRealSense(distortion=(0.5, 0.0, 0.0, 0.0, 0.0)))
     with realsense() as eye:
         depth = eye.read().depth_m
     assert set(depth[np.isfinite(depth)].tolist()) <= {0.5, 1.0}
-    naive = cv2.remap(np.float32([[0.5, 1.0]]), np.float32([[[0.5, 0.0]]]), None, cv2.INTER_LINEAR)
-    assert naive[0, 0] == pytest.approx(0.75)
 
 
 @pytest.mark.parametrize(
@@ -116,13 +105,9 @@ def test_a_realsense_without_depth_in_its_picture_is_an_error(install):
         eye.read(depth=False)
 
 
-WAITS = [{"warmup_frames": -1}, {"warmup_frames": 10**9}, {"timeout_s": math.nan}, {"timeout_s": 1e5}]
-
-
-@pytest.mark.parametrize("setting", [{"width": 0}, {"height": 10**20}, {"fps": 0}, *WAITS])
-def test_settings_of_a_realsense_out_of_range_are_refused(setting):
-    with pytest.raises(RobotConfigError, match=next(iter(setting))):
-        realsense(**setting)
+def test_a_setting_of_a_realsense_out_of_range_is_refused():
+    with pytest.raises(RobotConfigError, match="timeout_s"):
+        realsense(timeout_s=math.nan)
 
 
 # Missing packages -------------------------------------------------------------------------------------------
@@ -139,20 +124,13 @@ def test_a_missing_system_library_is_named(tmp_path, monkeypatch):
 # Plain USB camera -------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def usb(tmp_path, monkeypatch):
-    """A fake connected camera and its name."""
-    camera = FakeVideoDevice()
+def test_a_plain_camera_returns_colour_has_no_depth_and_may_hang_upside_down(tmp_path, monkeypatch):
+    camera, name = FakeVideoDevice(), tmp_path / "usb-Webcam-video-index0"
     monkeypatch.setattr(cv2, "VideoCapture", camera.open)
     monkeypatch.setattr(discover, "DEV", tmp_path)
-    name = tmp_path / "usb-Webcam-video-index0"
     name.touch()
-    return camera, str(name)
-
-
-def test_a_plain_camera_returns_colour_and_has_no_depth(usb):
-    camera, name = usb
-    with UvcCamera(device=name, extrinsics=EXTRINSICS, width=640, height=480, warmup_s=0.0) as eye:
+    settings = {"device": str(name), "extrinsics": EXTRINSICS, "warmup_s": 0.0}
+    with UvcCamera(width=640, height=480, **settings) as eye:
         image = eye.read(depth=False, max_age_s=10)
         assert (image.depth_m, image.intrinsics) == (None, None)
         assert (image.colour[0, :, 0] == 200).all()
@@ -161,13 +139,9 @@ def test_a_plain_camera_returns_colour_and_has_no_depth(usb):
         assert eye.settings()["width"] == 640
         assert (cv2.CAP_PROP_AUTO_EXPOSURE, 3) in camera.written  # automatic
         assert eye.refused == {}
-    assert not eye.has_depth
-    assert not camera.open_captures
-    assert not own_threads()
-
-
-def test_the_picture_of_a_plain_camera_upside_down_is_rotated(usb):
-    with UvcCamera(device=usb[1], extrinsics=EXTRINSICS, upside_down=True, warmup_s=0.0) as eye:
+    with UvcCamera(upside_down=True, **settings) as eye:
         colour = eye.read(depth=False, max_age_s=10).colour
     assert (colour[-1, :, 0] == 200).all()
     assert (colour[:-1, :, 0] == 100).all()
+    assert not camera.open_captures
+    assert not own_threads()

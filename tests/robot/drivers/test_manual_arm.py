@@ -75,31 +75,13 @@ def test_the_pose_is_unknown_before_the_first_motion_after_a_stop_and_after_reco
         arm.pose()
 
 
-def test_an_interrupted_prompt_is_repeated():
-    def interrupt(_):
-        raise KeyboardInterrupt
+@pytest.mark.parametrize(("raised", "error"), [(KeyboardInterrupt, KeyboardInterrupt), (EOFError, RobotConfigError)])
+def test_after_an_interrupted_prompt_or_without_a_terminal_the_pose_is_unknown(raised, error):
+    def ask(_):
+        raise raised
 
-    arm = connected(interrupt)
-    with pytest.raises(KeyboardInterrupt):
+    arm = connected(ask)
+    with pytest.raises(error):
         arm.move_to(Pose(0, 0, 100, 0), 100.0)
     with pytest.raises(DeviceError, match="call move_to first"):
         arm.pose()
-
-
-def test_a_request_without_a_terminal_raises():
-    def ended(_):
-        raise EOFError
-
-    with pytest.raises(RobotConfigError, match="run it in a terminal"):
-        connected(ended).move_to(Pose(0, 0, 100, 0), 100.0)
-
-
-def test_the_limits_apply_to_a_manual_arm_too():
-    arm = ManualArm(workspace=WORKSPACE, max_speed_mm_s=50.0, ask=lambda _: None)
-    with pytest.raises(DeviceError, match="must be connected"):
-        arm.move_to(Pose(0, 0, 100, 0), 10.0)
-    arm.connect()
-    with pytest.raises(DeviceError, match="workspace"):
-        arm.move_to(Pose(0, 0, 500, 0), 10.0)
-    with pytest.raises(DeviceError, match="speed"):
-        arm.move_to(Pose(0, 0, 100, 0), 60.0)

@@ -64,41 +64,28 @@ def test_a_camera_named_by_a_number_is_refused_with_the_names_of_those_connected
         OpencvTactile(finger="a", device=device)
 
 
-def test_without_stable_names_the_message_names_allow_index(dev):
+def test_a_camera_without_a_stable_name_needs_allow_index_and_a_missing_one_is_named(plug, dev):
     with pytest.raises(RobotConfigError, match="set allow_index = true"):
         OpencvTactile(finger="a", device="0")
-    assert stable_path("3", allow_index=True) == "/dev/video3"
-    assert stable_path("/dev/video3", allow_index=True) == "/dev/video3"
-
-
-def test_a_camera_that_is_not_plugged_in_is_named(plug, dev):
+    assert stable_path("3", allow_index=True) == stable_path("/dev/video3", allow_index=True) == "/dev/video3"
     name = plug(FakeVideoDevice())
     with pytest.raises(DeviceError, match=f"usb-Other does not exist.*Connected: {name}"):
         OpencvTactile(finger="a", device=str(dev / "v4l" / "by-id" / "usb-Other")).connect()
 
 
-def test_the_stable_name_is_resolved_and_opened_through_video4linux(plug, dev):
+def test_a_camera_in_use_cannot_be_connected_and_can_be_later(plug, dev):
     camera = FakeVideoDevice()
-    with OpencvTactile(finger="a", device=plug(camera, number=4), **QUICK):
-        assert camera.captures[0].path == str(dev / "video4")
-        assert camera.captures[0].backend == cv2.CAP_V4L2
-    assert not camera.open_captures
-
-
-def test_a_camera_in_use_cannot_be_connected_and_can_be_later(plug):
-    camera = FakeVideoDevice()
-    gel = OpencvTactile(finger="a", device=plug(camera), **QUICK)
+    gel = OpencvTactile(finger="a", device=plug(camera, number=4), **QUICK)
     camera.busy = True
     with pytest.raises(DeviceError, match="cannot be opened; is it used by another program"):
         gel.connect()
     assert not gel.is_connected
     assert not camera.open_captures
     camera.busy = False
-    for _ in range(2):
-        gel.connect()
+    with gel:
         gel.read(10)
-        gel.close()
-        gel.close()
+        assert camera.captures[-1].path == str(dev / "video4")
+        assert camera.captures[-1].backend == cv2.CAP_V4L2
     assert not camera.open_captures
 
 
@@ -112,7 +99,7 @@ def test_the_real_opencv_cannot_open_a_file_that_is_not_a_camera(dev):
 # Settings ---------------------------------------------------------------------------------------------------
 
 
-def test_format_is_written_first_then_size_and_rate_and_then_the_rest(plug):
+def test_settings_are_written_with_the_format_first_and_read_back(plug):
     camera = FakeVideoDevice()
     requested = {"exposure_ms": 5.0, "white_balance_k": 4600.0, "gain": 0.0}
     with GelSight(finger="a", device=plug(camera), **requested, **QUICK) as gel:
@@ -128,17 +115,11 @@ def test_format_is_written_first_then_size_and_rate_and_then_the_rest(plug):
             (cv2.CAP_PROP_GAIN, 0),
         ]
         assert gel.refused == {}
-
-
-def test_the_settings_that_the_camera_reports_are_recorded(plug):
-    with GelSight(finger="a", device=plug(FakeVideoDevice()), exposure_ms=5.0, **QUICK) as gel:
-        found = gel.settings()
-    assert found["fourcc"] == "MJPG"
-    assert (found["width"], found["height"], found["fps"]) == (1280, 960, 30.0)
+        found = json.loads(json.dumps(gel.settings()))
+    assert (found["fourcc"], found["width"], found["height"], found["fps"]) == ("MJPG", 1280, 960, 30.0)
     assert (found["auto_exposure"], found["exposure_ms"], found["auto_white_balance"]) == (False, 5.0, False)
     assert found["picture_px"] == [8, 6]  # the size of the actual pictures
     assert found["device"].endswith("video-index0")
-    json.dumps(found)
 
 
 def test_settings_that_the_camera_refuses_are_reported_with_the_actual_values(plug):
@@ -164,23 +145,13 @@ def test_the_zoom_control_of_a_digit_sets_its_brightness(plug):
     ("setting", "message"),
     [
         ({"width": 640}, "width and height"),
-        ({"width": -1, "height": -1}, "width must be"),
-        ({"fps": -1.0}, "fps"),
         ({"fps": math.nan}, "fps"),
         ({"fourcc": "MJPEG"}, "fourcc"),
-        ({"exposure_ms": -1.0}, "exposure_ms"),
         ({"exposure_ms": 5.0, "auto_exposure": True}, "exposure_ms must be left out"),
         ({"white_balance_k": 5000.0, "auto_white_balance": True}, "white_balance_k must be left out"),
-        ({"gain": math.inf}, "gain"),
-        ({"led": [1, 2]}, "led"),
         ({"led": [1, 2, 16]}, "led"),
         ({"crop": [0.5, 0.0, 0.5, 0.0]}, "crop"),
-        ({"crop": [0.1]}, "crop"),
-        ({"output_px": [0, 4]}, "output_px"),
-        ({"keep": 0}, "keep"),
-        ({"frozen_s": 0.0}, "frozen_s"),
         ({"timeout_s": math.inf}, "timeout_s"),
-        ({"warmup_s": 1e10}, "warmup_s"),
     ],
 )
 def test_settings_out_of_range_are_refused_before_connecting(setting, message):
@@ -191,22 +162,16 @@ def test_settings_out_of_range_are_refused_before_connecting(setting, message):
 # Pictures ---------------------------------------------------------------------------------------------------
 
 
-def test_pictures_are_rgb_with_row_0_on_top(plug):
+def test_pictures_are_rgb_with_row_0_on_top_and_that_of_a_digit_is_rotated_to_the_left(plug):
+    """The camera's first row becomes the left column, as after transposing and flipping."""
     with OpencvTactile(finger="a", device=plug(FakeVideoDevice()), **QUICK) as gel:
         pixels = gel.read(10).pixels
-    assert pixels.shape == (6, 8, 3)
-    assert (pixels[0, :, 0] == 200).all()
-    assert (pixels[1:, :, 0] == 100).all()
-    assert (pixels[..., 1] == 50).all()
-
-
-def test_the_picture_of_a_digit_is_rotated_to_the_left(plug):
-    """The camera's first row becomes the left column, as after transposing and flipping."""
     with Digit(finger="a", device=plug(FakeVideoDevice()), **QUICK) as gel:
-        pixels = gel.read(10).pixels
-    assert pixels.shape == (8, 6, 3)
-    assert (pixels[:, 0, 0] == 200).all()
-    assert (pixels[:, 1:, 0] == 100).all()
+        turned = gel.read(10).pixels
+    assert pixels[:, 0].tolist() == [[200, 50, pixels[0, 0, 2]], *[[100, 50, pixels[0, 0, 2]]] * 5]
+    assert turned.shape == (8, 6, 3)
+    assert (turned[:, 0, 0] == 200).all()
+    assert (turned[:, 1:, 0] == 100).all()
     picture = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
     np.testing.assert_array_equal(np.rot90(picture), cv2.flip(cv2.transpose(picture), 0))
 
@@ -228,8 +193,7 @@ def test_cropping_keeps_the_pixels_and_shrinking_takes_the_means():
     assert set(stripes[::2, ::2].ravel().tolist()) == {0}  # every second pixel would show only the dark stripes
 
 
-@pytest.mark.parametrize("shape", [(6, 8, 2), (6, 8), (6, 8, 4)])
-@pytest.mark.parametrize("make", [OpencvTactile, Digit, GelSightMini])
+@pytest.mark.parametrize(("make", "shape"), [(OpencvTactile, (6, 8, 2)), (Digit, (6, 8)), (GelSightMini, (6, 8, 4))])
 def test_pictures_without_three_colours_are_a_device_error_with_the_remedy(plug, make, shape):
     camera = FakeVideoDevice()
     camera.picture = lambda number: np.full(shape, number % 256, np.uint8)

@@ -169,18 +169,9 @@ def test_the_blocking_reason_names_the_action_for_a_person(fields, text):
     assert text in messages.parse(message | fields, messages.RobotState).blocking_reason
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"tool_mm": math.nan},
-        {"base_xyz_mm": [0.0, 0.0]},
-        {"base_xyz_mm": [0.0, 0.0, math.nan]},
-        {"speed_ratio": 1.5},
-    ],
-)
-def test_settings_out_of_range_are_refused_without_a_robot(changes):
-    with pytest.raises(RobotConfigError, match=next(iter(changes))):
-        arm_at("ws://127.0.0.1:9090", **changes)
+def test_settings_out_of_range_are_refused_without_a_robot():
+    with pytest.raises(RobotConfigError, match="base_xyz_mm"):
+        arm_at("ws://127.0.0.1:9090", base_xyz_mm=[0.0, 0.0, math.nan])
 
 
 # with the emulated robot
