@@ -182,11 +182,8 @@ def blocks_of(generation: Generation) -> Iterator[Arrays]:
 def write_blocks(store: IndexStore, photos: int, blocks: Iterable[Arrays], kind: str = FLAT) -> Generation:
     """Write a generation of blocks of arrays, and return it opened."""
     threads = torch.get_num_threads()
-    with store.lock(), store.draft() as draft:
-        draft.write_rows(rows_of(photos))
-        draft.build_index(draft.write_arrays(blocks)["embeddings"], kind, threads=threads)
-        draft.finish()
-    return store.open(name=draft.name, verify=False, threads=threads)
+    store.write(rows_of(photos), blocks, kind=kind, threads=threads)
+    return store.open(verify=False, threads=threads)
 
 
 def rows_of(photos: int) -> list[Row]:

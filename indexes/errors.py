@@ -1,19 +1,6 @@
 """Every error that `indexes` raises on purpose; any other exception is a bug.
 
 A message contains the requirement, the value and the remedy. Each class has the exit code of the command line.
-
-    IndexesError                  wrong use or bad input (exit code 2)
-    +-- VectorError               a vector is NaN, infinite, zero, not of unit norm, or of the wrong size
-    +-- RowError                  the rows, arrays or documents of an index are invalid
-    +-- ParameterError            an unknown kind, or a setting that is unknown or out of range
-    +-- NoIndex                   there is no index at the path
-    +-- CorruptIndex              a file of the index is missing, truncated or damaged
-    +-- MismatchedIndex           the index was made with another model or preprocessing than required
-    +-- UnsupportedFormat         the index has a newer or older format than this software supports
-    +-- LockedIndex               another writer is writing the index
-    +-- JobFailed                 the job ran and failed (exit code 1)
-        +-- WriteFailed           a file could not be written
-        +-- EngineError           the vector library failed
 """
 
 AGAIN = "run `retrieve build-index` again"

@@ -19,8 +19,8 @@ current and complete; the next writer deletes the unfinished files.
 """
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from os import getpid
 from pathlib import Path
 from typing import Any
@@ -29,8 +29,9 @@ from _touch_retrieval import files
 from _touch_retrieval.files import read_regular
 from indexes.errors import AGAIN, CorruptIndex, NoIndex, WriteFailed
 from indexes.kinds.vector_index import Floats
-from indexes.store.generation import EMBEDDINGS, Arrays, Draft, Generation, read_generation
+from indexes.store.generation import Arrays, Generation, Measure, check_fingerprint, read_generation, write_generation
 from indexes.store.locking import writer_lock
+from indexes.store.manifest import Manifest
 from indexes.store.rows import Row
 
 GENERATION = re.compile(r"gen-(\d{6,})")
@@ -44,14 +45,15 @@ class IndexStore:
     >>> import numpy as np
     >>> store = indexes.IndexStore("photos")
     >>> rows = [indexes.Row("mug/1.jpg", "mug", "1"), indexes.Row("tin/1.jpg", "tin", "2")]
-    >>> store.write(rows, np.eye(2, dtype=np.float32), fingerprint={"checkpoint": "abc"}).name
+    >>> blocks = [{"embeddings": np.eye(2, dtype=np.float32)}]
+    >>> store.write(rows, blocks, fingerprint={"checkpoint": "abc"}).generation
     'gen-000001'
     >>> store.open(expect={"checkpoint": "abc"}).count
     2
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
+        self.path, self._is_locked = Path(path), False
 
     def open(
         self,
@@ -82,7 +84,7 @@ class IndexStore:
             if name is not None or self.current() == requested:
                 raise
             generation = self._read(self.current(), verify, threads)  # a writer replaced it while it was being read
-        generation.require(expect or {})
+        check_fingerprint(self.path, generation.manifest.fingerprint, expect or {})
         return generation
 
     def current(self) -> str:
@@ -98,25 +100,87 @@ class IndexStore:
             raise CorruptIndex(f"{path}: must name a generation such as gen-000001, got {text!r}; {AGAIN}")
         return text
 
-    def lock(self) -> AbstractContextManager[None]:
-        """Return the writer lock: within `with store.lock():` other writers get `LockedIndex`."""
-        return writer_lock(self.path / "LOCK")
-
     @contextmanager
-    def draft(self) -> Iterator[Draft]:
-        """Yield the next generation to write, and make it current when the block ends; use it within `lock()`.
+    def lock(self) -> Iterator[None]:
+        """Hold the writer lock in the block: other writers get `LockedIndex`. `write` takes it if it is not held."""
+        if self._is_locked:
+            yield
+            return
+        with writer_lock(self.path / "LOCK"):
+            self._is_locked = True
+            try:
+                yield
+            finally:
+                self._is_locked = False
+
+    def write(
+        self,
+        rows: Sequence[Row],
+        blocks: Iterable[Arrays],
+        *,
+        kind: str = "flat",
+        documents: Mapping[str, Any] | None = None,
+        queries: Floats | None = None,
+        measure: Measure | None = None,
+        fingerprint: Mapping[str, str] | None = None,
+        about: Mapping[str, Any] | None = None,
+        software: str = "",
+        threads: int | None = None,
+    ) -> Manifest:
+        """Write a new generation, make it current, and return its manifest.
 
         After `WriteFailed` the current generation is the old or the new one, and complete. After any other error the
         index is unchanged.
+
+        Args:
+            rows: The N rows, sorted by path.
+            blocks: Arrays of consecutive rows by name, (n, ...) of finite numbers; "embeddings" are unit vectors (n, d)
+                float32. One block is in memory at a time.
+            kind: Name of the kind of index.
+            documents: Name to JSON document or array.
+            queries: Unit vectors (Q, d) to measure recall with; None to draw them near the embeddings.
+            measure: Returns further entries of `about` from the written index and arrays.
+            fingerprint: Origin of the vectors, compared by `IndexStore.open(expect=...)`.
+            about: Further entries of the manifest.
+            software: Version of the writing software.
+            threads: Number of threads; None for the library's own setting.
+
+        Raises:
+            RowError: A row, array or document is invalid.
+            VectorError: A vector is invalid.
+            ParameterError: The kind is unknown or needs more vectors.
+            LockedIndex: Another writer is writing the index.
+            WriteFailed: A file could not be written.
         """
+        with self.lock(), self._draft() as (folder, name):
+            return write_generation(
+                folder,
+                name,
+                rows,
+                blocks,
+                kind=kind,
+                documents=documents or {},
+                queries=queries,
+                measure=measure,
+                fingerprint=fingerprint or {},
+                about=about or {},
+                software=software,
+                threads=threads,
+            )
+
+    @contextmanager
+    def _draft(self) -> Iterator[tuple[Path, str]]:
+        """Yield a temporary folder and the name of the next generation; make it current when the block ends."""
         try:
-            self._require_index_folder()
+            numbers = self._numbers()
+            if not numbers and (self.path / "CURRENT").exists():
+                raise NoIndex(f"{self.path / 'CURRENT'} does not belong to an index; give another folder for the index")
             self._sweep()
-            name = f"gen-{max(self._numbers(), default=0) + 1:06d}"
+            name = f"gen-{max(numbers, default=0) + 1:06d}"
             folder = self.path / f"{name}.tmp-{getpid()}"
             try:
                 folder.mkdir()
-                yield Draft(folder, name)
+                yield folder, name
                 folder.rename(self.path / name)
             except BaseException:
                 _discard(folder)
@@ -126,57 +190,6 @@ class IndexStore:
         except OSError as error:
             where = error.filename or self.path
             raise WriteFailed(f"{where}: writing failed ({error.strerror or error}); write again") from error
-
-    def write(
-        self,
-        rows: Sequence[Row],
-        embeddings: Floats,
-        arrays: Arrays | None = None,
-        *,
-        kind: str = "flat",
-        documents: Mapping[str, Any] | None = None,
-        threads: int | None = None,
-        **about: Any,
-    ) -> Generation:
-        """Write a new generation of arrays in memory, make it current, and return it opened.
-
-        Args:
-            rows: The N rows, sorted by path.
-            embeddings: Unit vectors (N, d) float32.
-            arrays: Name to per-row array (N, ...) of finite numbers.
-            kind: Name of the kind of index.
-            documents: Name to JSON document or array.
-            threads: Number of threads; None for the library's own setting.
-            **about: Arguments of `Draft.finish`, such as the fingerprint.
-
-        Raises:
-            RowError: A row, array or document is invalid.
-            VectorError: A vector is invalid.
-            ParameterError: The kind is unknown or needs more vectors.
-            LockedIndex: Another writer is writing the index.
-            WriteFailed: A file could not be written.
-        """
-        with self.lock():
-            with self.draft() as draft:
-                draft.write_rows(rows)
-                written = draft.write_arrays([{EMBEDDINGS: embeddings, **(arrays or {})}])
-                draft.write_documents(documents or {})
-                draft.build_index(written[EMBEDDINGS], kind, threads=threads)
-                draft.finish(**about)
-            self.discard_before(draft.name)
-        return self.open(name=draft.name, verify=False, threads=threads)
-
-    def _require_index_folder(self) -> None:
-        """Raise NoIndex for a folder without generations that has a file CURRENT: it belongs to another program."""
-        path = self.path / "CURRENT"
-        try:
-            is_other = not self._numbers() and read_regular(path).strip()
-        except (FileNotFoundError, NotADirectoryError):  # if the path is a file, locking it fails with a message
-            return
-        except OSError as error:
-            raise NoIndex(f"{path} cannot be read ({error.strerror}); give another folder for the index") from error
-        if is_other:
-            raise NoIndex(f"{path} does not belong to an index and was not changed; give another folder for the index")
 
     def discard_before(self, name: str) -> None:
         """Delete old generations, except the two before `name`, which readers may be opening."""

@@ -12,9 +12,9 @@ from msgspec import Meta
 
 from _touch_retrieval.documents import typed
 from _touch_retrieval.files import durable_file, file_digest, open_regular, read_json
-from indexes.errors import AGAIN, CorruptIndex, RowError, UnsupportedFormat
+from indexes.errors import AGAIN, CorruptIndex, UnsupportedFormat
 
-FORMAT = 6
+FORMAT = 7
 NAME = "manifest.json"
 MAX_BYTES = 4 * 2**20
 """Largest manifest. With the names and digests of 4096 shards it has 1 MiB."""
@@ -69,12 +69,9 @@ class Manifest:
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Write the file, with a digest of its content at the end. Raises `RowError` if it is too large."""
-    text = encode_document(manifest, FORMAT)
-    if len(text) > MAX_BYTES:
-        raise RowError(f"a manifest must have at most {MAX_BYTES} bytes, got {len(text)}; shorten `about`")
+    """Write the file, with a digest of its content at the end."""
     with durable_file(folder / NAME) as handle:
-        handle.write(text)
+        handle.write(encode_document(manifest, FORMAT))
 
 
 def read_manifest(folder: Path) -> Manifest:
@@ -85,8 +82,7 @@ def read_manifest(folder: Path) -> Manifest:
 def encode_document(content: Any, version: int) -> bytes:
     """Return the JSON of a dataclass, with the format version first and the digest of the content last."""
     document = {"format": version} | asdict(content)
-    document["sha256"] = content_digest(document)
-    return json.dumps(document, allow_nan=False, indent=2).encode() + b"\n"
+    return json.dumps(document | {"sha256": content_digest(document)}, allow_nan=False, indent=2).encode() + b"\n"
 
 
 def read_document(path: Path, version: int, kind: type[T]) -> T:

@@ -4,11 +4,11 @@ Rows are sorted by path, and objects are numbered by name, so a photo or an obje
 """
 
 from bisect import bisect_left
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -47,7 +47,7 @@ class Row(Struct, frozen=True):
 _DECODER = msgspec.json.Decoder(Row)
 
 
-class Rows(Sequence[Row]):
+class Rows:
     """The N rows of a generation, parsed on access.
 
     Attributes:
@@ -65,15 +65,16 @@ class Rows(Sequence[Row]):
     def __len__(self) -> int:
         return len(self._stops)
 
-    @overload
-    def __getitem__(self, index: int) -> Row: ...
+    def __getitem__(self, number: int) -> Row:
+        number = range(len(self))[number]
+        start = self._stops[number - 1] if number else 0
+        try:
+            return _DECODER.decode(self._text[start : self._stops[number]].tobytes())
+        except (msgspec.DecodeError, RecursionError) as error:
+            raise CorruptIndex(f"row {number} of the index cannot be read ({error}); {AGAIN}") from error
 
-    @overload
-    def __getitem__(self, index: slice) -> list[Row]: ...
-
-    def __getitem__(self, index: int | slice) -> Row | list[Row]:
-        numbers = range(len(self))[index]
-        return self._parse(numbers) if isinstance(numbers, int) else [self._parse(number) for number in numbers]
+    def __iter__(self) -> Iterator[Row]:
+        return map(self.__getitem__, range(len(self)))
 
     def find(self, path: str) -> int:
         """Return the number of the row with this path; -1 if there is none."""
@@ -95,13 +96,6 @@ class Rows(Sequence[Row]):
         first = np.zeros(self.object_count, np.int64)
         first[self.objects[::-1]] = np.arange(len(self))[::-1]  # the last assignment remains
         return first
-
-    def _parse(self, number: int) -> Row:
-        start = self._stops[number - 1] if number else 0
-        try:
-            return _DECODER.decode(self._text[start : self._stops[number]].tobytes())
-        except (msgspec.DecodeError, RecursionError) as error:
-            raise CorruptIndex(f"row {number} of the index cannot be read ({error}); {AGAIN}") from error
 
 
 def encode_rows(rows: Iterable[Row]) -> bytes:
@@ -144,6 +138,6 @@ def read_rows(folder: Path) -> Rows:
     """Return the rows of a generation's folder, memory-mapped. Raises CorruptIndex, OSError or ValueError."""
     text = np.asarray(np.memmap(folder / TEXT, np.uint8, "r"))
     table = np.load(folder / TABLE, mmap_mode="r", allow_pickle=False)
-    if table.dtype != RECORD or not len(table) or table["stop"][-1] != len(text) or table["object"].min() < 0:
+    if table.dtype != RECORD or table["stop"][-1] != len(text):
         raise CorruptIndex(f"{folder / TABLE}: does not fit {TEXT}; {AGAIN}")
     return Rows(text, table)

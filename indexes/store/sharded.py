@@ -10,7 +10,6 @@ Opening a sharded index reads only this file. Its length depends on the number o
 """
 
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from hashlib import blake2b
 from pathlib import Path
@@ -19,13 +18,13 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from _touch_retrieval.files import file_digest, write_atomically
-from indexes.errors import AGAIN, CorruptIndex, MismatchedIndex, NoIndex
+from indexes.errors import AGAIN, CorruptIndex, NoIndex
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from indexes.store.manifest import NAME as GENERATION_MANIFEST
 from indexes.store.manifest import encode_document, read_document
 
-NAME, FORMAT = "SHARDS.json", 2
+NAME, FORMAT = "SHARDS.json", 3
 SHARD_FOLDER = re.compile(r"shard-(\d{2,})-of-(\d{2,})")
 MAX_SHARDS = 4096
 
@@ -52,7 +51,6 @@ class ShardedManifest:
         kind: Kinds of index of the shards.
         fingerprint: Fingerprint of all shards.
         about: Catalogue, checkpoint and further facts of the build.
-        calibration: The document of that name; None without one.
         of: Number of shards, including empty ones.
         shards: The shards that have photos.
     """
@@ -63,7 +61,6 @@ class ShardedManifest:
     kind: str
     fingerprint: dict[str, str]
     about: dict[str, Any]
-    calibration: Any
     of: Annotated[int, Meta(ge=1, le=MAX_SHARDS)]
     shards: Annotated[list[ShardEntry], Meta(min_length=1, max_length=MAX_SHARDS)]
 
@@ -94,23 +91,6 @@ def shard_number(object_id: str, shards: int) -> int:
     return int.from_bytes(digest[8:], "little") % shards
 
 
-def shard_folder(number: int, of: int) -> str:
-    """Return the folder name of shard `number`, counted from 0, of `of` shards."""
-    return f"shard-{number:02d}-of-{of:02d}"
-
-
-def shard_entry(index: Path, folder: str, generation: Generation) -> ShardEntry:
-    """Return the manifest entry of a written shard.
-
-    Args:
-        index: Folder of the sharded index.
-        folder: Folder of the shard in it.
-        generation: Generation of the shard.
-    """
-    digest = file_digest(index / folder / generation.name / GENERATION_MANIFEST)
-    return ShardEntry(folder, generation.name, digest, generation.count, generation.manifest.objects)
-
-
 def write_sharded_manifest(folder: Path, manifest: ShardedManifest) -> None:
     """Write the manifest, which switches the sharded index to this generation; delete files of killed writers."""
     for path in folder.glob(f".{NAME}.*.tmp"):
@@ -129,30 +109,18 @@ def read_sharded_manifest(folder: Path) -> ShardedManifest:
     return manifest
 
 
-def open_shard(
-    index: Path,
-    entry: ShardEntry,
-    fingerprint: Mapping[str, str],
-    *,
-    threads: int | None = None,
-) -> Generation:
+def open_shard(index: Path, entry: ShardEntry, *, threads: int | None = None) -> Generation:
     """Open and check a shard, as `IndexStore.open`.
 
     Args:
         index: Folder of the sharded index.
         entry: Manifest entry of the shard.
-        fingerprint: Fingerprint of the sharded index.
         threads: Number of threads of a search; None for the library's own setting.
 
     Raises:
         IndexesError: The shard is missing, damaged, or not the generation in the manifest.
     """
-    store = IndexStore(index / entry.folder)
-    generation = store.open(name=entry.generation, threads=threads)
-    try:
-        generation.require(fingerprint)
-    except MismatchedIndex as error:
-        raise CorruptIndex(f"{generation.folder} does not belong to this sharded index ({error})") from error
-    if file_digest(generation.folder / GENERATION_MANIFEST) != entry.sha256 or generation.count != entry.photos:
+    generation = IndexStore(index / entry.folder).open(name=entry.generation, threads=threads)
+    if file_digest(generation.folder / GENERATION_MANIFEST) != entry.sha256:
         raise CorruptIndex(f"{generation.folder} is not the generation that {index / NAME} lists; {AGAIN}")
     return generation

@@ -26,9 +26,9 @@ from indexes.store.generation import check_fingerprint
 from indexes.store.sharded import ShardedManifest, ShardEntry, open_shard
 from retrieval.console.output import say
 from retrieval.errors import BadInput, IncompleteSearch, RetrievalError
-from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_checkpoint_info
-from retrieval.search.opening import folder_shard
-from retrieval.search.shard import IndexInfo, Shards
+from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint
+from retrieval.search.opening import checkpoint_of
+from retrieval.search.shard import FolderShard, Shards
 
 OWNERS = "touch-retrieval"
 APPLICATION = re.compile(r"shard-\d+-of-\d+-[0-9a-f]{16}-([0-9a-f]{8})")
@@ -64,10 +64,9 @@ class OwnerActor:
 class ShardReplica:
     """One shard in a process of Ray Serve."""
 
-    def __init__(self, index: str, entry: ShardEntry, fingerprint: dict[str, str], model: str) -> None:
-        stored = read_checkpoint_info(Path(model))
-        generation = open_shard(Path(index), entry, fingerprint, threads=1)
-        self._shard = folder_shard(generation, stored)
+    def __init__(self, index: str, entry: ShardEntry, model: str) -> None:
+        generation = open_shard(Path(index), entry, threads=1)
+        self._shard = FolderShard(generation, checkpoint_of(generation.manifest, model))
         threadpool_limits(1, "blas")  # for the whole process: idle BLAS threads spin on CPUs that others need
 
     def call(self, method: str, *arguments: Any) -> Any:
@@ -85,16 +84,13 @@ class RayShards(Shards):
     """A sharded index that Ray Serve serves; the shards are their entries in the manifest.
 
     Args:
-        info: Information about the index.
-        entries: Its shards.
+        manifest: Manifest of the index.
         handles: Folder of each shard to the handle of its deployment.
         settings: Settings of the replicas.
     """
 
-    def __init__(
-        self, info: IndexInfo, entries: Sequence[ShardEntry], handles: dict[str, Any], settings: ReplicaSettings
-    ) -> None:
-        super().__init__(info, entries)
+    def __init__(self, manifest: ShardedManifest, handles: dict[str, Any], settings: ReplicaSettings) -> None:
+        super().__init__(manifest, manifest.shards)
         self._handles, self._settings = handles, settings
 
     def call(self, shards: Sequence[ShardEntry], method: str, *arguments: Any) -> list[Any]:
@@ -182,9 +178,7 @@ class Deployments:
                 # Create its router now: concurrent first calls would create several, and only one could be shut down.
                 self._handles[name] = self._ray.serve.get_app_handle(name).options()
             handles = {folder: self._handles[name] for folder, name in names.items()}
-        opened = RayShards(
-            IndexInfo.of(manifest, manifest.calibration, len(manifest.shards)), manifest.shards, handles, self._settings
-        )
+        opened = RayShards(manifest, handles, self._settings)
         weakref.finalize(opened, self._release, list(names.values()))
         return opened
 
@@ -215,7 +209,7 @@ class Deployments:
         serve, settings = self._ray.serve, self._settings
         deployed = serve.status().applications
         entries = [entry for entry in manifest.shards if names[entry.folder] not in deployed]
-        required, model = dict(manifest.fingerprint), str(stored.path.resolve())
+        model = str(stored.path.resolve())
         deployment = serve.deployment(
             ShardReplica,
             name="shard",
@@ -228,7 +222,7 @@ class Deployments:
         )
         targets = [
             serve.RunTarget(
-                deployment.bind(index, entry, required, model),
+                deployment.bind(index, entry, model),
                 name=names[entry.folder],
                 route_prefix=None,
             )

@@ -1,10 +1,9 @@
-"""Build an index from a folder of photos: list, find codes, then write rows, arrays, index and manifest."""
+"""Build an index from a folder of photos: list, read or find codes, and write a generation unless nothing changed."""
 
 import hashlib
-import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,22 +15,15 @@ from indexes.errors import CorruptIndex, IndexesError, NoIndex, UnsupportedForma
 from indexes.kinds.measure import RECALL_QUERIES
 from indexes.kinds.vector_index import VectorIndex
 from indexes.store.folder import IndexStore
-from indexes.store.generation import EMBEDDINGS
+from indexes.store.generation import Arrays
 from indexes.store.manifest import Manifest, read_manifest
-from indexes.store.rows import TEXT, Row, encode_rows
+from indexes.store.rows import TEXT, encode_rows
 from retrieval.data.catalogue import Catalogue, list_catalogue
-from retrieval.data.folder_walk import SkippedPhoto
 from retrieval.data.naming import FOLDER, Naming, naming_warnings
-from retrieval.errors import BadInput, NoReadablePhoto
-from retrieval.indexing.candidates import (
-    candidates_sentence,
-    kept_measurement,
-    measure_candidates,
-    query_codes,
-)
-from retrieval.indexing.codes import FileDigests, code_blocks, find_codes, photo_encoder
+from retrieval.errors import BadInput
+from retrieval.indexing.candidates import candidates_sentence, kept_measurement, measure_candidates, query_codes
+from retrieval.indexing.contents import IndexContents, read_contents
 from retrieval.indexing.report import BuildReport
-from retrieval.indexing.touches import ReferenceTouches, find_references
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.checkpoint_info import fingerprint
 from retrieval.model.fusion_scorer import CELLS, PARTIALS, StoredPartials, largest_rounding
@@ -85,16 +77,15 @@ def build_index(
     >>> report.photos, report.embedded  # the index exists, and no photo changed
     (4, 0)
     """
-    out = Path(out)
+    store = IndexStore(out)
     try:
-        before = read_manifest(out / IndexStore(out).current()).about
+        before = read_manifest(store.path / store.current()).about
     except IndexesError:
         before = {}
-    naming, note = naming_by(objects_from, before)
-    options = BuildOptions(naming, kind_name(kind), quiet, note, cells=stores_cells(cells, before, checkpoint))
-    report = build_listed(list_catalogue(folder, naming), checkpoint, out, options)
-    IndexStore(out).discard_before(report.generation)
-    return report
+    options, note = build_options(checkpoint, before, objects_from=objects_from, kind=kind, cells=cells, quiet=quiet)
+    report = build_listed(list_catalogue(folder, options.naming), checkpoint, store.path, options)
+    store.discard_before(report.generation)
+    return replace(report, reason=" ".join(filter(None, (note, report.reason))))
 
 
 @dataclass(frozen=True)
@@ -104,18 +95,52 @@ class BuildOptions:
     Attributes:
         naming: Rule that names the object of a photo.
         kind: Name of the kind of index.
-        quiet: Show no progress.
-        note: First sentence of the report's reason.
-        about: Further entries of the manifest.
         cells: Store the cells of photos; None for a model without cells.
+        quiet: Show no progress.
     """
 
     naming: Naming
-    kind: str = "flat"
-    quiet: bool = False
-    note: str = ""
-    about: Mapping[str, Any] = field(default_factory=dict)
-    cells: bool | None = None
+    kind: str
+    cells: bool | None
+    quiet: bool
+
+
+def build_options(
+    checkpoint: Checkpoint,
+    before: Mapping[str, Any],
+    *,
+    objects_from: str | None,
+    kind: str | type[VectorIndex],
+    cells: bool | None,
+    quiet: bool,
+) -> tuple[BuildOptions, str]:
+    """Return the options of a build, and a note if the rule that names objects changed.
+
+    Args:
+        checkpoint: The model.
+        before: Entries of the existing index's manifest; they determine what the user leaves open.
+        objects_from: As for `build_index`.
+        kind: As for `build_index`.
+        cells: As for `build_index`.
+        quiet: As for `build_index`.
+
+    Raises:
+        BadInput: As for `build_index`.
+    """
+    try:
+        known = Naming(before["objects_from"])
+    except (BadInput, KeyError, TypeError):  # no index, or a rule of another version
+        known = None
+    naming = Naming(objects_from) if objects_from is not None else known or Naming(FOLDER)
+    if not checkpoint.config.matcher.cell_dim and cells is not None:
+        raise BadInput(
+            f"--cells and --no-cells need a model with late interaction, but {checkpoint.path} has none; leave the "
+            "option out"
+        )
+    if checkpoint.config.matcher.cell_dim and cells is None:
+        cells = before.get(CELLS) is not False
+    note = f"The rule for object names changed from {known.text} to {naming.text}." if known and known != naming else ""
+    return BuildOptions(naming, kind_name(kind), cells, quiet), note
 
 
 def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, options: BuildOptions) -> BuildReport:
@@ -126,126 +151,33 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
         checkpoint: The model.
         out: The index folder.
         options: The options of the build.
+
+    Raises:
+        NoReadablePhoto: No photo can be read.
     """
     if options.cells is False:
         checkpoint = checkpoint.without_cells()
     load_kind(options.kind).require(options.kind, len(catalogue.photos), checkpoint.config.matcher.embedding_dim)
     store = IndexStore(out)
     with store.lock(), Cache(out / CACHE) as cache:
-        files = FileDigests(catalogue, cache)
-        references, catalogue = find_references(catalogue, checkpoint, cache, files.known, options.quiet)
-        start, encoder = time.perf_counter(), photo_encoder(checkpoint)
-        paths = [(photo.path,) for photo in catalogue.photos]
-        photos = find_codes(catalogue, paths, encoder, cache, files.known, options.quiet)
-        seconds = time.perf_counter() - start
-        files.store(references.codes.digests | photos.digests)
-        if not photos.keys:
-            raise no_photo(catalogue, [*catalogue.skipped, *photos.skipped])
-        rows = [
-            Row(photo.path, photo.object_id, photos.digests[photo.path], photo.metadata)
-            for photo in catalogue.photos
-            if (photo.path,) in photos.keys
-        ]
-        about: dict[str, Any] = {
+        contents = read_contents(catalogue, checkpoint, cache, options.quiet)
+        about = {
             "checkpoint": str(checkpoint.path.resolve()),
             "catalogue": catalogue.where,
             "objects_from": options.naming.text,
-            **({} if options.cells is None else {CELLS: options.cells}),
-            **references.about(checkpoint),
-            **options.about,
+            CELLS: options.cells,
+            **contents.references.about,
         }
         current, why = _current(store, checkpoint)
-        manifest = None if current is None or _differs(current, checkpoint, options, rows, about) else current
-        if manifest is not None:
+        is_written = current is None or _differs(current, checkpoint, options, contents, about)
+        if current is not None and not is_written:
             try:
-                store.open(name=manifest.generation)
+                store.open(name=current.generation)
             except CorruptIndex as error:
-                manifest, why = None, f"The existing index is not usable ({error})."
-        is_written = manifest is None
-        if manifest is None:
-            keys = [photos.keys[row.path,] for row in rows]
-            candidates = _measured_before(current, checkpoint, options, len(rows), photos.encoded)
-            with store.draft() as draft:
-                draft.write_rows(rows)
-                arrays = draft.write_arrays(code_blocks(cache, encoder, keys))
-                calibration = {"calibration": checkpoint.posterior.to_dict()} if checkpoint.posterior else {}
-                draft.write_documents(calibration | references.documents)
-                touches = query_codes(checkpoint, RECALL_QUERIES)
-                index = draft.build_index(arrays[EMBEDDINGS], options.kind, queries=touches and touches[1])
-                if candidates is None:
-                    candidates = measure_candidates(checkpoint, index, StoredPartials(arrays), quiet=options.quiet)
-                about |= {"candidates": candidates, "partial_error": largest_rounding(arrays[PARTIALS])}
-                manifest = draft.finish(fingerprint=fingerprint(checkpoint), about=about, software=__version__)
-            _forget_unused(cache, [*keys, *references.codes.keys.values()])
-    return _report(
-        out,
-        catalogue,
-        checkpoint,
-        options,
-        manifest,
-        rows,
-        references,
-        why,
-        is_written=is_written,
-        embedded=photos.encoded,
-        seconds=seconds,
-        skipped=photos.skipped,
-    )
-
-
-def no_photo(catalogue: Catalogue, skipped: list[SkippedPhoto]) -> NoReadablePhoto:
-    """Return the error for a catalogue without a readable photo.
-
-    Args:
-        catalogue: The catalogue.
-        skipped: Its photos that could not be read, at least one.
-    """
-    first = skipped[0]
-    return NoReadablePhoto(
-        f"no photo in {catalogue.where} can be read; the first: {first.path}: {first.reason}", skipped
-    )
-
-
-def naming_by(rule: str | None, about: Mapping[str, Any]) -> tuple[Naming, str]:
-    """Return the rule that names objects, and a note if it replaces another one.
-
-    Args:
-        rule: The user's rule; None for the rule of the existing index, else by folder.
-        about: Entries of that index's manifest.
-
-    Raises:
-        BadInput: The user's rule is invalid.
-    """
-    before = about.get("objects_from")
-    try:
-        known = None if before is None else Naming(before)
-    except (BadInput, TypeError):  # a rule of another version
-        known = None
-    naming = Naming(rule) if rule is not None else known or Naming(FOLDER)
-    if known is None or known == naming:
-        return naming, ""
-    return naming, f"The rule for object names changed from {known.text} to {naming.text}."
-
-
-def stores_cells(requested: bool | None, about: Mapping[str, Any], checkpoint: Checkpoint) -> bool | None:
-    """Return whether to store the cells of photos; None for a model without cells.
-
-    Args:
-        requested: The user's setting; None for that of the existing index, else True.
-        about: Entries of that index's manifest.
-        checkpoint: The model.
-
-    Raises:
-        BadInput: The user gave a setting, and the model has no cells.
-    """
-    if checkpoint.config.matcher.cell_dim:
-        return about.get(CELLS) is not False if requested is None else requested
-    if requested is None:
-        return None
-    raise BadInput(
-        f"--cells and --no-cells need a model with late interaction, and {checkpoint.path} has none (cell_dim = 0); "
-        "leave the option out"
-    )
+                is_written, why = True, f"The existing index is not usable ({error})."
+        if current is None or is_written:
+            current = _write(store, cache, checkpoint, options, contents, about, current)
+    return _report(out, catalogue, checkpoint, options, contents, current, why, is_written)
 
 
 def _current(store: IndexStore, checkpoint: Checkpoint) -> tuple[Manifest | None, str]:
@@ -262,7 +194,7 @@ def _current(store: IndexStore, checkpoint: Checkpoint) -> tuple[Manifest | None
 
 
 def _differs(
-    manifest: Manifest, checkpoint: Checkpoint, options: BuildOptions, rows: Sequence[Row], about: Mapping[str, Any]
+    manifest: Manifest, checkpoint: Checkpoint, options: BuildOptions, contents: IndexContents, about: dict[str, Any]
 ) -> bool:
     """Whether a new generation would differ from the current one."""
     return (
@@ -270,27 +202,45 @@ def _differs(
         or manifest.kind != options.kind
         # Compare `REFERENCE_ROWS` even if it is not in `about`: all references may have been removed.
         or any(manifest.about.get(key) != about.get(key) for key in (REFERENCE_ROWS, *about))
-        or manifest.files[TEXT].sha256 != hashlib.sha256(encode_rows(rows)).hexdigest()
+        or manifest.files[TEXT].sha256 != hashlib.sha256(encode_rows(contents.rows)).hexdigest()
     )
 
 
-def _measured_before(
-    manifest: Manifest | None, checkpoint: Checkpoint, options: BuildOptions, photos: int, encoded: int
-) -> dict[str, Any] | None:
-    """Return the measured number of candidates of the current generation if it still holds; else None."""
-    if manifest is None or manifest.kind != options.kind or manifest.about.get(CELLS) != options.cells:
-        return None
-    if manifest.fingerprint != fingerprint(checkpoint):
-        return None
-    return kept_measurement(manifest.about.get("candidates"), photos, encoded)
+def _write(
+    store: IndexStore,
+    cache: Cache,
+    checkpoint: Checkpoint,
+    options: BuildOptions,
+    contents: IndexContents,
+    about: dict[str, Any],
+    before: Manifest | None,
+) -> Manifest:
+    """Write a generation, and delete the codes that neither it nor the previous one uses."""
+    kept, now = None, (fingerprint(checkpoint), options.kind, options.cells)
+    if before is not None and (before.fingerprint, before.kind, before.about.get(CELLS)) == now:
+        kept = kept_measurement(before.about.get("candidates"), len(contents.rows), contents.encoded)
 
+    def measure(index: VectorIndex, arrays: Arrays) -> dict[str, Any]:
+        candidates = kept or measure_candidates(checkpoint, index, StoredPartials(arrays), quiet=options.quiet)
+        return {"candidates": candidates, "partial_error": largest_rounding(arrays[PARTIALS])}
 
-def _forget_unused(cache: Cache, keys: list[str]) -> None:
-    """Delete the codes that neither the new nor the previous generation uses."""
-    before = cache.get(_USED)
-    used = [] if before is None else msgspec.json.decode(before, type=list[str])
-    cache.keep([*keys, *used, *cache.keys("files")])
+    touches = query_codes(checkpoint, RECALL_QUERIES)
+    manifest = store.write(
+        contents.rows,
+        contents.blocks(cache),
+        kind=options.kind,
+        documents=contents.references.documents,
+        queries=touches and touches[1],
+        measure=measure,
+        fingerprint=fingerprint(checkpoint),
+        about=about,
+        software=__version__,
+    )
+    used, keys = cache.get(_USED), [*contents.keys, *contents.references.keys]
+    previous = [] if used is None else msgspec.json.decode(used, type=list[str])
+    cache.keep([*keys, *previous, *cache.keys("files")])
     cache.add({_USED: msgspec.json.encode(keys)})
+    return manifest
 
 
 def _report(
@@ -298,21 +248,16 @@ def _report(
     catalogue: Catalogue,
     checkpoint: Checkpoint,
     options: BuildOptions,
+    contents: IndexContents,
     manifest: Manifest,
-    rows: Sequence[Row],
-    references: ReferenceTouches,
     why: str,
-    *,
     is_written: bool,
-    embedded: int,
-    seconds: float,
-    skipped: list[SkippedPhoto],
 ) -> BuildReport:
-    objects, inside, candidates = Counter(row.object_id for row in rows), out.resolve(), manifest.about["candidates"]
+    rows, references, inside = contents.rows, contents.references, out.resolve()
+    objects, candidates = Counter(row.object_id for row in rows), manifest.about["candidates"]
     names, first_photo = sorted(objects), {row.object_id: row.path for row in reversed(rows)}
     shown = dict.fromkeys((names[0], names[len(names) // 2], names[-1]))
-    sentences = (options.note, why, candidates_sentence(candidates, len(rows)))
-    encoded = {"touch_only": len(references.touch_only), "encoded": references.codes.encoded}
+    encoded = {"touch_only": len(references.pictures), "encoded": references.encoded}
     return BuildReport(
         index=str(out),
         generation=manifest.generation,
@@ -323,18 +268,18 @@ def _report(
         objects_from=options.naming.text,
         examples=[(name, first_photo[name]) for name in shown],
         warnings=naming_warnings(objects, options.naming),
-        embedded=embedded,
-        reused=len(rows) - embedded,
-        skipped=[*catalogue.skipped, *skipped, *references.skipped],
+        embedded=contents.encoded,
+        reused=len(rows) - contents.encoded,
+        skipped=contents.skipped,
         ignored=[name for name in catalogue.ignored if not (catalogue.folder / name).resolve().is_relative_to(inside)],
         without_photo=sorted(set(catalogue.object_ids) - objects.keys()),
         notes=list(catalogue.notes),
         kind=manifest.kind,
-        reason=" ".join(filter(None, sentences)),
+        reason=" ".join(filter(None, (why, candidates_sentence(candidates, len(rows))))),
         recall=manifest.recall,
         candidates=candidates,
         partial_error=manifest.about["partial_error"],
         cells=options.cells,
-        seconds=seconds,
+        seconds=contents.seconds,
         references={**references.counts, **encoded} if references.rows else None,
     )

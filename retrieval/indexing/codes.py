@@ -3,19 +3,18 @@
 A code is a row of arrays as the index stores it: of a photo, its embedding and its partial activation; of a touch, its
 partial activation and what its gels show. Its key in the cache is made of the model and of the content of its files.
 
-Some threads read and hash files, others decode and encode. Several batches are encoded at once, each by a single
-thread. PyTorch therefore computes each matrix product on one thread. With its default of several, a product would wait
-for cores that are busy decoding.
+Several batches are read, decoded and encoded at once, each by a single thread. PyTorch therefore computes each matrix
+product on one thread. With its default of several, a product would wait for cores that are busy decoding.
 """
 
 import hashlib
 import os
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypeVar
+from threading import Lock
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -37,17 +36,11 @@ from retrieval.model.export import choose_photo_encoder
 from retrieval.model.fusion_scorer import stored_layout, to_stored
 from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
 
-T = TypeVar("T")
-R = TypeVar("R")
 Paths = tuple[str, ...]
 """Files of one photo (one) or of one touch (one for each finger), relative to the catalogue."""
 
 BATCH = 16
 """Photos that are encoded together."""
-READ = 32
-"""Items that a thread reads in one task. The overhead of a task is a tenth of the time to read and hash one photo."""
-BLOCK = 1024
-"""Codes that are copied from the cache to the index at once."""
 MIN_PHOTOS_FOR_ONNX = 256
 """Smallest number of new photos that ONNX Runtime encodes: exporting the towers takes about a second."""
 MIN_AGE_NS = 2 * 10**9
@@ -58,45 +51,60 @@ SHOWS = (CONTACT, NO_CONTACT, NOT_A_GEL)
 """What the gels of a touch show, by its number in a code."""
 
 
-class FileDigests:
-    """Digests of the files of a catalogue that did not change since an earlier build, by path.
+class FileRecord(NamedTuple):
+    """Size, time of the last change and SHA-256 of a file."""
+
+    bytes: int
+    changed_ns: int
+    digest: str
+
+
+class CatalogueFiles:
+    """The files of a catalogue; those that did not change since an earlier build need not be read.
 
     Args:
         catalogue: The catalogue.
         cache: The cache of the index.
 
     Attributes:
-        known: Digests of the files whose size and time did not change.
+        known: Records of the files that did not change or were read, by path.
     """
 
     _KEY = "files/all"
 
     def __init__(self, catalogue: Catalogue, cache: Cache) -> None:
-        self._cache, self._before = cache, time.time_ns() - MIN_AGE_NS
+        self._catalogue, self._cache, self._before = catalogue, cache, time.time_ns() - MIN_AGE_NS
         content = cache.get(self._KEY)
-        self._stored = {} if content is None else msgspec.json.decode(content, type=dict[str, tuple[int, int, str]])
-        self._statuses = dict[str, tuple[int, int]]()
-        for path in catalogue.paths:
-            try:
-                status = os.stat(f"{catalogue.folder}/{path}")
-            except (OSError, ValueError):  # reading the file reports the error
-                continue
-            self._statuses[path] = status.st_size, status.st_mtime_ns
+        self._stored = {} if content is None else msgspec.json.decode(content, type=dict[str, FileRecord])
         self.known = {
-            path: stored[2]
-            for path, status in self._statuses.items()
-            if (stored := self._stored.get(path)) and stored[:2] == status
+            path: record
+            for path in catalogue.paths
+            if (record := self._stored.get(path)) and record[:2] == self._status(path)
         }
 
-    def store(self, digests: Mapping[str, str]) -> None:
-        """Store the digests of all files that are old enough, in place of those of the earlier build."""
-        files = {
-            path: (*status, digests[path])
-            for path, status in self._statuses.items()
-            if path in digests and status[1] < self._before
-        }
-        if files != self._stored:
-            self._cache.add({self._KEY: msgspec.json.encode(files)})
+    def digest(self, path: str) -> str:
+        """Return the digest of a known file, or an empty string."""
+        record = self.known.get(path)
+        return "" if record is None else record.digest
+
+    def read(self, path: str) -> tuple[FileRecord, bytes]:
+        """Read a file. Raises ImageError."""
+        status = self._status(path)  # before reading: if the file changes now, the next build reads it again
+        content = self._catalogue.read(path)
+        return FileRecord(*status, hashlib.sha256(content).hexdigest()), content
+
+    def save(self) -> None:
+        """Store the records of all files that are old enough, in place of those of the earlier build."""
+        settled = {path: record for path, record in self.known.items() if record.changed_ns < self._before}
+        if settled != self._stored:
+            self._cache.add({self._KEY: msgspec.json.encode(settled)})
+
+    def _status(self, path: str) -> tuple[int, int]:
+        try:
+            status = os.stat(f"{self._catalogue.folder}/{path}")
+        except (OSError, ValueError):  # reading the file reports the error
+            return -1, -1
+        return status.st_size, status.st_mtime_ns
 
 
 class Encoder(NamedTuple):
@@ -188,97 +196,93 @@ def _model(checkpoint: Checkpoint, layout: np.dtype[Any]) -> str:
 
 @dataclass
 class Codes:
-    """The codes of some photos or touches are in the cache.
+    """The codes of some photos or touches, which are in the cache.
 
     Attributes:
         keys: Key of the code of each item that could be read and decoded.
-        digests: Content digest of its files.
-        skipped: Items that could not be read.
+        skipped: Items that could not.
         encoded: Number of items that were encoded now.
     """
 
     keys: dict[Paths, str] = field(default_factory=dict)
-    digests: dict[str, str] = field(default_factory=dict)
     skipped: list[SkippedPhoto] = field(default_factory=list)
     encoded: int = 0
 
 
-class _File(NamedTuple):
-    """An item that was read: its paths, the digests and the bytes of its files."""
+@dataclass
+class _Batch:
+    """What a thread made of some items: what it read, and the codes of new contents, or why there is none, by key."""
 
-    paths: Paths
-    digests: list[str]
-    data: list[bytes]
+    keys: dict[Paths, str] = field(default_factory=dict)
+    files: dict[str, FileRecord] = field(default_factory=dict)
+    skipped: list[SkippedPhoto] = field(default_factory=list)
+    codes: dict[str, bytes] = field(default_factory=dict)
+    unusable: dict[str, str] = field(default_factory=dict)
 
 
-def find_codes(
-    catalogue: Catalogue, items: Sequence[Paths], encoder: Encoder, cache: Cache, known: Mapping[str, str], quiet: bool
-) -> Codes:
+def find_codes(items: Sequence[Paths], encoder: Encoder, files: CatalogueFiles, cache: Cache, quiet: bool) -> Codes:
     """Store the codes of photos or touches in the cache of the index, each content once.
 
     Args:
-        catalogue: The catalogue.
         items: Files of each photo or touch.
         encoder: Makes the codes.
+        files: The files of the catalogue; those that are read now become known.
         cache: The cache of the index.
-        known: Digests of unchanged files by path.
         quiet: Show no progress.
 
     Raises:
         NumericalError: A partial activation exceeds float16.
     """
-    stored, found, threads = cache.keys(encoder.model), Codes(), torch.get_num_threads()
-    unread = []
+    stored, claim, found, unread = cache.keys(encoder.model), Lock(), Codes(), list[Paths]()
     for paths in items:
-        digests = [known.get(path, "") for path in paths]
-        key = encoder.key(digests)
+        key = encoder.key(files.digest(path) for path in paths)
         if key in stored:
             found.keys[paths] = key
-            found.digests.update(zip(paths, digests, strict=True))
         else:
             unread.append(paths)
     if not unread:
         return found
     encode, unusable = encoder.start(len(unread)), dict[str, str]()
 
-    def read_some(some: Sequence[Paths]) -> list[_File | SkippedPhoto]:
-        return [_read(catalogue, paths) for paths in some]
-
-    def encode_some(files: Sequence[_File]) -> tuple[dict[str, bytes], dict[str, str]]:
-        """Return the codes of some files, and reasons why there is none, by key."""
-        inputs, readable, reasons = [], list[_File](), dict[str, str]()
-        for file in files:
+    def process(some: Sequence[Paths]) -> _Batch:
+        batch, inputs, new = _Batch(), list[Any](), dict[str, Paths]()
+        for paths in some:
             try:
-                inputs.append(encoder.decode(file.data, file.paths))
-                readable.append(file)
+                read = {path: files.read(path) for path in paths}
             except ImageError as error:
-                reasons[encoder.key(file.digests)] = error.reason
-        codes = encode(inputs, [file.paths for file in readable]) if inputs else ()
-        return {encoder.key(file.digests): code.tobytes() for file, code in zip(readable, codes, strict=True)}, reasons
-
-    def new_contents() -> Generator[_File]:
-        with closing(map_ahead(read_some, batches(unread, READ), threads, 2 * threads)) as parts:
-            for file in (file for part in parts for file in part):
-                bar.advance()
-                if isinstance(file, SkippedPhoto):
-                    found.skipped.append(file)
-                    continue
-                found.keys[file.paths] = key = encoder.key(file.digests)
-                found.digests.update(zip(file.paths, file.digests, strict=True))
-                if key not in stored:
-                    stored.add(key)
-                    yield file
+                batch.skipped.append(SkippedPhoto(paths[0], error.reason))
+                continue
+            batch.files.update({path: record for path, (record, _) in read.items()})
+            batch.keys[paths] = key = encoder.key(record.digest for record, _ in read.values())
+            with claim:
+                is_new = key not in stored
+                stored.add(key)
+            if is_new:
+                try:
+                    inputs.append(encoder.decode([content for _, content in read.values()], paths))
+                    new[key] = paths
+                except ImageError as error:
+                    batch.unusable[key] = error.reason
+        codes = encode(inputs, list(new.values())) if new else ()
+        batch.codes = {key: code.tobytes() for key, code in zip(new, codes, strict=True)}
+        return batch
 
     with (
         Bar("embed", len(unread), encoder.what, quiet=quiet) as bar,
+        ThreadPoolExecutor(threads := torch.get_num_threads()) as pool,
         one_thread(),
-        closing(new_contents()) as contents,
-        closing(map_ahead(encode_some, batches(contents, encoder.batch), threads, 2 * threads)) as encoded,
     ):
-        for codes, reasons in encoded:
-            cache.add(codes)
-            found.encoded += len(codes)
-            unusable |= reasons
+        try:
+            for batch in map_in_order(pool, process, batches(unread, encoder.batch), 2 * threads):
+                cache.add(batch.codes)
+                files.known |= batch.files
+                found.keys |= batch.keys
+                found.skipped += batch.skipped
+                found.encoded += len(batch.codes)
+                unusable |= batch.unusable
+                bar.advance(len(batch.keys) + len(batch.skipped))
+        finally:
+            pool.shutdown(cancel_futures=True)
     for paths in [paths for paths, key in found.keys.items() if key in unusable]:
         found.skipped.append(SkippedPhoto(paths[0], unusable[found.keys.pop(paths)]))
     return found
@@ -290,36 +294,3 @@ def read_codes(cache: Cache, encoder: Encoder, keys: Sequence[str]) -> NDArray[A
     if not codes.keys() >= set(keys):
         raise WriteFailed(f"{cache.path}: a code was damaged and is deleted; build again")
     return np.frombuffer(b"".join(codes[key] for key in keys), encoder.layout)
-
-
-def code_blocks(cache: Cache, encoder: Encoder, keys: Sequence[str]) -> Iterator[dict[str, NDArray[Any]]]:
-    """Yield the codes of photos in blocks: arrays by name, such as "embeddings" (n, d)."""
-    for some in batches(keys, BLOCK):
-        records = read_codes(cache, encoder, some)
-        yield {name: records[name] for name in encoder.layout.names or ()}
-
-
-def _read(catalogue: Catalogue, paths: Paths) -> _File | SkippedPhoto:
-    try:
-        data = [catalogue.read(path) for path in paths]
-    except ImageError as error:
-        return SkippedPhoto(paths[0], error.reason)
-    return _File(paths, [hashlib.sha256(content).hexdigest() for content in data], data)
-
-
-def map_ahead(function: Callable[[T], R], items: Iterable[T], threads: int, window: int) -> Generator[R, None, None]:
-    """Yield `map(function, items)`, computed on threads ahead of the reader.
-
-    When the reader stops or an item fails, waiting items are dropped and running ones finish first.
-
-    Args:
-        function: Called on threads.
-        items: Its arguments.
-        threads: Number of threads.
-        window: Largest number of items ahead of the reader.
-    """
-    pool = ThreadPoolExecutor(threads)
-    try:
-        yield from map_in_order(pool, function, items, window - 1)
-    finally:
-        pool.shutdown(cancel_futures=True)

@@ -11,53 +11,41 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from _touch_retrieval.files import remove_folder
-from indexes import kind_name
+from _touch_retrieval.files import file_digest, remove_folder
 from indexes.errors import CorruptIndex, NoIndex, UnsupportedFormat
 from indexes.kinds.vector_index import VectorIndex
 from indexes.store.folder import IndexStore
 from indexes.store.locking import writer_lock
+from indexes.store.manifest import NAME as MANIFEST
 from indexes.store.sharded import (
     MAX_SHARDS,
     SHARD_FOLDER,
     ShardedManifest,
     ShardEntry,
     read_sharded_manifest,
-    shard_entry,
-    shard_folder,
     shard_number,
     write_sharded_manifest,
 )
-from retrieval.data.catalogue import Catalogue, CataloguePhoto, CatalogueTouch, list_catalogue
+from retrieval.data.catalogue import Catalogue, list_catalogue
 from retrieval.data.folder_walk import SkippedPhoto
-from retrieval.data.naming import Naming, naming_warnings
+from retrieval.data.naming import naming_warnings
 from retrieval.errors import BadInput, NoReadablePhoto
-from retrieval.indexing.build import BuildOptions, build_listed, naming_by, no_photo, stores_cells
+from retrieval.indexing.build import BuildOptions, build_listed, build_options
+from retrieval.indexing.contents import no_photo, require_reference_calibration
 from retrieval.indexing.report import BuildReport
-from retrieval.indexing.touches import require_reference_calibration
-from retrieval.model.checkpoint import Checkpoint, load_checkpoint
+from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.checkpoint_info import fingerprint
 from retrieval.model.fusion_scorer import CELLS
-from retrieval.model.references import REFERENCE_CALIBRATION, REFERENCE_ROWS
+from retrieval.model.references import REFERENCE_ROWS
 from retrieval.version import __version__
 
 
 @dataclass(frozen=True)
 class ShardJob:
-    """One shard to build, as sent to the process that builds it.
+    """One shard to build: its folder, its photos and touches, and the options."""
 
-    Attributes:
-        index: Folder of the sharded index.
-        folder: Folder of the shard in it.
-        catalogue: The shard's photos and touches.
-        model: Path of the checkpoint.
-        options: As for an index folder.
-    """
-
-    index: Path
-    folder: str
+    folder: Path
     catalogue: Catalogue
-    model: Path
     options: BuildOptions
 
 
@@ -66,14 +54,12 @@ class ShardBuild:
     """Result of a `ShardJob`.
 
     Attributes:
-        folder: Folder of the shard.
-        entry: Its entry in the manifest; None if none of its photos can be read.
-        report: Its report; None in the same case.
+        folder: Name of the shard's folder.
+        report: Its report; None if none of its photos can be read.
         skipped: Photos that could not be read.
     """
 
     folder: str
-    entry: ShardEntry | None
     report: BuildReport | None
     skipped: list[SkippedPhoto]
 
@@ -113,45 +99,41 @@ def build_sharded(
     Raises:
         BadInput: The number of shards is out of range, or `out` is an index folder.
     """
+    own = Path(out)
     if not 1 <= shards <= MAX_SHARDS:
         raise BadInput(f"shards must be from 1 to {MAX_SHARDS}; got {shards}")
-    own = Path(out)
     if (own / "CURRENT").is_file():
         raise BadInput(f"{out} is an index folder; give another folder for a sharded index of {shards} shards")
-    name = kind_name(kind)
     with writer_lock(own / "LOCK"):
-        before: ShardedManifest | None = None
-        note = ""
+        before, unusable = None, ""
         try:
             before = read_sharded_manifest(own)
         except NoIndex:
             pass
         except (CorruptIndex, UnsupportedFormat) as error:
-            note = f"The existing sharded index is not usable ({error})."
-        about = {} if before is None else before.about
-        naming, renamed = naming_by(objects_from, about)
-        cells = stores_cells(cells, about, checkpoint)
-        if cells is False:
-            checkpoint = checkpoint.without_cells()
-        catalogue = list_catalogue(folder, naming)
-        if catalogue.touches:
-            require_reference_calibration(checkpoint)
+            unusable = f"The existing sharded index is not usable ({error})."
+        options, note = build_options(
+            checkpoint, before.about if before else {}, objects_from=objects_from, kind=kind, cells=cells, quiet=quiet
+        )
+        catalogue = list_catalogue(folder, options.naming)
+        if catalogue.touches:  # before any shard is built
+            require_reference_calibration(checkpoint.without_cells() if options.cells is False else checkpoint)
         _delete_old_shards(own, before, shards)
-        options = BuildOptions(naming, name, quiet, cells=cells)
-        jobs = [
-            ShardJob(own, folder, part, checkpoint.path, replace(options, about={"shard": folder}))
-            for folder, part in _split_catalogue(catalogue, shards)
-        ]
+        jobs = [ShardJob(own / name, part, options) for name, part in _split_catalogue(catalogue, shards)]
         built = sorted((run or build_in_process)(jobs, checkpoint), key=lambda one: one.folder)
-        report = _report(out, catalogue, naming, built)
-        manifest = _manifest(before, built, shards, checkpoint, catalogue, report)
-        written = before is None or manifest.generation != before.generation
-        if written:
+        report = _report(own, catalogue, options, built)
+        manifest = _manifest(own, before, shards, checkpoint, catalogue, report, built)
+        if written := before is None or manifest.generation != before.generation:
             write_sharded_manifest(own, manifest)
         for entry in manifest.shards:
             IndexStore(own / entry.folder).discard_before(entry.generation)
-    reason = " ".join(filter(None, (renamed, note, report.reason)))
-    return replace(report, generation=manifest.generation, written=written, reason=reason)
+    return replace(
+        report,
+        generation=manifest.generation,
+        written=written,
+        reason=" ".join(filter(None, (note, unusable, report.reason))),
+        shards=[asdict(entry) for entry in manifest.shards],
+    )
 
 
 def build_in_process(jobs: Sequence[ShardJob], checkpoint: Checkpoint) -> Iterable[ShardBuild]:
@@ -159,25 +141,13 @@ def build_in_process(jobs: Sequence[ShardJob], checkpoint: Checkpoint) -> Iterab
     return [build_shard(job, checkpoint) for job in jobs]
 
 
-def build_shard(job: ShardJob, checkpoint: Checkpoint | None = None) -> ShardBuild:
-    """Build one shard.
-
-    Args:
-        job: The shard.
-        checkpoint: The model; None to load it from `job.model`.
-
-    Raises:
-        IndexesError: The shard could not be written.
-        RetrievalError: As for `build_index`, except if none of the shard's photos can be read.
-    """
-    model = checkpoint or load_checkpoint(job.model)
-    store = IndexStore(job.index / job.folder)
+def build_shard(job: ShardJob, checkpoint: Checkpoint) -> ShardBuild:
+    """Build one shard; it may have no readable photo. Raises the errors of `build_index`."""
     try:
-        report = build_listed(job.catalogue, model, store.path, job.options)
+        report = build_listed(job.catalogue, checkpoint, job.folder, job.options)
     except NoReadablePhoto as error:
-        return ShardBuild(job.folder, None, None, error.skipped)
-    generation = store.open(name=report.generation, verify=False)
-    return ShardBuild(job.folder, shard_entry(job.index, job.folder, generation), report, report.skipped)
+        return ShardBuild(job.folder.name, None, error.skipped)
+    return ShardBuild(job.folder.name, report, report.skipped)
 
 
 def _delete_old_shards(out: Path, before: ShardedManifest | None, shards: int) -> None:
@@ -189,32 +159,26 @@ def _delete_old_shards(out: Path, before: ShardedManifest | None, shards: int) -
             remove_folder(path)
 
 
-def _split_catalogue(catalogue: Catalogue, shards: int) -> list[tuple[str, Catalogue]]:
-    """Return folder and catalogue of each shard with photos or touches; other files belong to no shard."""
-    photos, touches = defaultdict[int, list[CataloguePhoto]](list), defaultdict[int, list[CatalogueTouch]](list)
-    for photo in catalogue.photos:
-        photos[shard_number(photo.object_id, shards)].append(photo)
-    for touch in catalogue.touches:
-        touches[shard_number(touch.object_id, shards)].append(touch)
+def _split_catalogue(catalogue: Catalogue, shards: int) -> Iterable[tuple[str, Catalogue]]:
+    """Yield folder and catalogue of each shard with photos or touches; other files belong to no shard."""
+    photos, touches = defaultdict[int, list[Any]](list), defaultdict[int, list[Any]](list)
+    for parts, items in ((photos, catalogue.photos), (touches, catalogue.touches)):
+        for item in items:
+            parts[shard_number(item.object_id, shards)].append(item)
     none = replace(catalogue, ignored=(), skipped=(), notes=())
-    return [
-        (
-            shard_folder(number, shards),
-            replace(none, photos=tuple(photos[number]), touches=tuple(touches[number])),
-        )
-        for number in sorted(photos.keys() | touches.keys())
-    ]
+    for number in sorted(photos.keys() | touches.keys()):
+        part = replace(none, photos=tuple(photos[number]), touches=tuple(touches[number]))
+        yield f"shard-{number:02d}-of-{shards:02d}", part
 
 
-def _report(out: str | Path, catalogue: Catalogue, naming: Naming, built: Sequence[ShardBuild]) -> BuildReport:
+def _report(out: Path, catalogue: Catalogue, options: BuildOptions, built: Sequence[ShardBuild]) -> BuildReport:
     """Merge the reports of all shards. Raises NoReadablePhoto if no shard has a photo."""
     reports = [one.report for one in built if one.report is not None]
     skipped = [*catalogue.skipped, *(item for one in built for item in one.skipped)]
     if not reports:
         raise no_photo(catalogue, skipped)
-    lost = {name for report in reports for name in report.without_photo}
     bad = {item.path for one in built if one.report is None for item in one.skipped}
-    lost |= {photo.object_id for photo in catalogue.photos if photo.path in bad}
+    lost = {photo.object_id for photo in catalogue.photos if photo.path in bad}
     reason, same = Counter(report.reason for report in reports).most_common(1)[0]
     references = [report.references for report in reports if report.references]
     sums = {key: sum(one[key] for one in references) for key in ("touches", "objects", "touch_only", "encoded")}
@@ -225,27 +189,27 @@ def _report(out: str | Path, catalogue: Catalogue, naming: Naming, built: Sequen
             for name in ("photos", "objects", "embedded", "reused", "seconds")
         },
         index=str(out),
-        warnings=naming_warnings(Counter(photo.object_id for photo in catalogue.photos), naming),
+        warnings=naming_warnings(Counter(photo.object_id for photo in catalogue.photos), options.naming),
         skipped=skipped,
         ignored=list(catalogue.ignored),
-        without_photo=sorted(lost),
+        without_photo=sorted(lost.union(*(report.without_photo for report in reports))),
         notes=list(catalogue.notes),
         reason=f"{len(reports)} shards; for {same} of them: {reason}",
         recall=min((report.recall for report in reports), key=lambda recall: recall["value"]),
         candidates=None,
         partial_error=max(report.partial_error for report in reports),
-        shards=[asdict(one.entry) for one in built if one.entry is not None],
         references=sums if references else None,
     )
 
 
 def _manifest(
+    own: Path,
     before: ShardedManifest | None,
-    built: Sequence[ShardBuild],
     shards: int,
     checkpoint: Checkpoint,
     catalogue: Catalogue,
     report: BuildReport,
+    built: Sequence[ShardBuild],
 ) -> ShardedManifest:
     """Return the new manifest, or the current one if they would be equal."""
     about: dict[str, Any] = {
@@ -253,24 +217,31 @@ def _manifest(
         "catalogue": catalogue.where,
         "objects_from": report.objects_from,
         "partial_error": report.partial_error,
-        **({} if report.cells is None else {CELLS: report.cells}),
+        CELLS: report.cells,
     }
-    if report.references is not None and checkpoint.references is not None:
+    if report.references is not None:
         about[REFERENCE_ROWS] = {key: report.references[key] for key in ("touches", "objects")}
-        about[REFERENCE_CALIBRATION] = {"calibration": checkpoint.references.to_dict()}
-    number = 1 if before is None else 1 + int(before.generation.rpartition("-")[2])
     made = ShardedManifest(
-        generation=f"sharded-{number:06d}",
+        generation=f"sharded-{1 + int(before.generation.rpartition('-')[2]) if before else 1:06d}",
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         software=__version__,
         kind=report.kind,
         fingerprint=fingerprint(checkpoint),
         about=about,
-        calibration=checkpoint.posterior.to_dict() if checkpoint.posterior else None,
         of=shards,
-        shards=[one.entry for one in built if one.entry is not None],
+        shards=[
+            ShardEntry(
+                folder=one.folder,
+                generation=one.report.generation,
+                sha256=file_digest(own / one.folder / one.report.generation / MANIFEST),
+                photos=one.report.photos,
+                objects=one.report.objects,
+            )
+            for one in built
+            if one.report is not None
+        ],
     )
-    same = before is not None and before == replace(
-        made, generation=before.generation, created=before.created, software=before.software
-    )
-    return before if before is not None and same else made
+    if before is None:
+        return made
+    same = replace(made, generation=before.generation, created=before.created, software=before.software)
+    return before if before == same else made

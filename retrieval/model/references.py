@@ -30,9 +30,9 @@ from retrieval.model.posterior import Posterior
 
 Floats = NDArray[np.float32]
 Numbers = NDArray[np.int64]
-REFERENCE_ROWS, REFERENCE_PARTIALS, REFERENCE_CALIBRATION = "references", "touches", "reference_calibration"
-"""Names in an index: of the document that lists its reference touches (and, in the manifest, of their number), of their
-partial activations and, in the manifest, of their calibration."""
+REFERENCE_ROWS, REFERENCE_PARTIALS = "references", "touches"
+"""Names in an index: of the document that lists its reference touches (and, in the manifest, of their number), and of
+their partial activations."""
 SHARPNESS = 16.0
 """Weight of the nearest of an object's references relative to the others. With 8, with 16 and with only the nearest,
 unseen simulated objects were found equally often."""
@@ -62,7 +62,7 @@ class ReferenceCalibration:
             raise BadInput("weight and with_photos must both be present or both be absent; one of them is missing")
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a plain dictionary, as stored in checkpoints and in the manifests of indexes."""
+        """Return a plain dictionary, as stored in checkpoints."""
         return dataclasses.asdict(self)
 
     @classmethod

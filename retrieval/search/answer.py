@@ -1,7 +1,6 @@
 """The result of a query: a verdict and a ranking of objects with probabilities, with the index and the timing."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,6 @@ from numpy.typing import NDArray
 
 from retrieval.errors import BadInput
 from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck
-from retrieval.model.posterior import PosteriorProbabilities
 from retrieval.model.touch_reader import TouchEncodings
 from retrieval.model.verification import ACCEPT, ANOTHER_GRASP, REJECT, DecisionBounds
 
@@ -283,14 +281,3 @@ def gel_classes(check: GelCheck | None, codes: TouchEncodings) -> NDArray[np.str
     if check is None or codes.readings is None:
         return np.full(len(codes.partials), CONTACT)
     return np.array(check.classify(codes.readings, codes.levels))
-
-
-def verdict_of(classes: Sequence[str], probabilities: PosteriorProbabilities | None) -> str:
-    """Return the verdict from the gel check of each grasp and the probabilities; None for an uncalibrated model."""
-    if NOT_A_GEL in classes:
-        return NOT_A_GEL
-    if CONTACT not in classes:
-        return NO_CONTACT
-    if probabilities is None:
-        return UNCALIBRATED
-    return MATCH if probabilities.is_match else NONE_OF_THESE

@@ -1,4 +1,4 @@
-"""Photos and objects of an index: object logits from photo logits, the best objects, and a sample."""
+"""Photos, reference touches and objects of an opened index: object logits from photo logits, and the best objects."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -7,14 +7,25 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from _touch_retrieval.documents import typed
 from indexes.errors import AGAIN, CorruptIndex
 from indexes.store.generation import Generation
 from indexes.store.rows import Row
 from retrieval.data.text import is_inside
+from retrieval.model.checkpoint_info import CheckpointInfo
 from retrieval.model.posterior import Posterior
+from retrieval.model.references import (
+    REFERENCE_PARTIALS,
+    REFERENCE_ROWS,
+    reference_similarity,
+    unit_embeddings,
+)
+from retrieval.search.answer import NearestReference
 
 Floats = NDArray[np.float32]
 Rows = NDArray[np.int64]
+Similarities = NDArray[np.float64]
+"""C (count,) of each object with the grasps of a query (`retrieval.model.references`); NaN without a reference."""
 SAMPLE = 100
 """Number of random objects that represent those that a query does not score."""
 
@@ -39,14 +50,7 @@ class ListedPhoto:
 
 
 def listed_photo(row: Row) -> ListedPhoto:
-    """Return the photo of a row.
-
-    Args:
-        row: A row of an index.
-
-    Raises:
-        CorruptIndex: The path is outside the catalogue. Pages would show such a file.
-    """
+    """Return the photo of a row. Raises CorruptIndex for a path outside the catalogue: pages would show such a file."""
     if not is_inside(row.path):
         raise CorruptIndex(f"the index must list photos inside the catalogue, but has {row.path!r}; {AGAIN}")
     return ListedPhoto(row.object_id, row.path, row.metadata, row.digest)
@@ -59,65 +63,132 @@ class ScoredObjects(NamedTuple):
         numbers: Their numbers (J,).
         logits: Their logits (J,) float64.
         rows: Rows (J,) of their best photos.
-        photo_logits: Logits (J,) from photos only, NaN without photos; None if the index has no reference touches.
+        photo_logits: Logits (J,) from photos only, NaN without photos.
     """
 
     numbers: Rows
     logits: NDArray[np.float64]
     rows: Rows
-    photo_logits: NDArray[np.float64] | None = None
+    photo_logits: NDArray[np.float64]
+
+    def best(self, top: int) -> Rows:
+        """Return the positions of the `top` objects with the largest logits; ties are ordered by name."""
+        selected = np.arange(len(self.logits))
+        if top < len(selected):  # including ties with the last one
+            selected = np.flatnonzero(self.logits >= np.partition(self.logits, -top)[-top])
+        order = np.lexsort((self.numbers[selected], -self.logits[selected]))  # numbers are in the order of names
+        return np.asarray(selected[order[:top]])
+
+
+@dataclass(frozen=True)
+class _ReferenceTouch:
+    """A reference touch: its object, the paths of its gel images, and the digests of their files."""
+
+    object_id: str
+    touch: tuple[str, ...]
+    digests: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _References:
+    """The document of reference touches, and the objects without photos."""
+
+    touches: list[_ReferenceTouch]
+    touch_only: list[str]
 
 
 class Objects:
     """The objects of an index, numbered in the order of their names.
 
-    In all methods, `rows` (n,) selects photos, and `logits` (n,) are their logits.
+    Args:
+        generation: The opened generation.
+        stored: Header of the checkpoint that built it.
+        columns: Columns of a partial activation with the scaled embedding.
+
+    Raises:
+        CorruptIndex: The list of reference touches is damaged.
     """
 
-    def __init__(self, generation: Generation) -> None:
-        rows = generation.rows
+    def __init__(self, generation: Generation, stored: CheckpointInfo, columns: slice) -> None:
+        rows, documents = generation.rows, generation.documents
+        self.posterior = stored.posterior or Posterior()  # without calibration objects are ranked, too
         self._of_row, self.count = rows.objects, rows.object_count
         self._original = None if (rows.originals == np.arange(len(rows))).all() else rows.originals
         """For each photo the first one with the same bytes; None if all photos differ."""
         self._photos = np.bincount(self._of_row)
+        self._columns, self._calibration = columns, stored.references
+        try:
+            self._references = typed(documents.get(REFERENCE_ROWS, {"touches": [], "touch_only": []}), _References)
+            for one in self._references.touches:
+                if len(one.touch) != len(one.digests) or not all(map(is_inside, one.touch)):
+                    raise ValueError("a gel image is outside the catalogue or has no digest")
+        except ValueError as error:
+            raise CorruptIndex(
+                f"{generation.folder}: the list of reference touches is invalid ({error}); {AGAIN}"
+            ) from error
+        numbers = np.array([rows.find_object(one.object_id) for one in self._references.touches], dtype=np.int64)
+        order = np.argsort(numbers, kind="stable")
+        order = order[numbers[order] >= 0]  # an object without a readable photo has no number
+        self._touches = [self._references.touches[place].touch for place in order]
+        partials = documents.get(REFERENCE_PARTIALS, np.empty((0, columns.stop), np.float32))
+        self._codes = unit_embeddings(partials[order], columns)
+        self._owners = numbers[order]
+        self._touched, self._starts = np.unique(self._owners, return_index=True)
+        self._touch_only = np.zeros(self.count, np.bool_)
+        self._touch_only[
+            [number for name in self._references.touch_only if (number := rows.find_object(name)) >= 0]
+        ] = True
 
-    def align_duplicates(self, rows: Rows, logits: Floats) -> Floats:
-        """Return the logits with equal values for photos with equal bytes.
+    @cached_property
+    def gel_images(self) -> dict[str, ListedPhoto]:
+        """The gel images of the reference touches, by path in the catalogue; queries do not need them."""
+        return {
+            path: ListedPhoto(one.object_id, path, {}, digest, is_touch=True)
+            for one in self._references.touches
+            for path, digest in zip(one.touch, one.digests, strict=True)
+        }
 
-        A matrix product may round its last rows differently.
-        """
-        if self._original is None:
-            return logits
-        original, of_original = self._original[rows], np.empty(len(self._original), dtype=np.float32)
-        of_original[original[::-1]] = logits[::-1]  # the last assignment remains: that of the first equal photo
-        equal: Floats = of_original[original]
-        return equal
+    def similarities(self, partials: Floats) -> Similarities:
+        """Return C of each object with grasps, given by their partial activations (G, touch_partial_width)."""
+        found = np.full(self.count, np.nan)
+        if len(self._touched):
+            cosines = unit_embeddings(partials, self._columns) @ self._codes.T
+            found[self._touched] = reference_similarity(cosines, self._starts).sum(0)
+        return found
 
-    def aggregate(self, rows: Rows, logits: Floats, posterior: Posterior, grasps: int) -> ScoredObjects:
+    def score(self, rows: Rows, logits: Floats, similarities: Similarities, grasps: int) -> ScoredObjects:
         """Return the objects of scored photos with their logits and best photos; ties take the first photo.
 
         Args:
             rows: Rows (n,) of the scored photos.
             logits: Their match logits (n,), summed over the grasps.
-            posterior: Combines the photos of an object.
+            similarities: Similarities of the grasps with the reference touches.
             grasps: Number of grasps.
         """
+        if (
+            self._original is not None
+        ):  # equal photos get equal logits: a matrix product may round its last rows differently
+            original, of_original = self._original[rows], np.empty(len(self._original), dtype=np.float32)
+            of_original[original[::-1]] = logits[::-1]  # the last assignment remains: that of the first equal photo
+            logits = of_original[original]
         numbers, owner = np.unique(self._of_row[rows], return_inverse=True)
         order = np.lexsort((rows, -logits, owner))
         first = order[np.searchsorted(owner[order], np.arange(len(numbers)))]
-        return ScoredObjects(
-            numbers, posterior.object_logits(logits, owner, self._photos[numbers], grasps), rows[first]
-        )
 
-    def best(self, scored: ScoredObjects, top: int) -> Rows:
-        """Return the positions in `scored` of the `top` objects with the largest logits; ties are ordered by name."""
-        selected = np.arange(len(scored.logits))
-        if top < len(selected):  # including ties with the last one
-            selected = np.flatnonzero(scored.logits >= np.partition(scored.logits, -top)[-top])
-        order = np.lexsort((scored.numbers[selected], -scored.logits[selected]))  # numbers are in the order of names
-        return np.asarray(selected[order[:top]])
+        posterior, counts = self.posterior, self._photos[numbers]
+        from_photos = posterior.object_logits(logits, owner, counts, grasps)
+        combined, mine, touch_only = from_photos.copy(), similarities[numbers], self._touch_only[numbers]
+        if (calibration := self._calibration) is not None:
+            one, both = np.isfinite(mine) & touch_only, np.isfinite(mine) & ~touch_only
+            combined[one] = posterior.logit_of(calibration.touch_only.log_ratio(mine[one], grasps), grasps)
+            if both.any() and calibration.with_photos is not None and calibration.weight is not None:
+                # Objects with both photos and reference touches have a posterior of their own.
+                sums = calibration.with_photos.object_logits(logits, owner, counts, grasps) + calibration.weight * mine
+                ratios = calibration.with_photos.log_ratio(sums[both], grasps)
+                combined[both] = posterior.logit_of(ratios, grasps)
+        return ScoredObjects(numbers, combined, rows[first], np.where(touch_only, np.nan, from_photos))
 
-    def remaining_rows(self, numbers: Rows, rows: Rows) -> Rows:
+    def other_rows(self, numbers: Rows, rows: Rows) -> Rows:
         """Return the photos of the objects `numbers` that are not among the sorted `rows`."""
         is_selected = np.zeros(self.count, dtype=bool)
         is_selected[numbers] = True
@@ -135,3 +206,19 @@ class Objects:
         drawn[np.random.default_rng(0).permutation(self.count)[:SAMPLE]] = True
         rows = np.flatnonzero(drawn[self._of_row])
         return rows, self._of_row[rows]
+
+    def nearest_by_reference(self, similarities: Similarities, maximum: int) -> Rows:
+        """Return the objects with the largest similarities, at most `maximum`."""
+        order = np.argsort(-similarities[self._touched], kind="stable")
+        return np.asarray(self._touched[order[:maximum]])
+
+    def nearest_reference(self, scored: ScoredObjects, place: int, partials: Floats) -> NearestReference | None:
+        """Return the reference touch of the object at `place` nearest to one of the grasps; None if it has none."""
+        number = scored.numbers[place]
+        start, stop = np.searchsorted(self._owners, (number, number + 1))
+        if start == stop:
+            return None
+        cosines = (unit_embeddings(partials, self._columns) @ self._codes[start:stop].T).max(0)
+        best = int(cosines.argmax())
+        adds = float(scored.logits[place] - scored.photo_logits[place])
+        return NearestReference(self._touches[start + best], float(cosines[best]), None if np.isnan(adds) else adds)

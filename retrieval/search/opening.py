@@ -1,23 +1,20 @@
 """Find an index, the checkpoint that built it, and the default of both; open an index folder or a sharded index."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from _touch_retrieval.files import file_digest
-from indexes.errors import AGAIN, CorruptIndex, IndexesError
+from indexes.errors import IndexesError
 from indexes.store.folder import IndexStore
-from indexes.store.generation import Generation, check_fingerprint
+from indexes.store.generation import check_fingerprint
 from indexes.store.manifest import Manifest, read_manifest
 from indexes.store.sharded import ShardedManifest, is_sharded, open_shard, read_sharded_manifest
 from retrieval.errors import BadInput, CheckpointError
-from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_checkpoint_info, read_scorer
-from retrieval.model.fusion_scorer import CELLS, FusionScorer, stored_layout
+from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_checkpoint_info
+from retrieval.model.fusion_scorer import CELLS
 from retrieval.model.shipped import SHIPPED_NAMES, shipped_model
-from retrieval.model.touch_reader import TouchEncoder
-from retrieval.search.shard import FolderShard, IndexInfo, Shards
+from retrieval.search.shard import FolderShard, Shards
 
 INDEX = Path("index")
 """Default index folder of `build-index` and `query`."""
@@ -99,7 +96,7 @@ OpenShards = Callable[[str | Path, ShardedManifest, CheckpointInfo], Shards]
 
 
 def open_index(
-    index: str | Path, model: str | Path | None, shards: OpenShards | None
+    index: Path, model: str | Path | None, shards: OpenShards | None
 ) -> tuple[FolderShard | Shards, CheckpointInfo]:
     """Open the current generation of an index folder or of a sharded index.
 
@@ -109,31 +106,29 @@ def open_index(
         shards: Opens the shards; None to open them in this process.
 
     Returns:
-        The index, and the checkpoint's header.
+        The index, and the checkpoint's header, as the index uses it.
 
     Raises:
         IndexesError: The index is missing, damaged, or of another model.
         CheckpointError: The checkpoint is missing or damaged.
     """
-    index = Path(index)
     if not is_sharded(index):
         generation = IndexStore(index).open(threads=1)  # one query at a time
-        stored = read_checkpoint_of(generation.manifest, model)
-        return folder_shard(generation, stored), stored
+        stored = checkpoint_of(generation.manifest, model)
+        return FolderShard(generation, stored), stored
     manifest = read_sharded_manifest(index)
-    stored = read_checkpoint_of(manifest, model)
+    stored = checkpoint_of(manifest, model)
     if shards is not None:
         return shards(index, manifest, stored), stored
     check_fingerprint(index, manifest.fingerprint, fingerprint(stored))
-    info = IndexInfo.of(manifest, manifest.calibration, len(manifest.shards))
-    opened = [open_shard(index, entry, manifest.fingerprint, threads=1) for entry in manifest.shards]
-    return Shards(info, [folder_shard(generation, stored) for generation in opened]), stored
+    opened = [FolderShard(open_shard(index, entry, threads=1), stored) for entry in manifest.shards]
+    return Shards(manifest, opened), stored
 
 
-def read_checkpoint_of(manifest: Manifest | ShardedManifest, model: str | Path | None) -> CheckpointInfo:
-    """Return the header of the checkpoint that built an index.
+def checkpoint_of(manifest: Manifest | ShardedManifest, model: str | Path | None) -> CheckpointInfo:
+    """Return the header of the checkpoint that built an index, as the index uses it: perhaps without cells.
 
-    The header is not compared with the index; `check_fingerprint` refuses another model.
+    A readable checkpoint is not compared with the index; `check_fingerprint` refuses another model.
 
     Args:
         manifest: Manifest of the index.
@@ -147,36 +142,4 @@ def read_checkpoint_of(manifest: Manifest | ShardedManifest, model: str | Path |
         from retrieval.model.checkpoint import load_checkpoint
 
         load_checkpoint(stored.path)  # raises an error for a damaged checkpoint
-    return stored
-
-
-def folder_shard(generation: Generation, stored: CheckpointInfo) -> FolderShard:
-    """Return a shard of an opened generation and the scoring layers. Raises MismatchedIndex or CorruptIndex."""
-    generation.require(fingerprint(stored))
-    matcher, scorer = stored.config.matcher, scorer_for(stored, generation.manifest.about)
-    width = matcher.partial_width if scorer.cell_dim else matcher.pooled_width
-    for name, (dtype, shape) in stored_layout(matcher.pooled_width, width).items():
-        array = generation.arrays.get(name)
-        if array is None or array.shape[1:] != shape or array.dtype != dtype:
-            got = "none" if array is None else f"{array.dtype} {array.shape}"
-            raise CorruptIndex(f"{generation.folder}: {name} must be {dtype} (photos, {shape[0]}), got {got}; {AGAIN}")
-    return FolderShard(generation, scorer, stored.config.has_embeddings)
-
-
-def scorer_for(stored: CheckpointInfo, about: Mapping[str, Any]) -> FusionScorer:
-    """Return the scoring layers of a checkpoint, without late interaction if the index was built without cells.
-
-    Args:
-        stored: Header of the checkpoint.
-        about: Entries of the index's manifest.
-    """
-    scorer = read_scorer(stored)
-    return replace(scorer, cell_dim=0) if about.get(CELLS) is False else scorer
-
-
-def torch_encoder(stored: CheckpointInfo, threads: int | None = None) -> TouchEncoder:
-    """Return a touch encoder that runs in PyTorch; the slow import of PyTorch happens here."""
-    from retrieval.model.checkpoint import load_checkpoint
-    from retrieval.model.encode import TorchEncoder
-
-    return TorchEncoder(load_checkpoint(stored.path, digest=stored.digest).matcher, threads)
+    return stored.without_cells() if manifest.about.get(CELLS) is False else stored

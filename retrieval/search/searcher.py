@@ -2,37 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 
-from indexes.errors import UnsupportedFormat
 from indexes.store.generation import Generation
+from indexes.store.sharded import ShardedManifest
 from retrieval.errors import BadInput
-from retrieval.model.checkpoint_info import CheckpointInfo
-from retrieval.model.fusion_scorer import FusionScorer
+from retrieval.model.checkpoint_info import CheckpointInfo, read_scorer
 from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
 from retrieval.model.onnx_encoder import find_export
-from retrieval.model.posterior import NONE_PRIOR, Posterior, PosteriorProbabilities, require_prior
+from retrieval.model.posterior import NONE_PRIOR, Posterior, require_prior
 from retrieval.model.references import REFERENCE_ROWS
-from retrieval.model.touch_reader import EncodedTouches, Stopwatch, TouchEncoder, TouchReader
+from retrieval.model.touch_reader import EncodedTouches, Stopwatch, TouchEncoder, TouchEncodings, TouchReader
 from retrieval.model.touches import AnyImage, AnyTouches, InputImage, parse_grasps
 from retrieval.model.verification import MAX_GRASPS, DecisionBounds
 from retrieval.search.answer import (
+    MATCH,
+    NONE_OF_THESE,
+    UNCALIBRATED,
     Match,
     QueryResult,
     Verification,
     gel_classes,
     is_clear,
-    verdict_of,
 )
 from retrieval.search.objects import Objects
-from retrieval.search.opening import OpenShards, open_index, scorer_for, torch_encoder
-from retrieval.search.references import reference_summary
-from retrieval.search.shard import FolderShard, RankedObject, ShardQuery, ShardResult, Shards
+from retrieval.search.opening import OpenShards, open_index
+from retrieval.search.shard import FolderShard, ShardQuery, ShardResult, Shards
 
 
 class Searcher:
@@ -51,27 +52,15 @@ class Searcher:
     """
 
     def __init__(
-        self,
-        index: str | Path,
-        shard: FolderShard | Shards,
-        checkpoint: CheckpointInfo,
-        encoder: TouchEncoder,
-        scorer: FusionScorer,
+        self, index: Path, shard: FolderShard | Shards, checkpoint: CheckpointInfo, encoder: TouchEncoder
     ) -> None:
-        self.index, self.shard, self.checkpoint = index, shard, checkpoint
-        self.encoder, self.scorer, self.info = encoder, scorer, shard.info
-        self.gel_check = checkpoint.gel_check
-        compares_contact = self.gel_check is not None and self.gel_check.level_above is not None
+        self.index, self.shard, self.checkpoint, self.encoder = index, shard, checkpoint, encoder
+        self.manifest, self.posterior = shard.manifest, checkpoint.posterior
+        self.scorer = shard.scorer if isinstance(shard, FolderShard) else read_scorer(checkpoint)
+        check = checkpoint.gel_check
+        compares_contact = check is not None and check.level_above is not None
         self.reader = TouchReader(checkpoint.config, encoder, compares_contact)
-        self.posterior: Posterior | None = None  # None: the model is not calibrated
-        if self.info.calibration is not None:
-            try:
-                self.posterior = Posterior.from_dict(self.info.calibration)
-            except BadInput as error:
-                raise UnsupportedFormat(
-                    f"{index}: the calibration has another version ({error}); run `retrieve build-index` again"
-                ) from error
-        self.catalogue = Path(self.info.about["catalogue"])
+        self.catalogue = Path(self.manifest.about["catalogue"])
         self._closed = False
 
     @classmethod
@@ -106,10 +95,8 @@ class Searcher:
         >>> from_arrays.results == from_files.results
         True
         """
-        shard, stored = open_index(index, model, shards)
-        encoder = find_export(stored, threads) or torch_encoder(stored, threads)
-        scorer = shard.scorer if isinstance(shard, FolderShard) else scorer_for(stored, shard.info.about)
-        return cls(Path(index), shard, stored, encoder, scorer)
+        shard, stored = open_index(Path(index), model, shards)
+        return cls(Path(index), shard, stored, find_export(stored, threads) or _torch_encoder(stored, threads))
 
     def close(self) -> None:
         """Release the index and the model; running queries continue. A second call does nothing."""
@@ -181,9 +168,9 @@ class Searcher:
             ImageError: An image cannot be read.
             NumericalError: A logit is not finite.
         """
-        opened = self._snapshot()
-        grasps = parse_grasps(touches, opened.reader.fingers)
-        return opened._results([grasps], background, top, candidates, none_prior)[0]
+        return self.query_many([touches], background=background, top=top, candidates=candidates, none_prior=none_prior)[
+            0
+        ]
 
     def query_many(
         self,
@@ -199,10 +186,33 @@ class Searcher:
         Touches are encoded in batches, so logits differ by at most 1e-4 from single queries. If the touches of one
         object are invalid, the error names the object and no query runs.
         """
-        opened = self._snapshot()
-        fingers = opened.reader.fingers
-        parsed = [parse_grasps(one, fingers, of=f"object {number}, ") for number, one in enumerate(objects, 1)]
-        return opened._results(parsed, background, top, candidates, none_prior)
+        opened, clock = self._snapshot(), Stopwatch()
+        counts: list[object] = [top] if candidates is None else [top, candidates]
+        if not all(isinstance(count, int | np.integer) and count >= 1 for count in counts):
+            raise BadInput(f"top and candidates must be whole numbers of 1 or more; got {top} and {candidates}")
+        require_prior(none_prior)
+        many = len(objects) > 1
+        parsed = [
+            parse_grasps(one, opened.reader.fingers, of=f"object {number}, " if many else "")
+            for number, one in enumerate(objects, 1)
+        ]
+        if not parsed:
+            return []
+        codes, shown = opened._encoded([grasp for grasps in parsed for grasp in grasps], background, clock)
+        found, start = list[tuple[list[str], ShardResult | None]](), 0
+        for grasps in parsed:
+            span = slice(start, start := start + len(grasps))
+            classes, result = shown[span], None
+            if _fault(classes) is None:
+                query = ShardQuery(codes.embeddings[span][classes == CONTACT], codes.partials[span][classes == CONTACT])
+                result = opened.shard.search(query, top, candidates)
+            clock.add({stage: result.timing_ms[stage] if result else 0.0 for stage in ("candidates", "rerank")})
+            found.append((classes.tolist(), result))
+        timing_ms = clock.finish(len(parsed))
+        return [
+            opened._result(grasps, classes, timing_ms, result, none_prior)
+            for grasps, (classes, result) in zip(parsed, found, strict=True)
+        ]
 
     def encode(self, touches: AnyTouches, *, background: Sequence[AnyImage] | None = None) -> EncodedTouches:
         """Return the unit embeddings (G, embedding_dim) and partial activations (G, touch_partial_width) of G grasps.
@@ -238,29 +248,25 @@ class Searcher:
         number, bounds, posterior = opened.expected_object(expect, far)
         grasps = parse_grasps(touches, opened.reader.fingers)
         names = [[image.name for image in grasp] for grasp in grasps]
-        codes = opened.reader.encode(grasps, opened.reader.no_contact_frames(background), Stopwatch())
-        checked = gel_classes(opened.gel_check, codes)
-        partials, classes = codes.partials[checked == CONTACT][:MAX_GRASPS], checked.tolist()
-        if NOT_A_GEL in classes or not len(partials):
-            decision = NOT_A_GEL if NOT_A_GEL in classes else NO_CONTACT
-            return Verification(expect, decision, names, classes, [], None)
-        shard = opened.folder_shard
+        codes, classes = opened._encoded(grasps, background, Stopwatch())
+        if (fault := _fault(classes)) is not None:
+            return Verification(expect, fault, names, classes.tolist(), [], None)
+        shard, partials = opened.folder_shard, codes.partials[classes == CONTACT][:MAX_GRASPS]
         ratios = [
-            float(posterior.log_ratio(shard.object_logit(number, partials[:count], posterior), count))
+            float(posterior.log_ratio(shard.object_logit(number, partials[:count]), count))
             for count in range(1, len(partials) + 1)
         ]
-        return Verification(expect, bounds.decide(np.array(ratios)), names, classes, ratios, bounds)
+        return Verification(expect, bounds.decide(np.array(ratios)), names, classes.tolist(), ratios, bounds)
 
     @property
     def can_verify(self) -> bool:
-        """Whether the model has error rates for verification, and the index the model's cells."""
-        has_cells = self.scorer.cell_dim == self.checkpoint.config.matcher.cell_dim
-        return self.checkpoint.verification is not None and has_cells and self.posterior is not None
+        """Whether the model has error rates for verification, which hold for an index with the model's cells."""
+        return self.checkpoint.verification is not None and self.posterior is not None
 
     def expected_object(self, expect: str, far: float) -> tuple[int, DecisionBounds, Posterior]:
         """Return the number of the expected object, the bounds of the decision and the posterior; raise as `verify`."""
         calibration, posterior = self.checkpoint.verification, self.posterior
-        if not self.can_verify or calibration is None or posterior is None:
+        if calibration is None or posterior is None:
             raise BadInput(
                 f"{self.checkpoint.path} has no error rates for verification with this index: fit a model with at "
                 "least 20 objects of 5 grasps (`retrieve train`: validation objects), and build its index with its "
@@ -280,38 +286,12 @@ class Searcher:
             raise BadInput(f"this searcher of {self.index} is closed; open the index again")
         return opened
 
-    def _results(
-        self,
-        objects: Sequence[Sequence[Sequence[InputImage]]],
-        background: Sequence[AnyImage] | None,
-        top: int,
-        candidates: int | None,
-        none_prior: float,
-    ) -> list[QueryResult]:
-        """Return a result for each object in the hand, which is given by its grasps."""
-        counts: list[object] = [top] if candidates is None else [top, candidates]
-        if not all(isinstance(count, int | np.integer) and count >= 1 for count in counts):
-            raise BadInput(f"top and candidates must be whole numbers of 1 or more; got {top} and {candidates}")
-        require_prior(none_prior)
-        if not objects:
-            return []
-        clock, every = Stopwatch(), [grasp for grasps in objects for grasp in grasps]
-        codes = self.reader.encode(every, self.reader.no_contact_frames(background), clock)
-        shown, found, start = gel_classes(self.gel_check, codes), list[tuple[list[str], ShardResult | None]](), 0
-        for grasps in objects:
-            span = slice(start, start := start + len(grasps))
-            classes, result = shown[span], None
-            in_contact = (classes == CONTACT) & (classes != NOT_A_GEL).all()
-            if in_contact.any():
-                query = ShardQuery(codes.embeddings[span][in_contact], codes.partials[span][in_contact])
-                result = self.shard.search(query, top, candidates, self.posterior)
-            clock.add({stage: result.timing_ms[stage] if result else 0.0 for stage in ("candidates", "rerank")})
-            found.append((classes.tolist(), result))
-        timing_ms = clock.finish(len(objects))
-        return [
-            self._result(grasps, classes, timing_ms, result, none_prior)
-            for grasps, (classes, result) in zip(objects, found, strict=True)
-        ]
+    def _encoded(
+        self, grasps: Sequence[Sequence[InputImage]], background: Sequence[AnyImage] | None, clock: Stopwatch
+    ) -> tuple[TouchEncodings, NDArray[np.str_]]:
+        """Return the codes of grasps and the gel check (G,) of each."""
+        codes = self.reader.encode(grasps, self.reader.no_contact_frames(background), clock)
+        return codes, gel_classes(self.checkpoint.gel_check, codes)
 
     def _result(
         self,
@@ -322,53 +302,74 @@ class Searcher:
         none_prior: float,
     ) -> QueryResult:
         """Return the answer; `found` is None without a grasp with contact."""
-        info, posterior, count = self.info, self.posterior, classes.count(CONTACT)
+        manifest, posterior, count = self.manifest, self.posterior, classes.count(CONTACT)
         probabilities, formula, more_grasps = None, None, None
+        verdict = _fault(classes) or UNCALIBRATED
         if found is not None and found.mass is not None and posterior is not None:
             logits = [one.logit for one in found.best]
             probabilities = posterior.probabilities_given(logits, found.mass, count, none_prior)
-            if not probabilities.is_match and is_clear(float(probabilities.objects_if_present[0])):
+            verdict = MATCH if probabilities.is_match else NONE_OF_THESE
+            if verdict == NONE_OF_THESE and is_clear(float(probabilities.objects_if_present[0])):
                 more_grasps = posterior.more_grasps(logits[0], found.mass.objects, count, none_prior)
-            references = reference_summary(info.about)
             formula = {
                 **posterior.to_dict(),
                 "none_prior": none_prior,
                 "grasps": count,
-                "objects": info.objects,
+                "objects": manifest.objects,
                 "scored_objects": found.objects,
                 "unscored_probability": probabilities.unscored,
-                **({REFERENCE_ROWS: references} if references else {}),
             }
-        sharding = {"shards": info.shards} if info.shards > 1 else {}
+            if (references := manifest.about.get(REFERENCE_ROWS)) and self.checkpoint.references is not None:
+                formula[REFERENCE_ROWS] = {**references, "calibration": self.checkpoint.references.to_dict()}
+        sharding = {"shards": len(manifest.shards)} if isinstance(manifest, ShardedManifest) else {}
         return QueryResult(
             touches=[[image.name for image in grasp] for grasp in grasps],
             grasps=classes,
             index={
                 "path": str(self.index),
-                "generation": info.name,
-                "kind": info.kind,
-                "photos": info.photos,
-                "objects": info.objects,
+                "generation": manifest.generation,
+                "kind": manifest.kind,
+                "photos": manifest.photos,
+                "objects": manifest.objects,
                 "scored": found.photos if found else 0,
                 **sharding,
                 "encoder": self.encoder.name,
-                "catalogue": str(info.about["catalogue"]),
+                "catalogue": str(self.catalogue),
                 "model": str(self.checkpoint.path),
                 "trained_on": self.checkpoint.provenance.get("source", "unknown"),
             },
             timing_ms=timing_ms,
-            verdict=verdict_of(classes, probabilities),
+            verdict=verdict,
             none_probability=probabilities.none if probabilities else None,
             posterior=formula,
-            results=self._ranking(found.best, probabilities) if found else [],
+            results=[
+                Match(
+                    place + 1,
+                    one.photo.object_id,
+                    one.logit,
+                    None if probabilities is None else float(probabilities.objects[place]),
+                    one.photo.path,
+                    one.photo.metadata,
+                    self.catalogue.absolute() / one.photo.path,
+                    one.reference,
+                    None if probabilities is None else float(probabilities.objects_if_present[place]),
+                )
+                for place, one in enumerate(found.best if found else ())
+            ],
             more_grasps=more_grasps,
         )
 
-    def _ranking(self, best: Sequence[RankedObject], probabilities: PosteriorProbabilities | None) -> list[Match]:
-        ranking, base = [], self.catalogue.absolute()
-        for place, (logit, photo, reference) in enumerate(best):
-            probability = None if probabilities is None else float(probabilities.objects[place])
-            if_present = None if probabilities is None else float(probabilities.objects_if_present[place])
-            fields = (place + 1, photo.object_id, logit, probability, photo.path, photo.metadata)
-            ranking.append(Match(*fields, base / photo.path, reference, if_present))
-        return ranking
+
+def _fault(classes: Iterable[str]) -> str | None:
+    """Return the verdict on grasps that cannot be used, by the gel check of each; None if they can."""
+    shown = set(classes)
+    if NOT_A_GEL in shown:
+        return NOT_A_GEL
+    return None if CONTACT in shown else NO_CONTACT
+
+
+def _torch_encoder(stored: CheckpointInfo, threads: int | None) -> TouchEncoder:
+    from retrieval.model.checkpoint import load_checkpoint  # the slow import of PyTorch
+    from retrieval.model.encode import TorchEncoder
+
+    return TorchEncoder(load_checkpoint(stored.path, digest=stored.digest).matcher, threads)

@@ -106,7 +106,7 @@ def index(parts: Parts) -> dict[str, Any]:
     stores_history: whether queries and feedback are stored; trials: number of unseen objects for the human baseline.
     """
     generation = parts.generations.current
-    searcher, info = generation.searcher, generation.searcher.info
+    searcher, info = generation.searcher, generation.searcher.manifest
     measured = info.about.get("candidates") or {}
     return {
         "generation": generation.name,

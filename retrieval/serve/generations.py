@@ -30,7 +30,7 @@ class ServedGeneration:
     @property
     def name(self) -> str:
         """The name of the generation."""
-        return self.searcher.info.name
+        return self.searcher.manifest.generation
 
     @cached_property
     def checkpoint(self) -> Checkpoint:

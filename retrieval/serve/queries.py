@@ -109,7 +109,7 @@ async def grasp(request: Request, parts: Parts, name: ObjectParameter = None) ->
 
 def _object_ids(generation: ServedGeneration, name: str | None) -> list[str]:
     """Return `[name]` if a name is given, else ids of objects spread over the catalogue; raises HttpProblem."""
-    shard, photos = generation.shard, generation.searcher.info.photos
+    shard, photos = generation.shard, generation.searcher.manifest.photos
     if name is not None:
         if not shard.page([], name, 0, 1).total:
             raise HttpProblem("unknown", f"The index has no object {name!r}. /v1/catalogue lists the objects.")

@@ -175,6 +175,6 @@ def _overflowing_partial() -> HardCase:
     rows = [Row("cup", "cup", "1"), Row("mug", "mug", "2")]
     with tempfile.TemporaryDirectory() as folder:
         store = IndexStore(folder)
-        ours, holds = error_of(lambda: store.write(rows, _axes(2), {"partials": partials}), "'mug'")
+        ours, holds = error_of(lambda: store.write(rows, [{"embeddings": _axes(2), "partials": partials}]), "'mug'")
     words = f"a partial activation of {partials[1, 0]}, and {naive} in the next sum"
     return HardCase("partials", "7e4 in float16", "error that names it", words, ours, holds, math.isfinite(naive))

@@ -35,7 +35,9 @@ OLD, NEW = ["00", "01", "02"], ["01", "03"]
 def write(path, ids):
     vectors = np.eye(4, dtype=np.float32)[[int(name) for name in ids]]
     rows = [Row(name, name, name) for name in ids]
-    IndexStore(path).write(rows, vectors, {"partials": vectors}, documents={"calibration": {}})
+    store = IndexStore(path)
+    written = store.write(rows, [{"embeddings": vectors, "partials": vectors}], documents={"calibration": {}})
+    store.discard_before(written.generation)
 
 def killed(path, number):
     steps = 0
@@ -107,7 +109,7 @@ while True:
     rows = [Row(f"{number:03}", str(turn), str(number)) for number in range(200)]
     vectors = np.random.default_rng(turn).normal(size=(200, 16))
     vectors = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
-    IndexStore(sys.argv[1]).write(rows, vectors, {"partials": vectors}, kind=sys.argv[2], threads=1)
+    IndexStore(sys.argv[1]).write(rows, [{"embeddings": vectors, "partials": vectors}], kind=sys.argv[2], threads=1)
     print(turn, flush=True)
 """
 

@@ -198,17 +198,8 @@ def test_a_users_own_class_is_a_kind(tmp_path, monkeypatch):
     assert indexes.kind_name(Backwards) == "backwards"
     store = indexes.IndexStore(tmp_path / "index")
     rows = [indexes.Row(f"{number:02}", "mug", str(number)) for number in range(40)]
-    assert store.write(rows, unit(40), kind="backwards").manifest.recall["value"] < 1
+    assert store.write(rows, [{"embeddings": unit(40)}], kind="backwards").recall["value"] < 1
     assert type(store.open().index) is Backwards
-
-
-def test_rows_that_a_kind_makes_up_are_refused():
-    class Wrong(Backwards):
-        def _search(self, queries, k):
-            return np.ones((len(queries), k), np.float32), np.full((len(queries), k), N)
-
-    with pytest.raises(CorruptIndex, match=f"found row {N}, but the index has {N}"):
-        Wrong.build(unit(N), "wrong").search(QUERIES, 1)
 
 
 def test_exceptions_of_faiss_become_our_error():

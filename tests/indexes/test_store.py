@@ -23,10 +23,17 @@ def names(count: int) -> list[str]:
     return [f"p{number:05d}" for number in range(count)]
 
 
-def filled(path, count: int = 20, kind: str = "flat", **more) -> Generation:
+def filled(path, count: int = 20, kind: str = "flat", arrays=None, **more) -> Generation:
     """A small index of `count` random vectors."""
-    more = {"fingerprint": FINGERPRINT, "threads": 1} | more
-    return IndexStore(path).write(rows_of(names(count)), unit(count, DIM), kind=kind, **more)
+    store, more = IndexStore(path), {"fingerprint": FINGERPRINT, "threads": 1} | more
+    store.discard_before(
+        store.write(rows_of(names(count)), blocks(unit(count, DIM), arrays), kind=kind, **more).generation
+    )
+    return store.open()
+
+
+def blocks(embeddings, arrays=None):
+    return [{"embeddings": embeddings, **(arrays or {})}]
 
 
 @pytest.mark.parametrize("kind", ["flat", "IVF4,SQ8;nprobe=2", "HNSW8"])
@@ -40,10 +47,10 @@ def test_a_written_index_is_read_back(tmp_path, kind):
         key=lambda row: row.path,
     )
     partials = np.random.default_rng(0).normal(size=(count, 6)).astype(np.float16)
-    written = IndexStore(tmp_path / "a" / "index").write(
+    store = IndexStore(tmp_path / "a" / "index")
+    manifest = store.write(
         rows,
-        unit(count, DIM),
-        {"partials": partials, "sizes": np.arange(count)},
+        blocks(unit(count, DIM), {"partials": partials, "sizes": np.arange(count)}),
         documents={"calibration": {"scale": 1.25}, "touches": partials[:3], "empty": partials[:0]},
         fingerprint=FINGERPRINT,
         about={"checkpoint": "model.safetensors"},
@@ -51,40 +58,38 @@ def test_a_written_index_is_read_back(tmp_path, kind):
         software="0.1.0",
         threads=1,
     )
-    read = IndexStore(tmp_path / "a" / "index").open(expect=FINGERPRINT, threads=1)
-    for generation in (written, read):
-        assert generation.folder == tmp_path / "a" / "index" / "gen-000001"
-        assert list(generation.rows) == rows
-        assert np.array_equal(generation.arrays["partials"], partials)
-        assert np.array_equal(generation.arrays["sizes"], np.arange(count))
-        assert isinstance(generation.arrays["partials"], np.memmap)
-        assert generation.documents["calibration"] == {"scale": 1.25}
-        assert np.array_equal(generation.documents["touches"], partials[:3])
-        assert generation.documents["empty"].shape == (0, 6)
-        assert np.array_equal(generation.embeddings, unit(count, DIM))
-    assert read.manifest == written.manifest
-    for one, other in zip(written.index.search(unit(5, DIM), 4), read.index.search(unit(5, DIM), 4), strict=True):
-        assert np.array_equal(one, other)
+    generation = store.open(expect=FINGERPRINT, threads=1)
+    assert generation.folder == tmp_path / "a" / "index" / "gen-000001"
+    assert generation.manifest == manifest
+    assert list(generation.rows) == rows
+    assert np.array_equal(generation.arrays["partials"], partials)
+    assert np.array_equal(generation.arrays["sizes"], np.arange(count))
+    assert isinstance(generation.arrays["partials"], np.memmap)
+    assert generation.documents["calibration"] == {"scale": 1.25}
+    assert np.array_equal(generation.documents["touches"], partials[:3])
+    assert generation.documents["empty"].shape == (0, 6)
+    assert np.array_equal(generation.embeddings, unit(count, DIM))
 
 
-def test_blocks_of_rows_give_the_same_files_as_one(tmp_path):
+def test_blocks_of_rows_give_the_same_files_as_one_and_are_measured_whole(tmp_path):
     vectors, partials = unit(50, DIM), np.arange(100).reshape(50, 2)
-    one = IndexStore(tmp_path / "one").write(rows_of(names(50)), vectors, {"partials": partials})
-    blocks = ({"embeddings": vectors[n : n + 7], "partials": partials[n : n + 7]} for n in range(0, 50, 7))
-    store = IndexStore(tmp_path / "other")
-    with store.lock(), store.draft() as draft:
-        draft.write_rows(rows_of(names(50)))
-        arrays = draft.write_arrays(blocks)
+    one = filled(tmp_path / "one", 50, arrays={"partials": partials})
+    parts = ({"embeddings": vectors[n : n + 7], "partials": partials[n : n + 7]} for n in range(0, 50, 7))
+
+    def measure(index, arrays):
         assert isinstance(arrays["partials"], np.memmap)
-        draft.build_index(arrays["embeddings"], "flat")
-        draft.finish()
-    assert one.manifest.files == store.open().manifest.files
+        return {"sum": int(arrays["partials"].sum()), "vectors": index.count}
+
+    manifest = IndexStore(tmp_path / "other").write(rows_of(names(50)), parts, about={"a": 1}, measure=measure)
+    assert manifest.files == one.manifest.files
+    assert manifest.about == {"a": 1, "sum": 4950, "vectors": 50}
 
 
 def test_rows_and_objects_are_found_by_name(tmp_path):
     paths = ["a/1", "a/2", "a-b/1", "c", "é/1", "🍎/1"]
     rows = [Row(path, path.split("/")[0], path[-1]) for path in sorted(paths)]
-    found = IndexStore(tmp_path).write(rows, unit(6, DIM)).rows
+    IndexStore(tmp_path).write(rows, blocks(unit(6, DIM)))
+    found = IndexStore(tmp_path).open().rows
     assert [found.find(row.path) for row in rows] == list(range(6))
     assert [found.find(path) for path in ("", "a", "b/1", "zz", "🍏")] == [-1] * 5
     objects = sorted({row.object_id for row in rows})
@@ -105,7 +110,7 @@ def test_the_folder_has_the_documented_layout(tmp_path):
     tables = ["embeddings.npy", "rows.jsonl", "rows.npy"]
     assert found == sorted(["calibration.json", "manifest.json", "vectors.faiss", *tables])
     manifest = json.loads((folder / "manifest.json").read_text())
-    must = {"format": 6, "generation": "gen-000001", "fingerprint": FINGERPRINT, "software": "1.2", "kind": "HNSW8"}
+    must = {"format": 7, "generation": "gen-000001", "fingerprint": FINGERPRINT, "software": "1.2", "kind": "HNSW8"}
     must |= {"about": {"catalogue": "mugs/"}, "dim": DIM, "photos": 20, "objects": 20}
     assert {key: manifest[key] for key in must} == must
     assert set(manifest["recall"]) == {"value", "at", "queries", "how", "ms", "exact_ms"}
@@ -136,9 +141,11 @@ def test_the_folder_has_the_documented_layout(tmp_path):
 )
 def test_bad_input_raises_a_clear_error_and_does_not_change_the_index(tmp_path, change, error, words):
     filled(tmp_path)
-    content = {"rows": rows_of("abc"), "embeddings": unit(3, DIM)} | change
+    content = {"rows": rows_of("abc"), "embeddings": unit(3, DIM), "arrays": None, "kind": "flat"} | change
     with pytest.raises(error, match=words):
-        IndexStore(tmp_path).write(**content)
+        IndexStore(tmp_path).write(
+            content["rows"], blocks(content["embeddings"], content["arrays"]), kind=content["kind"]
+        )
     assert IndexStore(tmp_path).open().count == 20
     assert not list(tmp_path.glob("*.tmp-*"))
 

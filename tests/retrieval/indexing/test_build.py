@@ -23,7 +23,6 @@ from retrieval.data.catalogue import Catalogue, list_catalogue
 from retrieval.errors import DatasetError, NumericalError
 from retrieval.indexing import codes
 from retrieval.indexing.build import CACHE, build_index
-from retrieval.indexing.codes import map_ahead
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
 from retrieval.model.encode import encode_photos
 from retrieval.search.searcher import Searcher
@@ -450,23 +449,3 @@ def test_recall_and_time_of_an_approximate_kind_are_measured_and_printed(catalog
     assert 0 <= report.recall["value"] <= 1
     assert min(report.recall["ms"], report.recall["exact_ms"]) > 0
     assert f"Recall@10 compared with exact search: {report.recall['value']:.3f}" in "\n".join(report.lines())
-
-
-def test_map_ahead_preserves_the_order_and_stays_within_its_window():
-    taken = []
-
-    def items():
-        for number in range(40):
-            taken.append(number)
-            yield number
-
-    for place, number in enumerate(map_ahead(lambda number: number, items(), threads=3, window=5)):
-        assert number == place
-        assert len(taken) <= place + 5
-
-
-def test_an_error_on_a_thread_is_raised_in_place_of_its_item():
-    results = map_ahead(lambda number: 1 / (number - 3), range(9), threads=2, window=4)
-    assert [next(results) for _ in range(3)] == [-1 / 3, -1 / 2, -1]
-    with pytest.raises(ZeroDivisionError):
-        next(results)

@@ -45,9 +45,8 @@ def shipped_in(folder, monkeypatch):
 def index_built_with(model, folder):
     rows = [Row(name, name, name) for name in "ab"]
     about = {"checkpoint": str(model)}
-    IndexStore(folder).write(
-        rows, np.eye(2, dtype=np.float32), fingerprint={"checkpoint": file_digest(model)}, about=about
-    )
+    blocks = [{"embeddings": np.eye(2, dtype=np.float32)}]
+    IndexStore(folder).write(rows, blocks, fingerprint={"checkpoint": file_digest(model)}, about=about)
     return folder
 
 

@@ -70,6 +70,14 @@ def variant(model, path, **changes):
     return load_checkpoint(path)
 
 
+def give_posterior(monkeypatch, searcher, posterior):
+    """Give an opened index another posterior; None for a model without one."""
+    monkeypatch.setattr(searcher, "posterior", posterior)
+    for shard in getattr(searcher.shard, "shards", [searcher.shard]):
+        monkeypatch.setattr(shard, "_is_calibrated", posterior is not None)
+        monkeypatch.setattr(shard.objects, "posterior", posterior or Posterior())
+
+
 @pytest.fixture(scope="module")
 def oracle(searcher, matcher, catalogue):
     """Touches -> {photo path: sum of match logits}, by the full network on every pair of touch and photo."""
@@ -109,7 +117,7 @@ def best_by_object(logits, posterior, grasps, photos=3):
 def posterior(request, searcher, monkeypatch):
     """The posterior of the searcher."""
     if request.param == "steep":
-        monkeypatch.setattr(searcher, "posterior", STEEP)
+        give_posterior(monkeypatch, searcher, STEEP)
     return searcher.posterior
 
 
@@ -170,7 +178,7 @@ def test_several_grasps_add_their_logits(given_posterior, catalogue, model, gras
         shutil.copy(path, tmp_path / "catalog" / path.parent.name)
     build_index(tmp_path / "catalog", load_checkpoint(model), tmp_path / "index", quiet=True)
     searcher = Searcher.open(tmp_path / "index")
-    monkeypatch.setattr(searcher, "posterior", given_posterior)
+    give_posterior(monkeypatch, searcher, given_posterior)
     single = [logits_by_object(searcher.query([grasp])) for grasp in grasps]
     np.testing.assert_allclose(logits_by_object(searcher.query(grasps)), np.sum(single, axis=0), atol=1e-6)
     assert np.ptp(single, axis=0).max() > 1e-4  # the grasps differ
@@ -316,7 +324,7 @@ def test_probabilities_equal_normalised_likelihoods_with_none_of_these_and_follo
 
 def test_the_probability_if_present_is_unchanged_if_none_of_these_is_certain(searcher, touch, monkeypatch):
     without_none = searcher.query([touch], none_prior=0)
-    monkeypatch.setattr(searcher, "posterior", dataclasses.replace(searcher.posterior, offset=-1000.0))
+    give_posterior(monkeypatch, searcher, dataclasses.replace(searcher.posterior, offset=-1000.0))
     result = searcher.query([touch])
     assert (result.none_probability, result.top.probability) == (1.0, 0.0)
     shown = [match.probability_if_present for match in result.results]
@@ -339,7 +347,7 @@ def test_more_grasps_is_the_number_needed_if_the_ranking_is_clear_and_few_suffic
     head = searcher.scorer
     scaled = dataclasses.replace(head, out=scale * head.out, out_bias=scale * head.out_bias)
     monkeypatch.setattr(searcher.shard, "scorer", scaled)
-    monkeypatch.setattr(searcher, "posterior", Posterior(1.0, math.log(8) - missing, dependence=0.5))
+    give_posterior(monkeypatch, searcher, Posterior(1.0, math.log(8) - missing, dependence=0.5))
     lift = 100 - searcher.query([touch]).top.logit
     monkeypatch.setattr(searcher.shard, "scorer", dataclasses.replace(scaled, out_bias=scaled.out_bias + lift))
     result = searcher.query([touch])
@@ -353,7 +361,7 @@ def test_objects_with_equal_probabilities_are_still_ranked_by_logit(searcher, to
     head, partials = searcher.scorer, searcher.encode(touch).partials
     larger = dataclasses.replace(head, out=10_000 * head.out, out_bias=10_000 * head.out_bias)
     monkeypatch.setattr(searcher.shard, "scorer", larger)
-    monkeypatch.setattr(searcher, "posterior", Posterior(slope=100.0))
+    give_posterior(monkeypatch, searcher, Posterior(slope=100.0))
     result = searcher.query([touch])
     assert [match.probability for match in result.results[-2:]] == [0.0, 0.0]
     # With this slope an object's logit is that of its best photo, minus log 3 / 100 for each object.
@@ -367,14 +375,14 @@ def test_objects_with_equal_probabilities_are_still_ranked_by_logit(searcher, to
     ("offset", "none_prior", "verdict"), [(50.0, 0.2, "match"), (-50.0, 0.2, "none of these"), (-50.0, 0.0, "match")]
 )
 def test_the_verdict_compares_the_best_with_none_of_these(offset, none_prior, verdict, searcher, touch, monkeypatch):
-    monkeypatch.setattr(searcher, "posterior", dataclasses.replace(searcher.posterior, offset=offset))
+    give_posterior(monkeypatch, searcher, dataclasses.replace(searcher.posterior, offset=offset))
     result = searcher.query([touch], none_prior=none_prior)
     assert (result.verdict, result.none_probability == 0) == (verdict, none_prior == 0)
     assert len(result.results) == 8  # the nearest objects are listed anyway
 
 
 def test_an_uncalibrated_model_gives_no_probability(searcher, touch, monkeypatch):
-    monkeypatch.setattr(searcher, "posterior", None)
+    give_posterior(monkeypatch, searcher, None)
     result = searcher.query([touch])
     assert result.verdict == "uncalibrated"
     assert {match.probability for match in result.results} == {None}
@@ -495,7 +503,8 @@ def made_up_objects(searcher, rng):
     """500 photos of 40 objects."""
     owners = np.concatenate([np.arange(40), rng.integers(0, 40, 460)])
     made_up = copy.copy(searcher.objects)
-    made_up._of_row, made_up._photos = owners, np.bincount(owners)
+    made_up._of_row, made_up._photos, made_up.posterior = owners, np.bincount(owners), STEEP
+    made_up._touch_only = np.zeros(40, dtype=bool)
     return made_up
 
 
@@ -506,7 +515,7 @@ def test_the_logit_and_the_best_photo_of_each_object_equal_plain_loops(levels, g
     made_up = made_up_objects(searcher, rng)
     rows = np.sort(rng.choice(500, 300, replace=False))
     logits = rng.integers(0, levels, 300).astype(np.float32) / levels
-    found = made_up.aggregate(rows, logits, STEEP, grasps)
+    found = made_up.score(rows, logits, np.full(40, np.nan), grasps)
     expected = by_plain_loops(made_up._of_row.tolist(), rows, logits, weight(STEEP, grasps))
     assert found.numbers.tolist() == sorted(expected)
     assert found.rows.tolist() == [expected[number][0] for number in sorted(expected)]
@@ -520,28 +529,29 @@ def test_equal_photos_give_the_same_logit_for_any_number_of_them(photos, searche
     made_up._of_row = np.array([0] * photos + [1])
     made_up._photos = np.bincount(made_up._of_row)
     logits = np.full(photos + 1, 1.3, dtype=np.float32)
-    many, one = made_up.aggregate(np.arange(photos + 1), logits, Posterior(slope=0.9), 1).logits
+    made_up.posterior = Posterior(slope=0.9)
+    many, one = made_up.score(np.arange(photos + 1), logits, np.full(8, np.nan), 1).logits
     assert many == one
 
 
 @pytest.mark.parametrize("levels", [1, 3, 10_000])
 @pytest.mark.parametrize("top", [1, 2, 7, 40, 1000])
-def test_the_best_objects_equal_a_plain_sort(top, levels, searcher):
+def test_the_best_objects_equal_a_plain_sort(top, levels):
     """By logit, then by number, which is the order of names."""
     rng = np.random.default_rng(top + levels)
-    made_up = made_up_objects(searcher, rng)
     numbers = np.sort(rng.choice(40, 30, replace=False))
     logits = rng.integers(0, levels, 30).astype(np.float64)
-    scored = ScoredObjects(numbers, logits, numbers)  # the photo of row n belongs to object n
+    scored = ScoredObjects(numbers, logits, numbers, logits)
     expected = sorted(range(30), key=lambda place: (-logits[place], numbers[place]))
-    assert made_up.best(scored, top).tolist() == expected[:top]
+    assert scored.best(top).tolist() == expected[:top]
 
 
 def test_equal_photos_get_the_logit_of_the_first_scored_one(searcher):
     made_up = copy.copy(searcher.objects)
-    made_up._original = np.array([0, 1, 0, 1, 4, 0, *range(6, 24)])
+    made_up._of_row, made_up._original = np.arange(24), np.array([0, 1, 0, 1, 4, 0, *range(6, 24)])
+    made_up._photos, made_up._touch_only = np.ones(24, dtype=int), np.zeros(24, dtype=bool)
     rows, logits = np.array([2, 3, 4, 5]), np.array([0.25, 0.5, 0.75, 0.26], dtype=np.float32)
-    assert made_up.align_duplicates(rows, logits).tolist() == [0.25, 0.5, 0.75, 0.25]
+    assert made_up.score(rows, logits, np.full(24, np.nan), 1).logits.tolist() == [0.25, 0.5, 0.75, 0.25]
 
 
 @pytest.mark.parametrize(

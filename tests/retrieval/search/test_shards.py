@@ -18,6 +18,7 @@ from retrieval.model.posterior import EvidenceMass, Posterior
 from retrieval.search.objects import ListedPhoto
 from retrieval.search.searcher import Searcher
 from retrieval.search.shard import RankedObject, ShardResult, merge_results
+from tests.retrieval.search.test_search import give_posterior
 
 NUMBERS = ("logit", "probability", "probability_if_present")
 STEEP = Posterior(slope=2.0, offset=-1.5, dependence=0.25, tests=1)
@@ -61,7 +62,7 @@ def test_with_all_photos_scored_answers_equal_those_of_one_folder(
 ):
     if posterior != "the model's own":
         for one in (divided, searcher):
-            monkeypatch.setattr(one, "posterior", posterior)
+            give_posterior(monkeypatch, one, posterior)
     for own in grasps:
         same_answers(
             divided.query(own[:count], none_prior=0.3),
@@ -250,7 +251,7 @@ def test_killed_before_every_switch_the_old_generations_answer(catalogue_copy, m
             build_sharded(catalog, load_checkpoint(model), cluster, 4, quiet=True)
         with Searcher.open(cluster) as searcher:
             assert [match.photo for match in searcher.query(touch).results] == expected
-            assert searcher.info.photos == 24
+            assert searcher.manifest.photos == 24
 
 
 def test_bad_photos_are_left_out_and_listed(catalogue_copy, model):

@@ -210,12 +210,12 @@ class Recogniser:
 
     def index_facts(self) -> dict[str, str]:
         """Return facts on the index and the model, by name."""
-        searcher, info = self.searcher, self.searcher.info
+        searcher, manifest = self.searcher, self.searcher.manifest
         facts = {
             "index": searcher.index,
-            "generation": info.name,
-            "photos": info.photos,
-            "objects": info.objects,
+            "generation": manifest.generation,
+            "photos": manifest.photos,
+            "objects": manifest.objects,
             "model": searcher.checkpoint.path,
             "trained_on": searcher.checkpoint.provenance.get("source", "unknown"),
             "encoder": searcher.encoder.name,

@@ -1,0 +1,186 @@
+"""What an index of a catalogue contains: the rows and codes of its photos, and its reference touches."""
+
+import hashlib
+import json
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from _touch_retrieval.cache import Cache
+from indexes.store.rows import Row
+from retrieval.data.catalogue import Catalogue, CataloguePhoto
+from retrieval.data.folder_walk import SkippedPhoto
+from retrieval.errors import BadInput, NoReadablePhoto
+from retrieval.indexing.codes import (
+    SHOWS,
+    CatalogueFiles,
+    Encoder,
+    find_codes,
+    photo_encoder,
+    read_codes,
+    touch_encoder,
+)
+from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.encode import batches
+from retrieval.model.gel_check import CONTACT
+from retrieval.model.references import REFERENCE_PARTIALS, REFERENCE_ROWS
+
+BLOCK = 1024
+"""Codes that are copied from the cache to the index at once."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceTouches:
+    """The reference touches of a catalogue (R of them).
+
+    Attributes:
+        rows: Object, paths of the gel images and their digests, of each touch.
+        partials: Their partial activations (R, touch_partial_width).
+        pictures: A gel image of each object without photos, in place of its photo.
+        keys: Keys of the codes of all touches in the cache.
+        encoded: Number of touches that were encoded now.
+        skipped: Touches that could not be used.
+    """
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    partials: NDArray[np.float16] = field(default_factory=lambda: np.empty((0, 0), np.float16))
+    pictures: list[CataloguePhoto] = field(default_factory=list)
+    keys: list[str] = field(default_factory=list)
+    encoded: int = 0
+    skipped: list[SkippedPhoto] = field(default_factory=list)
+
+    @property
+    def documents(self) -> dict[str, Any]:
+        """Documents of the generation; empty without references."""
+        touch_only = sorted(picture.object_id for picture in self.pictures)
+        listed = {"touches": self.rows, "touch_only": touch_only}
+        return {REFERENCE_ROWS: listed, REFERENCE_PARTIALS: self.partials} if self.rows else {}
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of touches and of their objects."""
+        return {"touches": len(self.rows), "objects": len({row["object_id"] for row in self.rows})}
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """Entries of the manifest; empty without references."""
+        if not self.rows:
+            return {}
+        digest = hashlib.sha256(json.dumps(self.documents[REFERENCE_ROWS]).encode()).hexdigest()
+        return {REFERENCE_ROWS: {**self.counts, "sha256": digest}}
+
+
+@dataclass(frozen=True, eq=False)
+class IndexContents:
+    """The photos that could be read, and the reference touches. The codes are in the cache of the index.
+
+    Attributes:
+        rows: Rows of the photos, and of a gel image of each object without photos.
+        keys: Key of the code of each row.
+        encoder: Encoder of the photos.
+        references: The reference touches.
+        encoded: Number of photos that were encoded now.
+        skipped: Photos and touches that could not be used.
+        seconds: Time of decoding and encoding photos.
+    """
+
+    rows: list[Row]
+    keys: list[str]
+    encoder: Encoder
+    references: ReferenceTouches
+    encoded: int
+    skipped: list[SkippedPhoto]
+    seconds: float
+
+    def blocks(self, cache: Cache) -> Iterator[dict[str, NDArray[Any]]]:
+        """Yield the codes of the rows in blocks: arrays by name, such as "embeddings" (n, d)."""
+        for some in batches(self.keys, BLOCK):
+            records = read_codes(cache, self.encoder, some)
+            yield {name: records[name] for name in self.encoder.layout.names or ()}
+
+
+def read_contents(catalogue: Catalogue, checkpoint: Checkpoint, cache: Cache, quiet: bool) -> IndexContents:
+    """Find or make the codes of a catalogue's photos and touches.
+
+    Args:
+        catalogue: The catalogue.
+        checkpoint: The model.
+        cache: The cache of the index.
+        quiet: Show no progress.
+
+    Raises:
+        NoReadablePhoto: No photo can be read.
+        BadInput: The catalogue has touches, and the model cannot compare them.
+    """
+    files = CatalogueFiles(catalogue, cache)
+    references = _find_references(catalogue, checkpoint, files, cache, quiet)
+    photos = sorted([*catalogue.photos, *references.pictures], key=lambda photo: photo.path)
+    start, encoder = time.perf_counter(), photo_encoder(checkpoint)
+    codes = find_codes([(photo.path,) for photo in photos], encoder, files, cache, quiet)
+    seconds = time.perf_counter() - start
+    files.save()
+    if not codes.keys:
+        raise no_photo(catalogue, [*catalogue.skipped, *codes.skipped])
+    photos = [photo for photo in photos if (photo.path,) in codes.keys]
+    return IndexContents(
+        [Row(photo.path, photo.object_id, files.digest(photo.path), photo.metadata) for photo in photos],
+        [codes.keys[photo.path,] for photo in photos],
+        encoder,
+        references,
+        codes.encoded,
+        [*catalogue.skipped, *codes.skipped, *references.skipped],
+        seconds,
+    )
+
+
+def no_photo(catalogue: Catalogue, skipped: Sequence[SkippedPhoto]) -> NoReadablePhoto:
+    """Return the error for a catalogue whose photos were all skipped, at least one."""
+    first = skipped[0]
+    return NoReadablePhoto(
+        f"no photo in {catalogue.where} can be read; the first: {first.path}: {first.reason}", list(skipped)
+    )
+
+
+def _find_references(
+    catalogue: Catalogue, checkpoint: Checkpoint, files: CatalogueFiles, cache: Cache, quiet: bool
+) -> ReferenceTouches:
+    """Find or make the codes of touches; those without contact or with another number of fingers are left out."""
+    if not catalogue.touches:
+        return ReferenceTouches()
+    require_reference_calibration(checkpoint)
+    encoder = touch_encoder(checkpoint)
+    codes = find_codes([touch.paths for touch in catalogue.touches], encoder, files, cache, quiet)
+    readable = [touch for touch in catalogue.touches if touch.paths in codes.keys]
+    records = read_codes(cache, encoder, [codes.keys[touch.paths] for touch in readable])
+    shown, photographed = [SHOWS[shows] for shows in records["shows"]], {photo.object_id for photo in catalogue.photos}
+    pictures, skipped, rows = dict[str, CataloguePhoto](), list(codes.skipped), list[dict[str, Any]]()
+    for touch, shows in zip(readable, shown, strict=True):
+        if shows != CONTACT:
+            skipped.append(SkippedPhoto(touch.paths[0], f"{shows}: not usable as a reference touch"))
+            continue
+        digests = [files.digest(path) for path in touch.paths]
+        rows.append({"object_id": touch.object_id, "touch": list(touch.paths), "digests": digests})
+        if touch.object_id not in photographed:
+            picture = CataloguePhoto(touch.paths[0], touch.object_id, touch.metadata)
+            pictures.setdefault(touch.object_id, picture)
+    partials = records["partial"][[shows == CONTACT for shows in shown]]
+    return ReferenceTouches(rows, partials, list(pictures.values()), list(codes.keys.values()), codes.encoded, skipped)
+
+
+def require_reference_calibration(checkpoint: Checkpoint) -> None:
+    """Raise BadInput for a model that cannot compare the touches of a catalogue with those of a query."""
+    if checkpoint.references is None or checkpoint.posterior is None:
+        raise BadInput(
+            "the catalogue has touches (touch_* files next to photos), but this model has no calibration of reference "
+            "touches. Use a shipped model, or one of `retrieve adapt` or `retrieve train` (preset relief, with enough "
+            "validation objects), or rename the files"
+        )
+    if checkpoint.config.preprocessing.background != "none":
+        raise BadInput(
+            "the catalogue has touches (touch_* files next to photos), but this model subtracts no-contact frames, "
+            "which a catalogue cannot contain. Use a model with background none, or rename the files"
+        )
