@@ -209,7 +209,7 @@ class Posterior:
         return None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a plain dictionary, as stored in checkpoints and in `calibration.json`."""
+        """Return a plain dictionary, as stored in checkpoints."""
         return asdict(self)
 
     @classmethod
