@@ -1,8 +1,8 @@
 """Training on several ranks, started by `torchrun`: the same results as one process, and recovery from a lost rank.
 
-tests/retrieval/training/test_train.py compares gradients and statistics. From the second step on, the weights of two
-ranks and of one process drift apart, like those of two processes whose initial weights differ in the eighth digit:
-Adam's first steps have the same length for small and large gradients. So results are compared with frozen towers.
+From the second step on, the weights of two ranks and of one process drift apart, like those of two processes whose
+initial weights differ in the eighth digit: Adam's first steps have the same length for small and large gradients. So
+gradients are compared with towers in training, and results with frozen towers.
 """
 
 import os
@@ -10,23 +10,53 @@ import re
 import signal
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
+import torch
 
+from retrieval.errors import ConfigError
 from retrieval.model.checkpoint import load_checkpoint
+from retrieval.training import distributed
 from retrieval.training.loop import state_path
 from tests import ray_processes
-from tests.retrieval.training.test_train import TINY_TOML
+from tests.retrieval.training.test_train import NORM, trainer_for, with_training
 from tests.waiting import run_process, wait_until
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3]), "OMP_NUM_THREADS": "1"}
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+TINY_TOML = """
+[matcher]
+tower = "small"
+tower_output = "pooled"
+hidden = 16
+candidate_width = 8
+embedding_dim = 8
+standardise = true
+[training]
+init = "random"
+iterations = 40
+touches_per_batch = 2
+distil_steps = 3
+validate_every = 30
+validation_fraction = 0.25
+contrastive_weight = 1.0
+[preprocessing]
+touch_px = 32
+photo_px = 32
+"""
 
 
 def command(recording, out, config, ranks=2):
     start = TORCHRUN if ranks == 2 else [sys.executable]
     return [*start, "-m", "retrieval", "train", str(recording), "--out", str(out), "--config", str(config)]
+
+
+def run(arguments):
+    done = subprocess.run(arguments, env=ENVIRONMENT, capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "Warning" not in done.stderr
 
 
 @pytest.fixture
@@ -48,21 +78,16 @@ def settings(tmp_path):
 
 @pytest.mark.slow
 def test_two_ranks_give_the_results_of_one_process(recording, settings, tmp_path):
+    """No rank looks for the files before the other has written them."""
     config, made = settings(freeze_towers="true", validate_every=20), []
     for ranks in (1, 2):
         out = tmp_path / f"{ranks}.safetensors"
-        done = subprocess.run(
-            command(recording, out, config, ranks),
-            env=ENVIRONMENT,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr
-        made.append(load_checkpoint(out).provenance)
+        run(command(recording, out, config, ranks))
+        made.append(load_checkpoint(out))
     one, two = made
-    assert two["step"] == one["step"]
-    assert two["metrics"] == pytest.approx(one["metrics"], abs=1e-3)
+    assert two.provenance["step"] == one.provenance["step"]
+    assert two.provenance["metrics"] == pytest.approx(one.provenance["metrics"], abs=1e-3)
+    assert two.matcher.candidate_encoder is not None
 
 
 @pytest.mark.slow
@@ -81,6 +106,84 @@ def test_a_killed_rank_ends_the_job_and_the_same_command_continues_it(victim, re
     with run_process(command(recording, out, config), env=ENVIRONMENT) as process:
         wait_until(lambda: state_path(out).stat().st_mtime_ns != state or process.poll() is not None, limit_s=240)
         assert process.poll() is None, process.stderr.read()
-        process.send_signal(signal.SIGINT)
+        process.send_signal(signal.SIGINT)  # both ranks stop after the same step
         _, output = process.communicate(timeout=240)
     assert "run the same command to continue" in output
+
+
+GRADIENTS = """
+import sys, torch
+from pathlib import Path
+from retrieval.training import distributed
+from retrieval.training.batches import TrainedFeatures
+from retrieval.data.dataset import load_grasps
+from retrieval.data.pairs import PairSampler
+from retrieval.model.losses.listwise import contrastive_loss
+from retrieval.training.initial_weights import build_matcher
+from retrieval.training.train import WeightedLosses, batch_loss, set_training_mode
+from tests.conftest import TINY
+from tests.retrieval.training.test_train import load, with_training
+
+torch.set_num_threads(1)
+distributed.start()
+# With bfloat16 hardware, towers in training would round differently in batches of another size.
+config = with_training(TINY, precision="float32")
+source, gradients = TrainedFeatures(config, torch.device("cpu")), {}
+loaded = load(source, PairSampler(load_grasps(Path(sys.argv[1])), seed=0).batch(0, 5))
+
+
+def loss(kind, loaded):
+    batch = loaded.batch
+    touch_objects, photo_objects = batch.touch_objects, batch.photo_objects
+    if kind == "local":  # the naive way: every rank's loss uses its own images only
+        touches, photos = (distributed.rank_rows(len(rows)) for rows in (batch.grasps, batch.photos))
+        touch, photo = matcher.touch_features(loaded.touches), matcher.photo_features(loaded.photos)
+        touch_objects, photo_objects = touch_objects[touches], photo_objects[photos]
+    else:
+        touch, photo = source.train_features(matcher, loaded)
+    if kind == "all":
+        return batch_loss(matcher, losses, batch, touch, photo)
+    touch, photo = matcher.touch_encoding(touch).embedding, matcher.photo_encoding(photo).embedding
+    objects = torch.from_numpy(touch_objects), torch.from_numpy(photo_objects)
+    return contrastive_loss(touch, photo, *objects, matcher.log_scale)
+
+
+for kind in ("all", "contrast", "local"):
+    torch.manual_seed(0)
+    matcher = build_matcher(config)
+    set_training_mode(matcher, config.training)
+    losses = WeightedLosses(config.training.weights, matcher, 9)
+    torch.manual_seed(1)
+    averaged = distributed.averaging_gradients(torch.nn.ModuleList([matcher, losses]), loss)
+    averaged(kind, loaded).backward()
+    gradients[kind] = {name: value.grad for name, value in matcher.named_parameters() if value.grad is not None}
+if distributed.rank() == 0:
+    torch.save(gradients, sys.argv[2])
+distributed.stop()
+"""
+
+
+@pytest.mark.slow
+def test_two_ranks_have_the_gradient_of_one_process_and_negatives_of_one_rank_alone_would_not(recording, tmp_path):
+    script = tmp_path / "gradients.py"
+    script.write_text(GRADIENTS)
+    for ranks, start in ((1, [sys.executable]), (2, TORCHRUN)):
+        run([*start, str(script), str(recording), str(tmp_path / f"{ranks}.pt")])
+    one, two = (torch.load(tmp_path / f"{ranks}.pt", weights_only=True) for ranks in (1, 2))
+
+    def difference(kind, reference):
+        """Return the largest difference of a gradient of two ranks, relative to the largest gradient."""
+        scale = max(float(value.abs().max()) for value in one[reference].values())
+        return max(float((two[kind][name] - one[reference][name]).abs().max()) for name in one[reference]) / scale
+
+    assert difference("all", "all") < 1e-5  # float32, summed in another order
+    assert difference("contrast", "contrast") < 1e-5
+    assert difference("local", "contrast") > 0.1
+
+
+@pytest.mark.parametrize("settings", [{}, {"freeze_batch_norm": True}, {"freeze_towers": True}])
+def test_ranks_of_cpus_must_freeze_batch_norm(settings, recording, tmp_path, monkeypatch):
+    monkeypatch.setattr(distributed, "world_size", lambda: 2)
+    refusal = nullcontext() if settings else pytest.raises(ConfigError, match=r"2 ranks on CPUs.*freeze_batch_norm")
+    with refusal:
+        trainer_for(recording, tmp_path / "m.safetensors", with_training(NORM, **settings))

@@ -1,7 +1,5 @@
 """Training of towers: a frozen stem and augmentation."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
@@ -9,53 +7,29 @@ import torch
 from retrieval.errors import ConfigError
 from retrieval.training.augmentation import augment_photos, augment_touches
 from tests.conftest import TINY
-from tests.retrieval.training.test_train import load, trainer_for, with_training
+from tests.retrieval.training.test_train import load, trainer_for, with_matcher, with_training
 
-CONFIG = dataclasses.replace(
-    TINY,
-    matcher=dataclasses.replace(
-        TINY.matcher, tower="mobilenet_v2", tower_output="stages", cell_dim=4, touch_cells=2, photo_cells=2
-    ),
-    training=dataclasses.replace(
-        TINY.training,
-        init="random",
-        freeze_stem=True,
-        freeze_batch_norm=True,
-        precision="float32",
-        iterations=2,
-        validate_every=2,
-    ),
-    preprocessing=dataclasses.replace(TINY.preprocessing, touch_px=32, photo_px=32, views=("whole", "zoom")),
-)
+FROZEN_STEM = with_training(TINY, freeze_stem=True, freeze_batch_norm=True, iterations=1)
 
 
-@pytest.fixture
-def new_trainer(recording, tmp_path):
-    return lambda config=CONFIG: trainer_for(recording, tmp_path / "m.safetensors", config)
-
-
-# The stem --------------------------------------------------------------------------------------------------------
-
-
-def test_the_stem_does_not_change_and_the_other_layers_do(new_trainer):
-    trainer = new_trainer()
-    before = {name: tensor.clone() for name, tensor in trainer.matcher.touch_tower.state_dict().items()}
+def test_the_stem_does_not_change_and_the_other_layers_do(recording, tmp_path):
+    config = with_matcher(
+        FROZEN_STEM, tower="mobilenet_v2", tower_output="stages", cell_dim=4, touch_cells=2, photo_cells=2
+    )
+    trainer = trainer_for(recording, tmp_path / "m.safetensors", config)
+    tower = trainer.matcher.touch_tower
+    before = {name: tensor.clone() for name, tensor in tower.state_dict().items()}
     trainer.run(quiet=True)
-    after = trainer.matcher.touch_tower.state_dict()
-    stem = {f"features.{name}" for name in trainer.matcher.touch_tower.stem_layers().state_dict()}
-    changed = {name for name, tensor in after.items() if not torch.equal(before[name], tensor)}
+    stem = {f"features.{name}" for name in tower.stem_layers().state_dict()}
+    changed = {name for name, tensor in tower.state_dict().items() if not torch.equal(before[name], tensor)}
     assert stem
     assert not changed & stem
     assert "features.17.conv.2.weight" in changed
 
 
-def test_a_tower_without_a_stem_is_refused_by_name(new_trainer):
-    config = dataclasses.replace(CONFIG, matcher=TINY.matcher)
+def test_a_tower_without_a_stem_is_refused_by_name(recording, tmp_path):
     with pytest.raises(ConfigError, match="SmallTower has no stem to freeze; set freeze_stem = false"):
-        new_trainer(config)
-
-
-# Augmentation ----------------------------------------------------------------------------------------------------
+        trainer_for(recording, tmp_path / "m.safetensors", FROZEN_STEM)
 
 
 def test_the_fingers_of_a_touch_are_flipped_together_top_to_bottom():
@@ -80,13 +54,13 @@ def test_the_views_of_a_photo_are_flipped_together_left_to_right_and_stay_in_the
     assert (second.amax((1, 2, 3)) - second.amin((1, 2, 3)) < 0.2).all()
 
 
-def test_a_step_depends_on_its_number_alone_and_no_two_steps_show_the_same_images(new_trainer):
-    trainer = new_trainer(with_training(CONFIG, augment=True))
+@pytest.mark.parametrize("augment", [True, False])
+def test_a_step_depends_on_its_number_alone_and_no_two_steps_show_the_same_augmented_images(
+    recording, tmp_path, augment
+):
+    trainer = trainer_for(recording, tmp_path / "m.safetensors", with_training(TINY, augment=augment))
     batch = trainer.sampler.batch(0, 4)
     first, again, next_step = (load(trainer.features, batch, step) for step in (3, 3, 4))
     assert torch.equal(first.touches, again.touches)
     assert torch.equal(first.photos, again.photos)
-    assert not torch.equal(first.touches, next_step.touches)
-    plain = new_trainer()
-    one, other = (load(plain.features, batch, step) for step in (3, 4))
-    assert torch.equal(one.touches, other.touches)
+    assert torch.equal(first.touches, next_step.touches) is not augment
