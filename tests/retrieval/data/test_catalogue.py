@@ -7,8 +7,7 @@ import os
 import pytest
 from PIL import Image
 
-from retrieval.data import catalogue as module
-from retrieval.data.catalogue import list_catalogue
+from retrieval.data.catalogue import CatalogueTouch, list_catalogue
 from retrieval.data.folder_walk import SkippedPhoto
 from retrieval.data.images import decode_rgb
 from retrieval.data.naming import Naming
@@ -21,11 +20,11 @@ def photo(colour=(255, 0, 0)):
     return buffer.getvalue()
 
 
-def fill(folder, *paths, content=None):
+def fill(folder, *paths):
     """Write a small picture at every path below `folder`."""
     for path in paths:
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
-        (folder / path).write_bytes(photo() if content is None else content)
+        (folder / path).write_bytes(photo())
     return folder
 
 
@@ -43,8 +42,10 @@ def found(folder):
 
 
 def test_the_first_folder_or_the_file_name_names_the_object(tmp_path):
-    fill(tmp_path, "mug/2.jpg", "mug/1.png", "cup.webp", "red ball/side/deep/x.PNG", "v1.2.tif")
+    fill(tmp_path, "mug/2.jpg", "mug/1.png", "cup.webp", "red ball/side/deep/x.PNG", "v1.2.tif", "a.JpEg", "b.HEIC")
     assert found(tmp_path) == {
+        "a.JpEg": "a",
+        "b.HEIC": "b",
         "cup.webp": "cup",
         "mug/1.png": "mug",
         "mug/2.jpg": "mug",
@@ -63,16 +64,12 @@ def test_photos_are_sorted_by_id_which_is_their_path_in_the_catalogue(tmp_path, 
     assert list_catalogue("two").object_ids == ("a", "b")  # a has a folder and a file
 
 
-@pytest.mark.parametrize("name", ["A.PNG", "A.JpEg", "a.jpg", "a.bmp", "a.TIF", "a.tiff", "a.webp", "a.HEIC", "a.avif"])
-def test_the_case_of_an_extension_does_not_matter(tmp_path, name):
-    assert found(fill(tmp_path, name)) == {name: name.rsplit(".", 1)[0]}
-
-
-def test_other_files_are_listed_as_ignored_and_dotfiles_not_at_all(tmp_path):
-    fill(tmp_path, "mug/1.png", "mug/notes.txt", "readme", ".DS_Store", "mug/.hidden.png", ".git/x.png")
+def test_other_files_are_ignored_or_skipped_with_a_reason_and_dotfiles_not_listed(tmp_path):
+    fill(tmp_path, "mug/1.png", "mug/notes.txt", "readme", ".DS_Store", "mug/.hidden.png", ".git/x.png", "cup/2.DNG")
     catalogue = list_catalogue(write_metadata(tmp_path, {"object_id": "mug"}))
     assert [item.path for item in catalogue.photos] == ["mug/1.png"]
     assert catalogue.ignored == ("mug/notes.txt", "readme")
+    assert catalogue.skipped == (SkippedPhoto("cup/2.DNG", ".dng pictures are not read: save it as PNG or JPEG"),)
 
 
 def test_a_missing_folder_a_file_and_an_empty_folder_give_different_errors(tmp_path):
@@ -107,15 +104,6 @@ def test_a_naming_that_no_photo_fits_is_an_error_with_an_example(tmp_path):
         list_catalogue(fill(tmp_path, "mug/0.png", "cup/0.png"), Naming("stem"))
 
 
-def test_unsupported_pictures_are_skipped_with_a_reason(tmp_path):
-    catalogue = list_catalogue(fill(tmp_path, "mug/1.png", "cup/1.gif", "cup/2.DNG", "docs/readme.txt"))
-    assert [item.path for item in catalogue.photos] == ["mug/1.png"]
-    assert {item.path: item.reason for item in catalogue.skipped} == {
-        "cup/1.gif": ".gif pictures are not read: save it as PNG or JPEG",
-        "cup/2.DNG": ".dng pictures are not read: save it as PNG or JPEG",
-    }
-
-
 def test_links_to_outside_folders_are_followed_once_and_loops_do_not_hang(tmp_path):
     root, outside = fill(tmp_path / "c", "mug/1.png", "cup/1.png"), fill(tmp_path / "o", "1.png")
     (root / "mug" / "up").symlink_to(root)
@@ -146,12 +134,6 @@ def test_a_name_that_is_not_utf8_is_skipped_and_reported(tmp_path):
     json.dumps([item.path for item in catalogue.skipped], ensure_ascii=False).encode()
 
 
-def test_listing_opens_no_photo(tmp_path, monkeypatch):
-    fill(tmp_path, "mug/1.png")
-    monkeypatch.setattr(module, "read_bytes", None)
-    assert len(list_catalogue(tmp_path).photos) == 1
-
-
 # Metadata --------------------------------------------------------------------------------------------------
 
 
@@ -162,11 +144,11 @@ def test_a_photos_own_metadata_takes_precedence_over_its_objects(tmp_path):
         {"object_id": "mug", "price": 5, "colour": "red"},
         "",
         {"file_name": "mug/2.png", "colour": "blue", "tags": ["a", {"b": None}]},
-        {"file_name": "./cup.png", "object_id": "cup", "name": "Straße"},
+        {"file_name": "./cup.png", "object_id": "cup", "name": "Straße \U0001f600"},
     )
     catalogue = list_catalogue(tmp_path)
     assert {item.path: item.metadata for item in catalogue.photos} == {
-        "cup.png": {"name": "Straße"},
+        "cup.png": {"name": "Straße \U0001f600"},
         "mug/1.png": {"price": 5, "colour": "red"},
         "mug/2.png": {"price": 5, "colour": "blue", "tags": ["a", {"b": None}]},
     }
@@ -196,16 +178,17 @@ def test_metadata_of_a_missing_photo_or_object_is_a_note_and_no_error(tmp_path):
 BAD_LINES = {
     '{"object_id": "mug"': "Expecting",
     "[1]": "one JSON object",
-    "{}": "must name a photo",
     '{"price": 5}': "must name a photo",
     '{"object_id": 5}': "object_id must be a non-empty string, got 5",
     '{"file_name": ""}': "file_name must be a non-empty string",
     '{"object_id": "mug", "x": NaN}': "NaN is not a finite number",
-    '{"object_id": "mug", "x": -Infinity}': "-Infinity is not a finite number",
     '{"object_id": "mug", "x": 1e999}': "1e999 is not a finite number",
     '{"file_name": "mug/1.png", "object_id": "cup"}': "belongs to object mug, but the line names cup",
     '{"object_id": "first"}': "first has two lines; merge them",
     '{"object_id": ' + "[" * 100_000: "nested deeper than 64 levels",
+    r'{"object_id": "mug", "note": "nice \ud83d"}': "contains a lone surrogate",
+    r'{"object_id": "mug\ud83d"}': "contains a lone surrogate",
+    r'{"object_id": "mug", "deep": [{"\udfff": 1}]}': "contains a lone surrogate",
 }
 
 
@@ -246,3 +229,53 @@ def test_broken_files_are_listed_and_reading_them_gives_the_reason(tmp_path):
     assert skipped["c.png"] == "the file is empty"
     assert skipped["d.png"] == "no such file"
     assert skipped["e.png"].startswith("cannot be read: is a pipe, a device or a socket, not a regular file")
+
+
+# Touches ---------------------------------------------------------------------------------------------------
+
+
+def listed(tmp_path, *names, metadata=(), naming=None):
+    return list_catalogue(write_metadata(fill(tmp_path, *names), *metadata), naming)
+
+
+def test_gel_images_next_to_photos_are_touches_and_not_photos(tmp_path):
+    found = listed(
+        tmp_path, "mug/1.jpg", "mug/touch_0_b.png", "mug/touch_0_a.png", "mug/touch_1_a.png", "tin/touch.jpg"
+    )
+    assert [photo.path for photo in found.photos] == ["mug/1.jpg", "tin/touch.jpg"]
+    assert found.touches == (
+        CatalogueTouch("mug", ("mug/touch_0_a.png", "mug/touch_0_b.png")),
+        CatalogueTouch("mug", ("mug/touch_1_a.png",)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("paths", "touches"),
+    [
+        (["mug/touch_7.png", "mug/touch_7_b.png"], [("mug/touch_7.png", "mug/touch_7_b.png")]),
+        (["mug/second/touch_rim_left_a.jpg"], [("mug/second/touch_rim_left_a.jpg",)]),
+        (["mug/touch_a.png", "mug/touch_b.png"], [("mug/touch_a.png",), ("mug/touch_b.png",)]),  # names, not fingers
+        (["touch_7.png", "mug/touched.png", "touch_1/view.png"], []),  # photos
+    ],
+)
+def test_the_file_name_gives_touch_and_finger(tmp_path, paths, touches):
+    found = listed(tmp_path, *paths)
+    assert [touch.paths for touch in found.touches] == touches
+    assert sorted(found.paths) == sorted(paths)
+
+
+def test_every_picture_is_a_photo_if_file_stems_name_the_objects(tmp_path):
+    found = listed(tmp_path, "all/touch_1.png", naming=Naming("stem"))
+    assert [photo.object_id for photo in found.photos] == ["touch"]
+    assert found.touches == ()
+
+
+def test_a_pattern_names_the_object_of_a_touch(tmp_path):
+    found = listed(tmp_path, "test/mug/touch_1.png", naming=Naming("{split}/{object}/{photo}"))
+    assert [touch.object_id for touch in found.touches] == ["mug"]
+
+
+def test_objects_may_have_only_touches_and_these_have_metadata(tmp_path):
+    found = listed(tmp_path, "mug/touch_1.png", metadata=[{"object_id": "mug", "shelf": 3}])
+    assert (len(found.photos), found.object_ids, found.notes) == (0, ("mug",), ())
+    assert found.touches[0].metadata == {"shelf": 3}

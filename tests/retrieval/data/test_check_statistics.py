@@ -89,7 +89,7 @@ def gels(count=20):
 
 
 @pytest.mark.parametrize("change", CHANGES)
-@pytest.mark.parametrize("rows", [[3], [0, 1, 2, 3, 4], [4, 6, 8, 10, 12, 14, 16, 18, 19]])
+@pytest.mark.parametrize("rows", [[3], [4, 6, 8, 10, 12, 14, 16, 18, 19]])
 def test_a_minority_of_changed_images_is_named_with_its_change(change, rows):
     images = gels()
     images[rows] = images[rows][CHANGES[change]]

@@ -81,28 +81,14 @@ def test_grasps_are_in_collection_order_and_their_files_in_finger_order(small_re
         assert item.photo == small_recording / row["photo_file_name"]
         assert item.touches == tuple(small_recording / row[f"touch_{finger}_file_name"] for finger in "ab")
         assert item.backgrounds == tuple(small_recording / row[f"touch_{finger}_before_file_name"] for finger in "ab")
-
-
-def test_a_recording_is_accepted_as_a_folder_or_as_a_read_recording(small_recording):
-    by_folder = load_grasps(small_recording)
-    assert by_folder == load_grasps(str(small_recording)) == load_grasps(read_recording(small_recording))
-
-
-def test_grasps_that_missed_are_left_out(small_recording):
-    assert Counter(item.object_id for item in load_grasps(small_recording)) == {"ribs-0000": 2, "bumps-0001": 2}
-
-
-def test_the_source_of_a_recording_is_the_one_its_writer_stored(small_recording):
+    assert grasps == load_grasps(str(small_recording)) == load_grasps(read_recording(small_recording))
     assert recording_source(small_recording) == "drawn test pictures, not a simulation of contact"
 
 
-def test_a_recording_with_misses_only_is_an_error(tmp_path):
+def test_a_recording_with_misses_only_and_a_folder_without_one_are_errors(tmp_path):
     folder = synthetic.write_recording(tmp_path / "r", synthetic.make_objects(1), 0, misses=2)
-    with pytest.raises(DatasetError, match=r"r contains no successful grasp with a photo and a touch"):
+    with pytest.raises(DatasetError, match=r"no successful grasp"):
         load_grasps(folder)
-
-
-def test_an_error_of_the_recording_reader_becomes_a_dataset_error(tmp_path):
     with pytest.raises(DatasetError, match=r"recording\.json"):
         load_grasps(tmp_path)
 
@@ -136,11 +122,6 @@ def test_the_data_digest_depends_on_bytes_and_ids_and_not_on_the_folder(small_re
         assert data_digest(grasps) != before
         path.write_bytes(data)
     assert data_digest(grasps) == before
-
-
-def test_the_data_digest_names_a_missing_file(small_recording, tmp_path):
-    shutil.copytree(small_recording, tmp_path / "r")
-    grasps = load_grasps(tmp_path / "r")
     grasps[1].touches[0].unlink()
     with pytest.raises(DatasetError, match=rf"{grasps[1].touches[0].name} cannot be read .*`retrieve check`"):
         data_digest(grasps)
@@ -153,7 +134,7 @@ def parts_of(split):
     return {"train": split.train, "validation": split.validation, "test": split.test}
 
 
-@settings(max_examples=50)
+@settings(max_examples=20)
 @given(counts=st.lists(st.integers(1, 3), min_size=6, max_size=40), seed=seeds)
 def test_every_object_is_in_exactly_one_part_of_at_least_two(counts, seed):
     grasps = grasps_of(*counts)
@@ -163,7 +144,7 @@ def test_every_object_is_in_exactly_one_part_of_at_least_two(counts, seed):
     assert min(map(len, parts_of(split).values())) >= 2
 
 
-@settings(max_examples=50)
+@settings(max_examples=20)
 @given(count=st.integers(6, 120), seed=seeds, validation=st.floats(0, 0.35), test=st.floats(0, 0.35))
 def test_fractions_are_met_to_half_an_object_with_a_minimum_of_two(count, seed, validation, test):
     split = make_split(grasps_of(*[1] * count), validation=validation, test=test, seed=seed)
@@ -174,15 +155,10 @@ def test_fractions_are_met_to_half_an_object_with_a_minimum_of_two(count, seed, 
             assert abs(len(part) - fraction * count) <= 0.5
 
 
-def test_the_papers_fractions_of_98_objects_are_18_and_10():
-    split = make_split(grasps_of(*[1] * 98), validation=0.1, test=0.184, seed=0)
-    assert [len(part) for part in parts_of(split).values()] == [70, 10, 18]
-
-
 linked = st.lists(st.tuples(st.integers(0, 11), st.integers(0, 7)), min_size=1, max_size=20)
 
 
-@settings(max_examples=50)
+@settings(max_examples=20)
 @given(links=linked, seed=seeds)
 def test_objects_that_share_a_sequence_however_indirectly_stay_together(links, seed):
     """The oracle joins one pair of objects at a time until nothing changes."""
@@ -203,7 +179,7 @@ def test_objects_that_share_a_sequence_however_indirectly_stay_together(links, s
         assert part_of[one] == part_of[two]
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(4))
 def test_a_large_group_stays_in_training_if_small_ones_meet_the_fraction(seed):
     """A naive draw takes the first group, here often ten objects for a target of four."""
     grasps = [*(grasp(f"linked-{i}", 0, "day one") for i in range(10)), *grasps_of(*[1] * 10)]
@@ -250,15 +226,10 @@ def test_a_split_can_be_stored_as_json_and_selects_its_grasps():
     "data",
     [
         None,
-        [],
-        "train",
-        7,
         {},
         {"train": ["a"], "test": ["b"]},
-        {"train": "mug", "validation": [], "test": []},
         {"train": ["mug", 3], "validation": [], "test": []},
-        {"train": None, "validation": [], "test": []},
-        *[{"seed": seed, "train": [], "validation": [], "test": []} for seed in ("1", None, 1.5, True)],
+        {"seed": "1", "train": [], "validation": [], "test": []},
     ],
     ids=repr,
 )
@@ -270,7 +241,7 @@ def test_data_that_is_not_a_split_is_refused_with_the_required_keys(data):
 # Pairs -----------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=50)
+@settings(max_examples=20)
 @given(
     counts=counts,
     seed=seeds,
@@ -293,7 +264,7 @@ def test_every_touch_has_the_requested_numbers_of_matching_and_other_photos(
         assert all(photo in own for _, _, photo, _, _ in mine)
 
 
-@settings(max_examples=50)
+@settings(max_examples=20)
 @given(counts=counts, seed=seeds, touches=st.integers(1, 9), share=st.booleans())
 def test_every_photo_is_listed_once_with_its_object_and_every_listed_photo_is_used(counts, seed, touches, share):
     batch = PairSampler(grasps_of(*counts), seed=seed, share_photos=share).batch(0, touches)
@@ -304,7 +275,7 @@ def test_every_photo_is_listed_once_with_its_object_and_every_listed_photo_is_us
     assert [names[i] for i in batch.touch_objects] == [item.object_id for item in batch.grasps]
 
 
-@settings(max_examples=50)
+@settings(max_examples=20)
 @given(counts=counts, seed=seeds, touches=st.integers(1, 7))
 def test_at_any_moment_every_object_has_been_used_equally_often(counts, seed, touches):
     sampler, used = PairSampler(grasps_of(*counts), seed=seed), Counter(range(len(counts)))
@@ -315,7 +286,7 @@ def test_at_any_moment_every_object_has_been_used_equally_often(counts, seed, to
             assert max(used.values()) - min(used.values()) <= 1
 
 
-@settings(max_examples=50)
+@settings(max_examples=20)
 @given(counts=counts, seed=seeds)
 def test_within_an_object_every_grasp_comes_once_before_any_comes_again(counts, seed):
     sampler, objects = PairSampler(grasps_of(*counts), seed=seed), len(counts)
@@ -326,27 +297,14 @@ def test_within_an_object_every_grasp_comes_once_before_any_comes_again(counts, 
             assert len(set(mine[start : start + count])) == count
 
 
-@settings(max_examples=50)
-@given(seed=seeds, steps=st.permutations(range(5)))
-def test_a_batch_depends_on_seed_and_step_and_not_on_earlier_calls(seed, steps):
-    grasps = grasps_of(3, 1, 4, 2)
-    sampler = PairSampler(grasps, seed=seed)
-    in_order = [contents(PairSampler(grasps, seed=seed).batch(step, 4)) for step in range(5)]
-    for step in steps:
-        sampler.evaluation_pairs()
-        assert contents(sampler.batch(step, 4)) == in_order[step]
-
-
-def test_the_order_of_the_grasps_of_two_objects_does_not_matter():
-    grasps = grasps_of(3, 4)
-    one, two = PairSampler(grasps, seed=5), PairSampler(grasps[3:] + grasps[:3], seed=5)
-    assert contents(one.batch(2, 6)) == contents(two.batch(2, 6))
-
-
-def test_batches_of_other_steps_and_other_seeds_differ():
+def test_a_batch_depends_on_seed_and_step_and_not_on_earlier_calls_or_the_order_of_objects():
     grasps = grasps_of(*[6] * 8)
-    batches = [PairSampler(grasps, seed=seed).batch(step, 6) for seed in (0, 1) for step in range(10)]
-    assert len({str(contents(batch)) for batch in batches}) == 20
+    batches = [contents(PairSampler(grasps, seed=seed).batch(step, 6)) for seed in (0, 1) for step in range(5)]
+    assert len(set(map(str, batches))) == 10
+    sampler = PairSampler(grasps[24:] + grasps[:24], seed=1)
+    for step in (3, 0, 4, 1):
+        sampler.evaluation_pairs()
+        assert contents(sampler.batch(step, 6)) == batches[5 + step]
 
 
 def test_positives_are_drawn_without_repeats_where_the_object_has_enough_photos():
@@ -394,13 +352,13 @@ def test_shared_negatives_use_every_other_object_and_each_of_its_photos_equally(
     drawn: dict[bool, Counter[str]] = {True: Counter(), False: Counter()}
     for share, photos in drawn.items():
         sampler = PairSampler(grasps, seed=1, share_photos=share, positives=3, negatives=2)
-        for step in range(2000):
+        for step in range(1000):
             batch = sampler.batch(step, 3)
             for touch, photo, label in zip(batch.touch_index, batch.photo_index, batch.labels, strict=True):
                 if not label and batch.touch_objects[touch] == 0:
                     photos[str(batch.photos[photo])] += 1
     total = sum(drawn[True].values())
-    assert total == sum(drawn[False].values()) == 2000
+    assert total == sum(drawn[False].values()) == 1000
     for photos in drawn.values():
         for name, count in photos.items():
             expected = total / 5 / (8 if name.startswith("object-05") else 4)

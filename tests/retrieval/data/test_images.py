@@ -135,14 +135,6 @@ def test_a_lossless_file_returns_its_pixels(tmp_path, kind, options):
     np.testing.assert_array_equal(rgb, pixels.astype(np.float32) / 255)
 
 
-@pytest.mark.parametrize("kind", ["JPEG", "WEBP"])
-def test_a_lossy_file_is_close_to_its_pixels(kind):
-    colour = Image.new("RGB", (16, 8), (200, 100, 50))
-    rgb = decode_rgb(saved(colour, kind, quality=95), "x")
-    assert rgb.shape == (8, 16, 3)
-    np.testing.assert_allclose(rgb * 255, np.broadcast_to([200, 100, 50], (8, 16, 3)), atol=4)  # colour rounding
-
-
 EIGHT_BIT = {
     "grey": (Image.new("L", (1, 1), 51), "PNG", {}, (0.2, 0.2, 0.2)),
     "1-bit white": (Image.new("1", (1, 1), 1), "PNG", {}, (1, 1, 1)),
@@ -156,6 +148,7 @@ EIGHT_BIT = {
     "grey key": (Image.new("L", (1, 1), 9), "PNG", {"transparency": 9}, (1, 1, 1)),
     "colour key": (Image.new("RGB", (1, 1), (9, 8, 7)), "PNG", {"transparency": (9, 8, 7)}, (1, 1, 1)),
     "not the key": (Image.new("RGB", (1, 1), (0, 0, 255)), "PNG", {"transparency": (9, 8, 7)}, (0, 0, 1)),
+    "palette key": (Image.new("RGB", (1, 1), (255, 0, 0)).quantize(2), "PNG", {"transparency": 0}, (1, 1, 1)),
 }
 
 
@@ -164,14 +157,6 @@ def test_every_eight_bit_kind_becomes_rgb_on_white(name):
     image, kind, options, expected = EIGHT_BIT[name]
     rgb = decode_rgb(saved(image, kind, **options), name)
     np.testing.assert_allclose(rgb, np.reshape(expected, (1, 1, 3)), atol=1e-7)
-
-
-def test_a_transparent_palette_entry_becomes_white_and_others_keep_their_colour():
-    image = Image.new("P", (2, 1))
-    image.putpalette([255, 0, 0, 0, 0, 255])
-    image.putpixel((1, 0), 1)
-    rgb = decode_rgb(saved(image, "PNG", transparency=0), "x")
-    np.testing.assert_array_equal(rgb[0], [[1, 1, 1], [0, 0, 1]])
 
 
 @pytest.mark.parametrize("kind", [".png", ".tiff"])
@@ -227,14 +212,6 @@ def test_the_exif_orientation_is_applied_once(orientation, kind):
         "tiff 16-bit": (tiff(sixteen[..., None], orientation), 5000 / 65535),
     }[kind]
     np.testing.assert_allclose(decode_rgb(data, "x")[..., 0], np.array(UPRIGHT[orientation]) * scale, atol=1e-6)
-
-
-def test_a_jpeg_with_a_rotated_orientation_is_turned_upright():
-    left_white = Image.new("L", (32, 16))
-    left_white.paste(255, (0, 0, 16, 16))
-    rgb = decode_rgb(saved(left_white, "JPEG", exif=exif(6)), "x")
-    assert rgb.shape == (32, 16, 3)
-    np.testing.assert_allclose(rgb[:, 8, 0], [1] * 16 + [0] * 16, atol=0.02)  # JPEG loss
 
 
 @pytest.mark.parametrize("orientation", [0, 9, 60000])
@@ -294,20 +271,13 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_unusable_pictures_are_refused_with_the_reason(name):
+def test_unusable_pictures_are_refused_with_the_reason(name, monkeypatch):
     data, reason = REFUSED[name]
+    if "bomb" in name:  # refused by its header
+        monkeypatch.setattr(ImageFile.ImageFile, "load", None)
     with pytest.raises(ImageError, match=reason) as caught:
         decode_rgb(data, "shot.png")
     assert str(caught.value).startswith("shot.png: ")
-
-
-def test_a_bomb_is_refused_by_its_header_before_decoding(monkeypatch):
-    def decoded(self):
-        raise AssertionError("decoded")
-
-    monkeypatch.setattr(ImageFile.ImageFile, "load", decoded)
-    with pytest.raises(ImageError, match="at most 20000000"):
-        decode_rgb(REFUSED["bomb"][0], "x")
 
 
 def jpeg_of(height, width, **options):
@@ -330,7 +300,7 @@ def test_a_large_jpeg_that_cannot_be_decoded_smaller_is_refused_before_it_is_dec
             decode_rgb(data, "x")
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(
     kind=st.sampled_from([b"IHDR", b"PLTE", b"tRNS", b"iCCP", b"zTXt", b"iTXt", b"eXIf", b"gAMA", b"acTL"]),
     data=st.data(),
@@ -359,12 +329,6 @@ def test_a_webp_bomb_is_refused_before_pillow_opens_it_since_opening_allocates(m
         data = b"RIFF" + struct.pack("<I", 4 + len(header)) + b"WEBP" + header
         with pytest.raises(ImageError, match="12000 x 5000"):
             decode_rgb(data, "x")
-
-
-@pytest.mark.parametrize("options", [{}, {"lossless": True}, {"lossless": True, "exif": exif(1)}])
-def test_the_size_of_real_webp_files_is_read_from_their_header(options):
-    data = saved(Image.fromarray(noise(7, 5)), "WEBP", **options)
-    assert images._webp_size(data) == (5, 7)
 
 
 def test_a_picture_of_the_largest_size_is_read(monkeypatch):
@@ -398,7 +362,7 @@ def test_a_truncated_jpeg_is_refused_although_opencv_fills_it_with_grey(tmp_path
 def test_a_file_truncated_at_any_length_is_refused_or_gives_the_whole_picture(name):
     data = sample_files()[name]
     whole = decode_rgb(data, name)
-    for length in {*range(0, len(data), max(len(data) // 60, 1)), *range(max(len(data) - 30, 0), len(data))}:
+    for length in {*range(0, len(data), max(len(data) // 30, 1)), *range(max(len(data) - 16, 0), len(data))}:
         try:
             part = decode_rgb(data[:length], name)
         except ImageError:
@@ -420,7 +384,7 @@ def check_only_image_errors(data):
     assert rgb.max() <= 1
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(
     prefix=st.sampled_from([b"", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*", b"RIFF....WEBP"]),
     rest=st.binary(max_size=200),
@@ -429,7 +393,7 @@ def test_random_bytes_are_an_image_error_or_a_picture(prefix, rest):
     check_only_image_errors(prefix + rest)
 
 
-@settings(max_examples=600)
+@settings(max_examples=250)
 @given(
     name=st.sampled_from(sorted(sample_files())),
     flips=st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 7)), min_size=1, max_size=6),
@@ -441,7 +405,7 @@ def test_flipped_bits_are_an_image_error_or_a_picture(name, flips):
     check_only_image_errors(bytes(data))
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(
     name=st.sampled_from(sorted(sample_files())),
     place=st.integers(0, 63),

@@ -77,11 +77,6 @@ def test_one_axis_may_shrink_while_the_other_grows():
     np.testing.assert_allclose(resize(image, (4, 5)), expected.transpose(1, 2, 0), atol=ATOL)
 
 
-def test_an_equal_size_is_the_same_picture():
-    image = np.random.default_rng(1).random((5, 6, 3)).astype(np.float32)
-    assert resize(image, (5, 6)) is image
-
-
 @pytest.mark.parametrize("shape", [(1, 1), (1, 4000), (4000, 1), (3, 5000)])
 def test_thin_pictures_resize_and_a_constant_stays_constant(shape):
     out = resize(np.full((*shape, 3), 0.7, np.float32), (64, 64))
@@ -157,13 +152,6 @@ def test_the_reference_is_read_only_by_a_policy_that_needs_it(tmp_path, monkeypa
     assert len(calls) == reads
 
 
-def test_no_reference_is_resized_under_policy_none(monkeypatch):
-    calls = []
-    monkeypatch.setattr(resizing, "_shrink", lambda image, axis, length: calls.append(axis) or image)
-    Preprocessing(touch_px=2).touch(grey(1), grey(2))
-    assert len(calls) == 2
-
-
 # Preprocessing ---------------------------------------------------------------------------------------------
 
 
@@ -218,7 +206,7 @@ def test_a_setting_out_of_range_is_refused_by_name(change):
         Preprocessing(**change)
 
 
-def test_the_digest_depends_on_the_settings_and_the_version():
+def test_the_digest_depends_on_the_settings_and_the_version(monkeypatch):
     text = '{"background": "none", "photo_px": 256, "touch_px": 128, "version": 2}'
     assert Preprocessing().digest() == hashlib.sha256(text.encode()).hexdigest()
     others = {
@@ -226,10 +214,6 @@ def test_the_digest_depends_on_the_settings_and_the_version():
         Preprocessing(photo_px=64).digest(),
         Preprocessing(background="abs").digest(),
     }
-    assert len(others | {Preprocessing().digest()}) == 4
-
-
-def test_another_version_gives_another_digest(monkeypatch):
-    before = Preprocessing().digest()
+    others.add(Preprocessing().digest())
     monkeypatch.setattr(preprocessing, "PREPROCESSING_VERSION", 1)
-    assert Preprocessing().digest() != before
+    assert len(others | {Preprocessing().digest()}) == 5

