@@ -16,6 +16,7 @@ from retrieval.commands.options import Command
 from retrieval.frontier import APPROXIMATIONS
 from retrieval.methods import METHODS
 from retrieval.model.shipped import shipped_model
+from tests import synthetic
 from tests.meshes import box, sphere, stl
 
 
@@ -68,11 +69,9 @@ def test_the_exit_code_distinguishes_none_of_these_from_a_match(built, capsys):
     assert document["none_probability"] > 0.99
     assert len(document["results"]) == 8
     best = document["results"][0]
-    assert output.err.splitlines()[-1] == (
-        f"none of these: the catalogue lacks the object with probability {document['none_probability']:.2f}; if it has "
-        f"the object, this is {best['object_id']} with probability {best['probability_if_present']:.2f}. "
-        f"{document['advice']}"
-    )
+    last = output.err.splitlines()[-1]
+    assert f"probability {document['none_probability']:.2f}; if it has the object, this is {best['object_id']}" in last
+    assert last.endswith(document["advice"])
     assert main([*QUERY, *NO_UNKNOWN_OBJECTS, "--json"]) == 0
     output = capsys.readouterr()
     document = json.loads(output.out)
@@ -82,16 +81,11 @@ def test_the_exit_code_distinguishes_none_of_these_from_a_match(built, capsys):
     assert output.err.splitlines()[-1] == last
 
 
-def test_an_index_is_rebuilt_with_its_own_model(workplace, model, capsys):
-    assert main(["build-index", "catalog/", "--model", str(model)]) == 0
-    capsys.readouterr()
-    assert main(["build-index", "catalog/"]) == 0
-    assert capsys.readouterr().err.startswith(f"model: {model} (the one that index was built with)\n")
-
-
 def test_json_is_the_only_thing_on_stdout_and_has_the_documented_keys(workplace, model, capsys):
     main(["build-index", "catalog/", "--model", str(model), "--json"])
     assert json.loads(capsys.readouterr().out)["photos"] == 24
+    assert main(["build-index", "catalog/"]) == 0
+    assert capsys.readouterr().err.startswith(f"model: {model} (the one that index was built with)\n")
     query = [*QUERY, "--gelsight", "a.png", "b.png", "--top", "3", "--json"]
     assert main([*query, *NO_UNKNOWN_OBJECTS]) == 0
     document = json.loads(capsys.readouterr().out)
@@ -111,18 +105,16 @@ def test_json_is_the_only_thing_on_stdout_and_has_the_documented_keys(workplace,
     assert set(document["results"][0]) == {"rank", "object_id", "logit", *probabilities, "photo", "metadata"}
 
 
-def test_html_is_written_in_addition_to_the_table(built, capsys):
-    assert main([*QUERY, "--html", "out.html", *NO_UNKNOWN_OBJECTS]) == 0
+def test_html_is_written_in_addition_to_the_table_over_pages_only(built, capsys):
+    for _ in range(2):
+        assert main([*QUERY, "--html", "out.html", *NO_UNKNOWN_OBJECTS]) == 0
     assert "data:image/jpeg;base64," in Path("out.html").read_text()
-    assert main([*QUERY, "--html", "out.html", *NO_UNKNOWN_OBJECTS]) == 0
-
-
-@pytest.mark.parametrize("name", ["a.png", "index/CURRENT", "index/gen-000001/manifest.json"])
-def test_html_does_not_overwrite_a_photo_or_an_index(built, capsys, name):
-    before = Path(name).read_bytes()
-    assert main([*QUERY, "--index", "index", "--html", name]) == 2
-    assert f"{name} must be named *.html" in capsys.readouterr().err
-    assert Path(name).read_bytes() == before
+    assert "rank  object" in capsys.readouterr().out
+    for name in ("a.png", "index/CURRENT"):
+        before = Path(name).read_bytes()
+        assert main([*QUERY, "--html", name]) == 2
+        assert f"{name} must be named *.html" in capsys.readouterr().err
+        assert Path(name).read_bytes() == before
 
 
 WRONG_USE = {
@@ -137,6 +129,8 @@ WRONG_USE = {
     "no model": (["build-index", "catalog/", "--model", "none.safetensors"], "there is no checkpoint"),
     "unknown kind": (["build-index", "catalog/", "--kind", "tree"], "flat"),
     "no recording": (["train", "catalog/", "--out", "m.safetensors"], "recording.json"),
+    "no checkpoint": (["train", "nowhere", "--out", "m.txt"], "must be named *.safetensors"),
+    "no gate": (["train", "nowhere", "--task", "grasp-success", "--out", "m.txt"], "must be named *.safetensors"),
     "no preset": (["train", "catalog/", "--out", "m.safetensors", "--config", "huge"], "small"),
     "unknown data set": (["import", "imagenet", "src", "--out", "out"], "billets"),
     "unknown rig": (["collect", "--rig", "sawyer", "--out", "rec"], "one of real, sim"),
@@ -223,22 +217,15 @@ def test_no_folder_is_created_for_an_output_file(words, built, capsys):
     assert not Path("none").exists()
 
 
-@pytest.mark.parametrize("out", ["catalog", "catalog/", "catalog/../catalog", "catalog/cup", "link"])
-def test_an_index_is_not_written_among_the_photos(out, workplace, model, capsys):
+def test_an_index_is_not_written_among_the_photos(workplace, model, capsys):
     (workplace / "link").symlink_to("catalog")
     (workplace / "catalog" / "cup").mkdir(exist_ok=True)
     shutil.copy("a.png", workplace / "catalog" / "cup" / "deep.png")
     before = sorted(workplace.rglob("*"))
-    assert main(["build-index", "catalog", "--model", str(model), "--out", out]) == 2
-    assert f"the index would be written among the photos in {Path(out)}" in capsys.readouterr().err
+    for out in ("catalog", "catalog/../catalog", "catalog/cup", "link"):
+        assert main(["build-index", "catalog", "--model", str(model), "--out", out]) == 2
+        assert f"the index would be written among the photos in {Path(out)}" in capsys.readouterr().err
     assert sorted(workplace.rglob("*")) == before
-
-
-@pytest.mark.parametrize("task", ["match", "grasp-success"])
-def test_a_checkpoint_with_another_suffix_is_refused_before_anything_is_read(task, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert main(["train", "nowhere", "--task", task, "--out", "m.txt"]) == 2
-    assert "must be named *.safetensors, such as m.safetensors; got m.txt" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("make", [os.mkdir, os.mkfifo])
@@ -313,26 +300,19 @@ def test_help_lists_the_choices(command, choices, capsys):
     assert set(choices) <= {word.strip("<>") for word in words}
 
 
-def test_check_prints_licence_and_terms_or_that_none_is_stated(recording, tmp_path, capsys):
-    shutil.copytree(recording, tmp_path / "r")
-    path = tmp_path / "r" / "recording.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"licence": "CC BY 4.0", "terms": "name the authors"}))
-    assert main(["check", str(tmp_path / "r"), "--json"]) == 0
-    output = capsys.readouterr()
-    assert "licence of the data: CC BY 4.0 (name the authors)" in output.err.splitlines()
-    assert json.loads(output.out)["licence"]["licence"] == "CC BY 4.0"
+def test_check_prints_the_licence_and_exits_with_1_if_it_finds_errors(tmp_path, capsys):
+    recording = synthetic.write_recording(tmp_path / "r", synthetic.make_objects(3), 2)
     assert main(["check", str(recording)]) == 0
     assert "licence of the data: not stated" in capsys.readouterr().err.splitlines()
-
-
-def test_check_exits_with_1_if_it_finds_errors(recording, tmp_path, capsys):
-    assert main(["check", str(recording)]) == 0
-    broken = tmp_path / "recording"
-    shutil.copytree(recording, broken)
-    next(iter(sorted((broken / "images").glob("*touch_a.png")))).write_bytes(b"")
-    assert main(["check", str(broken), "--json"]) == 1
+    about = recording / "recording.json"
+    about.write_text(json.dumps(json.loads(about.read_text()) | {"licence": "CC BY 4.0", "terms": "name the authors"}))
+    min((recording / "images").glob("*touch_a.png")).write_bytes(b"")
+    assert main(["check", str(recording), "--json"]) == 1
     output = capsys.readouterr()
-    assert json.loads(output.out)["findings"][0]["kind"] == "broken"
+    document = json.loads(output.out)
+    assert document["licence"]["licence"] == "CC BY 4.0"
+    assert document["findings"][0]["kind"] == "broken"
+    assert "licence of the data: CC BY 4.0 (name the authors)" in output.err.splitlines()
     assert "is not suitable for training" in output.err
 
 
@@ -388,18 +368,13 @@ def test_meshes_that_cannot_be_grasped_are_listed_and_the_others_are_collected(t
     (globe, faces), collect = sphere(20), ["collect", "--rig", "rig.toml", "--grasps", "1", "--seed", "1"]
     stl(Path("meshes/a_globe.stl"), 80 * globe, faces)
     stl(Path("meshes/b_box.stl"), *box(60, 90, 120))
-    stl(Path("meshes/c_box.stl"), *box(50, 70, 100))
-    assert main([*collect, "--objects", "3", "--out", "rec"]) == 0
+    assert main([*collect, "--objects", "2", "--out", "rec"]) == 0
     lines = capsys.readouterr().err.splitlines()
     skipped = [line for line in lines if "skipped: wider than the gripper opens: 15" in line]
     assert [line.split("-")[0] for line in skipped] == ["mesh.a_globe"]
-    assert lines[-1] == "rec: 2 accepted grasps of 2 objects, 1 skipped"
+    assert lines[-1] == "rec: 1 accepted grasps of 1 objects, 1 skipped"
     assert main([*collect, "--objects", "1", "--out", "none"]) == 1
-    assert (
-        capsys.readouterr()
-        .err.splitlines()[-1]
-        .endswith("no grasp was accepted; none/attempts.jsonl lists the reasons")
-    )
+    assert "none/attempts.jsonl lists the reasons" in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_a_trained_gate_decides_which_grasps_are_accepted(workplace, capsys):
