@@ -102,6 +102,13 @@ class Protocol:
         in_depth: Whether single objects, calibrated probabilities and decisions of each row are reported. Then one
             split serves all seeds, which only repeat the training; no method is fitted on validation objects, and rows
             have no low-pass control of their own and no verdict.
+
+    >>> from retrieval.evaluation.protocol import topn_accuracy, folds
+    >>> def halves(facts, seed):
+    ...     return folds(facts.names, [facts.names[::2], facts.names[1::2]], seed)
+    >>> protocol = retrieval.Protocol("vt60", "Halves", "Objects are halved by name.", halves, topn_accuracy(10))
+    >>> protocol.main
+    'topn_k10'
     """
 
     data_set: str | None
