@@ -182,7 +182,7 @@ def _named_in(folder):
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is read from /proc")
-@pytest.mark.parametrize("attack", ["many_keys", "jpeg_scans", "png_pixels", "slow_bodies"])
+@pytest.mark.parametrize("attack", ["many_keys", "jpeg_scans", "png_pixels"])
 def test_the_service_answers_others_during_an_attack_with_bounded_memory_and_ends_quickly(index, touch, attack):
     measured = attacks.measure(getattr(attacks, attack), index, tuple(path.read_bytes() for path in touch))
     print(measured.row())
