@@ -12,7 +12,7 @@ from retrieval.model.towers.weights import gel_tower as packaged_gel_tower
 from robot.sim.gel.sensor import draw_sensor
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_press_of_a_random_surface_changes_the_gel_image(seed):
     sensor, surface = draw_sensor(0, "a"), RandomSurface.draw(seed)
     gap = surface.gap_mm(np.random.default_rng(seed), 0.126)
@@ -23,7 +23,7 @@ def test_a_press_of_a_random_surface_changes_the_gel_image(seed):
     assert all(np.abs(picture - frame).mean() > 1 for picture in made)
 
 
-def test_the_contrast_is_lowest_if_the_presses_of_a_surface_are_alike():
+def test_the_losses_are_lowest_for_alike_presses_and_for_imagenets_features_with_any_offset():
     training = gel_tower.GelTowerTraining.__new__(gel_tower.GelTowerTraining)
     training.projection = torch.nn.Identity()
     torch.manual_seed(0)
@@ -31,10 +31,6 @@ def test_the_contrast_is_lowest_if_the_presses_of_a_surface_are_alike():
     assert training.contrast(surfaces) < 0.05
     # 19 other presses, all as far away as each other.
     assert training.contrast(torch.randn(20, 4096)) == pytest.approx(np.log(19), abs=0.1)
-
-
-def test_the_distance_from_imagenet_ignores_a_common_offset():
-    torch.manual_seed(0)
     published = torch.randn(20, 8)
     assert gel_tower.distance(published + 3, published) == pytest.approx(0, abs=1e-6)
     assert gel_tower.distance(2 * published, published) > 0.3

@@ -30,24 +30,32 @@ def test_every_preset_loads_and_names_a_tower_that_exists(name):
 
 
 def test_the_preset_paper_contains_the_papers_numbers():
-    config = load_config("paper")
-    matcher, training, preprocessing = config.matcher, config.training, config.preprocessing
-    assert matcher.tower == "resnet50"
-    assert matcher.tower_output == "classes"  # the 1000 outputs of each network are concatenated
-    assert matcher.fingers == 2
-    assert matcher.hidden == 1024
-    assert matcher.dropout > 0
-    assert not matcher.standardise
-    assert training.init == "imagenet"
-    assert training.iterations == 26_000
-    assert (training.positives_per_touch, training.negatives_per_touch) == (4, 4)
-    assert training.touches_per_batch * (4 + 4) == 48
-    assert (training.learning_rate, training.schedule) == (1e-4, "constant")
-    assert training.weights == dict.fromkeys(LOSSES, 0.0)
-    assert not training.freeze_batch_norm
-    assert not training.freeze_towers
-    assert round(98 * training.test_fraction) == 18
-    assert (preprocessing.touch_px, preprocessing.photo_px, preprocessing.background) == (128, 256, "none")
+    tables = load_config("paper").to_dict()
+    papers = {
+        "matcher": {
+            "tower": "resnet50",
+            "tower_output": "classes",  # the 1000 outputs of each network are concatenated
+            "fingers": 2,
+            "hidden": 1024,
+            "standardise": False,
+        },
+        "training": {
+            "init": "imagenet",
+            "iterations": 26_000,
+            "touches_per_batch": 6,  # 48 pairs
+            "positives_per_touch": 4,
+            "negatives_per_touch": 4,
+            "learning_rate": 1e-4,
+            "schedule": "constant",
+            "freeze_batch_norm": False,
+            "freeze_towers": False,
+            **{f"{loss}_weight": 0.0 for loss in LOSSES},
+        },
+        "preprocessing": {"touch_px": 128, "photo_px": 256, "background": "none"},
+    }
+    assert {table: {name: tables[table][name] for name in entries} for table, entries in papers.items()} == papers
+    assert tables["matcher"]["dropout"] > 0
+    assert round(98 * tables["training"]["test_fraction"]) == 18
 
 
 def test_the_defaults_are_the_papers_which_has_no_candidate_encoder():
