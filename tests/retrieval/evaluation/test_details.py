@@ -8,13 +8,8 @@ import pytest
 
 from retrieval.evaluation.details import draw_k_way_tests, draw_pairs, reliability
 from retrieval.evaluation.queries import fit_posterior
-from retrieval.metrics.table import ScoreTable
 from retrieval.model.posterior import Posterior
-
-
-def table_of(scores, owner, own=None):
-    own = np.eye(len(owner), dtype=bool) if own is None else own
-    return ScoreTable(np.asarray(scores, dtype=np.float32), np.array(owner), np.array(owner), own)
+from tests.retrieval.metrics.test_registry import table_of
 
 
 def planted(objects=20, grasps=10, seed=0, scale=1.0):

@@ -8,14 +8,8 @@ from retrieval.evaluation.queries import identification_trials
 from retrieval.evaluation.reject import false_accepts, galleries, reject, statistic
 from retrieval.metrics.intervals import summarise
 from retrieval.metrics.measure import object_means
-from retrieval.metrics.table import ScoreTable
 from retrieval.model.posterior import Posterior
-
-
-def table_of(scores, owner):
-    return ScoreTable(
-        np.asarray(scores, dtype=np.float32), np.array(owner), np.array(owner), np.eye(len(owner), dtype=bool)
-    )
+from tests.retrieval.metrics.test_registry import table_of
 
 
 def planted(objects=12, grasps=8, gap=3.0, seed=0, scale=1.0):

@@ -9,27 +9,12 @@ from retrieval.methods.method import MethodSettings
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from retrieval.model.fusion import LOG_SCALE_MAX
 from retrieval.model.losses.listwise import contrastive_loss
-from retrieval.training.features import Features
+from tests.retrieval.methods.test_methods import planted
 
-CONFIG = Config(matcher=MatcherConfig(embedding_dim=4), training=TrainingConfig(iterations=80))
-
-
-def planted(objects, seed, each=6):
-    """Return touch and photo features that are linear in two numbers of the object, with noise."""
-    shared, rng = np.random.default_rng(11), np.random.default_rng(seed)
-    latent = np.repeat(rng.standard_normal((objects, 2)), each, axis=0)
-    touch, photo = (
-        latent @ shared.standard_normal((2, d)) + 0.3 * rng.standard_normal((len(latent), d)) for d in (6, 5)
-    )
-    return Features(
-        tuple(f"{seed}-{row}" for row in range(len(latent))),
-        tuple(f"{seed}-{row // each}" for row in range(len(latent))),
-        touch.reshape(-1, 1, 6).astype(np.float32),
-        photo.astype(np.float32),
-    )
+CONFIG = Config(matcher=MatcherConfig(embedding_dim=4), training=TrainingConfig(iterations=40))
 
 
-TRAIN, VALIDATION, TEST = planted(10, 0), planted(4, 1), planted(5, 2)
+TRAIN, VALIDATION, TEST = (planted(objects, seed, widths=(6, 5)) for seed, objects in enumerate((10, 4, 5)))
 
 
 def test_scores_are_scaled_cosines():
