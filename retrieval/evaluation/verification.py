@@ -9,7 +9,7 @@ to 100 % of cases; a bootstrap over objects did so in 76 to 97 %, least for smal
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import torch
@@ -31,16 +31,8 @@ FARS = (0.1, 0.01, 0.001)
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Errors:
-    """Errors of one number of grasps and training seed: objects, sequences, equal error rate, and FRR at `FARS`."""
-
-    objects: int
-    sequences: int
-    eer: float
-    frr: tuple[float, ...]
-
-
+Errors = tuple[int, int, tuple[float, ...]]
+"""Numbers of objects and of sequences, equal error rate, then false-reject rates at `FARS`, of one training seed."""
 ErrorsByImpostors = dict[str, dict[str, Errors]]
 """Kind of impostors ("random", "similar") -> number of grasps -> errors."""
 
@@ -76,8 +68,8 @@ def verification_errors(scores: MethodScores, features: Features, checkpoint: Ch
         if sequences is not None and (objects := len(np.unique(sequences.owner))) >= MIN_OBJECTS:
             genuine = sequences.genuine[-1]
             for kind, impostors in (("random", sequences.impostor.ravel()), ("similar", sequences.similar)):
-                frr = tuple(false_rejects(far, genuine, impostors) for far in FARS)
-                found[kind][str(grasps)] = Errors(objects, len(genuine), equal_error_rate(genuine, impostors), frr)
+                frr = [false_rejects(far, genuine, impostors) for far in FARS]
+                found[kind][str(grasps)] = objects, len(genuine), (equal_error_rate(genuine, impostors), *frr)
     return found if found["random"] else None
 
 
@@ -90,7 +82,8 @@ def verification_rates(by_seed: Sequence[ErrorsByImpostors]) -> dict[str, dict[s
 
 
 def _rates(kind: str, by_seed: Sequence[Errors]) -> VerificationRates:
-    objects = by_seed[0].objects
+    objects, sequences, _ = by_seed[0]
+    eer, *frr = np.mean([rates for _, _, rates in by_seed], axis=0).tolist()
 
     def rate(value: float, far: float) -> Rate:
         needed = objects_needed(far) if kind == "random" else math.ceil(ERRORS_NEEDED / far)
@@ -98,12 +91,11 @@ def _rates(kind: str, by_seed: Sequence[Errors]) -> VerificationRates:
             return Rate(None, None, None, needed)
         return Rate(**asdict(error_rate(value, objects)), objects_needed=needed)
 
-    eer = float(np.mean([one.eer for one in by_seed]))
     return VerificationRates(
         objects,
-        by_seed[0].sequences,
+        sequences,
         rate(eer, eer) if eer else Rate(None, None, None, None),
-        {f"{far:g}": rate(float(np.mean([one.frr[place] for one in by_seed])), far) for place, far in enumerate(FARS)},
+        {f"{far:g}": rate(value, far) for far, value in zip(FARS, frr, strict=True)},
     )
 
 

@@ -3,26 +3,23 @@
 import dataclasses
 import json
 from collections import defaultdict
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from _touch_retrieval.cache import Cache
 from retrieval.commands.main import main
-from retrieval.data.dataset import Grasp, Split, load_grasps
+from retrieval.data.dataset import Split, load_grasps
 from retrieval.errors import BadInput, ConfigError, DatasetError, JobInterrupted
 from retrieval.evaluation import PROTOCOLS, UNSEEN_OBJECTS
 from retrieval.evaluation.evaluate import evaluate
 from retrieval.evaluation.experiment import Experiment, ProtocolRun, permute_touches
 from retrieval.evaluation.inputs import Row, TowerEncoder
-from retrieval.evaluation.protocol import RecordingFacts, read_recording_facts
+from retrieval.evaluation.protocol import read_recording_facts
 from retrieval.evaluation.protocols.recording import with_split
 from retrieval.evaluation.results import Timings, read_results
 from retrieval.methods.cca import Cca
 from retrieval.methods.method import Method
-from retrieval.metrics.intervals import summarise
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.report.evaluation import write_report
 from retrieval.training.features import Features
@@ -241,29 +238,24 @@ def test_a_control_is_left_out_without_no_contact_frames(run, tmp_path):
     assert found.rows["chance"].details.reliability == {}
 
 
-def test_an_informative_modality_has_a_high_ceiling_and_noise_stays_at_chance(tmp_path):
-    """Photos identify the object; touches are noise."""
-    rng = np.random.default_rng(0)
-    names = [f"object-{number:02}" for number in range(24)]
-    owners = tuple(name for name in names for _ in range(6))
-    known = rng.standard_normal((24, 8)).astype(np.float32).repeat(6, axis=0)
-    photo = known + np.float32(0.05) * rng.standard_normal(known.shape).astype(np.float32)
-    touch = rng.standard_normal((144, 1, 8)).astype(np.float32)
-    grasps = [Grasp(str(row), owner, None, Path(f"{row}.png"), (), ()) for row, owner in enumerate(owners)]
-    split = Split(0, tuple(names[:12]), tuple(names[12:16]), tuple(names[16:]))
-    features = Features(tuple(map(str, range(144))), owners, touch, photo)
-    encoded = {("touch", with_cells, None): features for with_cells in (True, False)}
-    rows = [Row("cca", "cca", TowerEncoder(grasps, CONFIG, None, None, tmp_path, True, encoded))]
-    protocol = dataclasses.replace(PROTOCOLS.load(UNSEEN_OBJECTS), folds=lambda *_: [split])
-    facts = RecordingFacts(Path("drawn"), "drawn", grasps, {}, {})
-    facts.__dict__["digest"] = "drawn"  # there are no images
-    run, found = ProtocolRun("x", protocol, facts, rows, [0], tmp_path, True), {}
-    with Cache(tmp_path / "cache.sqlite") as cache:
-        for kind in protocol.ceilings:
-            outcome = Experiment(run, rows[0], kind, 0, 0, 0, is_control=True).run(cache)
-            found[kind] = summarise([outcome.measures["topn_k5"]]).value[0]
-    assert found["photo_to_photo"] > 0.99
-    assert found["touch_to_touch"] < 0.4  # chance is .2
+def test_ceilings_compare_touches_with_touches_and_photos_with_photos(tmp_path):
+    touch, photo = np.arange(24, dtype=np.float32).reshape(4, 2, 3), np.ones((4, 5), np.float32)
+    features = Features(tuple("1234"), tuple("aabb"), touch, photo)
+    towers = TowerEncoder(
+        [],
+        CONFIG,
+        None,
+        None,
+        tmp_path,
+        True,
+        dict.fromkeys([("touch", cells, None) for cells in (True, False)], features),
+    )
+    touches, photos = (towers.inputs(kind, with_cells=False) for kind in ("touch_to_touch", "photo_to_photo"))
+    np.testing.assert_array_equal(touches.photo, touch.reshape(4, 6))
+    np.testing.assert_array_equal(photos.touch, photo[:, None])
+    assert touches.touch is touch
+    assert photos.photo is photo
+    assert towers.missing_reason("photo_to_photo") == "no object has two different photos"
 
 
 @pytest.fixture(scope="module")
@@ -327,6 +319,8 @@ def test_wrong_arguments_are_refused_before_anything_is_read(run, tmp_path):
         run(tmp_path / "out", methods=("cca", "oracle"))
     with pytest.raises(BadInput, match="at least 1 seed, got 0"):
         run(tmp_path / "out", seeds=0)
+    with pytest.raises(BadInput, match="takes a split, got rct"):
+        run(tmp_path / "out", protocols=["rct"], split=Split(0, (), (), ()))
     assert not (tmp_path / "out").exists()
 
 

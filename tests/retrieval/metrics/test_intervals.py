@@ -154,6 +154,7 @@ def test_p_equals_that_by_hand():
     assert sign_flip_p(np.array([0.1, 0.2, -0.3])) == 1
     assert sign_flip_p(np.zeros(5)) == 1
     assert sign_flip_p(np.array([0.4])) == 1
+    assert sign_flip_p(np.ones(30)) == 1 / 10_001  # no random flip of 10,000 is as far from 0
 
 
 def test_the_identity_flip_counts_although_its_sum_is_rounded_differently():
