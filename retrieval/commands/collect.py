@@ -48,10 +48,6 @@ def collect(
     from robot.recording.attempt_log import acceptance_table
     from robot.rig import load_rig
 
-    # The overview is written next to the recording, because every image inside belongs to a grasp.
-    # "." and ".." have no name to extend, so they are resolved.
-    folder = out if out.name not in ("", "..") else out.resolve()
-    sheet = folder.with_name(f"{folder.name}-preview.png")
     decide: Any = None
     gate_name = None
     if gate is not None:
@@ -59,36 +55,33 @@ def collect(
         from retrieval.model.gate import load_gate
 
         decide, gate_name = load_gate(gate), f"learned, sha256 {file_digest(gate)}"
-    settings = CollectSettings(grasps=grasps, rounds=rounds)
-    if rounds:
-        say(
-            f"{grasps} rounds through {objects} objects, one accepted grasp of each in a round; where a person changes "
-            "the objects, the rig requests another object after each accepted grasp"
-        )
     with resumable(out), Bar("collect", 0, "grasps") as bar:
         tallies = collect_grasps(
             partial(load_rig, rig, seed=seed),
             out,
             objects=objects,
             seed=seed,
-            settings=settings,
+            settings=CollectSettings(grasps=grasps, rounds=rounds),
             gate=decide,
             gate_name=gate_name,
             jobs=jobs,
             progress=lambda now: bar.show(now.grasps_done, now.grasps_target, str(now)),
         )
-    for line in acceptance_table(tallies, grasps_target=settings.grasps).splitlines():
+    for line in acceptance_table(tallies, grasps_target=grasps).splitlines():
         say(line)
     accepted = sum(tally.accepted for tally in tallies)
     if accepted == 0:
         raise RetrievalError(f"no grasp was accepted; {out}/attempts.jsonl lists the reasons")
     skipped = sum(tally.skipped is not None for tally in tallies)
-    others = f", {skipped} skipped" * bool(skipped)
-    say(f"{out}: {accepted} accepted grasps of {len(tallies) - skipped} objects{others}")
+    say(
+        f"{out}: {accepted} accepted grasps of {len(tallies) - skipped} objects"
+        + f", {skipped} skipped" * bool(skipped)
+    )
     if preview:
         from robot.recording.preview import write_preview
 
-        say(f"preview: {write_preview(out, sheet)}")
+        folder = out.resolve()  # the overview is next to the recording, because every image inside belongs to a grasp
+        say(f"preview: {write_preview(out, folder.with_name(f'{folder.name}-preview.png'))}")
 
 
 def _print_motions(name: str, objects: int, seed: int) -> None:
@@ -96,8 +89,7 @@ def _print_motions(name: str, objects: int, seed: int) -> None:
     from robot.grasping.dry_run import make_dry_run
     from robot.rig import load_rig
 
-    rig = make_dry_run(load_rig(name, seed=seed), show)
-    with rig:
+    with make_dry_run(load_rig(name, seed=seed), show) as rig:
         runner = AttemptRunner(rig, seed, rig.attempt)
         for object_id in rig.object_ids(objects):
             attempt = runner.run(object_id, 0)

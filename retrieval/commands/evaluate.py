@@ -108,7 +108,7 @@ def evaluate(
         preset=Path(preset).stem,
         methods=methods.split(",") if methods else METHODS_OF_PRESETS.get(preset, ()),
         model=model,
-        compared={name: _compared(choice, init) for name, choice in map(_named, compare or ())},
+        compared=dict(_compared(word, init) for word in compare or ()),
         seeds=seeds,
         split=read_split(split),
         skipped=skipped,
@@ -165,14 +165,11 @@ def _data_sets(protocol: str, data: Path, imported: Path) -> tuple[list[str], di
     return [name for name in requested if name not in skipped], recordings, skipped
 
 
-def _named(word: str) -> tuple[str, str]:
-    name, equals, choice = word.partition("=")
-    if not equals or not name or "/" in name:
+def _compared(word: str, init: str | None) -> "tuple[str, Path | Config]":
+    """Return the name of NAME=CHOICE, and the file of a checkpoint or the configuration of a touch tower."""
+    name, _, choice = word.partition("=")
+    if not choice or not name or "/" in name:
         raise BadInput(f"--compare must have the form NAME=CHOICE, got {word!r}")
-    return name, choice
-
-
-def _compared(choice: str, init: str | None) -> "Path | Config":
     if choice in SHIPPED_NAMES:
-        return shipped_model(SHIPPED_NAMES[choice])
-    return Path(choice) if choice.endswith(".safetensors") else training_config(choice, None, init=init)
+        return name, shipped_model(SHIPPED_NAMES[choice])
+    return name, Path(choice) if choice.endswith(".safetensors") else training_config(choice, None, init=init)

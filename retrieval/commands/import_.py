@@ -33,11 +33,16 @@ def import_(
     ] = None,
 ) -> None:
     """Convert a public data set, or your own pictures, to a recording."""
-    from robot.importers import IMPORTERS, read_options
+    from robot.importers import IMPORTERS, load_importer, options_of, read_options, title_of
 
     if name is None:
-        for line in _list_importers():
-            show(line)
+        width = max(map(len, IMPORTERS.names())) + 2
+        for listed in sorted(IMPORTERS.names()):
+            show(f"{listed:{width}}{title_of(listed)}")
+            known = {option: default for option, (_, default) in options_of(load_importer(listed)).items()}
+            if known:
+                words = (f"{option}={shlex.quote(str(default))}" for option, default in known.items())
+                show(f"{'':{width}}--option {' '.join(words)}")
         return
     options = read_options(IMPORTERS.resolve(name), option or ())
     if source is None or out is None:
@@ -59,19 +64,3 @@ def run_importer(name: str, source: Path, out: Path, **options: Any) -> "Recordi
 
     with Bar(f"import {name}", 0, "grasps") as bar:
         return load_importer(name)(source, out, bar.show, **options)
-
-
-def _list_importers() -> list[str]:
-    """Return one line for each data set, and one with its options and their defaults."""
-    from robot.importers import IMPORTERS, load_importer, options_of, title_of
-
-    lines = []
-    names = sorted(IMPORTERS.names())
-    width = max(map(len, names)) + 2
-    for name in names:
-        lines.append(f"{name:{width}}{title_of(name)}")
-        options = [
-            f"{option}={shlex.quote(str(default))}" for option, (_, default) in options_of(load_importer(name)).items()
-        ]
-        lines += [f"{'':{width}}--option {' '.join(options)}"] if options else []
-    return lines

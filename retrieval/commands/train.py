@@ -75,13 +75,13 @@ def train(
     try:
         settings = training_config(config, iterations, init=init)
         _show_licences(training_licences(recording, settings.training))
-        options: dict[str, Any] = {"split": read_split(split)}
+        parts = read_split(split)
         if cluster:
             from retrieval.cluster.training import train_on_ray
 
-            checkpoint = train_on_ray(recording, out, settings, workers=workers or 2, **options)
+            checkpoint = train_on_ray(recording, out, settings, workers=workers or 2, split=parts)
         else:
-            checkpoint = train_matcher(recording, out, settings, **options)
+            checkpoint = train_matcher(recording, out, settings, split=parts)
         if distributed.rank():
             return
     finally:

@@ -40,7 +40,7 @@ def towers(sample: Sample) -> ApproximationResult:
     exact = _logits(sample, _touch_partials(copy.deepcopy(sample.checkpoint.matcher).double(), images), photos)
     points, works = list[Tradeoff](), list[Callable[[], object]]()
     for name, encode, is_default in encoders(sample.checkpoint):
-        error = _largest_error(_logits(sample, encode(images), photos), exact)
+        error = float(np.abs(_logits(sample, encode(images), photos) - exact).max())
         points.append(Tradeoff(name, "", error, is_default=is_default))
         works.append(partial(encode, images[:1]))
     return ApproximationResult(
@@ -53,10 +53,6 @@ def towers(sample: Sample) -> ApproximationResult:
 
 def _logits(sample: Sample, touch_partials: Array, photos: NDArray[Any]) -> Array:
     return np.array([sample.logits(touch_partial, photos) for touch_partial in touch_partials])
-
-
-def _largest_error(logits: Array, exact: Array) -> float:
-    return float(np.abs(logits - exact).max())
 
 
 def _panel(
@@ -113,7 +109,7 @@ def partials(sample: Sample) -> ApproximationResult:
     points, works = list[Tradeoff](), list[Callable[[], object]]()
     for name, store, read, is_default in FORMATS:
         setting = f"{sum(part.nbytes for part in store(many)) // len(many)} bytes a photo"
-        error = _largest_error(_logits(sample, queries, read(store(whole))), exact)
+        error = float(np.abs(_logits(sample, queries, read(store(whole))) - exact).max())
         points.append(Tradeoff(name, setting, error, is_default=is_default))
         works.append(partial(lambda read, stored: sample.logits(queries[0], read(stored)), read, store(many)))
     return ApproximationResult(

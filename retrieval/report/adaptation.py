@@ -13,6 +13,8 @@ ROWS = {
     "unadapted model": "baseline_{}",
 }
 """Label -> name of a measure in `Adaptation.measures`."""
+BETTER = "Better than the low-pass control: the fit uses more than light and coarse shape."
+NOT_BETTER = "Not better than the low-pass control: no evidence that the fit uses touch. Record more objects."
 
 
 def print_adaptation(result: Adaptation) -> None:
@@ -29,10 +31,7 @@ def print_adaptation(result: Adaptation) -> None:
     gallery = measures["held_out_top1"].gallery
     print_columns(f"On held-out objects, {gallery}", ("one touch", *MEASURES.values()), rows, words=(0,))
     show(f"Each object was held out once; {gallery}.")
-    if gains["top1"].low > 0:
-        show("Better than the low-pass control: the fit uses more than light and coarse shape.")
-    else:
-        show("Not better than the low-pass control: no evidence that the fit uses touch. Record more objects.")
+    show(BETTER if gains["top1"].low > 0 else NOT_BETTER)
     if result.is_baseline:
         show(
             "The unadapted model is used: its pair accuracy is at least that of the fit. Only its calibrations and its "

@@ -45,6 +45,15 @@ INTERVALS_OF_CHOICES = (
     "test and training objects (corrected resampled t-test, because choices share objects). {ties}"
 )
 TIES = "Ties get their expected rank, so a constant scorer gets exactly chance."
+GALLERY = "From a touch to all photos of the unseen objects; any photo of the object is right."
+CONTROLS = (
+    "The same method on inputs without the information of interest. Permuted touches, no-contact frames and the order "
+    "of capture should be at chance. Low-pass touches contain light and coarse shape, so they may be above chance."
+)
+CEILINGS = (
+    "CCA trained and tested within one modality. Matching between touch and photo can hardly be better than the worse "
+    "of the two. The difference between that ceiling and the result is due to the change of modality."
+)
 TOO_FEW = "Not evaluated: the open-set decision requires at least three validation objects and three test objects."
 
 Blocks = Iterator[Block | None]
@@ -138,7 +147,7 @@ def _methods(view: ProtocolView) -> Blocks:
     if keys := view.headlines[:5]:
         yield Picture(
             view.figure_name("overview"),
-            f"Dots with intervals. {_values(view, keys)}.",
+            "Dots with intervals: each measure of each method; the table below has the numbers.",
             "Value and 95 % interval of each method; dashed: chance in closed form.",
             lambda: plots.overview(view, keys),
         )
@@ -148,22 +157,11 @@ def _methods(view: ProtocolView) -> Blocks:
     yield tables.choices(view)
 
 
-def _values(view: ProtocolView, keys: list[str]) -> str:  # for the text alternative of a figure
-    lines = []
-    for key in keys:
-        found = view.summaries(key)
-        values = [f"{view.label(name)} {percent(summary.value[0])} %" for name, summary in found.items()]
-        chance = percent(next(iter(found.values())).chance[0])
-        lines.append(f"{view.measure_label(key)}: {', '.join(values)}; chance {chance} %")
-    return ". ".join(lines)
-
-
 def _topn(view: ProtocolView) -> Blocks:
-    keys = [key for key in ("topn_k5", "topn_k10") if view.summaries(key)]
-    if keys:
+    if keys := [key for key in ("topn_k5", "topn_k10") if view.summaries(key)]:
         yield Picture(
             view.figure_name("guess-curves"),
-            f"Rising curves. {_values(view, keys)}.",
+            "Rising curves: top-N accuracy of each method against N.",
             "How often the object is among the first N answers, with K − 1 other objects as candidates. Bands: 95 % "
             "intervals.",
             lambda: plots.topn_curves(view, keys),
@@ -171,10 +169,10 @@ def _topn(view: ProtocolView) -> Blocks:
 
 
 def _grasps(view: ProtocolView) -> Blocks:
-    if keys := [key for key in map(grasps_metric_name, SET_SIZES) if view.summaries(key)]:
+    if any(map(view.summaries, map(grasps_metric_name, SET_SIZES))):
         yield Picture(
             view.figure_name("grasps"),
-            f"Top-1 accuracy against grasps in a query. {_values(view, keys)}.",
+            "Top-1 accuracy against grasps in a query; the table below has the numbers.",
             "A query of several grasps of one object against three photos of each of five objects. Dashed: chance.",
             lambda: plots.grasps(view),
         )
@@ -186,39 +184,15 @@ def _time(view: ProtocolView) -> Blocks:
         if key := next((key for key in ("topn_k5", view.result.main) if view.summaries(key)), None):
             yield Picture(
                 view.figure_name("time"),
-                f"Accuracy against time on a logarithmic scale. {_values(view, [key])}. Times in the table.",
+                "Accuracy against time on a logarithmic scale; the tables have the numbers.",
                 "Upper left is better. The grey steps join the methods on the Pareto front; dashed: chance.",
                 lambda: plots.accuracy_and_time(view, key),
             )
         yield tables.times(view, view.timings, view.times)
 
 
-def _gallery(view: ProtocolView) -> Blocks:
-    if table := tables.section(view, "gallery"):
-        yield Text("From a touch to all photos of the unseen objects; any photo of the object is right.")
-        yield table
-
-
-# Validity ------------------------------------------------------------------------------------------
-
-
-def _controls(view: ProtocolView) -> Blocks:
-    if view.result.controls:
-        yield Text(
-            "The same method on inputs without the information of interest. Permuted touches, no-contact frames and "
-            "the order of capture should be at chance. Low-pass touches contain light and coarse shape, so they may be "
-            "above chance."
-        )
-        yield tables.controls(view, view.result.controls)
-
-
-def _ceilings(view: ProtocolView) -> Blocks:
-    if table := tables.controls(view, view.result.ceilings):
-        yield Text(
-            "CCA trained and tested within one modality. Matching between touch and photo can hardly be better than "
-            "the worse of the two. The difference between that ceiling and the result is due to the change of modality."
-        )
-        yield table
+def _explained(text: str, table: Table | None) -> Blocks:
+    return iter([Text(text), table] if table else [])
 
 
 # Objects -------------------------------------------------------------------------------------------
@@ -237,12 +211,10 @@ def _objects(view: ProtocolView, name: str, details: Details) -> Iterator[Block]
         ("test", "topn_k5", "(a) candidates: test objects only"),
         ("all", "topn_k5_all_objects", "(b) candidates: all objects (red: test, grey: validation, blue: training)"),
     ):
-        if accuracy := details.per_object.get(f"{key}_candidates"):
-            best, worst = max(accuracy, key=accuracy.__getitem__), min(accuracy, key=accuracy.__getitem__)
-            low, high = percent(accuracy[worst]), percent(accuracy[best])
+        if details.per_object.get(f"{key}_candidates"):
             yield Picture(
                 view.figure_name(f"objects-{key}-{name}"),
-                f"Bars, {label}, {words}: {high} % ({best}) to {low} % ({worst}).",
+                f"Bars: accuracy of each object, {label}, {words}.",
                 f"Top-1 accuracy among five objects for each object, {label}; {words}.",
                 partial(plots.objects, view, name, f"{key}_candidates", measure),
             )
@@ -252,14 +224,12 @@ def _objects(view: ProtocolView, name: str, details: Details) -> Iterator[Block]
 
 
 def _reliability(view: ProtocolView, name: str, details: Details) -> Iterator[Block]:
-    label, diagrams = view.label(name), details.reliability
-    descriptions = [
-        f"{text}: ECE {percent(diagrams[key]['ece'])} %" for key, text in plots.RELIABILITIES.items() if key in diagrams
-    ]
-    if descriptions:
+    label = view.label(name)
+    if details.reliability:
+        ece = ", ".join(f"{kind} {percent(found['ece'])} %" for kind, found in details.reliability.items())
         yield Picture(
             view.figure_name(f"reliability-{name}"),
-            f"Reliability diagrams, {label}. {'; '.join(descriptions)}.",
+            f"Reliability diagrams, {label}. ECE: {ece}.",
             f"Right answers against the probability that {label} stated; a calibrated method is on the diagonal.",
             partial(plots.reliability, view, name),
         )
@@ -331,10 +301,10 @@ PARTS: dict[str, Callable[[ProtocolView], Blocks]] = {
     "Top-N accuracy": _topn,
     "Several grasps": _grasps,
     "Accuracy and time": _time,
-    "Full gallery": _gallery,
+    "Full gallery": lambda view: _explained(GALLERY, tables.section(view, "gallery")),
     "Differences": lambda view: iter([tables.differences(view)]),
-    "Controls": _controls,
-    "Ceilings": _ceilings,
+    "Controls": lambda view: _explained(CONTROLS, tables.controls(view, view.result.controls)),
+    "Ceilings": lambda view: _explained(CEILINGS, tables.controls(view, view.result.ceilings)),
     "Accuracy by object": lambda view: _each(view, _objects),
     "Confusions": lambda view: _each(view, tables.confusions),
     "Calibration": lambda view: _each(view, _reliability),

@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Collection, Sequence
-from itertools import chain, repeat
 
 from retrieval.console.output import printable, show
 from retrieval.search.answer import NearestReference, QueryResult
@@ -12,25 +11,23 @@ def print_table(result: QueryResult) -> None:
     """Print the ranking of a query, with "none of these" at its end; print nothing if there is no ranking."""
     if not result.results:
         return
-    rows: list[tuple[str, ...]] = [
-        (
+    rows = [
+        [
             str(match.rank),
             match.object_id,
             "-" if match.probability is None else f"{match.probability:.3f}",
             "-" if match.probability_if_present is None else f"{match.probability_if_present:.3f}",
             f"{match.logit:+.2f}",
             match.photo,
-        )
+            *_reference(match.reference),
+        ]
         for match in result.results
     ]
     if result.none_probability is not None:
-        rows.append(("-", "none of these", f"{result.none_probability:.3f}", "", "", ""))
-    header: tuple[str, ...] = ("rank", "object", "probability", "if present", "logit", "photo")
-    if any(match.reference for match in result.results):
-        header += ("nearest touch", "cosine", "adds")
-        nearest = chain((_reference(match.reference) for match in result.results), repeat(_reference(None)))
-        rows = [(*row, *reference_cells) for row, reference_cells in zip(rows, nearest, strict=False)]
-    print_columns("Which object is in the hand?", header, rows, words=(1, 5, 6))
+        rows.append(["-", "none of these", f"{result.none_probability:.3f}", *[""] * 6])
+    header = ("rank", "object", "probability", "if present", "logit", "photo", "nearest touch", "cosine", "adds")
+    count = 9 if any(match.reference for match in result.results) else 6
+    print_columns("Which object is in the hand?", header[:count], [row[:count] for row in rows], words=(1, 5, 6))
 
 
 def _reference(nearest: NearestReference | None) -> tuple[str, str, str]:
