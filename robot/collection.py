@@ -11,7 +11,6 @@ that was stopped or killed continues at the same point when it is started again.
 import atexit
 import functools
 import itertools
-import json
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -27,10 +26,10 @@ from robot.recording.attempt_log import AttemptLog, LoggedAttempt, Tally, tally
 from robot.recording.folder import (
     INFO_FILE,
     RecordingWriter,
+    full_info,
     read_info,
     read_recording,
     safe_name,
-    software_version,
 )
 from robot.recording.grasp import RecordedGrasp, check_name
 from robot.rig import Rig
@@ -68,8 +67,7 @@ class CollectSettings:
     @property
     def limit(self) -> int:
         """Largest number of attempts at one object."""
-        default = _ATTEMPTS_PER_GRASP * self.grasps + _SPARE_ATTEMPTS
-        return default if self.most_attempts is None else self.most_attempts
+        return self.most_attempts or _ATTEMPTS_PER_GRASP * self.grasps + _SPARE_ATTEMPTS
 
 
 @dataclass(frozen=True)
@@ -148,8 +146,6 @@ def collect(
     if jobs > 1 and not rig.can_run_jobs:
         raise RobotConfigError(f"{type(rig).__name__} can run in one process only, so jobs must be 1, got {jobs}")
     names = rig.object_ids(objects) if isinstance(objects, int) else list(objects)
-    if len(set(names)) != len(names):
-        raise RobotConfigError("objects must have different names, but one name occurs twice")
     for name in names:
         check_name("an object's name", name)
     with rig:
@@ -178,17 +174,11 @@ def _recording_info(rig: Rig, seed: int, settings: CollectSettings, gate_name: s
     collection = {"gate": gate_name, **asdict(settings), "most_attempts": settings.limit}
     if not settings.rounds:
         del collection["rounds"]
-    info = {
-        **rig.info,
-        "seed": seed,
-        "background": "before each grasp" if settings.attempt and "before" in settings.attempt.outputs else "none",
-        "devices": rig.settings(),
-        "collection": collection,
-    }
-    try:
-        return dict(json.loads(json.dumps(info, allow_nan=False)))
-    except (TypeError, ValueError) as error:
-        raise RobotConfigError(f"the rig's info and device settings must be plain JSON: {error}") from error
+    has_before = settings.attempt is not None and "before" in settings.attempt.outputs
+    background = "before each grasp" if has_before else "none"
+    return full_info(
+        {**rig.info, "seed": seed, "background": background, "devices": rig.settings(), "collection": collection}
+    )
 
 
 def _check_can_continue(folder: Path, expected: Mapping[str, Any], strict: bool) -> None:
@@ -202,15 +192,9 @@ def _check_can_continue(folder: Path, expected: Mapping[str, Any], strict: bool)
     stored = read_info(folder)
     if "collection" not in stored:
         raise RecordingError(f"{folder} contains a recording that was not collected by a rig; give another folder")
-    if strict:
-        expected = {**expected, "software_version": software_version()}
-    else:
-        expected = {name: value for name, value in expected.items() if name != "devices"}
-    before, now = (
-        _flatten({**info, "collection": {"rounds": False, **info["collection"]}}) for info in (stored, expected)
-    )
+    before, now = ({"collection.rounds": False, **_flatten(info)} for info in (stored, expected))
     for name, value in now.items():
-        if before.get(name) != value:
+        if before.get(name) != value and (strict or not name.startswith(("devices.", "software_version"))):
             what = name.replace("collection.", "").replace("_", " ")
             raise RecordingError(
                 f"{folder} was collected with {what} {before.get(name)!r}, not {value!r}; give another folder, or the "
@@ -219,10 +203,11 @@ def _check_can_continue(folder: Path, expected: Mapping[str, Any], strict: bool)
 
 
 def _flatten(info: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in info.items():
-        flat |= _flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
-    return flat
+    parts = [
+        _flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+        for key, value in info.items()
+    ]
+    return {name: value for part in parts for name, value in part.items()}
 
 
 class _Collection:
@@ -238,8 +223,7 @@ class _Collection:
         progress: Callable[[Progress], None] | None,
         is_enough: Callable[[Sequence[RecordedGrasp]], bool] | None,
     ) -> None:
-        logged = {attempt.grasp_id for attempt in log.attempts} - {None}
-        if lost := writer.grasp_ids - logged:
+        if lost := writer.grasp_ids - {attempt.grasp_id for attempt in log.attempts}:
             raise RecordingError(
                 f"{log.folder}: attempts.jsonl lacks grasp {min(lost)}; restore it or give a new folder"
             )
@@ -279,8 +263,7 @@ class _Collection:
 
     def _submit_ahead(self, workers: WorkerPool[GraspAttempt], target: int, name: str) -> None:
         """Submit the attempts that are needed next, those of this turn first."""
-        later = itertools.dropwhile(lambda turn: turn != (target, name), self._turns())
-        for turn_target, object_id in later:
+        for turn_target, object_id in itertools.dropwhile(lambda turn: turn != (target, name), self._turns()):
             while self._needs_attempt(object_id, turn_target, ahead=True):
                 if sum(map(len, self._pending.values())) >= workers.window and self._pending[name]:
                     return

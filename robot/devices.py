@@ -121,8 +121,10 @@ class Device(ABC):
     def _check_age(self, time_s: float, max_age_s: float) -> None:
         age = self.clock() - time_s
         if not -_CLOCK_SLACK_S <= age <= max_age_s:
-            allowed = f"from {-_CLOCK_SLACK_S:g} to {max_age_s:g} s"
-            raise DeviceError(f"{self.name}: the frame's age must be {allowed}, got {age:.3g} s; is the stream frozen?")
+            raise DeviceError(
+                f"{self.name}: the frame's age must be from {-_CLOCK_SLACK_S:g} to {max_age_s:g} s, got {age:.3g} s; "
+                "is the stream frozen?"
+            )
 
 
 @contextlib.contextmanager
@@ -201,8 +203,7 @@ class Arm(Actuator):
     def move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
         """Move to `pose`, inside the workspace, and return the pose reached."""
         if not self.workspace.contains(pose) or not math.isfinite(pose.yaw_rad):
-            lower, upper = self.workspace.lower, self.workspace.upper
-            raise DeviceError(f"{self.name}: a pose must be in the workspace {lower} to {upper}, got {pose}")
+            raise DeviceError(f"{self.name}: a pose must be in the workspace {self.workspace}, got {pose}")
         if pose.tilt_rad and not self.can_tilt:
             raise DeviceError(f"{self.name}: tilt must be 0, because the fingers always point down; got {pose}")
         self._check("speed", speed_mm_s, 1e-3, self.max_speed_mm_s, "mm/s")
@@ -224,7 +225,8 @@ class Arm(Actuator):
         """Move, and return the pose when the arm has arrived."""
 
     @abstractmethod
-    def _pose(self) -> Pose: ...
+    def _pose(self) -> Pose:
+        """Return the current pose."""
 
 
 class Gripper(Actuator):
@@ -273,13 +275,16 @@ class Gripper(Actuator):
             return self._grasp(float(force_n), float(speed_mm_s))
 
     @abstractmethod
-    def _state(self) -> GripperState: ...
+    def _state(self) -> GripperState:
+        """Return the current state."""
 
     @abstractmethod
-    def _open(self, opening_mm: float) -> GripperState: ...
+    def _open(self, opening_mm: float) -> GripperState:
+        """Move the jaws, and return the state when they have arrived."""
 
     @abstractmethod
-    def _grasp(self, force_n: float, speed_mm_s: float) -> GripperState: ...
+    def _grasp(self, force_n: float, speed_mm_s: float) -> GripperState:
+        """Close, and return the state when the jaws have stopped."""
 
 
 class TactileSensor(Device):
@@ -309,7 +314,8 @@ class TactileSensor(Device):
             return frame
 
     @abstractmethod
-    def _read(self) -> Frame: ...
+    def _read(self) -> Frame:
+        """Return the newest frame."""
 
     def _read_near(self, time_s: float) -> Frame:
         """Return the newest frame by default, for a sensor that buffers no older ones."""
@@ -370,7 +376,8 @@ class Camera(Device):
             return image
 
     @abstractmethod
-    def _read(self, depth: bool) -> RGBD: ...
+    def _read(self, depth: bool) -> RGBD:
+        """Return the newest picture."""
 
 
 def _check_colour(name: str, pixels: npt.NDArray[Any]) -> None:

@@ -114,12 +114,14 @@ def export_lerobot(recording: Recording, out: Path, progress: Progress | None = 
         types = {key: kinds[kind] for key, kind in _FIELDS.items()}
         _write_table(folder / f"meta/episodes/{_FILE}.parquet".format(**_NUMBERS), episodes, types)
         _write_tasks(folder / "meta" / "tasks.parquet", tasks)
-        values_of = {name: np.array([[step[name]] for step in steps], np.float64) for name in _STEP_COLUMNS}
-        stats = {name: _stats([_summary(values)], len(steps)) for name, values in values_of.items()}
+        stats = {
+            name: _stats([_summary(np.array([[step[name]] for step in steps], np.float64))], len(steps))
+            for name in _STEP_COLUMNS
+        }
         for camera in cameras:
             stats[camera.key] = _stats(camera.summaries, len(camera.summaries) * math.prod(camera.size))
-        _write_json(folder / "meta" / "stats.json", stats)
-        _write_json(folder / "meta" / "info.json", _info(recording, moments, cameras, len(tasks)))
+        for name, document in (("stats", stats), ("info", _info(recording, moments, cameras, len(tasks)))):
+            (folder / "meta" / f"{name}.json").write_text(json.dumps(document, indent=4) + "\n", "utf-8")
     return tuple(
         f"the frames {moment} the touch are left out because some grasps do not have them"
         for moment, each in recorded.items()
@@ -218,8 +220,7 @@ def _episode(episode: int, grasp: RecordedGrasp, length: int, cameras: Sequence[
     for camera in cameras:
         row[f"videos/{camera.key}/from_timestamp"] = float(episode * length / FPS)
         row[f"videos/{camera.key}/to_timestamp"] = float((episode + 1) * length / FPS)
-    fields = grasp.to_row()
-    return row | {key: fields.get(key) for key in _FIELDS}
+    return row | {key: getattr(grasp, key) for key in _FIELDS}
 
 
 def _write_table(path: Path, rows: Sequence[Mapping[str, Any]], types: Mapping[str, Any]) -> None:
@@ -242,10 +243,6 @@ def _write_tasks(path: Path, tasks: Mapping[str, int]) -> None:
     table = pa.table({"task_index": pa.array(tasks.values(), pa.int64()), index: pa.array(tasks, pa.string())})
     table = table.replace_schema_metadata({b"pandas": json.dumps(metadata).encode()})
     import_extra("pyarrow.parquet", _WHAT).write_table(table, path)
-
-
-def _write_json(path: Path, value: Any) -> None:
-    path.write_text(json.dumps(value, indent=4) + "\n", "utf-8")
 
 
 def _info(recording: Recording, moments: Sequence[str], cameras: Sequence[_Camera], tasks: int) -> dict[str, Any]:

@@ -43,8 +43,7 @@ def build(cls: type[_T], settings: Mapping[str, Any], *, where: str = "", **argu
     known = ", ".join(sorted(keywords))
     if unknown := sorted(set(settings) - set(keywords)):
         raise RobotConfigError(f"{where or cls.__name__} has no setting {unknown[0]!r}; known settings: {known}")
-    required = {name for name, (_, is_required) in keywords.items() if is_required}
-    if missing := sorted(required - set(settings)):
+    if missing := sorted({name for name, (_, is_required) in keywords.items() if is_required} - set(settings)):
         raise RobotConfigError(f"{where or cls.__name__} requires {missing[0]!r}; known settings: {known}")
     try:
         checked = {

@@ -88,8 +88,7 @@ class LineFile(contextlib.AbstractContextManager["LineFile"]):
     """
 
     def __init__(self, path: Path) -> None:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
-        self._file = os.fdopen(descriptor, "r+b", buffering=0)
+        self._file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644), "r+b", buffering=0)
         try:
             open_regular(path).close()
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -123,11 +122,6 @@ class LineFile(contextlib.AbstractContextManager["LineFile"]):
             raise
         self._end += len(data)
 
-    @property
-    def is_closed(self) -> bool:
-        """Whether the file is closed."""
-        return self._file.closed
-
     def close(self) -> None:
         """Close the file and release its lock; a second call does nothing."""
         self._file.close()
@@ -147,9 +141,15 @@ def file_content(column: str, source: ImageSource) -> tuple[bytes, str]:
         RecordingError: The source is neither valid pixels nor a PNG or JPEG file.
     """
     if isinstance(source, np.ndarray):
-        return _png(column, source), ".png"
-    if not isinstance(source, bytes | str | Path):
-        raise RecordingError(f"{column} must be a NumPy array, or a PNG or JPEG file; got {type(source).__name__}")
+        import cv2
+
+        colour = column != "depth"
+        good = source.dtype == (np.uint8 if colour else np.uint16) and source.ndim > 1 and source.size > 0
+        if not good or source.shape[2:] != ((3,) if colour else ()):
+            shape = "H x W x 3 uint8 RGB" if colour else "H x W uint16 in millimetres"
+            raise RecordingError(f"{column} must be {shape}, got {source.shape} {source.dtype}")
+        pixels = np.ascontiguousarray(source)
+        return cv2.imencode(".png", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if colour else pixels)[1].tobytes(), ".png"
     data = source if isinstance(source, bytes) else read_content(source, RecordingError)
     for magic, suffix in _SUFFIXES.items():
         if data.startswith(magic):
@@ -177,30 +177,14 @@ def read_content(path: str | Path, error_type: type[RobotError]) -> bytes:
         raise error_type(f"{path!s} cannot be read: {getattr(error, 'strerror', error)}") from error
 
 
-def parse_object(text: bytes, error_type: type[RobotError]) -> dict[str, Any]:
+def parse_object(text: bytes, error_type: type[RobotError], name: str = "it") -> dict[str, Any]:
     """Parse the JSON object of a line or file; raise `error_type` for anything else, NaN and infinity included."""
     try:
         return msgspec.json.decode(text, type=dict[str, Any])
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise error_type(f"must be one JSON object in UTF-8, without NaN and Infinity: {error}") from error
+        raise error_type(f"{name} must be one JSON object in UTF-8, without NaN and Infinity: {error}") from error
 
 
 def read_json_object(path: str | Path, error_type: type[RobotError]) -> dict[str, Any]:
     """Read the JSON object of a file; raise `error_type` with the file's name if this fails."""
-    data = read_content(path, error_type)
-    try:
-        return parse_object(data, error_type)
-    except RobotError as error:
-        raise error_type(f"{path}: {error}") from error
-
-
-def _png(column: str, pixels: npt.NDArray[Any]) -> bytes:
-    import cv2
-
-    colour = column != "depth"
-    good = pixels.dtype == (np.uint8 if colour else np.uint16) and pixels.size > 0
-    if not good or (pixels.ndim != 3 or pixels.shape[2] != 3 if colour else pixels.ndim != 2):
-        shape = "H x W x 3 uint8 RGB" if colour else "H x W uint16 in millimetres"
-        raise RecordingError(f"{column} must be {shape}, got {pixels.shape} {pixels.dtype}")
-    plain = np.ascontiguousarray(pixels)
-    return cv2.imencode(".png", cv2.cvtColor(plain, cv2.COLOR_RGB2BGR) if colour else plain)[1].tobytes()
+    return parse_object(read_content(path, error_type), error_type, str(path))

@@ -70,9 +70,9 @@ class WorkerPool(Generic[T]):
     def __exit__(self, *_: object) -> None:
         """Wait for the work in progress and cancel the rest."""
         cv2.setNumThreads(self._cv2_threads)
-        for name, value in self._environment.items():
+        for name in _THREADS:
             del os.environ[name]
-            os.environ.update({} if value is None else {name: value})
+        os.environ.update({name: value for name, value in self._environment.items() if value is not None})
         if self._pool is None:
             return
         # A second Ctrl-C would interrupt the join, and Python would then hang at exit (CPython issue 90882).

@@ -114,8 +114,7 @@ class AttemptRunner:
             plan = rig.planner.plan(rig, image, self.settings.grasp, rng)
         except PlanError as error:
             failed: AttemptOutcome = "ungraspable" if isinstance(error, UngraspableError) else "no_plan"
-            duration_s = round(rig.clock() - start, 3)
-            return GraspAttempt(object_id, number, failed, reason=str(error), duration_s=duration_s)
+            return GraspAttempt(object_id, number, failed, reason=str(error), duration_s=round(rig.clock() - start, 3))
         images = {"photo": self._jpeg(image.colour)}
         if "depth" in self.settings.outputs and image.depth_m is not None:
             images["depth"], _ = file_content("depth", depth_in_mm(image.depth_m))
@@ -204,14 +203,11 @@ class AttemptRunner:
 
     def _jpeg(self, pixels: npt.NDArray[np.uint8]) -> bytes:
         quality = [cv2.IMWRITE_JPEG_QUALITY, self.settings.jpeg_quality]
-        done, data = cv2.imencode(".jpg", cv2.cvtColor(np.ascontiguousarray(pixels), cv2.COLOR_RGB2BGR), quality)
-        if not done:
-            raise DeviceError(f"a picture of shape {pixels.shape} cannot be written as JPG")
-        return bytes(data.tobytes())
+        bgr = cv2.cvtColor(np.ascontiguousarray(pixels), cv2.COLOR_RGB2BGR)
+        return bytes(cv2.imencode(".jpg", bgr, quality)[1].tobytes())
 
 
 def depth_in_mm(depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
     """Return depth in whole millimetres as a recording stores it, 0 where unknown or beyond 65 m."""
     depth = np.rint(depth_m.astype(np.float64) * 1000)
-    known = np.isfinite(depth) & (depth > 0) & (depth < 65536)
-    return np.where(known, depth, 0).astype(np.uint16)
+    return np.where((np.isfinite(depth) & (depth > 0) & (depth < 65536)), depth, 0).astype(np.uint16)

@@ -34,12 +34,9 @@ class GraspFrames:
 
 def recorded_touches(images: Mapping[str, bytes]) -> dict[str, GraspFrames]:
     """Return each finger's frames from the content of image files by column: the gate gets the pixels of training."""
-
-    def decode(column: str) -> Any:
-        return decode_picture(images[column]) if column in images else None
-
+    pixels: dict[str, Any] = {column: decode_picture(data) for column, data in images.items() if "touch" in column}
     return {
-        match[1]: GraspFrames(decode(f"{column}_before"), decode(column), decode(f"{column}_after"))
+        match[1]: GraspFrames(pixels.get(f"{column}_before"), pixels[column], pixels.get(f"{column}_after"))
         for column in images
         if (match := _TOUCH.fullmatch(column))
     }

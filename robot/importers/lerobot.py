@@ -146,8 +146,7 @@ class _LeRobotSource:
         facts = self._info.recording or {"rig": self._info.robot_type}
         keys = ("source", "licence", "terms", "citation", "rig", "sensor")
         texts = {key: facts[key] for key in keys if isinstance(facts.get(key), str)}
-        own_terms = {"terms": ""} if "licence" in texts else {}
-        return {"sensor": ", ".join(self.touch)} | own_terms | texts
+        return {"sensor": ", ".join(self.touch)} | ({"terms": ""} if "licence" in texts else {}) | texts
 
     def episodes(self, columns: Sequence[str]) -> Iterator[_Row]:
         """Yield the rows of meta/episodes, with those of the columns that exist."""

@@ -115,15 +115,13 @@ class _Task:
         if not self.ends or not all(np.diff([0, *self.ends]) > 0) or self.ends[-1] > steps:
             raise ImporterError(f"{path}: meta/episode_ends must increase up to at most {steps}, the number of steps")
         self.fingers = sum(array.shape[1] for array in self._gels)
-        if not 1 <= self.fingers <= 26:
-            raise ImporterError(f"{path}: a touch must have 1 to 26 areas, got {self.fingers}")
 
     def items(self) -> Iterator[Item]:
         """Yield one grasp for each episode."""
         for episode, (start, end) in enumerate(itertools.pairwise([0, *self.ends])):
             name = safe_name(self.name, f"{episode:06d}")
             images = episode_images(partial(self._steps, start, end), self.fingers)
-            yield Item(name, self.name, images, {"sequence_id": f"{self.name}-{episode:06d}"})
+            yield Item(name, self.name, images, {"sequence_id": name})
 
     def _steps(self, start: int, end: int) -> Iterator[Step]:
         for step in range(start, end):

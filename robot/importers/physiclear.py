@@ -80,8 +80,7 @@ def _items(part: str, path: Path, frames: int) -> Iterator[Item | Skip]:
     for number in range(1, frames + 1):
         name = safe_name(sequence, str(number))
         touch = SharedImage(name, lambda number=number: read()[number])  # type: ignore[arg-type]
-        images = {"photo": touch, "touch_a": touch, "touch_a_before": before}
-        yield Item(name, part, images, {"sequence_id": sequence})
+        yield Item(name, part, {"photo": touch, "touch_a": touch, "touch_a_before": before}, {"sequence_id": sequence})
 
 
 def strongest_frames(path: Path, count: int) -> list[Frame]:

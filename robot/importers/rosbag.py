@@ -185,15 +185,11 @@ class Bag(contextlib.AbstractContextManager["Bag"]):
     def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
         """Yield the messages of some topics in the order in which they were recorded."""
         connections = [connection for connection in self._reader.connections if connection.topic in topics]
-        messages = self._reader.messages(connections)
-        while True:
-            try:
-                connection, time_ns, data = next(messages)
-            except StopIteration:
-                return
-            except Exception as error:
-                raise ImporterError(f"its bag is damaged: {error}; {_REPAIR}") from error
-            yield BagMessage(connection.topic, time_ns, partial(self._decode, data, connection))
+        try:
+            for connection, time_ns, data in self._reader.messages(connections):
+                yield BagMessage(connection.topic, time_ns, partial(self._decode, data, connection))
+        except Exception as error:
+            raise ImporterError(f"its bag is damaged: {error}; {_REPAIR}") from error
 
     def _decode(self, data: bytes, connection: Any) -> Any:
         try:

@@ -181,7 +181,7 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
 
     def __init__(self, folder: str | Path, info: Mapping[str, Any]) -> None:
         self.folder, self._threads = Path(folder), sync_threads()
-        expected = _full_info(info)
+        expected = full_info(info)
         _check_no_other_files(self.folder)
         with storage_errors(self.folder):
             (self.folder / IMAGES_FOLDER).mkdir(parents=True, exist_ok=True)
@@ -223,11 +223,9 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
             fields: Further fields of `RecordedGrasp`.
 
         Raises:
-            RecordingError: An argument is invalid, or the writer is closed.
+            RecordingError: An argument is invalid.
             StorageError: The disk refused a write.
         """
-        if self._lines.is_closed:
-            raise RecordingError(f"the writer of {self.folder} is closed; open another")
         _check_id("grasp_id", grasp_id)
         if grasp_id in self._grasp_ids:
             raise RecordingError(f"the recording already contains grasp {grasp_id}; see grasp_ids")
@@ -265,15 +263,13 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
         return next((path for path in paths if (self.folder / path).is_file()), None)
 
     def update_info(self, **info: Any) -> None:
-        """Add or replace entries of recording.json, except schema_version, source, sensor, units and background.
+        """Add or replace entries of recording.json.
 
         Raises:
-            RecordingError: An entry is fixed or is not plain JSON.
+            RecordingError: An entry is not plain JSON.
             StorageError: The disk refused the write.
         """
-        if fixed := sorted({*_FIXED_KEYS, "schema_version"} & set(info)):
-            raise RecordingError(f"{fixed[0]} of an existing recording cannot be changed")
-        updated = _full_info({**self.info, **info})
+        updated = full_info({**self.info, **info})
         if updated != self.info:
             with storage_errors(self.folder):
                 self._write_info(updated)
@@ -313,7 +309,7 @@ def _check_id(what: str, name: str) -> None:
         )
 
 
-def _full_info(info: Mapping[str, Any]) -> dict[str, Any]:
+def full_info(info: Mapping[str, Any]) -> dict[str, Any]:
     """Return `info` with defaults, as JSON reads it back; raise RecordingError if it is invalid."""
     defaults = {
         "schema_version": SCHEMA_VERSION,

@@ -79,8 +79,7 @@ class RecordedGrasp:
     def images(self) -> dict[str, str]:
         """Return the files by column name without `_file_name`: photo, depth, touch_a, touch_a_before, ..."""
         files = {"photo": self.photo} | ({} if self.depth is None else {"depth": self.depth})
-        by_moment = {"": self.touches, "_before": self.touches_before, "_after": self.touches_after}
-        for moment, touches in by_moment.items():
+        for moment, touches in {"": self.touches, "_before": self.touches_before, "_after": self.touches_after}.items():
             files |= {f"touch_{finger}{moment}": touches[finger] for finger in sorted(touches)}
         return files
 

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from robot.errors import PlanError, RobotConfigError
+from robot.errors import PlanError
 from robot.readings import RGBD, Region
 from robot.sight.cloud import Rays, find_object_points, find_table
 from robot.sight.solids import (
@@ -108,18 +108,13 @@ def fit_cylinder(image: RGBD, extrinsics: npt.ArrayLike, region: Region | None =
 
     Args:
         image: Picture with depth.
-        extrinsics: (4, 4) camera frame to rig frame, mm.
+        extrinsics: (4, 4) camera frame to rig frame, mm, finite.
         region: Box in the rig's frame that limits the search in x and y; None for no limit.
 
     Raises:
         PlanError: No object is visible in depth (glass is not), or too little of it.
-        RobotConfigError: The extrinsics are not finite.
     """
-    if image.depth_m is None:
-        raise PlanError("a cylinder fit requires a picture with depth; read the camera with depth=True")
-    if not np.isfinite(extrinsics).all():
-        numbers = np.asarray(extrinsics).tolist()
-        raise RobotConfigError(f"extrinsics must be finite, got {numbers}; calibrate the camera again")
+    assert image.depth_m is not None, "a cylinder fit requires a picture with depth"
     depth = np.where(image.depth_m > 0, image.depth_m, np.nan) * np.float32(1000)
     rays = Rays.from_image(image, np.asarray(extrinsics, np.float64))
     table = find_table(depth, rays)
@@ -214,8 +209,8 @@ def _upright_candidate(points: Array, top: float, noise: float, rays: Rays, box:
     if circle is None:
         return _enclosing_candidate(points, top, "no circle fits its visible side")
     arc = _arc_deg(circle, side)
-    start = np.array([circle.x, circle.y]), circle.radius
-    whole = refine_circle(points[:, :2], *start, noise, largest, away, top - points[:, 2])
+    centre = np.array([circle.x, circle.y])
+    whole = refine_circle(points[:, :2], centre, circle.radius, noise, largest, away, top - points[:, 2])
     if whole is not None:
         circle, side = whole, points[:, :2]
     if arc < MIN_ARC_DEG or circle.inliers.sum() < MIN_SIDE_POINTS:

@@ -134,8 +134,7 @@ def _nearest_squared_distance(points: Array, others: Array) -> Array:
     """Return the (N,) squared distances to the nearest of others, by |a|^2 + |b|^2 - 2 a b about their mean."""
     middle = others.mean(0)
     a, b = points - middle, others - middle
-    squared = (a**2).sum(1) + ((b**2).sum(1)[:, None] - 2 * b @ a.T).min(0)
-    return np.asarray(np.maximum(squared, 0.0))
+    return np.asarray(np.maximum(((a**2).sum(1) + ((b**2).sum(1)[:, None] - 2 * b @ a.T).min(0)), 0.0))
 
 
 def _grid(first: Array, second: Array) -> tuple[Array, Array]:

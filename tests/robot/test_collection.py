@@ -554,7 +554,6 @@ def test_a_recording_that_no_rig_collected_and_a_lost_log_are_refused(tmp_path, 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"names": ["a", "a"]}, "different names"),
         ({"jobs": 0}, "jobs must be a whole number >= 1"),
         ({"grasps": 0}, ">= 1"),
         ({"limit": 0}, ">= 1"),
