@@ -218,7 +218,7 @@ def test_an_incomplete_last_line_of_any_length_is_dropped_with_a_note(tmp_path):
 )
 def test_a_bad_recording_json_is_an_error_that_names_it(tmp_path, text):
     (write(tmp_path, ROW) / "recording.json").write_text(text)
-    with pytest.raises(RecordingError, match=r"recording\.json: "):
+    with pytest.raises(RecordingError, match=r"recording\.json"):
         read_recording(tmp_path)
 
 
