@@ -15,13 +15,10 @@ import shutil
 import stat
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
 from typing import Any, BinaryIO
-
-_UNFLUSHED = (errno.EACCES, errno.EPERM, errno.EINVAL, errno.ENOTSUP)
-"""Errors of folders that are writable but not readable, and of disks that cannot flush folders."""
 
 
 @contextmanager
@@ -66,11 +63,8 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
         temporary.replace(place)
     finally:
         temporary.unlink(missing_ok=True)
-    try:
+    with suppress(OSError):  # as in SQLite: some disks cannot flush a folder, and some folders cannot be read
         sync(place.parent)
-    except OSError as error:
-        if error.errno not in _UNFLUSHED:
-            raise
 
 
 def remove_folder(folder: Path) -> None:

@@ -19,7 +19,7 @@ from retrieval.console.output import say
 from retrieval.errors import BadInput
 
 if TYPE_CHECKING:
-    from retrieval.data.licences import DataLicence
+    from retrieval.data.dataset import DataLicence
 
 
 def train(

@@ -12,14 +12,15 @@ Names that start with a dot are skipped. A photo's path in the catalogue, with f
 Listing opens no photo.
 """
 
+import os
 import re
 from collections import defaultdict
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from _touch_retrieval.files import parse_json, read_regular
-from retrieval.data.folder_walk import SkippedPhoto, list_files
 from retrieval.data.images import EXTENSIONS, read_bytes
 from retrieval.data.naming import STEM, Naming
 from retrieval.data.text import is_utf8
@@ -32,6 +33,14 @@ UNSUPPORTED_EXTENSIONS = frozenset(
 """Extensions of picture formats that are not read. An object with only such files has no photo."""
 _TOUCH = re.compile(r"(touch_.*?)(?:_([a-z]))?", re.DOTALL)
 _LAYOUT = "put photos in <object_id>/<photo> or <object_id>.<ext>"
+
+
+@dataclass(frozen=True)
+class SkippedPhoto:
+    """A file or folder that cannot be used, with the reason."""
+
+    path: str
+    reason: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +136,7 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
     if not root.is_dir():
         what = "is a file" if root.exists() else "does not exist"
         raise DatasetError(f"a catalogue must be a folder of photos, but {root} {what}: {_LAYOUT}")
-    names, skipped = list_files(root)
+    names, skipped = _list_files(root)
     by_object, by_photo = _read_metadata(root / METADATA_FILE, naming)
 
     photos: list[CataloguePhoto] = []
@@ -160,6 +169,44 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
     return replace(
         catalogue, notes=tuple(f"{METADATA_FILE} names {name}, which is not in the catalogue" for name in unknown)
     )
+
+
+def _list_files(folder: Path) -> tuple[list[str], list[SkippedPhoto]]:
+    """Return the files below a folder as posix paths relative to it, and what cannot be used.
+
+    A link to a folder is followed if it leads out of `folder`, and each target once: no loop is endless.
+    """
+    root = Path(os.path.realpath(folder))
+    names: list[str] = []
+    skipped: list[SkippedPhoto] = []
+    targets: set[Path] = set()
+
+    def walk(place: str, prefix: str) -> None:
+        try:
+            entries = sorted(os.scandir(place), key=attrgetter("name"))
+        except OSError as error:
+            raise DatasetError(f"cannot list the catalogue folder {place}: {error.strerror}") from error
+        for entry in entries:
+            path = prefix + entry.name
+            if entry.name.startswith("."):
+                continue
+            if not path.isascii() and not is_utf8(path):
+                printable = path.encode(errors="surrogateescape").decode(errors="backslashreplace")
+                skipped.append(SkippedPhoto(printable, "the name is not valid UTF-8; rename it"))
+            elif not os.path.isdir(entry):  # False for a link that leads to itself
+                names.append(path)
+            elif not entry.is_symlink():
+                walk(entry.path, f"{path}/")
+            elif (target := Path(os.path.realpath(entry.path))).is_relative_to(root) or root.is_relative_to(target):
+                skipped.append(SkippedPhoto(path, "a link into or around the catalogue itself is not followed"))
+            elif target in targets:
+                skipped.append(SkippedPhoto(path, f"a link to {target}, which another link has listed already"))
+            else:
+                targets.add(target)
+                walk(entry.path, f"{path}/")
+
+    walk(str(folder), "")
+    return names, skipped
 
 
 def _touch_name(path: str, naming: Naming) -> tuple[str, str] | None:

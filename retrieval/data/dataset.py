@@ -1,4 +1,4 @@
-"""Grasps of a recording, object-disjoint splits, and a cache of images."""
+"""Grasps of a recording, the licence of its data, object-disjoint splits, and a cache of images."""
 
 import hashlib
 import json
@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from _touch_retrieval.documents import typed
-from _touch_retrieval.files import read_regular
-from retrieval.data.licences import NOT_STATED, DataLicence
-from retrieval.errors import DatasetError
+from _touch_retrieval.files import file_digest
+from retrieval.errors import BadInput, DatasetError
 from robot.errors import RobotError
 from robot.recording.folder import Recording, read_info, read_recording
 
@@ -137,6 +136,38 @@ def load_attempts(folder: Path) -> list[Attempt]:
     return attempts
 
 
+NOT_STATED = "not stated"
+LICENCES = "licences"
+"""Key of a checkpoint's provenance: the fields of each DataLicence."""
+
+
+@dataclass(frozen=True)
+class DataLicence:
+    """The licence of one source of training data.
+
+    Attributes:
+        source: The recording's source, or the file or folder.
+        licence: Name of the licence, or `NOT_STATED`.
+        terms: Conditions of use, or where to find them; empty if nothing is known.
+    """
+
+    source: str
+    licence: str = NOT_STATED
+    terms: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.licence} ({self.terms})" if self.terms else self.licence
+
+
+def stored_licences(provenance: Mapping[str, Any]) -> list[DataLicence]:
+    """Return the licences in the provenance of a checkpoint; none if an older version made it.
+
+    Raises:
+        BadInput: The provenance is damaged.
+    """
+    return typed(provenance.get(LICENCES, []), list[DataLicence], LICENCES, error=BadInput)
+
+
 def recording_source(folder: Path) -> str:
     """Return the source that a recording names in its recording.json."""
     return str(read_info(folder)["source"])
@@ -159,14 +190,13 @@ def object_kinds(folder: Path) -> dict[str, str]:
 
 def finger_count(grasps: Sequence[Grasp]) -> int:
     """Return the number of gel images of each touch. Raises DatasetError if it differs between grasps."""
-    first = grasps[0]
-    for grasp in grasps:
-        if len(grasp.touches) != len(first.touches):
-            raise DatasetError(
-                f"every touch must have the same number of gel images; {first.grasp_id} has {len(first.touches)}, "
-                f"{grasp.grasp_id} has {len(grasp.touches)}; use a separate recording for each sensor"
-            )
-    return len(first.touches)
+    examples = {len(grasp.touches): grasp.grasp_id for grasp in reversed(grasps)}
+    if len(examples) > 1:
+        found = ", ".join(f"{name} has {count}" for count, name in examples.items())
+        raise DatasetError(
+            f"every touch must have the same number of gel images; {found}; use a separate recording for each sensor"
+        )
+    return next(iter(examples))
 
 
 def data_digest(grasps: Iterable[Grasp]) -> str:
@@ -176,7 +206,7 @@ def data_digest(grasps: Iterable[Grasp]) -> str:
         digest.update(json.dumps([grasp.grasp_id, grasp.object_id, grasp.sequence_id]).encode())
         for path in (grasp.photo, *grasp.touches, *grasp.backgrounds):
             try:
-                digest.update(hashlib.sha256(read_regular(path)).digest())
+                digest.update(bytes.fromhex(file_digest(path)))
             except OSError as error:
                 raise DatasetError(f"{path} cannot be read ({error.strerror}); run `retrieve check`") from error
     return digest.hexdigest()

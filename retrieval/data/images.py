@@ -63,8 +63,6 @@ def read_bytes(path: str | Path) -> bytes:
         return read_regular(path, MAX_BYTES)
     except FileNotFoundError:
         raise ImageError(path, "no such file") from None
-    except IsADirectoryError:
-        raise ImageError(path, "is a folder; name a picture file") from None
     except (OSError, ValueError, MemoryError) as error:
         raise ImageError(path, f"cannot be read: {_reason(error)}") from error
 

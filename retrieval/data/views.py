@@ -89,7 +89,8 @@ def _ground_residuals(values: NDArray[np.float32]) -> tuple[NDArray[np.float32],
         normal, right = (chosen @ products).reshape(-1, 3, 3), (chosen * border) @ terms.T
         weights[:] = np.linalg.solve(normal, right[..., None])[..., 0]
         residuals = np.abs(border - (weights @ terms).astype(np.float32))
-        scatter = 1.4826 * _medians(residuals, inliers) + 1e-4  # standard deviation of a normal distribution
+        medians = np.nanmedian(np.where(inliers, residuals.astype(np.float64), np.nan), axis=1)
+        scatter = 1.4826 * medians + 1e-4  # standard deviation of a normal distribution
         inliers = residuals < 3 * scatter[:, None]
     return values - (weights @ planes).astype(np.float32).reshape(values.shape), scatter
 
@@ -104,14 +105,6 @@ def _border() -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float6
     planes = np.stack([np.ones_like(x), x, y])
     terms = planes[:, ring].T
     return ring, planes, (terms[:, :, None] * terms[:, None, :]).reshape(-1, 9)
-
-
-def _medians(values: NDArray[np.float32], selected: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the median (n,) of the selected values of each row (n, R); each row has at least one."""
-    ranked = np.sort(np.where(selected, values, np.float32(np.inf)), axis=1)
-    count, rows = selected.sum(axis=1), np.arange(len(values))
-    middle: NDArray[np.float64] = (ranked[rows, (count - 1) // 2].astype(np.float64) + ranked[rows, count // 2]) / 2
-    return middle
 
 
 def _largest_region(differs: NDArray[np.bool_]) -> tuple[int, int, int, int] | None:

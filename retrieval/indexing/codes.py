@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from _touch_retrieval.cache import Cache, cache_key
 from indexes.errors import WriteFailed
 from retrieval.console.progress import Bar
-from retrieval.data.catalogue import Catalogue
-from retrieval.data.folder_walk import SkippedPhoto
+from retrieval.data.catalogue import Catalogue, SkippedPhoto
 from retrieval.data.images import decode_rgb
 from retrieval.data.loading import map_in_order
 from retrieval.errors import ImageError, NumericalError

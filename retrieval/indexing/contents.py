@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from _touch_retrieval.cache import Cache
 from indexes.store.rows import Row
-from retrieval.data.catalogue import Catalogue, CataloguePhoto
-from retrieval.data.folder_walk import SkippedPhoto
+from retrieval.data.catalogue import Catalogue, CataloguePhoto, SkippedPhoto
 from retrieval.errors import BadInput, NoReadablePhoto
 from retrieval.indexing.codes import (
     SHOWS,

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from retrieval.data.folder_walk import SkippedPhoto
+from retrieval.data.catalogue import SkippedPhoto
 
 SHOWN, FEW = 20, 5
 """Number of printed lines for entries with a reason each, and for entries without."""

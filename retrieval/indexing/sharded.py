@@ -26,8 +26,7 @@ from indexes.store.sharded import (
     shard_number,
     write_sharded_manifest,
 )
-from retrieval.data.catalogue import Catalogue, list_catalogue
-from retrieval.data.folder_walk import SkippedPhoto
+from retrieval.data.catalogue import Catalogue, SkippedPhoto, list_catalogue
 from retrieval.data.naming import naming_warnings
 from retrieval.errors import BadInput, NoReadablePhoto
 from retrieval.indexing.build import BuildOptions, build_listed, build_options

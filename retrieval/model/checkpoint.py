@@ -19,8 +19,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from _touch_retrieval.files import write_atomically
-from retrieval.data.dataset import Split
-from retrieval.data.licences import stored_licences
+from retrieval.data.dataset import Split, stored_licences
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.checkpoint_info import (
     FORMAT,

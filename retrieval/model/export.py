@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from _touch_retrieval.files import write_atomically
 from retrieval.console.files import require_output
-from retrieval.data.licences import LICENCES
+from retrieval.data.dataset import LICENCES
 from retrieval.errors import BadInput, CheckpointError, RetrievalError
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import (

@@ -22,6 +22,7 @@ from torch import nn
 
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import (
+    LICENCES,
     AnyRecording,
     Grasp,
     Split,
@@ -34,7 +35,6 @@ from retrieval.data.dataset import (
     recording_licence,
     recording_source,
 )
-from retrieval.data.licences import LICENCES
 from retrieval.errors import BadInput
 from retrieval.metrics.measure import Measure, pooled
 from retrieval.metrics.pairs import fit_calibration

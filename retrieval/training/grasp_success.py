@@ -28,6 +28,7 @@ from torch import Tensor
 
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import (
+    LICENCES,
     Attempt,
     ImageCache,
     data_digest,
@@ -36,7 +37,6 @@ from retrieval.data.dataset import (
     recording_licence,
     recording_source,
 )
-from retrieval.data.licences import LICENCES
 from retrieval.errors import DatasetError
 from retrieval.metrics.intervals import grouped_interval
 from retrieval.model.checkpoint import require_writable, write_tensors

@@ -5,8 +5,7 @@ from pathlib import Path
 
 from torch import Tensor, nn
 
-from retrieval.data.dataset import recording_licence
-from retrieval.data.licences import DataLicence, stored_licences
+from retrieval.data.dataset import DataLicence, recording_licence, stored_licences
 from retrieval.errors import CheckpointError
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.checkpoint_info import CheckpointInfo, read_checkpoint_info

@@ -15,7 +15,9 @@ from _touch_retrieval.registry import code_digest
 from retrieval.console.interruption import interruption
 from retrieval.data.check.split import require_fit
 from retrieval.data.dataset import (
+    LICENCES,
     AnyRecording,
+    DataLicence,
     Grasp,
     Split,
     data_digest,
@@ -25,7 +27,6 @@ from retrieval.data.dataset import (
     make_split,
     recording_source,
 )
-from retrieval.data.licences import LICENCES, DataLicence
 from retrieval.data.pairs import PairBatch, PairSampler
 from retrieval.errors import JobInterrupted
 from retrieval.metrics.pairs import negative_log_likelihood, pair_accuracy, pair_auc

@@ -203,7 +203,7 @@ def moves_and_reports(arm: Arm, goal: Pose, speed_mm_s: float) -> None:
     assert arm.pose() == reached
 
 
-@pytest.mark.parametrize("yaw_rad", [-3.0, -1.2, 0.0, 0.7, 3.1])
+@pytest.mark.parametrize("yaw_rad", [-3.0, 0.7])
 def test_a_ur_arm_moves_at_the_requested_speed_and_reports_the_pose_of_the_rigs_frame(ur, yaw_rad):
     fake, arm = ur
     moves_and_reports(arm, Pose(30.0, -40.0, 100.0, yaw_rad), 150.0)
@@ -219,7 +219,7 @@ def test_a_ur_arm_is_stopped_after_a_protective_stop(ur):
     assert fake.calls[-1] == "stopL"
 
 
-@pytest.mark.parametrize("yaw_rad", [-2.0, 0.0, 1.5])
+@pytest.mark.parametrize("yaw_rad", [-2.0, 1.5])
 def test_a_franka_arm_moves_at_the_requested_speed_and_reports_the_pose_of_the_rigs_frame(franka, yaw_rad):
     robot, _ = franka
     with OwnArm(workspace=WORKSPACE, robot="franka:FrankaArm", settings={"host": "fr3", **ORIGIN}) as arm:

@@ -30,10 +30,6 @@ SLACK = 1.25
 _FLIPS = ((1, 1), (-1, 1), (1, -1), (-1, -1))
 _BLOCK = 512
 _NEIGHBOUR_RANK, _RELATIVE_LIMIT = 3, 0.25
-_MIN_LIMIT, _MAX_LIMIT = 0.02, 0.1
-"""Limits for a comparison of only two pictures: the effect of a new size, and a distance below that of unlike pictures
-(.34 was the smallest between photos and touches on simulated recordings)."""
-
 Greys = NDArray[np.float32]
 """(n, 256): thumbnails in grey levels 0..255."""
 
@@ -79,13 +75,13 @@ def _shifted_across(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 DISTORTIONS = (_as_jpeg, _brighter, _shifted, _shifted_across)
 
 
-def shapes(greys: Greys, common: Greys | None = None) -> Greys:
+def shapes(greys: Greys, common: Greys) -> Greys:
     """Return the shapes of thumbnails (..., 256) as unit vectors: the residuals after a constant and `common` (256,).
 
     A residual of zero gives zeros.
     """
-    shared = [np.ones(PX**2, np.float32)] + ([] if common is None else [common])
-    basis = np.linalg.qr(np.stack(shared, axis=1).astype(np.float64))[0].astype(np.float32)
+    shared = np.stack([np.ones(PX**2, np.float32), common], axis=1)
+    basis = np.linalg.qr(shared.astype(np.float64))[0].astype(np.float32)
     rest = greys - (greys @ basis) @ basis.T
     length = np.linalg.norm(rest, axis=-1, keepdims=True)
     return np.asarray(rest / np.where(length > 1e-3, length, np.inf))
@@ -95,14 +91,6 @@ def flip_thumbnails(greys: Greys, flip: tuple[int, int]) -> Greys:
     """Return the thumbnails (n, 256) of the flipped pictures."""
     turned = greys.reshape(-1, PX, PX)[:, :: flip[0], :: flip[1]]
     return np.ascontiguousarray(turned).reshape(-1, PX**2)
-
-
-def is_copy(one: Thumbnail, other: Thumbnail) -> bool:
-    """Return whether `one` is a near copy of `other`, by their shapes without a median picture."""
-    original = shapes(other.grey)
-    limit = max(SLACK * (1 - float((shapes(other.distorted) @ original).min())), _MIN_LIMIT)
-    similarity = max(float(shapes(flip_thumbnails(one.grey[None], flip))[0] @ original) for flip in _FLIPS)
-    return 1 - similarity <= min(limit, _MAX_LIMIT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +120,7 @@ def nearest_pictures(thumbnails: Sequence[Thumbnail], objects: Sequence[str]) ->
     greys = np.array([one.grey for one in thumbnails], dtype=np.float32).reshape(-1, PX**2)
     distorted = np.array([one.distorted for one in thumbnails], dtype=np.float32).reshape(-1, len(DISTORTIONS), PX**2)
     owner = np.unique(np.array(objects, dtype=str), return_inverse=True)[1]
-    common = np.median(greys, axis=0) if len(greys) else None
+    common = np.median(greys, axis=0) if len(greys) else np.zeros(PX**2, np.float32)
     originals = shapes(greys, common)
 
     row, distance, third = np.zeros(len(greys), np.int64), np.zeros(len(greys)), np.ones(len(greys))

@@ -109,14 +109,11 @@ def read_pictures(
         is_flat = bool(np.ptp(image, axis=(0, 1)).max() <= _FLAT)
         return ImageRecord(sha256(data).hexdigest(), is_flat, resize(image, _SMALL), reduced)
 
-    records: ImageRecords = {}
-    broken: dict[Path, str] = {}
+    found: dict[Path, ImageRecord | str] = {}
     paths = sorted(files)
     with ThreadPoolExecutor(2) as pool, Bar("check", len(paths), "images") as bar:
         for path, record in zip(paths, pool.map(read, paths), strict=True):
-            if isinstance(record, str):
-                broken[path] = record
-            else:
-                records[path] = record
+            found[path] = record
             bar.advance()
-    return records, broken
+    broken = {path: reason for path, reason in found.items() if isinstance(reason, str)}
+    return {path: record for path, record in found.items() if isinstance(record, ImageRecord)}, broken

@@ -14,7 +14,7 @@ import numpy as np
 from retrieval.console.output import abbreviate_list
 from retrieval.data.check import appearance
 from retrieval.data.check.drift import check_drift
-from retrieval.data.check.near_copies import is_copy, nearest_pictures
+from retrieval.data.check.near_copies import nearest_pictures
 from retrieval.data.check.pictures import Finding, ImageRecords, findings_for, fingers_of, read_pictures, thumbnails
 from retrieval.data.check.split import check_split
 from retrieval.data.dataset import Attempt, Grasp, Split, load_all_attempts, require_accepted
@@ -69,7 +69,6 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
     used = [attempt for attempt in readable if attempt.accepted]
     findings += _shared_backgrounds(unnamed(used), records)
     findings += _repeated_touches(unnamed(used), records)
-    findings += _own_photos(unnamed(used), records)
     # A recording without photos has the touch in place of the photo; its no-contact frames are checked all the same.
     if all(attempt.time_s is not None for attempt in used):
         used.sort(key=lambda attempt: attempt.time_s or 0.0)
@@ -117,9 +116,8 @@ def _duplicates(folder: Path, grasps: Sequence[Grasp], records: ImageRecords) ->
     """Find files of two objects with the same bytes."""
     users: dict[str, dict[str, Path]] = defaultdict(dict)
     for grasp in grasps:
-        for path in (grasp.photo, *grasp.touches):
-            if path in records:
-                users[records[path].digest].setdefault(grasp.object_id, path)
+        for path in filter(records.get, (grasp.photo, *grasp.touches)):
+            users[records[path].digest].setdefault(grasp.object_id, path)
     for objects in users.values():
         if len(objects) > 1:
             where = [f"{name} ({path.relative_to(folder)})" for name, path in sorted(objects.items())]
@@ -176,16 +174,6 @@ def _shared_backgrounds(grasps: Sequence[Grasp], records: ImageRecords) -> Itera
             f"{len(set(served.values()))} objects: drift since such a frame was taken stays in its difference "
             "from the touch and may identify the object; compare with the controls of `retrieve evaluate`",
         )
-
-
-def _own_photos(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
-    """Find touches whose picture is the photo of the same grasp, in any encoding or size."""
-    names = []
-    for grasp in grasps:
-        photo, *touches = thumbnails(records, (grasp.photo, *grasp.touches))
-        if any(is_copy(touch, photo) for touch in touches):
-            names.append(grasp.grasp_id)
-    yield from findings_for("error", "same-modality", "a touch shows its own photo", names, grasps)
 
 
 def _near_copies(grasps: Sequence[Grasp], records: ImageRecords, accepted: Sequence[Grasp]) -> Iterator[Finding]:

@@ -16,23 +16,21 @@ def check_split(grasps: Sequence[Grasp], split: Split) -> Iterable[Finding]:
     for part, objects in parts.items():
         for name in objects:
             part_of[name].add(part)
-    if shared := sorted(name for name, on in part_of.items() if len(on) > 1):
-        yield Finding("error", "split-objects", f"the split shares {len(shared)} object(s): {abbreviate_list(shared)}")
     sides: dict[str, set[str]] = defaultdict(set)
     for grasp in grasps:
         if grasp.sequence_id is not None:
             sides[grasp.sequence_id] |= part_of.get(grasp.object_id, set())
-    if leaking := sorted(name for name, on in sides.items() if len(on) > 1):
-        text = f"the split cuts {len(leaking)} sequence(s) in two, so that neighbouring frames are on both sides"
-        yield Finding("error", "split-sequences", f"{text}: {abbreviate_list(leaking)}")
     recorded = {grasp.object_id for grasp in grasps}
-    if unknown := sorted(set(part_of) - recorded):
-        text = f"the split names {len(unknown)} object(s) not recorded: {abbreviate_list(unknown)}"
-        yield Finding("warning", "split-unknown", text)
-    if absent := sorted(recorded - set(part_of)):
-        yield Finding(
-            "warning", "split-absent", f"the split leaves out {len(absent)} object(s): {abbreviate_list(absent)}"
-        )
+    shared, cut = ({name for name, its in each.items() if len(its) > 1} for each in (part_of, sides))
+    for severity, kind, text, names in (
+        ("error", "split-objects", "shares {} object(s)", shared),
+        ("error", "split-sequences", "cuts {} sequence(s) in two, so that neighbouring frames are on both sides", cut),
+        ("warning", "split-unknown", "names {} object(s) not recorded", part_of.keys() - recorded),
+        ("warning", "split-absent", "leaves out {} object(s)", recorded - part_of.keys()),
+    ):
+        if names:
+            listed = abbreviate_list(sorted(names))
+            yield Finding(severity, kind, f"the split {text.format(len(names))}: {listed}")
 
 
 def require_fit(split: Split, grasps: Sequence[Grasp]) -> None:

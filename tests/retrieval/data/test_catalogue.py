@@ -7,8 +7,7 @@ import os
 import pytest
 from PIL import Image
 
-from retrieval.data.catalogue import CatalogueTouch, list_catalogue
-from retrieval.data.folder_walk import SkippedPhoto
+from retrieval.data.catalogue import CatalogueTouch, SkippedPhoto, list_catalogue
 from retrieval.data.images import decode_rgb
 from retrieval.data.naming import Naming
 from retrieval.errors import DatasetError, ImageError

@@ -241,14 +241,6 @@ def test_a_sequence_with_swapped_folders_and_exchanged_channels_are_named(broken
     assert "throughout the sequence(s) one folder," in found[0].message
 
 
-def test_a_small_copy_of_the_photo_in_place_of_the_touch_is_named(tmp_path):
-    folder = synthetic.write_recording(tmp_path / "one", synthetic.make_objects(6), 2, fingers="a", before=False)
-    broken = Broken(folder, tmp_path / "r")
-    photo = cv2.resize(cv2.imread(str(broken.file(3, "photo"))), (160, 120), interpolation=cv2.INTER_AREA)
-    broken.edit(3, "touch_a", lambda _: photo)
-    assert kinds(remarks(broken.folder)) == {("error", "same-modality", broken.names([3]))}
-
-
 def test_two_grasps_are_too_few_to_find_a_swap(tmp_path):
     folder = synthetic.write_recording(tmp_path / "r", synthetic.make_objects(1), 2, before=False)
     broken = Broken(folder, tmp_path / "copy")

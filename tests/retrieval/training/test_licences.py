@@ -7,8 +7,7 @@ import shutil
 import onnx
 import pytest
 
-from retrieval.data.dataset import recording_licence
-from retrieval.data.licences import DataLicence, stored_licences
+from retrieval.data.dataset import DataLicence, recording_licence, stored_licences
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.export import touch_encoder_to_onnx
 from retrieval.model.shipped import shipped_model
