@@ -139,14 +139,12 @@ def load_checkpoint(path: str | Path, *, digest: str | None = None) -> Checkpoin
 
 def load_weights(module: nn.Module, state: Mapping[str, Tensor]) -> None:
     """Load `state` into `module`. Raises CheckpointError unless names and shapes are exactly the module's."""
-    got, expected = ({name: tuple(item.shape) for name, item in part.items()} for part in (state, module.state_dict()))
-    for name in sorted(got.keys() | expected.keys()):
-        if got.get(name) != expected.get(name):
-            raise CheckpointError(
-                f"its weights do not fit its configuration: {name} is {got.get(name, 'absent')}, "
-                f"must be {expected.get(name, 'absent')}"
-            )
-    module.load_state_dict(state)
+    try:
+        module.load_state_dict(state)
+    except RuntimeError as error:  # a line for each weight
+        raise CheckpointError(
+            f"its weights do not fit its configuration: {str(error).splitlines()[-1].strip()}"
+        ) from error
 
 
 def write_tensors(path: Path, state: dict[str, Tensor], header: Mapping[str, Any]) -> None:

@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -71,20 +71,9 @@ def _convolution(inputs: int, outputs: int, kernel: int) -> list[nn.Module]:
     return [layer, nn.ReLU()]
 
 
-class FingerFrames(Protocol):
-    """One finger's frames, (H, W, 3) uint8 RGB, from `robot.grasping.gates`; None if the rig does not take them."""
-
-    @property
-    def before(self) -> NDArray[np.uint8] | None:
-        """The no-contact frame."""
-
-    @property
-    def during(self) -> NDArray[np.uint8]:
-        """The frame during the grasp."""
-
-    @property
-    def after(self) -> NDArray[np.uint8] | None:
-        """The frame after the lift."""
+FingerFrames = Any
+"""One finger's `before` (no contact), `during` and `after` (the lift): (H, W, 3) uint8 RGB, or None if the rig takes no
+such frame (`robot.grasping.gates.GraspFrames`)."""
 
 
 class GraspSuccessGate:

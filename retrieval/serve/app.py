@@ -81,4 +81,4 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         for queue in (parts.queue, parts.grasps, *parts.frames.values()):
             queue.close()
         if parts.history_writer:
-            await asyncio.to_thread(parts.history_writer.close)
+            await asyncio.to_thread(parts.history_writer.store.close)

@@ -5,22 +5,22 @@ if a picture exceeds the limits of CPU time or memory, and the service kills the
 picture gets a new process. Small pictures, such as those of sensors, are decoded in parallel; large ones one at a time,
 so that small ones do not wait for them and their memory does not add up.
 
-A request to a process and its answer are one frame each: the lengths of a JSON document and of a byte string, then
-both. This module imports little, because each process repeats the imports.
+A request to a process, and its answer, are a JSON document and a byte string. This module imports little, because each
+process repeats the imports.
 """
 
 import asyncio
 import json
 import math
-import os
 import resource
 import signal
-import struct
+import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +31,6 @@ from retrieval.model.touches import GelImage
 from retrieval.serve.settings import MAX_BODY_PIXELS
 
 PROGRAM = "from retrieval.serve.decoders import serve_pictures; serve_pictures()"
-_BUFFER_BYTES = 1 << 20
 PROCESSES = 2  # the number of images of a touch
 SMALL_PIXELS = 1 << 21
 """Maximum pixels of a picture that is decoded in parallel; a sensor of 1920 x 1080 pixels has fewer."""
@@ -39,7 +38,6 @@ DECODE_CPU_S = 5
 """Maximum CPU time for one picture. The slowest picture of maximum size that we could construct takes 2 s."""
 DECODE_BYTES = 200_000_000
 """Maximum memory for one picture. PNG, JPEG, BMP and TIFF pictures of maximum size need less, some formats more."""
-_LENGTHS = struct.Struct(">II")
 
 
 class Decoders:
@@ -56,12 +54,13 @@ class Decoders:
         Raises:
             RetrievalError: A process cannot be started.
         """
-        self._idle += await asyncio.gather(*(_Process.start() for _ in range(PROCESSES)))
+        self._idle += [_Process() for _ in range(PROCESSES)]
+        await asyncio.gather(*(asyncio.to_thread(process.wait_until_ready) for process in self._idle))
 
     async def close(self) -> None:
         """End the processes; those of requests end with them."""
         idle, self._idle = self._idle, []
-        await asyncio.gather(*self._ending, *(process.end() for process in idle))
+        await asyncio.gather(*self._ending, *(asyncio.to_thread(process.end) for process in idle))
 
     async def read(self, named_files: Sequence[tuple[str, bytes]], px: int) -> list[GelImage]:
         """Decode pictures to the input size of the model.
@@ -108,11 +107,12 @@ class Decoders:
 
         Cancelling ends the process. Raises ImageError or RetrievalError.
         """
-        process = self._idle.pop() if self._idle else await _Process.start()
+        process = self._idle.pop() if self._idle else _Process()
         try:
-            document, content = await process.request({"name": name, "px": px, "max_pixels": max_pixels}, data)
+            options = {"name": name, "px": px, "max_pixels": max_pixels}
+            document, content = await asyncio.to_thread(process.request, options, data)
             self._idle.append(process)
-        except (EOFError, ConnectionError):
+        except (EOFError, OSError):
             raise ImageError(
                 name,
                 f"decoding needs more than {DECODE_CPU_S} s of CPU time or {DECODE_BYTES // 10**6} MB: "
@@ -120,7 +120,7 @@ class Decoders:
             ) from None
         finally:
             if process not in self._idle:
-                task = asyncio.ensure_future(process.end())
+                task = asyncio.create_task(asyncio.to_thread(process.end))
                 self._ending.add(task)
                 task.add_done_callback(self._ending.discard)
         if "error" in document:
@@ -129,78 +129,61 @@ class Decoders:
 
 
 class _Process:
-    """A decoder process."""
+    """A decoder process; its methods wait for it."""
 
-    def __init__(self, process: asyncio.subprocess.Process) -> None:
-        self._process = process
-
-    @classmethod
-    async def start(cls) -> "_Process":
-        """Start a process and wait until its imports are done, or raise RetrievalError."""
+    def __init__(self) -> None:
         program = f"import sys; sys.path[:] = {sys.path!r}; {PROGRAM}"
-        pipe = asyncio.subprocess.PIPE
+        self._pipe, theirs = Pipe()
+        line = [sys.executable, "-c", program, str(theirs.fileno())]
         try:
-            process = cls(
-                await asyncio.create_subprocess_exec(
-                    sys.executable, "-c", program, stdin=pipe, stdout=pipe, limit=_BUFFER_BYTES
-                )
-            )
+            # Output of libraries goes to standard error.
+            self._process = subprocess.Popen(line, stdout=2, pass_fds=[theirs.fileno()])
         except OSError as error:
             raise RetrievalError(f"The image decoder process cannot be started: {error}") from error
-        try:
-            await process._answer()
-        except BaseException as error:
-            await process.end()
-            if isinstance(error, EOFError):
+        finally:
+            theirs.close()
+        self._is_ready = False
+
+    def wait_until_ready(self) -> None:
+        """Wait until the imports of the process are done, or raise RetrievalError."""
+        if not self._is_ready:
+            try:
+                self._pipe.recv_bytes()
+            except (EOFError, OSError) as error:
                 raise RetrievalError("The image decoder process ended during its start.") from error
-            raise
-        return process
+            self._is_ready = True
 
-    async def request(self, document: dict[str, Any], content: bytes) -> tuple[dict[str, Any], bytes]:
-        """Send a request and return the answer; raises EOFError or ConnectionError if the process ended."""
-        assert self._process.stdin is not None
-        self._process.stdin.write(frame(document, content))
-        await self._process.stdin.drain()
-        return await self._answer()
+    def request(self, document: dict[str, Any], content: bytes) -> tuple[dict[str, Any], bytes]:
+        """Send a request and return the answer; raises EOFError or OSError if the process ends."""
+        self.wait_until_ready()
+        self._pipe.send_bytes(json.dumps(document).encode())
+        self._pipe.send_bytes(content)
+        return json.loads(self._pipe.recv_bytes()), self._pipe.recv_bytes()
 
-    async def _answer(self) -> tuple[dict[str, Any], bytes]:
-        assert self._process.stdout is not None
-        read = self._process.stdout.readexactly
-        text, content = _LENGTHS.unpack(await read(_LENGTHS.size))
-        return json.loads(await read(text)), await read(content)
-
-    async def end(self) -> None:
-        """Kill the process and wait until its pipes are closed, because the event loop may end next."""
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        if self._process.returncode is None:
-            self._process.kill()
-        self._process.stdin.close()
-        await self._process.stdout.read()
-        await self._process.wait()
+    def end(self) -> None:
+        """Kill the process; a thread that waits for its answer gets EOFError."""
+        self._process.kill()
+        self._process.wait()
 
 
 # The process -----------------------------------------------------------------------------------------------------
 
 
 def serve_pictures() -> None:
-    """Decode pictures until standard input ends."""
+    """Decode pictures until the pipe, whose number is the process's argument, is closed."""
     for number in (signal.SIGINT, signal.SIGTERM):  # the service handles them and ends its processes
         signal.signal(number, signal.SIG_IGN)
     _one_thread()
-    answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # keep output of libraries out of the answers
-    answers.write(frame({}))  # the imports are done
-    answers.flush()
-    while lengths := sys.stdin.buffer.read(_LENGTHS.size):
-        answers.write(_answer(sys.stdin.buffer, *_LENGTHS.unpack(lengths)))
-        answers.flush()
-
-
-def frame(document: dict[str, Any], content: bytes = b"") -> bytes:
-    """Return a request or an answer as bytes."""
-    text = json.dumps(document).encode()
-    return _LENGTHS.pack(len(text), len(content)) + text + content
+    pipe = Connection(int(sys.argv[1]))
+    pipe.send_bytes(b"")  # the imports are done
+    while True:
+        try:
+            options, data = json.loads(pipe.recv_bytes()), pipe.recv_bytes()
+        except EOFError:
+            return
+        document, content = _answer(options, data)
+        pipe.send_bytes(json.dumps(document).encode())
+        pipe.send_bytes(content)
 
 
 def read_gel_image(data: bytes, name: str, px: int, max_pixels: int) -> RgbImage | int:
@@ -214,9 +197,8 @@ def read_gel_image(data: bytes, name: str, px: int, max_pixels: int) -> RgbImage
     return resize(decode(data, name), (px, px)) if width * height <= max_pixels else width * height
 
 
-def _answer(requests: BinaryIO, text: int, content: int) -> bytes:
+def _answer(options: dict[str, Any], data: bytes) -> tuple[dict[str, Any], bytes]:
     """Return the answer to a request; the process ends if a picture needs too much memory."""
-    options, data = json.loads(requests.read(text)), requests.read(content)
     _limit(resource.RLIMIT_CPU, math.ceil(time.process_time()) + DECODE_CPU_S)
     if sys.platform == "linux":  # other systems do not enforce the limit
         pages = int(Path("/proc/self/statm").read_text().split()[5])
@@ -226,8 +208,8 @@ def _answer(requests: BinaryIO, text: int, content: int) -> bytes:
     except ImageError as error:
         if isinstance(error.__cause__, MemoryError):
             raise SystemExit(1) from error
-        return frame({"error": error.reason, "name": error.path})
-    return frame({"pixels": found}) if isinstance(found, int) else frame({}, found.tobytes())
+        return {"error": error.reason, "name": error.path}, b""
+    return ({"pixels": found}, b"") if isinstance(found, int) else ({}, found.tobytes())
 
 
 def _one_thread() -> None:

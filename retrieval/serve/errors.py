@@ -6,7 +6,6 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
-from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
@@ -52,15 +51,6 @@ class DocumentResponse(JSONResponse):
             return super().render(replace_surrogates(content))
 
 
-class ProblemDocument(BaseModel):
-    """Every error of the service, as `application/problem+json`."""
-
-    type: str = Field(examples=[PREFIX + "bad-image"])
-    title: str = Field(examples=["An image cannot be read"])
-    status: int = Field(examples=[422])
-    detail: str = Field(examples=["grasp 1, finger a: not a PNG, JPEG, BMP, TIFF, WebP, AVIF or HEIC picture"])
-
-
 class HttpProblem(HTTPException):
     """An error that becomes a problem document: a key of `KINDS`, a sentence for people, and further headers."""
 
@@ -78,10 +68,12 @@ class HttpProblem(HTTPException):
         return DocumentResponse(document, status, {"cache-control": "no-store", **(self.headers or {})}, MEDIA_TYPE)
 
 
+_TEXT = {"type": "string"}
+_PROBLEM = {"type": _TEXT, "title": _TEXT, "status": {"type": "integer"}, "detail": _TEXT}
 PROBLEM_RESPONSES: dict[int | str, dict[str, Any]] = {
     "default": {
         "description": "A problem document (RFC 9457).",
-        "content": {MEDIA_TYPE: {"schema": ProblemDocument.model_json_schema()}},
+        "content": {MEDIA_TYPE: {"schema": {"type": "object", "properties": _PROBLEM, "required": [*_PROBLEM]}}},
     }
 }
 """OpenAPI description of all errors of a route."""

@@ -170,11 +170,3 @@ async def session(body: SessionBody, parts: Parts) -> Response:
     if token is not None:
         response.set_cookie(COOKIE, token, httponly=True, samesite="strict", path="/")
     return response
-
-
-@router.delete("/v1/session", status_code=204)
-async def end_session() -> Response:
-    """Delete the cookie."""
-    response = Response(status_code=204)
-    response.delete_cookie(COOKIE, httponly=True, samesite="strict", path="/")
-    return response

@@ -13,7 +13,6 @@ import secrets
 import sqlite3
 import time
 from collections.abc import Iterator, Mapping, Sequence, Set
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import astuple, dataclass
 from pathlib import Path
@@ -31,10 +30,6 @@ from retrieval.search.answer import QueryResult
 from retrieval.serve.uploads import RequestPictures
 
 log = logging.getLogger(__name__)
-STORE_S = 1.0
-"""Maximum time for which an answer waits until its query is stored; a slow or hanging disk takes longer."""
-MAX_PENDING_WRITES = 16
-"""Maximum number of queries that wait for the disk; further queries are not stored."""
 IMAGE_TYPES = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
 """First bytes of the image formats that every browser shows, and a recording may contain -> media type."""
 RIGHT, OBJECT, NONE = "right", "object", "none"
@@ -272,28 +267,16 @@ class HistoryWriter:
     def __init__(self, folder: Path, recorder: Recorder, max_queries: int) -> None:
         self.store = HistoryStore(folder / "history.sqlite", max_queries)
         self._recorder, self._lock = recorder, Lock()
-        self._writer, self._pending = ThreadPoolExecutor(1, "history"), 0
 
     async def add_query(self, pictures: RequestPictures, result: QueryResult) -> str | None:
-        """Store a query; return its id, or None if it cannot be stored within `STORE_S`."""
+        """Store a query; return its id, or None if it cannot be stored, such as on a full disk."""
         query_id = new_id()
         try:
-            if self._pending >= MAX_PENDING_WRITES:
-                raise TimeoutError
-            self._pending += 1
-            row = query_id, pictures.files, pictures.background, result
-            writing = asyncio.wrap_future(self._writer.submit(self.store.add_query, *row))
-            writing.add_done_callback(self._count_down)
-            await asyncio.wait_for(asyncio.shield(writing), STORE_S)
+            await asyncio.to_thread(self.store.add_query, query_id, pictures.files, pictures.background, result)
         except Exception as error:
-            log.warning("A query is not stored: %s", str(error) or "the disk takes too long")
+            log.warning("A query is not stored: %s", error)
             return None
         return query_id
-
-    def _count_down(self, writing: asyncio.Future[None]) -> None:
-        self._pending -= 1
-        if not writing.cancelled():
-            writing.exception()  # mark as retrieved: the answer may have been sent without waiting
 
     def record_pending(self) -> None:
         """Record the feedback that is not recorded yet.
@@ -328,11 +311,6 @@ class HistoryWriter:
             }
             images |= {f"touch_{finger}_before": as_png_or_jpeg(data) for finger, data in before.items()}
             self._recorder.append(grasp_id, object_id, images, grasped=True, sequence_id=query_id)
-
-    def close(self) -> None:
-        """Write the waiting queries, and close the database."""
-        self._writer.shutdown()
-        self.store.close()
 
 
 def as_png_or_jpeg(data: bytes) -> bytes:

@@ -4,16 +4,7 @@ import base64
 
 import pytest
 
-from retrieval.serve import store
 from tests.serving import service
-
-
-@pytest.fixture(scope="session", autouse=True)
-def patient_history():
-    """Wait longer than a second until a query is stored: the machine may be busy."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(store, "STORE_S", 60.0)
-        yield
 
 
 @pytest.fixture(scope="module")
