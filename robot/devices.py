@@ -56,7 +56,7 @@ class Device(ABC):
         """Connect completely or not at all; a second call does nothing."""
         if self._connected:
             return
-        with _on_error(self._close, f"{self.name} was closed"), self._convert_os_errors("cannot be connected"):
+        with _on_error(self._close, f"{self.name} was closed"), self._use("cannot be connected", connected=False):
             self._connect()
         self._connected = True
 
@@ -65,7 +65,7 @@ class Device(ABC):
         if not self._connected:
             return
         self._connected = False
-        with self._convert_os_errors("cannot be closed"):
+        with self._use("cannot be closed", connected=False):
             self._close()
 
     def settings(self) -> dict[str, Any]:
@@ -100,14 +100,10 @@ class Device(ABC):
         """Do nothing by default, for a device without persistent faults."""
 
     @contextlib.contextmanager
-    def _use(self, failure: str) -> Iterator[None]:
-        if not self._connected:
+    def _use(self, failure: str, *, connected: bool = True) -> Iterator[None]:
+        """Convert each OSError into a DeviceError; with `connected`, require that the device is."""
+        if connected and not self._connected:
             raise DeviceError(f"{self.name} must be connected before it is used; call connect() first")
-        with self._convert_os_errors(failure):
-            yield
-
-    @contextlib.contextmanager
-    def _convert_os_errors(self, failure: str) -> Iterator[None]:
         try:
             yield
         except OSError as error:

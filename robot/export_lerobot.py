@@ -32,14 +32,13 @@ from numpy.typing import NDArray
 from robot.errors import ImporterError, RecordingError
 from robot.importers.episodes import MOMENT_SUFFIXES, Picture
 from robot.importers.importing import Progress, import_extra, picture_bytes
+from robot.importers.lerobot import DATA_PATH, EPISODES_PATH, VIDEO_PATH
 from robot.recording.folder import Recording
 from robot.recording.grasp import RecordedGrasp
 from robot.storage import decode_picture, storage_errors
 
 FPS = 1
 """Nominal, because steps have no fixed rate; readers require an integer."""
-_FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
-_DATA, _VIDEO = f"data/{_FILE}.parquet", "videos/{video_key}/" + f"{_FILE}.mp4"
 _NUMBERS = {"chunk_index": 0, "file_index": 0}
 _CODEC = {"crf": "10", "g": "1", "bf": "0", "preset": "fast"}
 _STEP_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index", "moment")
@@ -95,7 +94,7 @@ def export_lerobot(recording: Recording, out: Path, progress: Progress | None = 
         with contextlib.ExitStack() as videos:
             for camera in cameras:
                 camera.size = _read_picture(recording.folder / grasps[0].images()[camera.columns[0]]).shape[:2]
-                path = folder / _VIDEO.format(video_key=camera.key, **_NUMBERS)
+                path = folder / VIDEO_PATH.format(video_key=camera.key, **_NUMBERS)
                 camera.add = videos.enter_context(_video(av, path, camera.size))
             for episode, grasp in enumerate(grasps):
                 for step, moment_number in enumerate(numbers):
@@ -110,9 +109,9 @@ def export_lerobot(recording: Recording, out: Path, progress: Progress | None = 
                 if progress is not None:
                     progress(episode + 1, len(grasps))
         kinds = {"string": pa.string(), "bool": pa.bool_(), "double": pa.float64(), "list": pa.list_(pa.float64())}
-        _write_table(folder / _DATA.format(**_NUMBERS), steps, {"timestamp": pa.float32()})
+        _write_table(folder / DATA_PATH.format(**_NUMBERS), steps, {"timestamp": pa.float32()})
         types = {key: kinds[kind] for key, kind in _FIELDS.items()}
-        _write_table(folder / f"meta/episodes/{_FILE}.parquet".format(**_NUMBERS), episodes, types)
+        _write_table(folder / EPISODES_PATH.format(**_NUMBERS), episodes, types)
         _write_tasks(folder / "meta" / "tasks.parquet", tasks)
         stats = {
             name: _stats([_summary(np.array([[step[name]] for step in steps], np.float64))], len(steps))
@@ -271,8 +270,8 @@ def _info(recording: Recording, moments: Sequence[str], cameras: Sequence[_Camer
         "video_files_size_in_mb": 200,
         "fps": FPS,
         "splits": {"train": f"0:{episodes}"},
-        "data_path": _DATA,
-        "video_path": _VIDEO,
+        "data_path": DATA_PATH,
+        "video_path": VIDEO_PATH,
         "features": features,
         "recording": {key: recording.info.get(key) for key in _FACTS} | {"moments": list(moments)},
     }

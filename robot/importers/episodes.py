@@ -40,7 +40,12 @@ def episode_images(steps: Callable[[], Iterable[Step]], fingers: int, labels: Se
 
     @cache
     def read() -> dict[str, Picture]:
-        found = _labelled_steps(iter(steps()), moments) if labels else _peak_contact_steps(iter(steps()))
+        if labels:
+            found = {moment: _copy_step(step) for moment, step in zip(labels, steps(), strict=False)}
+            if len(found) < len(labels):
+                raise ImporterError(f"its episode has only {len(found)} of {len(labels)} steps")
+        else:
+            found = _peak_contact_steps(iter(steps()))
         touches = {
             f"touch_{finger}{MOMENT_SUFFIXES[moment]}": touch
             for moment, (_, gels) in found.items()
@@ -50,13 +55,6 @@ def episode_images(steps: Callable[[], Iterable[Step]], fingers: int, labels: Se
 
     columns = [f"touch_{finger}{MOMENT_SUFFIXES[moment]}" for finger in ascii_lowercase[:fingers] for moment in moments]
     return {column: partial(lambda name: read()[name], column) for column in ("photo", *columns)}
-
-
-def _labelled_steps(steps: Iterator[Step], moments: Sequence[str]) -> dict[str, Step]:
-    found = {moment: _copy_step(step) for moment, step in zip(moments, steps, strict=False)}
-    if len(found) < len(moments):
-        raise ImporterError(f"its episode has only {len(found)} of {len(moments)} steps")
-    return found
 
 
 def _peak_contact_steps(steps: Iterator[Step]) -> dict[str, Step]:

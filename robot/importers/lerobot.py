@@ -56,7 +56,8 @@ DATA_SET = DataSet(
     unverified=("that the first step of an episode is without contact",),
 )
 _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
-_DATA_PATH, _VIDEO_PATH = f"data/{_FILE}.parquet", "videos/{video_key}/" + f"{_FILE}.mp4"
+DATA_PATH, EPISODES_PATH = f"data/{_FILE}.parquet", f"meta/episodes/{_FILE}.parquet"
+VIDEO_PATH = "videos/{video_key}/" + f"{_FILE}.mp4"
 _GEL = re.compile("touch|tactile|gel|digit", re.IGNORECASE)
 _FIELDS = ("force_n", "opening_mm", "touch_skew_s", "time_s", "outcome", "grasped", "pose")
 _WHAT = "a LeRobot data set"
@@ -101,8 +102,8 @@ class _Info(msgspec.Struct):
     codebase_version: str
     fps: Annotated[float, msgspec.Meta(gt=0, le=1e6)]
     features: dict[str, _Feature]
-    data_path: str = _DATA_PATH
-    video_path: str = _VIDEO_PATH
+    data_path: str = DATA_PATH
+    video_path: str = VIDEO_PATH
     robot_type: str | None = None
     recording: dict[str, Any] = {}
 
@@ -115,9 +116,9 @@ def _read_info(path: Path) -> _Info:
         raise ImporterError(f"{path} must be that of a LeRobot data set: {error}") from error
     if not re.fullmatch(r"v3(\.\d+)*", info.codebase_version):
         raise ImporterError(f"{path} must have LeRobot version 3, got {info.codebase_version}; convert it with lerobot")
-    if (info.data_path, info.video_path) != (_DATA_PATH, _VIDEO_PATH):
+    if (info.data_path, info.video_path) != (DATA_PATH, VIDEO_PATH):
         raise ImporterError(
-            f"{path} must have the paths {_DATA_PATH} and {_VIDEO_PATH}, got {info.data_path} and {info.video_path}"
+            f"{path} must have the paths {DATA_PATH} and {VIDEO_PATH}, got {info.data_path} and {info.video_path}"
         )
     return info
 

@@ -12,7 +12,7 @@ import pytest
 
 from robot.collection import CollectSettings, Progress, collect
 from robot.errors import DeviceError, RecordingError, RobotConfigError, StorageError, UngraspableError
-from robot.grasping.attempt import AttemptRunner, depth_in_mm
+from robot.grasping.attempt import AttemptRunner
 from robot.grasping.gates import ContactAreaGate, recorded_touches
 from robot.grasping.planner import CylinderPlanner
 from robot.grasping.settings import AttemptSettings, GraspSettings
@@ -105,12 +105,6 @@ def test_a_grasp_contains_every_measurement(whole):
         assert pixels.shape[:2] == ((108, 128) if column in ("photo", "depth") else (24, 32))
     photo = cv2.imread(str(whole / row["photo_file_name"]))[..., ::-1]
     assert np.abs(np.median(photo.reshape(-1, 3), axis=0) - (150, 140, 120)).max() < 5  # the table's red, green, blue
-
-
-def test_depth_is_integer_millimetres_and_zero_where_unknown():
-    depth = np.array([[0.9004, np.nan, -1.0, 0.0, 70.0, np.inf]], np.float32)
-    assert depth_in_mm(depth).tolist() == [[900, 0, 0, 0, 0, 0]]
-    assert depth_in_mm(depth).dtype == np.uint16
 
 
 def test_the_recording_contains_times_from_its_beginning_and_the_settings_of_its_collection(whole):
