@@ -101,16 +101,12 @@ def naming_warnings(photos: Mapping[str, int], naming: Naming) -> list[str]:
             f"object, with {sum(photos[name] for name in generic)} photo(s): if the objects' folders are below it, use "
             f"--objects-from '{{split}}/{{object}}/{{photo}}'"
         )
-    elif len(names) == 1 and photos[names[0]] > 1:
-        warnings.append(f"all {photos[names[0]]} photos are assigned to one object, {names[0]}")
     stem_of = {name: without_number(name) for name in names}
     stems = Counter(stem_of.values())
     similar = [name for name, stem in stem_of.items() if stem and stems[stem] > 1]
     if naming.text != STEM and similar:
-        single = all(photos[name] == 1 for name in names)
-        what = "every object has one photo, and " if single else ""
         warnings.append(
-            f"{what}the names of {len(similar)} of {len(names)} objects differ from another name only by a number: "
+            f"the names of {len(similar)} of {len(names)} objects differ from another name only by a number: "
             f"{abbreviate_list(similar, _MAX_EXAMPLES)}; if these show one object, use --objects-from stem or a pattern"
         )
     return warnings

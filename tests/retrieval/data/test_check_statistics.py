@@ -7,8 +7,6 @@ import pytest
 from retrieval.data.check.appearance import CHANGES, changed_layout, swapped_fingers
 from retrieval.data.check.drift import nearest_grasp_accuracy
 from retrieval.data.check.near_copies import (
-    DISTORTIONS,
-    PX,
     flip_thumbnails,
     nearest_pictures,
     shapes,
@@ -31,15 +29,6 @@ def nearest(images):
     return nearest_pictures([thumbnail(image) for image in images], [f"object {row}" for row in range(len(images))])
 
 
-def test_a_shape_ignores_a_constant_and_any_multiple_of_the_common_picture():
-    rng = np.random.default_rng(0)
-    grey, common = rng.normal(size=(2, PX**2)).astype(np.float32)
-    plain = shapes(grey[None], common)
-    np.testing.assert_allclose(shapes((3 * grey + 7 + 2 * common)[None], common), plain, atol=1e-5)  # float32
-    assert float(np.linalg.norm(plain)) == pytest.approx(1, rel=1e-5)
-    assert (shapes((5 + 2 * common)[None], common) == 0).all()
-
-
 def test_the_nearest_picture_of_another_object_equals_that_of_plain_loops():
     images = [scene(seed) for seed in range(7)]
     greys = np.stack([thumbnail(image).grey for image in images])
@@ -55,11 +44,10 @@ def test_the_nearest_picture_of_another_object_equals_that_of_plain_loops():
         assert found.distance[query] == pytest.approx(min(distances.values()), abs=1e-5)  # float32
 
 
-@pytest.mark.parametrize("change", [*DISTORTIONS, lambda picture: picture[::-1]])
-def test_a_distorted_copy_is_within_its_limit_and_no_other_picture_is(change):
-    images = [scene(seed) for seed in range(9)]
-    copy = np.ascontiguousarray(change(np.rint(255 * images[2]).astype(np.uint8))).astype(np.float32) / 255
-    found = nearest([*images, copy])
+def test_both_a_picture_and_its_flipped_brighter_copy_are_copies_and_no_other_picture_is():
+    images = [1.1 * scene(seed) + 0.02 for seed in range(9)]
+    images.append(1.05 * np.ascontiguousarray(images[2][::-1]))
+    found = nearest([np.clip(image, 0, 1).astype(np.float32) for image in images])
     assert np.flatnonzero(found.copy).tolist() == [2, 9]
     assert found.row[[2, 9]].tolist() == [9, 2]
     assert found.checked.all()

@@ -42,17 +42,15 @@ def decoded(monkeypatch):
 @pytest.mark.parametrize(
     ("min_side", "shape"),
     [
-        (None, (1200, 1600)),
-        (1200, (1200, 1600)),
-        (601, (1200, 1600)),
-        (600, (600, 800)),
+        (None, (600, 800)),
+        (301, (600, 800)),
         (300, (300, 400)),
-        (1, (150, 200)),
+        (1, (75, 100)),
     ],
 )
 @pytest.mark.parametrize("progressive", [False, True])
 def test_a_jpeg_is_decoded_as_small_as_its_shorter_side_may_be(min_side, shape, progressive):
-    data = jpeg(1200, 1600, progressive=progressive)
+    data = jpeg(600, 800, progressive=progressive)
     assert decode_rgb(data, "x", min_side).shape[:2] == shape
 
 
@@ -136,7 +134,6 @@ def test_files_and_bytes_give_equal_views_and_decoded_pictures_are_not_reduced(t
     np.testing.assert_array_equal(_preprocess(picture, "x", settings), settings.photo(decode_rgb(data, "x")))
 
 
-@pytest.mark.parametrize("length", [0, 30, 700])
-def test_a_truncated_photo_is_refused_with_reduced_decoding_too(length):
+def test_a_truncated_photo_is_refused_with_reduced_decoding_too():
     with pytest.raises(ImageError):
-        Preprocessing(photo_px=32, reduced=True).photo_from_bytes(jpeg(1024, 1024)[:length], Path("x.jpg"))
+        Preprocessing(photo_px=32, reduced=True).photo_from_bytes(jpeg(1024, 1024)[:700], Path("x.jpg"))

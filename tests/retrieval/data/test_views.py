@@ -14,7 +14,7 @@ from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import resize
 from retrieval.data.views import VIEWS, PixelBox, crop_square, find_object, tile_views
 from retrieval.errors import ConfigError
-from retrieval.model.config import Config, MatcherConfig
+from retrieval.model.config import MatcherConfig
 from retrieval.model.fusion import Matcher
 
 GROUND = (0.55, 0.5, 0.45)
@@ -156,13 +156,6 @@ def test_the_digest_of_the_whole_view_equals_that_of_older_settings():
     assert Preprocessing().digest() == Preprocessing(views=("whole",)).digest()
     assert Preprocessing().digest() != Preprocessing(views=("zoom",)).digest()
     assert Preprocessing(views=("crop", "zoom")).digest() != Preprocessing(views=("zoom", "crop")).digest()
-
-
-def test_views_can_be_read_from_a_file():
-    made = Config(preprocessing=Preprocessing(views=("zoom", "grey")))
-    table = made.to_dict()
-    table["preprocessing"]["views"] = list(table["preprocessing"]["views"])
-    assert Config.from_dict(table) == made
 
 
 def test_a_photos_features_are_those_of_its_views_side_by_side():
