@@ -61,8 +61,9 @@ class OwnDevice(Actuator):
         with package_errors(f"{self.name} cannot be made"):
             self._program = self._make(**self._options)
         if lacking := [name for name in self._methods if not callable(getattr(self._program, name, None))]:
-            methods = ", ".join(self._methods)
-            raise DeviceError(f"{self.name} must have the methods {methods}; it lacks {', '.join(lacking)}")
+            raise DeviceError(
+                f"{self.name} must have the methods {', '.join(self._methods)}; it lacks {', '.join(lacking)}"
+            )
         self._report()
 
     def _close(self) -> None:
@@ -109,8 +110,9 @@ class OwnArm(OwnDevice, Arm):
         max_speed_mm_s: float = 1000.0,
         clock: Clock = time.monotonic,
     ) -> None:
-        limits = {"workspace": workspace, "max_speed_mm_s": max_speed_mm_s}
-        super().__init__(robot=robot, settings=settings, clock=clock, **limits)
+        super().__init__(
+            robot=robot, settings=settings, clock=clock, workspace=workspace, max_speed_mm_s=max_speed_mm_s
+        )
 
     def _move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
         """Move, then compare the reported pose with the requested one."""
@@ -156,9 +158,15 @@ class OwnGripper(OwnDevice, Gripper):
         """Check the settings; raise RobotConfigError, or UnknownName for a class that cannot be imported."""
         if min_force_n > max_force_n:
             raise RobotConfigError(f"min_force_n must be at most max_force_n, got {min_force_n} and {max_force_n}")
-        forces = {"min_force_n": min_force_n, "max_force_n": max_force_n}
-        limits = {"stroke_mm": stroke_mm, "max_speed_mm_s": max_speed_mm_s, **forces}
-        super().__init__(robot=robot, settings=settings, clock=clock, **limits)
+        super().__init__(
+            robot=robot,
+            settings=settings,
+            clock=clock,
+            stroke_mm=stroke_mm,
+            min_force_n=min_force_n,
+            max_force_n=max_force_n,
+            max_speed_mm_s=max_speed_mm_s,
+        )
 
     def _state(self) -> GripperState:
         return typed(self._call("state"), GripperState, f"state of {self.name}", error=DeviceError)

@@ -6,7 +6,6 @@ the distortion model of the colour stream. Automatic exposure settles within abo
 """
 
 import contextlib
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -96,11 +95,6 @@ class RealSense(Camera):
         lens = video.get_intrinsics()
         self._scale_m = float(profile.get_device().first_depth_sensor().get_depth_scale())
         coefficients = list(map(float, lens.coeffs))
-        if not all(map(math.isfinite, (self._scale_m, *coefficients))):
-            raise DeviceError(
-                f"realsense reports the depth scale {self._scale_m} and the distortion {coefficients}, which must be "
-                "finite; plug the camera in again"
-            )
         self._intrinsics = Intrinsics(lens.fx, lens.fy, lens.ppx, lens.ppy)
         self._undistortion = _undistortion(rs, lens) if any(coefficients) else None
         self._reported = {

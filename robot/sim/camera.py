@@ -99,11 +99,6 @@ class PinholeCamera:
         return np.asarray(local @ self.to_rig[:3, :3].T)
 
     @cached_property
-    def depth_per_distance(self) -> Array:
-        """Depth (px * px,) along the camera's axis per distance along each ray."""
-        return np.asarray(self.rays @ self.to_rig[:3, 2])
-
-    @cached_property
     def table_distance_mm(self) -> Array:
         """Distance (px * px,) to the table along each ray."""
         return -self.position_mm[2] / self.rays[:, 2]
@@ -300,7 +295,7 @@ def depth(view: CameraView, noise_seed: int) -> npt.NDArray[np.float32]:
     """
     px = view.camera.px
     rng = np.random.default_rng([73, noise_seed])
-    exact = (view.distance_mm * view.camera.depth_per_distance).reshape(px, px)
+    exact = (view.distance_mm * (view.camera.rays @ view.camera.to_rig[:3, 2])).reshape(px, px)
     # Next to an edge, some pixels mix the near and the far surface.
     near, far = cv2.erode(exact, np.ones((3, 3), np.uint8)), cv2.dilate(exact, np.ones((3, 3), np.uint8))
     mixed = near + rng.random(exact.shape) * (far - near)

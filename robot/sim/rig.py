@@ -41,29 +41,25 @@ _TABLE_MM = 15.0
 """Largest distance of objects from the centre of the workspace, in x and in y."""
 
 
-class SimClock:
-    """Clock that advances only when a device acts."""
+class SimState:
+    """State that the devices share: the scene of this attempt, the pose of the hand, the opening, and the time.
+
+    The time advances only when a device acts.
+    """
 
     def __init__(self) -> None:
         self.now_s = 0.0
+        self.scene: Scene | None = None
+        self.pose = Pose(0.0, 0.0, 300.0, 0.0)
+        self.opening_mm = STROKE_MM
 
-    def __call__(self) -> float:
+    def clock(self) -> float:
         """Return the time in seconds."""
         return self.now_s
 
     def sleep(self, seconds: float) -> None:
         """Advance the time."""
         self.now_s += seconds
-
-
-class SimState:
-    """State that the devices share: the scene of this attempt, the pose of the hand, the opening, and the time."""
-
-    def __init__(self, clock: SimClock) -> None:
-        self.clock = clock
-        self.scene: Scene | None = None
-        self.pose = Pose(0.0, 0.0, 300.0, 0.0)
-        self.opening_mm = STROKE_MM
 
     def current_scene(self) -> Scene:
         """Return the scene of this attempt; raise DeviceError if there is none."""
@@ -173,8 +169,7 @@ class SimRig(Rig):
         rng = np.random.default_rng([102, seed])
         turn, size = rng.uniform(0.0, 2.0 * math.pi), rng.uniform(*options.localisation_mm)
         self.error_mm = np.array([size * math.cos(turn), size * math.sin(turn), 0.0])
-        clock = SimClock()
-        self.sim_state = SimState(clock)
+        self.sim_state = SimState()
         super().__init__(
             SimArm(self.sim_state),
             SimGripper(self.sim_state),
@@ -188,8 +183,8 @@ class SimRig(Rig):
                 "gels": [{finger: pair[finger].gel.to_dict() for finger in sorted(pair)} for pair in self._gels],
                 **({"meshes_sha256": self.meshes.digest, "units": _MESH_UNITS} if self.meshes else {}),
             },
-            clock=clock,
-            sleep=clock.sleep,
+            clock=self.sim_state.clock,
+            sleep=self.sim_state.sleep,
             attempt=attempt,
             planner=load_planner(options.planner, "mesh" if self.meshes else "cylinder"),
         )
@@ -218,7 +213,7 @@ class SimRig(Rig):
             hand=self._hand,
             seed=int(rng.integers(2**31)),
         )
-        self.sim_state.clock.now_s = number * _ATTEMPT_S
+        self.sim_state.now_s = number * _ATTEMPT_S
 
     def labels(self, object_id: str) -> dict[str, float | bool | str]:
         """Return `SimObject.labels` of an object; raise RobotConfigError if the rig has none of this name."""
@@ -275,7 +270,7 @@ class SimArm(VirtualDevice, Arm):
 
     def _move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
         before = self._sim_state.pose.as_tuple()[:3]
-        self._sim_state.clock.sleep(math.dist(before, pose.as_tuple()[:3]) / speed_mm_s)
+        self._sim_state.sleep(math.dist(before, pose.as_tuple()[:3]) / speed_mm_s)
         self._sim_state.pose = pose
         return pose
 
@@ -310,7 +305,7 @@ class SimGripper(VirtualDevice, Gripper):
         sim_state = self._sim_state
         grip = Grip(sim_state.pose, force_n, sim_state.opening_mm)
         sim_state.scene = replace(sim_state.current_scene(), grip=grip)
-        sim_state.clock.sleep(sim_state.opening_mm / speed_mm_s)
+        sim_state.sleep(sim_state.opening_mm / speed_mm_s)
         return self._state()
 
     def _state(self) -> GripperState:

@@ -77,8 +77,6 @@ COLLIDED = "the robot reports a collision and the arm holds: find the contact an
 _BUTTON = {0: "not pressed", 1: "pressed", 2: "in an unknown state", 3: "released, but the stop is still active"}
 _SOURCE = {0: "nobody", 1: "the red button", 2: "an unknown source", 3: "a motor controller", 4: "the robot's engine"}
 _MAX_LEAN_RAD = math.radians(10.0)
-STILL_RAD, STILL_S = 1e-3, 0.1
-"""An arm is still if no joint moves by more than STILL_RAD within STILL_S."""
 
 _Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
 
@@ -171,16 +169,6 @@ def joints_of(message: Message) -> Joints | None:
 def _arm_joints(state: _JointState) -> Joints | None:
     angles = dict(zip(state.name, state.position, strict=False))
     return np.array([angles[name] for name in JOINTS]) if angles.keys() >= set(JOINTS) else None
-
-
-def is_still(arrivals: Sequence[ReceivedMessage], since_s: float, now_s: float) -> bool:
-    """Return whether the arm was still for the last STILL_S, by joint states that arrived after `since_s`."""
-    recent = [
-        joints
-        for arrival in arrivals
-        if arrival.time_s >= max(since_s, now_s - STILL_S) and (joints := joints_of(arrival.message)) is not None
-    ]
-    return now_s - since_s >= STILL_S and len(recent) >= 3 and float(np.ptp(recent, axis=0).max()) < STILL_RAD
 
 
 def tip_of(message: Message, tip: str) -> Message:

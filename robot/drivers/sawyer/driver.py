@@ -42,7 +42,6 @@ from robot.drivers.sawyer.codec import (
     ReceivedMessage,
     decode,
     encode,
-    is_still,
     joints_of,
     waypoints,
 )
@@ -225,6 +224,8 @@ _MAX_TURN_RAD = 0.5
 """A larger joint step between two way-points means another branch of the inverse kinematics."""
 _STOP_S = 2.0
 """Time in which the arm must become still after a hold command."""
+_STILL_RAD, _STILL_S = 1e-3, 0.1
+"""An arm is still if no joint moves by more than _STILL_RAD within _STILL_S."""
 _TICK_S, _COMMAND_TIMEOUT_S = 0.01, 0.2
 """Time between two commands; time without commands after which the robot ends the motion."""
 _RAMP_S = 0.3
@@ -281,7 +282,7 @@ class Sawyer(Arm):
         yaw, tool_yaw = math.radians(options.base_yaw_deg), math.radians(options.tool_yaw_deg)
         self._mount = Mount(options.base_xyz_mm, yaw, options.tool_mm, tool_yaw)
         self._url = f"ws://{options.host}:{options.port}"
-        self._is_moving = self._sees_collisions = False
+        self._sees_collisions = False
         self._link = self._new_link()
 
     def _new_link(self) -> RosbridgeLink:
@@ -340,13 +341,8 @@ class Sawyer(Arm):
         self._check_free()
 
     def _close(self) -> None:
-        """Close the link; first hold the arm if another thread of this program still moves it."""
-        try:
-            if self._is_moving:
-                with contextlib.suppress(DeviceError):
-                    self._command(self._fresh_joints())
-        finally:
-            self._link.close()
+        """Close the link; the robot ends a motion of another thread after _COMMAND_TIMEOUT_S."""
+        self._link.close()
 
     def _settings(self) -> dict[str, Any]:
         return {
@@ -408,12 +404,8 @@ class Sawyer(Arm):
             solved.append(self._solve(waypoint, solved[-1], start))
         joints = np.array(solved)
         schedule = JointTrajectory.from_waypoints(poses, joints, speed_mm_s, self._options.joint_speed_rad_s, _RAMP_S)
-        self._is_moving = True
-        try:
-            self._follow(schedule, began)
-            self._settle(joints[-1], began)
-        finally:
-            self._is_moving = False
+        self._follow(schedule, began)
+        self._settle(joints[-1], began)
         return self._pose_since(self.clock())
 
     def _solve(self, pose: Pose, before: Joints, start: Joints) -> Joints:
@@ -469,7 +461,14 @@ class Sawyer(Arm):
             time.sleep(_TICK_S)
 
     def _is_still(self, since_s: float) -> bool:
-        return is_still(self._link.history(codec.JOINT_STATES[0]), since_s, self.clock())
+        """Return whether the arm was still for the last _STILL_S, by joint states that arrived after `since_s`."""
+        now_s = self.clock()
+        recent = [
+            joints
+            for arrival in self._link.history(codec.JOINT_STATES[0])
+            if arrival.time_s >= max(since_s, now_s - _STILL_S) and (joints := joints_of(arrival.message)) is not None
+        ]
+        return now_s - since_s >= _STILL_S and len(recent) >= 3 and float(np.ptp(recent, axis=0).max()) < _STILL_RAD
 
     def _watch(self, commanded: Joints, began: float) -> Joints:
         """Return the current joints; raise DeviceError if the motion must not continue."""

@@ -30,7 +30,7 @@ class UsbDevice(Device):
 
     _options: UsbCameraSettings
     _path: str
-    _reader: FrameReader | None = None
+    _reader: FrameReader
     _camera: dict[str, Any] = {}  # noqa: RUF012
 
     def _open_stream(self) -> CaptureStream:
@@ -46,19 +46,14 @@ class UsbDevice(Device):
         self._reader.start()
 
     def _close(self) -> None:
-        self._connected_reader.close()
+        self._reader.close()
 
     def _settings(self) -> dict[str, Any]:
         """Return the camera's settings of the last opening of its stream."""
         return dict(self._camera)
 
     def _recover(self) -> None:
-        self._connected_reader.recover()
-
-    @property
-    def _connected_reader(self) -> FrameReader:
-        assert self._reader is not None, "the base class refuses calls before connecting"
-        return self._reader
+        self._reader.recover()
 
 
 # Gels --------------------------------------------------------------------------------------------------------
@@ -112,7 +107,7 @@ class OpencvTactile(UsbDevice, TactileSensor):
         Unlike `read`, it waits for a lost stream no longer than this. With `timeout_s` 0 it does not wait at all.
         """
         with self._use("cannot be read"):
-            return self._picture(self._connected_reader.after(time_s, timeout_s))
+            return self._picture(self._reader.after(time_s, timeout_s))
 
     def _connect(self) -> None:
         super()._connect()
@@ -123,10 +118,10 @@ class OpencvTactile(UsbDevice, TactileSensor):
         return {**super()._settings(), "picture_px": self._picture_px}
 
     def _read(self) -> Frame:
-        return self._picture(self._connected_reader.newest())
+        return self._picture(self._reader.newest())
 
     def _read_near(self, time_s: float) -> Frame:
-        return self._picture(self._connected_reader.near(time_s))
+        return self._picture(self._reader.near(time_s))
 
     def _picture(self, frame: Frame) -> Frame:
         """Rotate, crop, then convert to RGB. The conversion is last, because it is faster with fewer pixels."""
@@ -218,7 +213,7 @@ class UvcCamera(UsbDevice, Camera):
         self._path = stable_path(self._options.device, self._options.allow_index)
 
     def _read(self, depth: bool) -> RGBD:
-        frame = self._connected_reader.newest()
+        frame = self._reader.newest()
         colour = to_rgb(frame.pixels)
         if self._options.upside_down:
             colour = np.ascontiguousarray(colour[::-1, ::-1])

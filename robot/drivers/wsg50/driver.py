@@ -105,11 +105,6 @@ class Link:
         self.needs_sync = True
         self._tokens = itertools.count(int.from_bytes(os.urandom(6), "little"))
 
-    @property
-    def is_open(self) -> bool:
-        """Whether the port is open, as far as this side has noticed."""
-        return self._port is not None
-
     def open(self) -> None:
         """Open the port if it is closed; send nothing."""
         if self._port is not None:
@@ -409,10 +404,7 @@ class WSG50(Gripper):
         """If the jaws move, stop them. Then send DISCONNECT, without which the gripper enters FAST STOP over TCP."""
         try:
             if self._link.has_echoed or self._may_be_moving:  # else no motion was started
-                if self._link.is_open:
-                    self._stop_if_moving()
-                else:  # the link was lost after the start of a motion; over a serial line the jaws still move
-                    self._stop()
+                self._stop_if_moving()  # also if the link was lost: over a serial line the jaws still move
                 self._stop_updates()
                 self._link.send(Packet(CommandId.DISCONNECT))
         finally:

@@ -22,10 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from _touch_retrieval.documents import typed
-from robot.sim.gel.optics import Optics
 from robot.sim.gel.surface import Array, Field, Surface, resized
 
-CHANNELS = 3
 _COARSE = 4  # image pixels per point of the smoothed maps; the shortest reach is many pixels
 
 Matrix = NDArray[np.float64]
@@ -51,7 +49,7 @@ class FittedLimits:
 
 
 @dataclass(frozen=True)
-class FittedOptics(Optics):
+class FittedOptics:
     """Optics of a fitted sensor.
 
     Attributes:
@@ -72,10 +70,6 @@ class FittedOptics(Optics):
     flat: tuple[tuple[float, ...], ...]
     limits: FittedLimits
 
-    def backdrop(self, field: Field) -> Array:
-        """Return the fitted backdrop (rows, cols, 3)."""
-        return _maps(self, field)[0].copy()
-
     def colours(self, surface: Surface, slopes: tuple[Array, Array]) -> Array:
         """Return the backdrop plus the weighted features (rows, cols, 3)."""
         backdrop, weights = _maps(self, surface.field)
@@ -84,7 +78,7 @@ class FittedOptics(Optics):
             features += self._neighbourhood(surface)
         out = backdrop.copy()
         part = np.empty_like(features[0])
-        for channel in range(CHANNELS):
+        for channel in range(3):
             total = np.zeros_like(part)
             for feature, weight in zip(features, weights, strict=False):
                 np.multiply(feature, weight[channel], out=part)
@@ -109,15 +103,10 @@ class FittedOptics(Optics):
         maps = []
         for reach in self.reaches_mm:
             smooth = cv2.GaussianBlur(heights, (0, 0), reach / steps[1], sigmaY=reach / steps[0])
-            maps += [smooth, _slope(smooth, 1, steps[1]), _slope(smooth, 0, steps[0])]
+            slopes = (np.gradient(smooth, np.float32(steps[axis]), axis=axis) for axis in (1, 0))
+            maps += [smooth, *(slope.astype(np.float32) for slope in slopes)]
         limits = zip(maps, self.limits.lowest, self.limits.highest, strict=True)
         return [resized(np.clip(one, low, high), (field.rows, field.cols)) for one, low, high in limits]
-
-
-def _slope(heights: Array, axis: int, step_mm: float) -> Array:
-    if heights.shape[axis] < 2:
-        return np.zeros_like(heights)
-    return np.asarray(np.gradient(heights, np.float32(step_mm), axis=axis), np.float32)
 
 
 def normal_features(nx: Any, ny: Any, degree: int) -> list[Any]:
@@ -149,7 +138,7 @@ def _maps(optics: FittedOptics, field: Field) -> tuple[Array, list[Array]]:
     limits = optics.limits
     clipped = np.clip(x, limits.left, limits.right), np.clip(y, limits.top, limits.bottom)
     places = [np.broadcast_to(term, (field.rows, field.cols)) for term in place_terms(*clipped, optics.places)]
-    weights = np.array(optics.weights, np.float32).reshape(-1, optics.places, CHANNELS)
+    weights = np.array(optics.weights, np.float32).reshape(-1, optics.places, 3)
     maps = [np.tensordot(row.T, np.stack(places), axes=1) for row in weights]
     return np.maximum(np.asarray(backdrop, np.float32), 1), maps
 

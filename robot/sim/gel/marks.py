@@ -38,10 +38,7 @@ def flaw_maps(flaws: Flaws, field: Field) -> tuple[Array, Array, Array]:
     rng = np.random.default_rng([flaws.seed, 0x6E1])
     darkening = _specks(rng, flaws.specks, field) * _hairs(rng, flaws.hairs, field)
     heights = _grains(rng, flaws.grains, field)
-    down, right = (
-        np.gradient(heights, field.pixel_mm, axis=axis) if heights.shape[axis] > 1 else np.zeros_like(heights)
-        for axis in (0, 1)
-    )
+    down, right = np.gradient(heights, field.pixel_mm)
     rough = rng.standard_normal((2, field.rows, field.cols), dtype=np.float32)
     # Skin is rough at many scales; a camera still resolves grains of two pixels.
     rough = np.stack([cv2.GaussianBlur(one, (0, 0), 1.4) * np.float32(5.0 * flaws.texture) for one in rough])
@@ -125,10 +122,9 @@ def marker_positions(markers: Markers, surface: Surface) -> Array:
     pixels = ((at_rest / (width, height) + 0.5) * heights.shape[::-1] - 0.5).astype(np.float32)
     out = at_rest.copy()
     for axis, step in enumerate(steps):
-        if heights.shape[1 - axis] > 1:
-            slope = np.gradient(smooth, axis=1 - axis) / np.float32(step)
-            found = cv2.remap(slope, pixels[:, :1], pixels[:, 1:], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            out[:, axis] -= np.clip(found[:, 0] * _SPREAD * _REACH_MM, -width, width)
+        slope = np.gradient(smooth, axis=1 - axis) / np.float32(step)
+        found = cv2.remap(slope, pixels[:, :1], pixels[:, 1:], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        out[:, axis] -= np.clip(found[:, 0] * _SPREAD * _REACH_MM, -width, width)
     return out
 
 

@@ -1,7 +1,7 @@
 """From the shape of a gel to colours: near-field LEDs, or a low-order model fitted to real presses.
 
-Both return grey levels (0 to 255, before clipping) for red, green and blue; a flat gel gives the backdrop. The other
-effects of a sensor (tint, dust, blur, noise) are in `robot.sim.gel.sensor`.
+Both have a method `colours`, which returns grey levels (0 to 255, before clipping) for red, green and blue; a flat gel
+gives the backdrop. The other effects of a sensor (tint, dust, blur, noise) are in `robot.sim.gel.sensor`.
 
 LEDs: a point source at s with axis o and emission order m lights the point p of a matt surface with normal n by
 w = max(0, n . d) max(0, -o . d)^m / |s - p|^2, d = (s - p) / |s - p|. A bar b is a row of such points; w_b is the sum
@@ -12,7 +12,6 @@ is 1 minus the blocked part of the bar's light; LedOptics describes backdrop, mi
 """
 
 import math
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -21,19 +20,6 @@ import numpy as np
 
 from robot.sim.gel.surface import Array, Field, Surface, resized
 from robot.sim.jit import jit
-
-
-class Optics(ABC):
-    """Base class of models that turn a surface into colours. Frozen and hashable, for caches."""
-
-    @abstractmethod
-    def backdrop(self, field: Field) -> Array:
-        """Return the unpressed gel: (rows, cols, 3) grey levels."""
-
-    @abstractmethod
-    def colours(self, surface: Surface, slopes: tuple[Array, Array]) -> Array:
-        """Return the pressed gel: (rows, cols, 3) grey levels; `slopes` are those of the surface plus its flaws."""
-
 
 # Near-field LEDs -------------------------------------------------------------------------------------------
 
@@ -102,7 +88,7 @@ MINI_MIX = ((0.76, 0.19, 0.05), (0.23, 0.69, 0.08), (0.07, 0.07, 0.86))
 
 
 @dataclass(frozen=True)
-class LedOptics(Optics):
+class LedOptics:
     """Bars of near-field LEDs.
 
     Attributes:
@@ -126,7 +112,7 @@ class LedOptics(Optics):
         return _backdrop(self.backdrops, field)
 
     def colours(self, surface: Surface, slopes: tuple[Array, Array]) -> Array:
-        """Return the picture of the surface lit by the bars (rows, cols, 3)."""
+        """Return the picture (rows, cols, 3) of the surface with these slopes, those of its flaws included."""
         field = surface.field
         (leds, strengths), (x, y) = _leds(self.bars, field), field.positions()
         shades = np.ones((len(self.bars), field.rows, field.cols), np.float32)

@@ -21,13 +21,14 @@ from numpy.typing import NDArray
 from robot.errors import UnknownName
 from robot.gel_settings import GelSettings
 from robot.sim.contact.layer import Layer
-from robot.sim.gel.fitted_optics import load_fitted
+from robot.sim.gel.fitted_optics import FittedOptics, load_fitted
 from robot.sim.gel.marks import Flaws, Markers, flaw_maps, marker_darkening
-from robot.sim.gel.optics import MINI_BACKDROPS, MINI_BARS, GaussianBackdrop, LedBar, LedOptics, Optics
+from robot.sim.gel.optics import MINI_BACKDROPS, MINI_BARS, GaussianBackdrop, LedBar, LedOptics
 from robot.sim.gel.surface import Array, Field, Surface
 from robot.sim.jit import jit
 
 Picture = NDArray[np.uint8]
+Optics = LedOptics | FittedOptics
 
 MODULUS_MPA = (0.2, 0.8)
 POISSON = (0.45, 0.49)
@@ -92,7 +93,7 @@ class GelSensor:
             seed: seed of the camera noise.
 
         Raises:
-            SceneError: The map is empty, has another number of axes, or is not finite.
+            SceneError: The map is not finite.
         """
         return self.capture(self.render_clean(displacement_mm), seed)
 
@@ -118,22 +119,19 @@ class GelSensor:
 
     def capture(self, clean: Array, seed: int) -> Picture:
         """Return the camera's picture of `clean`: noisy, rounded, clipped to 0..255, reduced and compressed."""
-        picture = self._add_noise(clean, seed)
+        rows, values = clean.shape[0], clean.shape[1] * 3  # a row's colours one after the other
+        tile, place = _draw_noise(self.field.rows, self.field.cols, seed)
+        noisy, flat = np.empty((rows, values), np.uint8), np.ascontiguousarray(clean).reshape(rows, values)
+        _add_camera_noise(flat, tile, place, np.float32(self.noise.read), np.float32(self.noise.shot), noisy)
+        picture: Picture = noisy.reshape(clean.shape)
         if self.detail < 1:
-            rows, cols = (max(1, round(self.detail * size)) for size in picture.shape[:2])
-            small = cv2.resize(picture, (cols, rows), interpolation=cv2.INTER_AREA)
+            height, width = (max(1, round(self.detail * size)) for size in picture.shape[:2])
+            small = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
             picture = np.asarray(cv2.resize(small, picture.shape[1::-1], interpolation=cv2.INTER_LINEAR), np.uint8)
         if self.jpeg_quality is not None:
             data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])[1]
             picture = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)[..., ::-1]
         return picture
-
-    def _add_noise(self, clean: Array, seed: int) -> Picture:
-        rows, values = clean.shape[0], clean.shape[1] * 3  # a row's colours one after the other
-        tile, place = _draw_noise(self.field.rows, self.field.cols, seed)
-        out, flat = np.empty((rows, values), np.uint8), np.ascontiguousarray(clean).reshape(rows, values)
-        _add_camera_noise(flat, tile, place, np.float32(self.noise.read), np.float32(self.noise.shot), out)
-        return out.reshape(clean.shape)
 
 
 @lru_cache(maxsize=64)

@@ -65,20 +65,14 @@ class Surface:
         field: the part of the gel in the camera's view.
 
     Raises:
-        SceneError: The map is not two-dimensional, is empty, or is not finite.
+        SceneError: The map is not finite.
     """
 
     def __init__(self, displacement_mm: NDArray[Any], field: Field) -> None:
         self.field = field
-        array = np.asarray(displacement_mm)
-        if array.ndim != 2 or array.size == 0 or array.dtype.kind not in "fiu":
-            raise SceneError(
-                f"displacement_mm must be a (rows, cols) map of numbers, got {array.dtype} of shape {array.shape}; "
-                "give Contact.displacement_mm"
-            )
-        if not np.isfinite(array).all():
+        if not np.isfinite(displacement_mm).all():
             raise SceneError("displacement_mm must be finite; see Contact.flags")
-        self.displacement_mm: Array = np.clip(array, -_MAX_DEPTH_MM, _MAX_DEPTH_MM).astype(np.float32)
+        self.displacement_mm: Array = np.clip(displacement_mm, -_MAX_DEPTH_MM, _MAX_DEPTH_MM).astype(np.float32)
 
     @cached_property
     def slopes(self) -> tuple[Array, Array]:

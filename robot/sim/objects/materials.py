@@ -6,26 +6,21 @@ Values are typical of the class at room temperature; each object draws its own a
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Annotated
 
 import numpy as np
-from msgspec import Meta
-
-from _touch_retrieval.documents import Positive
-from robot.settings import TypedSettings
 
 
 @dataclass(frozen=True)
-class ObjectMaterial(TypedSettings):
+class ObjectMaterial:
     """Isotropic linear elasticity, density, friction against gel, and gloss and roughness for shading (0 to 1)."""
 
     name: str
-    modulus_mpa: Positive
-    poisson: Annotated[float, Meta(ge=-1.0, le=0.5)]
-    density_kg_m3: Annotated[float, Meta(ge=1.0, le=25000.0)]
-    friction: Annotated[float, Meta(ge=0.0, le=5.0)]
-    gloss: Annotated[float, Meta(ge=0.0, le=1.0)]
-    roughness: Annotated[float, Meta(ge=0.0, le=1.0)]
+    modulus_mpa: float
+    poisson: float
+    density_kg_m3: float
+    friction: float
+    gloss: float
+    roughness: float
 
 
 _TABLE = (

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial import ConvexHull, cKDTree
 
 from robot.errors import SceneError
 from robot.sim.objects.appearance import draw_appearance
@@ -313,11 +313,8 @@ def _read(file: Path) -> tuple[Vectors, Faces]:
         data = io.BytesIO(file.read_bytes())
         loaded = trimesh.load(data, file_type=kind, force="mesh", process=False, skip_materials=True)
         return np.array(loaded.vertices, np.float64), np.array(loaded.faces, np.int64)
-    except OSError as error:
-        raise SceneError(f"{file} cannot be read: {error.strerror or error}") from error
     except Exception as error:  # a damaged file can raise any exception in the parser
-        reason = "it is damaged and not text" if isinstance(error, ImportError) else error  # encoding detection
-        raise SceneError(f"{file} is not a readable {kind.upper()} mesh: {reason}") from error
+        raise SceneError(f"{file} is not a readable {kind.upper()} mesh: {error}") from error
 
 
 def _check_closed(faces: Faces, file: Path) -> None:
@@ -338,10 +335,7 @@ def _check_closed(faces: Faces, file: Path) -> None:
 def _min_width(vertices: Vectors) -> float:
     """Return the smallest horizontal width, over the directions normal to the sides of the outline's convex hull."""
     flat = vertices[:, :2]
-    try:
-        hull = flat[ConvexHull(flat).vertices]
-    except QhullError:
-        return 0.0
+    hull = flat[ConvexHull(flat).vertices]
     sides = np.roll(hull, -1, axis=0) - hull
     across = np.stack([-sides[:, 1], sides[:, 0]], axis=1) / np.linalg.norm(sides, axis=1, keepdims=True)
     return float(np.ptp(hull @ across.T, axis=0).min())

@@ -29,10 +29,7 @@ def stable_up_directions(vertices: Array, centre_of_mass: Array) -> list[Array]:
 
     There are at most 6 directions; only its own z if no pose is stable.
     """
-    try:
-        hull = ConvexHull(vertices)
-    except QhullError:
-        return [UP]
+    hull = ConvexHull(vertices)
     corners = vertices[hull.vertices] - centre_of_mass
     # Scans have thousands of sides. Try one of those that point the same way to about a degree.
     _, first = np.unique(np.rint(hull.equations[:, :3] / 0.02), axis=0, return_index=True)

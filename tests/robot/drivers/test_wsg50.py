@@ -323,7 +323,8 @@ def test_connecting_without_a_gripper_is_a_device_error_and_leaves_nothing_open(
         emulator.silent = True
         with pytest.raises(DeviceError, match="is it on and connected"):
             gripper.connect()
-        assert not gripper._link.is_open
+        with pytest.raises(LinkLost, match="it is closed"):
+            gripper._link.sync()
         assert emulator.received == [0x06] * 3  # three tries of an echo and nothing else
 
 

@@ -69,19 +69,14 @@ def test_rays_meet_the_side_of_a_cylinder_and_the_face_of_a_box():
     np.testing.assert_allclose(box().cast(origins, directions), -20 - origins[:, 1], atol=ATOL)
 
 
-def test_a_ray_that_starts_inside_hits_at_once():
-    for body in (can(), can(Relief("ribs", 1.0, 5.0))):
-        found = body.cast(np.array([[0.0, 0, 40], [5, 5, 20]]), np.array([[1.0, 0, 0], [0, 0, 1]]))
-        np.testing.assert_array_equal(found, 0)
-
-
 @pytest.mark.parametrize("relief", [Relief("smooth", 0.0, 5.0), Relief("ribs", 1.0, 5.0)])
-def test_a_ray_hits_where_its_distance_is_finite(relief):
+def test_a_ray_hits_where_its_distance_is_finite_and_at_once_if_it_starts_inside(relief):
     body = can(relief)
     origins, directions = wall_rays(body, pitch=2.0)
     found = body.hit(origins, directions)
     np.testing.assert_array_equal(found, np.isfinite(body.cast(origins, directions)))
     assert 0.1 < found.mean() < 1
+    np.testing.assert_array_equal(body.cast(np.array([[0.0, 0, 40], [5, 5, 20]]), directions[:2]), 0)
 
 
 def test_a_ray_along_an_axis_has_no_nan():
@@ -181,7 +176,7 @@ def test_sphere_tracing_without_the_slope_of_the_relief_passes_through_it():
     assert naive_inside
 
 
-@pytest.mark.parametrize("index", range(12))
+@pytest.mark.parametrize("index", range(6))
 def test_casting_agrees_with_a_slow_march(index):
     body = draw_object(3, index).body
     origins, directions = random_rays(body, 60, seed=index, level=index % 2 == 0)

@@ -3,8 +3,6 @@
 import numba
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from robot.sim.jit import jit
 from robot.sim.objects.draw import draw_object
@@ -46,16 +44,6 @@ def test_exactly_rounded_operations_are_bitwise_equal():
     operands = numbers(2, 1000)
     for function in (lambda a, b: rounded_corner(a, b, 1.5), arctan2):
         np.testing.assert_array_equal(evaluate_formula(trace_formula(function, 2), *operands)[0], function(*operands))
-
-
-@given(st.lists(st.floats(width=32, allow_nan=False), min_size=1, max_size=130), st.floats(-5, 5))
-def test_any_number_comes_through_comparisons_as_in_numpy(values, limit):
-    def function(a):
-        return np.maximum(np.minimum(a, limit), -2), np.where(a > limit, a, limit), np.abs(a)
-
-    operand = np.array(values, np.float32)
-    for ours, exact in zip(evaluate_formula(trace_formula(function, 1), operand), function(operand), strict=True):
-        np.testing.assert_array_equal(ours, exact.astype(np.float32))
 
 
 # Against plain numpy -----------------------------------------------------------------------------------------

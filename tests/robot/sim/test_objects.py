@@ -80,7 +80,7 @@ def test_appearance_and_material_do_not_depend_on_shape_and_relief():
 
 
 def test_colour_is_not_correlated_with_tactile_properties():
-    objects = [draw_object(6, index) for index in range(1500)]
+    objects = [draw_object(6, index) for index in range(600)]
     appearance = np.array(
         [[*item.appearance.colour, item.appearance.paint is None, item.appearance.label is None] for item in objects]
     )
@@ -98,8 +98,8 @@ def test_colour_is_not_correlated_with_tactile_properties():
         ]
     )
     correlation = np.corrcoef(appearance.T.astype(float), tactile.T)[: appearance.shape[1], appearance.shape[1] :]
-    # Of 40 independent pairs of 1500 samples, the largest exceeds 0.11 once in a thousand object sets.
-    assert np.abs(correlation).max() < 0.11
+    # Of 40 independent pairs of 600 samples, the largest exceeds 0.17 once in a thousand object sets.
+    assert np.abs(correlation).max() < 0.17
 
 
 # Mass ------------------------------------------------------------------------------------------------------

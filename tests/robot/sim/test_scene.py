@@ -29,66 +29,30 @@ def scene(outputs, **changes):
     return Scene(**settings)
 
 
-def passes_of(outputs, **changes):
-    """Return the computations done for these outputs, by name and number."""
+MISS = Grip(Pose(140.0, 0.0, MIDDLE_MM, 0.3), force_n=12.0)
+
+
+@pytest.mark.parametrize(
+    ("outputs", "changes", "passes"),
+    [
+        (ALL, {}, "view photo depth 2*turn 2*wall 2*contact 2*gel 2*background"),
+        ([], {}, ""),
+        (["photo"], {}, "view photo"),
+        (["depth"], {}, "view depth"),
+        (["photo", "depth"], {}, "view photo depth"),
+        (["touch_a", "touch_b"], {}, "2*turn 2*wall 2*contact 2*gel"),
+        (["touch_a_before"], {"grip": None}, "background"),
+        (["touch_a", "touch_a_after"], {"sensors": {"a": SENSORS["a"]}}, "2*turn wall bare_finger contact gel"),
+        (["touch_a"], {}, "2*turn 2*wall contact gel"),
+        (["touch_a", "touch_a_after"], {}, "2*turn 2*wall 2*contact gel"),
+        (["touch_a", "touch_b", "touch_a_after"], {"grip": MISS}, "2*turn 2*wall background"),
+    ],
+)
+def test_each_output_does_only_what_it_needs_and_shares_the_rest(outputs, changes, passes):
     made = scene(outputs, **changes)
-    images = made.run()
-    assert set(images) == set(outputs)
-    return dict(made.passes)
-
-
-def test_a_whole_scene_does_each_thing_once_for_each_finger():
-    assert passes_of(ALL) == {
-        "view": 1,
-        "photo": 1,
-        "depth": 1,
-        "turn": 2,
-        "wall": 2,
-        "contact": 2,
-        "gel": 2,
-        "background": 2,
-    }
-
-
-def test_no_outputs_need_no_work():
-    assert passes_of(()) == {}
-
-
-def test_a_photo_needs_neither_depth_nor_touch():
-    assert passes_of(["photo"]) == {"view": 1, "photo": 1}
-
-
-def test_a_depth_image_needs_no_shading():
-    assert passes_of(["depth"]) == {"view": 1, "depth": 1}
-
-
-def test_photo_and_depth_share_one_geometry_pass():
-    assert passes_of(["photo", "depth"])["view"] == 1
-
-
-def test_touches_need_no_camera():
-    assert not set(passes_of(["touch_a", "touch_b"])) & {"view", "photo", "depth"}
-
-
-def test_a_no_contact_frame_needs_no_contact_solve_and_no_grip():
-    assert passes_of(["touch_a_before"], grip=None) == {"background": 1}
-
-
-def test_a_sensor_on_one_finger_solves_one_contact():
-    done = passes_of(["touch_a", "touch_a_after"], sensors={"a": SENSORS["a"]})
-    assert done["contact"] == done["wall"] == done["bare_finger"] == 1
-
-
-def test_one_of_two_fingers_solves_one_contact_until_the_lift_needs_the_other():
-    assert passes_of(["touch_a"])["contact"] == 1
-    assert passes_of(["touch_a", "touch_a_after"])["contact"] == 2
-
-
-def test_a_missed_grasp_solves_no_contact():
-    miss = Grip(Pose(140.0, 0.0, MIDDLE_MM, 0.3), force_n=12.0)
-    done = passes_of(["touch_a", "touch_b", "touch_a_after"], grip=miss)
-    assert "contact" not in done
-    assert "gel" not in done
+    assert set(made.run()) == set(outputs)
+    counts = (each.rpartition("*") for each in passes.split())
+    assert dict(made.passes) == {name: int(count or 1) for count, _, name in counts}
 
 
 def test_a_finger_that_comes_down_on_the_object_is_a_miss_with_this_reason():
@@ -99,24 +63,17 @@ def test_a_finger_that_comes_down_on_the_object_is_a_miss_with_this_reason():
 
 
 def test_a_missed_grasp_shows_the_no_contact_frame():
-    miss = Grip(Pose(140.0, 0.0, MIDDLE_MM, 0.3), force_n=12.0)
-    images = scene(["touch_a", "touch_a_before"], grip=miss).run()
+    images = scene(["touch_a", "touch_a_before"], grip=MISS).run()
     difference = images["touch_a"].astype(float) - images["touch_a_before"].astype(float)
     assert abs(difference.mean()) < 0.3
     assert np.abs(difference).max() < 25
 
 
-def test_the_same_seed_makes_the_same_pictures_and_another_one_does_not():
-    first, again, other = scene(ALL).run(), scene(ALL).run(), scene(ALL, seed=6).run()
-    for name in ALL:
-        np.testing.assert_array_equal(first[name], again[name])
-        assert not np.array_equal(first[name], other[name], equal_nan=True)
-
-
-def test_the_order_of_outputs_changes_no_pixel():
-    whole = scene(ALL).run()
+def test_pictures_depend_on_the_seed_and_not_on_the_other_outputs():
+    whole, other = scene(ALL).run(), scene(ALL, seed=6).run()
     for name in sorted(ALL, reverse=True):
         np.testing.assert_array_equal(scene([name]).run()[name], whole[name])
+        assert not np.array_equal(whole[name], other[name], equal_nan=True)
 
 
 def test_both_gels_carry_the_clamping_force():

@@ -1,5 +1,3 @@
 """Shape families: SHAPES maps a name to the function that draws one of its instances."""
 
 from robot.sim.objects.shapes.families import SHAPES as SHAPES
-from robot.sim.objects.shapes.shape import Chart as Chart
-from robot.sim.objects.shapes.shape import Shape as Shape

@@ -1,7 +1,5 @@
 """Outlines extruded from the table: boxes, prisms, ovals; tapered or twisted."""
 
-from abc import ABC, abstractmethod
-
 import numpy as np
 
 from robot.sim.objects.shapes.shape import (
@@ -18,31 +16,7 @@ from robot.sim.objects.shapes.shape import (
 )
 
 
-class Outline(ABC):
-    """A flat closed curve around the origin, in mm.
-
-    Subclasses set the extents along x and y, the distance of the farthest point from the origin, and the arc length.
-    """
-
-    reach_x_mm: float
-    reach_y_mm: float
-    radius_mm: float
-    length_mm: float
-
-    @abstractmethod
-    def distance(self, x: Floats, y: Floats) -> Floats:
-        """Return the signed distance in mm, exact outside."""
-
-    @abstractmethod
-    def locate(self, x: Floats, y: Floats) -> Floats:
-        """Return the arc length in mm of the curve's point nearest to (x, y), in [0, length_mm)."""
-
-    @abstractmethod
-    def points_at(self, s: Floats) -> tuple[Points, Points]:
-        """Return points of the curve at arc length s and outward normals there, (N, 2) each."""
-
-
-class RoundedRectangle(Outline):
+class RoundedRectangle:
     """2 half_x by 2 half_y with corners of radius `corner_mm` > 0; an oval if the radius equals the smaller half."""
 
     def __init__(self, half_x_mm: float, half_y_mm: float, corner_mm: float) -> None:
@@ -83,7 +57,7 @@ class RoundedRectangle(Outline):
         return sign * (core + self.corner_mm * normal), sign * normal
 
 
-class Polygon(Outline):
+class Polygon:
     """A regular polygon, `apothem_mm` from its middle to a face, with corners of radius `corner_mm` > 0."""
 
     def __init__(self, sides: int, apothem_mm: float, corner_mm: float) -> None:
@@ -133,6 +107,10 @@ class Polygon(Outline):
             [along * np.cos(turn) + across * np.sin(turn), along * np.sin(turn) - across * np.cos(turn)], axis=1
         )
         return core + self.corner_mm * normal, normal
+
+
+Outline = RoundedRectangle | Polygon
+"""A flat closed curve around the origin, in mm: its extents along x and y, its farthest point, and its arc length."""
 
 
 class OutlineChart(Chart):

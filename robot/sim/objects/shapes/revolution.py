@@ -1,6 +1,5 @@
 """Solids of revolution: parts drawn in the half-plane (r, z), joined with rounded seams."""
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,19 +16,8 @@ from robot.sim.objects.shapes.shape import (
 )
 
 
-class Profile(ABC):
-    """A flat signed distance in the half-plane r >= 0, with its highest point and greatest distance from the axis."""
-
-    top_mm: float
-    radius_mm: float
-
-    @abstractmethod
-    def distance(self, r: Floats, z: Floats) -> Floats:
-        """Return the signed distance in mm."""
-
-
 @dataclass(frozen=True)
-class Drum(Profile):
+class Drum:
     """A cylinder from `bottom_mm` to `top_mm` with edges rounded by `rim_mm`."""
 
     radius_mm: float
@@ -44,7 +32,7 @@ class Drum(Profile):
         return rounded_corner(r - np.float32(self.radius_mm), ends, self.rim_mm)
 
 
-class Ball(Profile):
+class Ball:
     """A sphere centred on the axis; with `ring_mm`, a horizontal torus of that radius."""
 
     def __init__(self, size_mm: float, height_mm: float, *, ring_mm: float = 0.0) -> None:
@@ -56,7 +44,7 @@ class Ball(Profile):
         return length(r - np.float32(self.ring_mm), z - np.float32(self.height_mm)) - np.float32(self.size_mm)
 
 
-class Cone(Profile):
+class Cone:
     """A frustum: radius `base_mm` at the bottom, `head_mm` at the top; `rim_mm` rounds its edges."""
 
     def __init__(self, base_mm: float, head_mm: float, bottom_mm: float, top_mm: float, *, rim_mm: float = 0.0) -> None:
@@ -72,6 +60,10 @@ class Cone(Profile):
         side = (r - np.float32((self.base_mm + self.head_mm) / 2) + height * np.float32(slope)) * cosine
         # Side and ends do not meet at right angles, but the rounded maximum stays below the distance.
         return -smooth_min(-side, half - np.abs(height), 2 * self.rim_mm)
+
+
+Profile = Drum | Ball | Cone
+"""A flat signed distance in the half-plane r >= 0, with its highest point and greatest distance from the axis."""
 
 
 class Revolution(Shape):
