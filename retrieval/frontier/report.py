@@ -105,8 +105,7 @@ def figure(panels: Sequence[Panel]) -> Figure:
 
 
 def _draw(axes: Axes, panel: Panel) -> None:
-    axes.set_xscale("log")
-    axes.set_yscale("log")
+    axes.set(xscale="log", yscale="log", xlabel=f"{panel.time}, ms", ylabel=panel.unit)
     axes.margins(x=0.12, y=0.1)
     floor = _FLOOR * min((point.error for point in panel.points if point.error), default=1.0)
     for number, name in enumerate(dict.fromkeys(point.series for point in panel.points)):
@@ -114,8 +113,6 @@ def _draw(axes: Axes, panel: Panel) -> None:
     _front(axes, panel, floor)
     axes.axhline(max(panel.tolerance, floor), color="#333333", ls="--", lw=1, zorder=0, label="tolerance")
     axes.set_title(f"{capitalized(panel.title)}, against {panel.reference}", fontsize=9.5, loc="left")
-    axes.set_xlabel(f"{panel.time}, ms")
-    axes.set_ylabel(panel.unit)
     logarithmic(axes.xaxis)
     logarithmic(axes.yaxis)
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1), frameon=False)

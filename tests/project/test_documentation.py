@@ -224,11 +224,6 @@ def test_the_program_of_the_readme_gives_the_same_answers_as_the_command(home, m
         best, (start, _, probability) = document["results"][0], line.rpartition(" ")
         assert start == f"{document['verdict']} {best['object_id']}"
         assert float(probability) == pytest.approx(best["probability"], abs=1e-4)
-
-
-def test_the_program_of_the_readme_runs_with_an_uncalibrated_model(home, model, monkeypatch, capsys):
-    assert main(["build-index", "catalog", "--out", "demo/index", "--model", str(model)]) == 0
-    capsys.readouterr()
     real_open = retrieval.open
 
     def open_uncalibrated(path):

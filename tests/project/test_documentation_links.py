@@ -59,20 +59,13 @@ def test_every_module_in_a_command_exists():
         assert target.with_suffix(".py").is_file() or (target / "__main__.py").is_file(), (path, module)
 
 
-def test_every_project_file_that_a_page_names_exists():
-    for page in (*PAGES, CONTRIBUTING):
-        for name in re.findall(rf"(?<![\w/]){OURS}/[\w./*-]*(?:\.\w+|/)", text_of(page)):
-            assert list(ROOT.glob(name.rstrip("/"))), (page.name, name)
-
-
-def test_every_project_name_in_a_page_exists():
-    for page in (*PAGES, CONTRIBUTING):
-        for name in re.findall(r"`((?:retrieval|robot|indexes)(?:\.[A-Za-z_]\w*)+)`", text_of(page)):
-            assert pkgutil.resolve_name(name), (page.name, name)
-
-
-def test_every_extra_that_a_page_names_exists():
+@pytest.mark.parametrize("page", [*PAGES, CONTRIBUTING], ids=lambda page: page.stem)
+def test_every_file_name_and_extra_of_the_project_in_a_page_exists(page):
+    text = text_of(page)
+    for name in re.findall(rf"(?<![\w/]){OURS}/[\w./*-]*(?:\.\w+|/)", text):
+        assert list(ROOT.glob(name.rstrip("/"))), name
+    for name in re.findall(r"`((?:retrieval|robot|indexes)(?:\.[A-Za-z_]\w*)+)`", text):
+        assert pkgutil.resolve_name(name), name
     known = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    named = [extra for page in PAGES for extra in re.findall(r"touch-retrieval\[([\w,]+)\]", text_of(page))]
-    assert named
+    named = re.findall(r"touch-retrieval\[([\w,]+)\]", text)
     assert {extra for extras in named for extra in extras.split(",")} <= set(known)

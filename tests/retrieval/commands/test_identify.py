@@ -55,10 +55,10 @@ def test_it_stops_at_the_first_grasp_whose_answer_is_clear(identify, tmp_path, c
 def test_an_unclear_answer_takes_all_grasps_at_different_heights_and_continues_where_it_was_stopped(
     identify, tmp_path, capsys
 ):
-    identify("--confidence", "1", "--grasps", "3")
+    identify("--confidence", "1", "--grasps", "2")
     whole = capsys.readouterr().err
     lines = (tmp_path / "run" / "metadata.jsonl").read_text().splitlines()
-    assert "grasp 3 of at most 3" in whole
+    assert "grasp 2 of at most 2" in whole
     heights_mm = sorted(grasp.pose[2] for grasp in read_recording(tmp_path / "run").grasps if grasp.grasped)
     assert min(later - earlier for earlier, later in itertools.pairwise(heights_mm)) > 4
     # A killed run: the second grasp and all later ones are missing.
@@ -67,7 +67,7 @@ def test_an_unclear_answer_takes_all_grasps_at_different_heights_and_continues_w
     attempts.write_text("".join(f"{line}\n" for line in attempts.read_text().splitlines()[: last + 1]))
     recorded = [line for line in lines if json.loads(line)["grasp_id"] in attempts.read_text()]
     (tmp_path / "run" / "metadata.jsonl").write_text("".join(f"{line}\n" for line in recorded))
-    identify("--confidence", "1", "--grasps", "3")
+    identify("--confidence", "1", "--grasps", "2")
     assert (tmp_path / "run" / "metadata.jsonl").read_text().splitlines() == lines
     assert capsys.readouterr().err == whole
 
