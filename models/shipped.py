@@ -37,11 +37,8 @@ from retrieval.model.config import Config, load_config
 from retrieval.model.encode import default_device, one_thread
 from retrieval.model.shipped import SHIPPED, shipped_model
 from retrieval.training import distil
-from retrieval.training.batches import FrozenFeatures, recorded_features
-from retrieval.training.calibration.calibrate import calibrate_checkpoint
-from retrieval.training.calibration.touches import score_grasps
-from retrieval.training.calibration.verification import fit_verification
-from retrieval.training.features import Features, encode_recording, features_by_image
+from retrieval.training.calibration import calibrate_checkpoint, fit_verification, score_grasps
+from retrieval.training.features import Features, FrozenFeatures, encode_recording, features_by_image, recorded_features
 
 RIGS = Path(__file__).parent
 RIG, TOUCH_RIG, GELS_RIG = (RIGS / f"shipped_{name}.toml" for name in ("rig", "touches", "gels"))

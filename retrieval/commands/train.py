@@ -65,8 +65,16 @@ def train(
 
         _show_licences([recording_licence(recording)])
         steps: dict[str, Any] = {} if iterations is None else {"iterations": iterations}
-        for line in train_gate(recording, out, **steps).lines():
-            say(line)
+        found = train_gate(recording, out, **steps)
+        trained = f"trained on {found['train_grasps']} grasps, {found['train_held']} of them held"
+        say(f"{out}: uses the frame {found['frame']} the grasp; {trained}")
+        say(
+            f"accuracy {found['accuracy']:.3f} (95 %: {found['interval'][0]:.3f} to {found['interval'][1]:.3f}) on "
+            f"{found['validation_grasps']} grasps of {found['validation_objects']} other objects; always predicting "
+            f"the more frequent class: {found['chance']:.3f}"
+        )
+        parts = [f"{part} of {whole} {name}" for name, (part, whole) in found["accepted"].items()]
+        say(f"accepted: {', '.join(parts)}")
         return
     from retrieval.training import distributed
     from retrieval.training.initial_weights import training_licences

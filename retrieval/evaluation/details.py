@@ -19,7 +19,7 @@ from retrieval.metrics.pairs import reliability_bins
 from retrieval.metrics.registry import PHOTOS_PER_CANDIDATE, confusions, k_way
 from retrieval.metrics.table import ScoreTable, object_scores
 from retrieval.model.posterior import Posterior
-from retrieval.training.calibration.posterior import MIN_OBJECTS
+from retrieval.training.calibration import MIN_OBJECTS
 from retrieval.training.features import Features
 
 K_WAY_TESTS = {"k5": (5, 1, 1), "k10": (10, 1, 1), "k5_g5": (5, 5, PHOTOS_PER_CANDIDATE)}

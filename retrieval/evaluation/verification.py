@@ -19,8 +19,7 @@ from retrieval.evaluation.queries import MethodScores
 from retrieval.evaluation.results import Rate, VerificationRates
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.verification import ERRORS_NEEDED, error_rate, objects_needed
-from retrieval.training.calibration.posterior import MIN_OBJECTS, fit_posterior
-from retrieval.training.calibration.verification import verification_sequences
+from retrieval.training.calibration import MIN_OBJECTS, fit_posterior, verification_sequences
 from retrieval.training.features import Features
 
 GRASPS = (1, 2, 3, 5)

@@ -46,16 +46,14 @@ from retrieval.model.shipped import is_shipped, shipped_model
 from retrieval.model.towers import TOWER_SEPARATOR
 from retrieval.model.towers.tower import Tower
 from retrieval.model.towers.weights import GEL
-from retrieval.training.batches import FrozenFeatures
-from retrieval.training.calibration.calibrate import with_calibrations, with_gel_check
-from retrieval.training.calibration.touches import ScoredTouches, score_touches
+from retrieval.training.calibration import ScoredTouches, score_touches, with_calibrations, with_gel_check
 from retrieval.training.cca_towers import (
     MAX_CALIBRATION_TOUCHES,
     CcaSelection,
     select_settings,
     tower_widths,
 )
-from retrieval.training.features import Features, encode_recording, features_by_image
+from retrieval.training.features import Features, FrozenFeatures, encode_recording, features_by_image
 from retrieval.training.initial_weights import checkpoint_licences
 from retrieval.training.selection import held_out_folds
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from retrieval.errors import BadInput
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
-from retrieval.training.calibration.touches import ScoredTouches
+from retrieval.training.calibration import ScoredTouches
 from retrieval.training.cca import MAX_DIRECTIONS, CcaView, Standardiser, canonical_correlations, decompose, unit_rows
 from retrieval.training.features import Features
 from retrieval.training.selection import ranking_auc, validation_rows

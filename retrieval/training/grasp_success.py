@@ -17,9 +17,9 @@ A gate selects the touches that a matcher later trains on, so it makes them easi
 
 import dataclasses
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -54,48 +54,6 @@ _GREY_LEVEL = 1 / 255
 Differences = Callable[[Sequence[Attempt]], list[list[NDArray[np.float32]]]]
 
 
-@dataclass(frozen=True)
-class GateReport:
-    """Accuracy of a gate, that of the last step, on validation objects, which have no other use.
-
-    Attributes:
-        path: File of the gate.
-        frame: The frame that it uses, `retrieval.model.gate.GateSettings.frame`.
-        train_grasps: Number of training grasps.
-        train_held: Number of held grasps among them.
-        validation_grasps: Number of validation grasps.
-        validation_objects: Number of validation objects.
-        accuracy: Fraction of validation grasps classified correctly.
-        interval: 95 % interval of the accuracy; grasps of one object are treated as dependent.
-        chance: Accuracy of always predicting the more frequent class.
-        accepted: (accepted, all) grasps by outcome.
-    """
-
-    path: str
-    frame: str
-    train_grasps: int
-    train_held: int
-    validation_grasps: int
-    validation_objects: int
-    accuracy: float
-    interval: tuple[float, float]
-    chance: float
-    accepted: dict[str, tuple[int, int]]
-
-    def lines(self) -> Iterator[str]:
-        """Yield the lines of the report for people."""
-        yield (
-            f"{self.path}: uses the frame {self.frame} the grasp; trained on {self.train_grasps} grasps, "
-            f"{self.train_held} of them held"
-        )
-        yield (
-            f"accuracy {self.accuracy:.3f} (95 %: {self.interval[0]:.3f} to {self.interval[1]:.3f}) on "
-            f"{self.validation_grasps} grasps of {self.validation_objects} other objects; always predicting the more "
-            f"frequent class: {self.chance:.3f}"
-        )
-        yield "accepted: " + ", ".join(f"{part} of {whole} {name}" for name, (part, whole) in self.accepted.items())
-
-
 def train_gate(
     recording: Path,
     out: Path,
@@ -104,7 +62,7 @@ def train_gate(
     seed: int = 0,
     settings: GateSettings | None = None,
     quiet: bool = False,
-) -> GateReport:
+) -> dict[str, Any]:
     """Train a gate on the successful and failed grasps of a recording and write it to `out`.
 
     A quarter of the objects are for validation. Training takes half a minute, plus 15 ms for each grasp.
@@ -119,7 +77,10 @@ def train_gate(
         quiet: No progress on stderr.
 
     Returns:
-        The accuracy on validation objects.
+        The metrics in the file: the frame that the gate uses; "train_grasps", "train_held", "validation_grasps" and
+        "validation_objects"; the "accuracy" on validation objects, its 95 % "interval" (grasps of one object are
+        dependent) and "chance", the accuracy of always predicting the more frequent class; and (accepted, all) grasps
+        by outcome, "accepted".
 
     Raises:
         DatasetError: The recording lacks successful grasps, failed grasps, or required frames.
@@ -156,21 +117,20 @@ def train_gate(
     is_correct, outcomes = accepted == held, [attempt.outcome for attempt in validation]
     owner = np.array([attempt.grasp.object_id for attempt in validation])
     by_object = [is_correct[owner == name].tolist() for name in np.unique(owner)]
-    report = GateReport(
-        path=str(out),
-        frame=settings.frame,
-        train_grasps=len(train),
-        train_held=sum(attempt.held for attempt in train),
-        validation_grasps=len(validation),
-        validation_objects=len(by_object),
-        accuracy=float(is_correct.mean()),
-        interval=grouped_interval(by_object),
-        chance=float(max(held.mean(), 1 - held.mean())),
-        accepted={
+    metrics = {
+        "frame": settings.frame,
+        "train_grasps": len(train),
+        "train_held": sum(attempt.held for attempt in train),
+        "validation_grasps": len(validation),
+        "validation_objects": len(by_object),
+        "accuracy": float(is_correct.mean()),
+        "interval": grouped_interval(by_object),
+        "chance": float(max(held.mean(), 1 - held.mean())),
+        "accepted": {
             name: (sum(accepted[[each == name for each in outcomes]].tolist()), count)
             for name, count in sorted(Counter(outcomes).items())
         },
-    )
+    }
     provenance = {
         "iterations": iterations,
         "seed": seed,
@@ -178,11 +138,11 @@ def train_gate(
         LICENCES: [dataclasses.asdict(recording_licence(recording))],
         "data_digest": data_digest(attempt.grasp for attempt in attempts),
         "outcomes": dict(Counter(attempt.outcome for attempt in attempts)),
-        "metrics": {key: value for key, value in dataclasses.asdict(report).items() if key != "path"},
+        "metrics": metrics,
     }
     header = {"task": TASK, "gate": dataclasses.asdict(settings), "split": split.to_dict(), "provenance": provenance}
     write_tensors(out, gate.net.state_dict(), header)
-    return report
+    return metrics
 
 
 def _frames(attempt: Attempt, frame: str) -> tuple[Path, ...]:

@@ -29,7 +29,7 @@ from retrieval.metrics.intervals import binomial_interval
 from retrieval.model.candidate_encoder import CandidateEncoder
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import encode_touches
-from retrieval.training.batches import BatchImages
+from retrieval.training.features import BatchImages
 from tests import synthetic
 from tests.documents import ROOT
 

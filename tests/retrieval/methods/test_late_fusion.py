@@ -83,7 +83,7 @@ def test_the_method_trains_the_same_model_as_the_command_line(recording, split, 
 
 
 def test_another_setting_or_other_features_are_trained_again(parts, tmp_path, monkeypatch):
-    monkeypatch.setattr("retrieval.training.batches.touch_features", lambda *_: pytest.fail("read an image"))
+    monkeypatch.setattr("retrieval.training.features.touch_features", lambda *_: pytest.fail("read an image"))
     first = fit(LateFusion, parts, tmp_path)
     slower = with_training(FROZEN, learning_rate=1e-4)
     assert fit(LateFusion, parts, tmp_path, slower).best_params != first.best_params

@@ -20,9 +20,8 @@ from retrieval.model.fusion import Matcher
 from retrieval.model.posterior import Posterior
 from retrieval.model.references import ReferenceCalibration
 from retrieval.search.searcher import Searcher
-from retrieval.training.calibration import calibrate
-from retrieval.training.calibration.posterior import fit_posterior
-from retrieval.training.calibration.touches import score_grasps
+from retrieval.training import calibration
+from retrieval.training.calibration import calibrate_checkpoint, fit_posterior, score_grasps
 from tests.conftest import TINY
 from tests.reference_model import REFERENCE_CALIBRATION, write_reference_model
 
@@ -196,9 +195,9 @@ def test_the_pooled_posterior_is_fitted_on_the_logits_of_the_matcher_without_cel
     expected = score_grasps(pooled, grasps, short_touches, short)
     found = score_grasps(matcher, grasps, touches, photos, pooled=True)
     np.testing.assert_allclose(found.logits, expected.logits, atol=1e-5)
-    monkeypatch.setattr(calibrate, "recorded_features", lambda *_, **__: (touches, photos))
-    monkeypatch.setattr(calibrate, "_sample_grasps", lambda some, _: some)  # keeps their order
-    made = calibrate.calibrate_checkpoint(checkpoint, None, grasps, grasps)
+    monkeypatch.setattr(calibration, "recorded_features", lambda *_, **__: (touches, photos))
+    monkeypatch.setattr(calibration, "_sample_grasps", lambda some, *_: some)  # keeps their order
+    made = calibrate_checkpoint(checkpoint, None, grasps, grasps)
     assert made.pooled_posterior.slope == pytest.approx(fit_posterior(expected).slope, rel=1e-3)
     assert made.posterior != made.pooled_posterior
 

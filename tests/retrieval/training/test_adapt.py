@@ -15,9 +15,7 @@ from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
 from retrieval.model.fusion import Matcher
 from retrieval.model.towers.tower import build_tower
 from retrieval.training.adapt import accuracies, adapt, config_for, draw_folds, fit_folds, load_towers
-from retrieval.training.calibration.posterior import fit_posterior
-from retrieval.training.calibration.touches import ScoredTouches
-from retrieval.training.calibration.verification import fit_verification, verification_sequences
+from retrieval.training.calibration import ScoredTouches, fit_posterior, fit_verification, verification_sequences
 from retrieval.training.cca_towers import GRID, CcaSettings, TowerWidths, fit_projections, select_settings
 from retrieval.training.features import Features
 from retrieval.training.initial_weights import build_matcher

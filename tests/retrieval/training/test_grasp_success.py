@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch.nn.functional import binary_cross_entropy_with_logits
 
+from retrieval.commands.main import main
 from retrieval.data.dataset import load_attempts, load_grasps
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import BadInput, CheckpointError, ConfigError, DatasetError, NumericalError
@@ -124,38 +125,44 @@ def test_without_outcomes_the_field_grasped_counts(tmp_path):
 def test_the_frame_after_the_lift_shows_a_slip_that_the_frame_during_the_grasp_does_not(trained):
     """In these pictures a grasp that slips looks exactly like a held one until the lift."""
     after, during = trained["after"][1], trained["during"][1]
-    assert after.accepted == {"held": (4, 4), "missed": (0, 2), "slipped": (0, 2)}
-    assert during.accepted["missed"] == (0, 2)
-    assert after.accuracy > during.accuracy
+    assert after["accepted"] == {"held": (4, 4), "missed": (0, 2), "slipped": (0, 2)}
+    assert during["accepted"]["missed"] == (0, 2)
+    assert after["accuracy"] > during["accuracy"]
 
 
 def test_the_report_and_the_file_state_accuracy_chance_and_accepted_grasps_of_other_objects(trained, attempts):
     out, report = trained["after"]
-    assert (report.train_grasps, report.train_held, report.validation_objects) == (24, 12, 2)
-    assert report.interval == pytest.approx((0.025 ** (1 / 8), 1.0))
-    text = "\n".join(report.lines())
-    assert "accuracy 1.000 (95 %: 0.631 to 1.000) on 8 grasps of 2 other objects" in text
-    assert "always predicting the more frequent class: 0.500" in text
-    assert "accepted: 4 of 4 held, 0 of 2 missed, 0 of 2 slipped" in text
+    assert [report[f"train_{name}"] for name in ("grasps", "held")] == [24, 12]
+    assert [report[f"validation_{name}"] for name in ("grasps", "objects")] == [8, 2]
+    assert (report["accuracy"], report["chance"]) == (1.0, 0.5)
+    assert report["interval"] == pytest.approx((0.025 ** (1 / 8), 1.0))
     header = read_tensors(out)[1]
     provenance = header["provenance"]
     assert (provenance["source"], provenance["iterations"], provenance["seed"]) == ("test", ENOUGH, 0)
     assert provenance["outcomes"] == {"held": 16, "missed": 8, "slipped": 8}
-    assert provenance["metrics"]["accuracy"] == report.accuracy
+    assert provenance["metrics"]["accuracy"] == report["accuracy"]
     assert not set(header["split"]["train"]) & set(header["split"]["validation"])
     assert str(attempts) not in json.dumps(header)
+
+
+def test_the_command_prints_accuracy_interval_chance_and_the_accepted_grasps(attempts, tmp_path, capsys):
+    out = tmp_path / "gate.safetensors"
+    assert main(["train", str(attempts), "--task", "grasp-success", "--iterations", "2", "--out", str(out)]) == 0
+    output, metrics = capsys.readouterr().err, read_tensors(out)[1]["provenance"]["metrics"]
+    assert f"accuracy {metrics['accuracy']:.3f} (95 %: {metrics['interval'][0]:.3f} to" in output
+    assert f"frequent class: {metrics['chance']:.3f}" in output
+    assert f"accepted: {metrics['accepted']['held'][0]} of 4 held" in output
 
 
 def test_the_frame_after_the_lift_is_used_if_there_is_one_and_only_its_files_are_read(attempts, tmp_path, monkeypatch):
     read, load, out = [], Preprocessing.load_touch, tmp_path / "g.safetensors"
     monkeypatch.setattr(Preprocessing, "load_touch", lambda self, *paths: read.append(paths) or load(self, *paths))
-    assert train_gate(attempts, out, iterations=2, quiet=True).frame == "after"
+    assert train_gate(attempts, out, iterations=2, quiet=True)["frame"] == "after"
     names = [path.stem for pair in read for path in pair]
     assert len(set(names)) == len(names)
     assert all(name.endswith(("_after", "_before")) for name in names)
-    assert (
-        train_gate(write(tmp_path / "r", columns=("during", "before")), out, iterations=1, quiet=True).frame == "during"
-    )
+    without = write(tmp_path / "r", columns=("during", "before"))
+    assert train_gate(without, out, iterations=1, quiet=True)["frame"] == "during"
     assert load_gate(out).settings == GateSettings(frame="during")
 
 

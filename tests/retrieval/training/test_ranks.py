@@ -115,7 +115,7 @@ GRADIENTS = """
 import sys, torch
 from pathlib import Path
 from retrieval.training import distributed
-from retrieval.training.batches import TrainedFeatures
+from retrieval.training.features import TrainedFeatures
 from retrieval.data.dataset import load_grasps
 from retrieval.data.pairs import PairSampler
 from retrieval.model.losses.listwise import contrastive_loss

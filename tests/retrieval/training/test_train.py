@@ -18,7 +18,7 @@ from retrieval.model.checkpoint import load_checkpoint, read_tensors
 from retrieval.model.losses.listwise import contrastive_loss, listwise_loss
 from retrieval.model.losses.loss import Loss, match_loss
 from retrieval.model.towers.tower import Tower
-from retrieval.training.batches import TrainedFeatures
+from retrieval.training.features import TrainedFeatures
 from retrieval.training.initial_weights import build_matcher
 from retrieval.training.loop import state_path
 from retrieval.training.train import Trainer, WeightedLosses, batch_loss, set_training_mode, shuffle_fingers, train

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from retrieval.model.references import reference_similarity
-from retrieval.training.calibration.references import fit_references
-from retrieval.training.calibration.touches import ScoredTouches
+from retrieval.training.calibration import ScoredTouches, fit_references
 
 
 def reference_touches(objects=10, touches=4, noise=0.3, photos=True, seed=0):

@@ -10,8 +10,14 @@ from retrieval.model.config import MatcherConfig
 from retrieval.model.encode import touch_features
 from retrieval.model.fusion import Matcher
 from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
-from retrieval.training.calibration.gel_check import GelCheckFeatures, contact_threshold, fit_gel_check, fit_gel_head
-from retrieval.training.foreign_images import SYNTHETIC_KINDS, draw_foreign
+from retrieval.training.gel_check import (
+    SYNTHETIC_KINDS,
+    GelCheckFeatures,
+    contact_threshold,
+    draw_foreign,
+    fit_gel_check,
+    fit_gel_head,
+)
 
 
 def test_the_contact_threshold_is_above_no_contact_gels_and_as_high_as_it_costs_few_touches():

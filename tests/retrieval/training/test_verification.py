@@ -19,8 +19,7 @@ from retrieval.model.verification import (
     REJECT,
     VerificationCalibration,
 )
-from retrieval.training.calibration.touches import ScoredTouches
-from retrieval.training.calibration.verification import fit_verification, verification_sequences
+from retrieval.training.calibration import ScoredTouches, fit_verification, verification_sequences
 
 POSTERIOR = Posterior(slope=1.0, offset=-2.0, dependence=0.5)
 EMBEDDING_DIM = 4

@@ -7,8 +7,7 @@ import pytest
 
 from retrieval.errors import BadInput
 from retrieval.model.posterior import SLOPE_BOUNDS, Posterior
-from retrieval.training.calibration.posterior import fit_posterior
-from retrieval.training.calibration.touches import ScoredTouches
+from retrieval.training.calibration import ScoredTouches, fit_posterior
 
 ADDING = Posterior(slope=1.0, offset=0.0, dependence=0.0)
 
