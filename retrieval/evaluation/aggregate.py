@@ -53,17 +53,19 @@ class Aggregation:
     def summaries(self, by_seed: MeasuresBySeed) -> Summaries:
         """Return values with intervals, for measures that all seeds have."""
         found = {name: [one[name] for one in by_seed] for name in _shared(by_seed)}
-        if self.ratio is not None:
-            return {name: summarise_splits(each, self.ratio) for name, each in found.items()}
-        return {name: summarise(each, seed=self.seed) for name, each in found.items()}
+        return {
+            name: summarise(each, seed=self.seed) if self.ratio is None else summarise_splits(each, self.ratio)
+            for name, each in found.items()
+        }
 
     def differences(self, a: MeasuresBySeed, b: MeasuresBySeed) -> dict[str, Difference]:
         """Return paired differences `a` - `b`, by name."""
         names = [name for name in _shared(a) if name in _shared(b)]
         pairs = {name: ([one[name] for one in a], [one[name] for one in b]) for name in names}
-        if self.ratio is not None:
-            return {name: compare_splits(*pair, self.ratio) for name, pair in pairs.items()}
-        return {name: compare(*pair, seed=self.seed) for name, pair in pairs.items()}
+        return {
+            name: compare(*pair, seed=self.seed) if self.ratio is None else compare_splits(*pair, self.ratio)
+            for name, pair in pairs.items()
+        }
 
 
 def _shared(by_seed: MeasuresBySeed) -> list[str]:
@@ -112,7 +114,7 @@ def protocol_result(
         labels=[(name, metric.label) for name, metric in protocol.measures.items()],
         unit="choice" if protocol.choices else "sequence" if protocol.is_by_sequence else "object",
         recording=RecordingResult(
-            protocol.data_set or facts.name,
+            protocol.data_set or facts.folder.resolve().name,
             facts.source,
             facts.digest,
             len(facts.names),

@@ -1,7 +1,8 @@
 """Single objects and decisions of a method on one split: accuracy by object, confusions, calibration, rejection."""
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -9,12 +10,13 @@ from numpy.typing import NDArray
 from scipy.special import expit, softmax
 
 from retrieval.evaluation.queries import MethodScores, fit_posterior
-from retrieval.evaluation.reject import RejectionMeasures, reject
-from retrieval.evaluation.results import Confusion, Details, PairThreshold, Rejection
+from retrieval.evaluation.reject import reject
+from retrieval.evaluation.results import Confusion, Details, Rejection
 from retrieval.evaluation.verification import ErrorsByImpostors, verification_errors, verification_rates
 from retrieval.methods.late_fusion import LateFusion
 from retrieval.methods.method import Method
-from retrieval.metrics.intervals import summarise
+from retrieval.metrics.intervals import Summary, summarise
+from retrieval.metrics.measure import Measure
 from retrieval.metrics.pairs import reliability_bins
 from retrieval.metrics.registry import PHOTOS_PER_CANDIDATE, confusions, k_way
 from retrieval.metrics.table import ScoreTable, object_scores
@@ -31,14 +33,10 @@ _TESTS_OF_A_ROW = 4
 
 @dataclass(frozen=True, eq=False)
 class SeedDetails:
-    """`Details` of one training seed; confusions are fractions by (object, mistaken for)."""
+    """Details of one training seed; those that have intervals are apart."""
 
-    pair_threshold: PairThreshold
-    per_object: dict[str, dict[str, float]]
-    confusions: list[tuple[str, str, float]]
-    calibration: dict[str, Any]
-    reliability: dict[str, Any]
-    reject: RejectionMeasures | None
+    details: Details
+    reject: Rejection[Measure] | None
     verification: ErrorsByImpostors | None
 
 
@@ -58,7 +56,7 @@ def describe(method: Method, scores: MethodScores, features: Features) -> SeedDe
         "test_candidates": k_way(test, 5, seed=seed),
         "all_candidates": k_way(scores.touches(None, None), 5, seed=seed),
     }
-    return SeedDetails(
+    details = Details(
         pair_threshold=scores.pair_threshold,
         per_object={
             key: {objects[number]: float(mean[0]) for number, mean in zip(*measure.by_object(), strict=True)}
@@ -66,12 +64,15 @@ def describe(method: Method, scores: MethodScores, features: Features) -> SeedDe
             if measure
         },
         confusions=[
-            (objects[true], objects[predicted], fraction) for true, predicted, fraction in confusions(test, seed=seed)
+            Confusion(objects[true], objects[other], fraction) for true, other, fraction in confusions(test, seed=seed)
         ],
         calibration={"posteriors": {str(grasps): posterior.to_dict() for grasps, posterior in fitted.items()}},
         reliability=reliability(fitted, scores.sets("test") | {1: test}, seed=seed),
-        reject=reject(fitted[1], test, seed=seed) if fitted and len(test.objects) >= MIN_OBJECTS else None,
-        verification=verification_errors(scores, features, method.checkpoint) if type(method) is LateFusion else None,
+    )
+    return SeedDetails(
+        details,
+        reject(fitted[1], test, seed=seed) if fitted and len(test.objects) >= MIN_OBJECTS else None,
+        verification_errors(scores, features, method.checkpoint) if type(method) is LateFusion else None,
     )
 
 
@@ -143,28 +144,26 @@ def combine(by_seed: Sequence[SeedDetails], seed: int) -> Details:
         by_seed: The details of each seed.
         seed: Seed of the resamples.
     """
-    first = by_seed[0]
-    fractions: dict[tuple[str, str], float] = {}
-    for true, predicted, fraction in (each for one in by_seed for each in one.confusions):
-        fractions[true, predicted] = fractions.get((true, predicted), 0) + fraction / len(by_seed)
+    first = by_seed[0].details
+    fractions: dict[tuple[str, str], float] = defaultdict(float)
+    for one in (confusion for each in by_seed for confusion in each.details.confusions):
+        fractions[one.object_id, one.mistaken_for] += one.share / len(by_seed)
     largest = sorted(fractions.items(), key=lambda item: (-item[1], item[0]))[:_CONFUSIONS]
     rejections = [one.reject for one in by_seed if one.reject]
     verified = [one.verification for one in by_seed if one.verification]
-    return Details(
-        pair_threshold=first.pair_threshold,
+    return replace(
+        first,
         per_object={
-            key: {name: float(np.mean([one.per_object[key][name] for one in by_seed])) for name in accuracies}
+            key: {name: float(np.mean([one.details.per_object[key][name] for one in by_seed])) for name in accuracies}
             for key, accuracies in first.per_object.items()
         },
         confusions=[Confusion(*pair, fraction) for pair, fraction in largest],
-        calibration=first.calibration,
-        reliability=first.reliability,
         reject=_rejection(rejections, seed) if rejections else None,
         verification=verification_rates(verified) if verified else None,
     )
 
 
-def _rejection(by_seed: Sequence[RejectionMeasures], seed: int) -> Rejection:
+def _rejection(by_seed: Sequence[Rejection[Measure]], seed: int) -> Rejection[Summary]:
     names = "auroc", "false_accepts_at_95", "balanced_accuracy"
     summaries = {name: summarise([getattr(one, name) for one in by_seed], seed=seed) for name in names}
     return Rejection(**summaries, roc=by_seed[0].roc, risk_coverage=by_seed[0].risk_coverage)

@@ -1,11 +1,10 @@
 """Experiments: fit one method in one fold, score its queries, measure them; each is stored by all its inputs."""
 
 import shutil
-import time
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from retrieval.evaluation.aggregate import Aggregation, MeasuresBySeed, protocol
 from retrieval.evaluation.details import SeedDetails, combine, describe
 from retrieval.evaluation.inputs import Row, TowerEncoder, thin_grasps
 from retrieval.evaluation.protocol import Protocol, RecordingFacts
-from retrieval.evaluation.queries import MethodScores, Queries, draw_queries, score_queries
+from retrieval.evaluation.queries import MethodScores, Queries, draw_queries, score_queries, timed
 from retrieval.evaluation.results import FeatureCounts, MethodTimes, ProtocolResult, ProtocolTimes, RowResult
 from retrieval.methods import CHANCE, METHODS
 from retrieval.methods.late_fusion import LateFusion
@@ -156,8 +155,7 @@ class Experiment:
     @cached_property
     def queries(self) -> Queries:
         """Touches and photos to score."""
-        grasps = self.of.facts.grasps
-        grasps = thin_grasps(grasps, self._max_grasps) if self._max_grasps else grasps
+        grasps = thin_grasps(self.of.facts.grasps, self._max_grasps)
         return draw_queries(grasps, self.split, self.draw_seed, self.of.protocol.max_grasps)
 
     @property
@@ -187,10 +185,9 @@ class Experiment:
         parts = [self.features.of_objects(part) for part in (self.split.train, self.split.validation)]
         if is_permuted:
             parts = [permute_touches(part, self.seed) for part in parts]
-        fitted, start = method(settings), time.perf_counter()
+        fitted = method(settings)
         with one_thread():  # heads are small; times refer to one core
-            fitted.fit(*parts)
-        return fitted, time.perf_counter() - start
+            return fitted, timed(lambda: fitted.fit(*parts))[1]
 
     def _measures(self, scores: MethodScores) -> dict[str, Measure]:
         """Return the measures of each gallery, pooled."""
@@ -365,14 +362,7 @@ def _method_times(outcomes: Sequence[Sequence[Outcome]]) -> MethodTimes:
 @one_thread()
 def _tower_times(towers: TowerEncoder, count: int = 4, repeats: int = 3) -> tuple[float, float]:
     """Return the median times (ms) of the towers for a touch and a photo, on one thread, without reading files."""
-    images, times = BatchImages(towers.config.preprocessing), []
-    for grasp in towers.grasps[:count]:
-        touch, photo = images.touch(grasp), images.photo(grasp.photo)
-        for _ in range(repeats):
-            start = time.perf_counter()
-            touch_features(towers.matcher, [touch])
-            middle = time.perf_counter()
-            photo_features(towers.matcher, [photo])
-            times.append((middle - start, time.perf_counter() - middle))
-    touch_s, photo_s = np.median(times, axis=0)
-    return 1e3 * float(touch_s), 1e3 * float(photo_s)
+    images, grasps = BatchImages(towers.config.preprocessing), towers.grasps[:count] * repeats
+    touches = [timed(partial(touch_features, towers.matcher, [images.touch(grasp)]))[1] for grasp in grasps]
+    photos = [timed(partial(photo_features, towers.matcher, [images.photo(grasp.photo)]))[1] for grasp in grasps]
+    return 1e3 * float(np.median(touches)), 1e3 * float(np.median(photos))

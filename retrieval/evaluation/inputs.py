@@ -132,7 +132,7 @@ class TowerEncoder:
             return replace(touches, touch=touches.photo[:, None])
         if not with_cells:
             return self.inputs(kind, max_grasps=max_grasps).pooled(self.matcher)
-        grasps = thin_grasps(self.grasps, max_grasps) if max_grasps else self.grasps
+        grasps = thin_grasps(self.grasps, max_grasps)
         if kind in ("touch", "background"):
             return self._encode(grasps, "touch", "margin" if kind == "background" else "photo", None)
         return self._encode(grasps, kind, "photo", self.inputs("touch"))
@@ -174,14 +174,17 @@ def missing_no_contact_reason(grasps: Sequence[Grasp]) -> str | None:
     return None
 
 
-def thin_grasps(grasps: Sequence[Grasp], max_grasps: int) -> list[Grasp]:
-    """Return at most `max_grasps` grasps of each object, evenly spaced in the order of its grasps."""
+def thin_grasps(grasps: Sequence[Grasp], max_grasps: int | None) -> list[Grasp]:
+    """Return at most `max_grasps` grasps of each object, evenly spaced in the order of its grasps; None for all."""
     rows_of: dict[str, list[int]] = defaultdict(list)
     for row, grasp in enumerate(grasps):
         rows_of[grasp.object_id].append(row)
-    selected: set[int] = set()
-    for rows in rows_of.values():
-        selected |= {rows[place] for place in np.linspace(0, len(rows) - 1, min(max_grasps, len(rows))).astype(int)}
+    counts = {name: min(max_grasps or len(rows), len(rows)) for name, rows in rows_of.items()}
+    selected = {
+        rows[place]
+        for name, rows in rows_of.items()
+        for place in np.linspace(0, len(rows) - 1, counts[name]).astype(int)
+    }
     return [grasps[row] for row in sorted(selected)]
 
 

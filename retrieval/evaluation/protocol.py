@@ -9,7 +9,6 @@ import numpy as np
 
 from _touch_retrieval.files import read_json
 from retrieval.data.dataset import Grasp, Split, data_digest, load_grasps, object_kinds, recording_source
-from retrieval.errors import DatasetError
 from retrieval.evaluation.inputs import CONTROL_CCA
 from retrieval.metrics.registry import Metric, k_way
 
@@ -30,11 +29,6 @@ class RecordingFacts:
     grasps: list[Grasp]
     class_of: Mapping[str, str]
     splits: Mapping[str, Split]
-
-    @property
-    def name(self) -> str:
-        """Name of its folder."""
-        return self.folder.resolve().name
 
     @cached_property
     def digest(self) -> str:
@@ -68,12 +62,7 @@ def read_recording_facts(folder: Path) -> RecordingFacts:
         DatasetError: A file is missing or invalid.
     """
     grasps = load_grasps(folder)  # also checks recording.json
-    splits = {}
-    for path in sorted((folder / "splits").glob("*.json")):
-        try:
-            splits[path.stem] = Split.from_dict(read_json(path))
-        except ValueError as error:
-            raise DatasetError(f"{path} is not a JSON file: {error}") from error
+    splits = {path.stem: Split.from_dict(read_json(path)) for path in sorted((folder / "splits").glob("*.json"))}
     return RecordingFacts(folder, recording_source(folder), grasps, object_kinds(folder), splits)
 
 

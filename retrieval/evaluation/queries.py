@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ PARTS = ("train", "validation", "test")
 SETS_OF_AN_OBJECT = 20
 
 Rows = NDArray[np.int64]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,15 +80,23 @@ def draw_queries(grasps: Sequence[Grasp], split: Split, seed: int, max_grasps: M
                 f"An evaluation needs at least 2 {part} objects, but the recording has {count} of the split's. Record "
                 "more objects, or give your own split."
             )
-    rng = np.random.default_rng([seed, 11])
-    drawn_rows = [_draw_touches(grasps, name, max_grasps.get(part_of[name]), rng) for name in objects]
+    rng, drawn_rows = np.random.default_rng([seed, 11]), []
+    for name, part in zip(objects, parts, strict=True):
+        rows = np.array([row for row, grasp in enumerate(grasps) if grasp.object_id == name])
+        limit = max_grasps.get(part, len(rows))
+        drawn_rows.append(rows if len(rows) <= limit else np.sort(rng.choice(rows, limit, replace=False)))
     touches = np.concatenate(drawn_rows)
     owner = np.repeat(np.arange(len(objects)), [len(rows) for rows in drawn_rows])
     column: dict[Path, int] = {}
     own_photo = np.array([column.setdefault(grasps[row].photo, len(column)) for row in touches])
     first = np.unique(own_photo, return_index=True)[1]
     touches_of = [np.flatnonzero(owner == place) for place, part in enumerate(parts) if part != "train"]
-    sets = {size: _draw_sets(touches_of, size, rng) for size in SET_SIZES}
+    sets = {}
+    for size in SET_SIZES:
+        enough = [places for places in touches_of if len(places) >= size + PHOTOS_PER_CANDIDATE]
+        drawn = [rng.choice(places, size, replace=False) for places in enough for _ in range(SETS_OF_AN_OBJECT)]
+        if drawn:
+            sets[size] = np.array(drawn)
     return Queries(
         touches=touches,
         photos=touches[first],
@@ -96,22 +105,8 @@ def draw_queries(grasps: Sequence[Grasp], split: Split, seed: int, max_grasps: M
         photo_owner=owner[first],
         objects=objects,
         part_of=parts,
-        sets={size: drawn for size, drawn in sets.items() if len(drawn)},
+        sets=sets,
     )
-
-
-def _draw_touches(grasps: Sequence[Grasp], name: str, max_grasps: int | None, rng: np.random.Generator) -> Rows:
-    rows = np.array([row for row, grasp in enumerate(grasps) if grasp.object_id == name])
-    if max_grasps is None or len(rows) <= max_grasps:
-        return rows
-    return np.sort(rng.choice(rows, max_grasps, replace=False))
-
-
-def _draw_sets(touches_of: Sequence[Rows], size: int, rng: np.random.Generator) -> Rows:
-    """Return sets (S, size) of the touches of each object that has enough."""
-    enough = [places for places in touches_of if len(places) >= size + PHOTOS_PER_CANDIDATE]
-    drawn = [rng.choice(places, size, replace=False) for places in enough for _ in range(SETS_OF_AN_OBJECT)]
-    return np.array(drawn, dtype=np.int64).reshape(-1, size)
 
 
 # Scores ------------------------------------------------------------------------------------------------
@@ -121,15 +116,15 @@ MIN_THRESHOLD_OBJECTS = 10
 _QUERY_REPEATS = 5
 
 
-def identification_trials(table: ScoreTable, seed: int = 0) -> IdentificationTrials:
-    """Return a trial for each of the rows `table.with_targets`, as if a row were one touch, of `table.objects`.
+def scored_touches(table: ScoreTable) -> ScoredTouches:
+    """Return a score table as posteriors and verification take it; a row counts as one touch."""
+    return ScoredTouches(table.scores, table.touch_owner, table.photo_owner, table.own)
 
-    Raises:
-        BadInput: The table has fewer than three objects.
-    """
+
+def identification_trials(table: ScoreTable, seed: int = 0) -> IdentificationTrials:
+    """Return a trial for each of the rows `table.with_targets`. Raises BadInput for fewer than three objects."""
     targets = table.with_targets
-    scored = ScoredTouches(targets.scores, targets.touch_owner, targets.photo_owner, targets.own)
-    return IdentificationTrials.of(scored, np.arange(len(targets.touch_owner))[:, None], seed)
+    return IdentificationTrials.of(scored_touches(targets), np.arange(len(targets.touch_owner))[:, None], seed)
 
 
 def fit_posterior(validation: ScoreTable, seed: int = 0) -> Posterior | None:
@@ -166,40 +161,40 @@ class MethodScores:
 
     def touches(self, rows: str | None, columns: str | None) -> ScoreTable:
         """Return the scores of the touches of one part of the objects with the photos of one part; None for all."""
-        queries = self.queries
-        touches, photos = queries.of_part(queries.touch_owner, rows), queries.of_part(queries.photo_owner, columns)
-        own = queries.own_photo[touches][:, None] == photos
         words = f"{columns} objects" if columns else "objects of all parts"
-        return self._table(self.scores, touches, queries.touch_owner, photos, own, words, "touches")
+        singles = np.arange(len(self.queries.touches))[:, None]
+        return self._shown(self._table(self.scores, singles, rows, columns, words, "touches"))
 
     def sets(self, part: str) -> dict[int, ScoreTable]:
         """Return the scores of sets of grasps with photos of the same part, by number of grasps.
 
         Sizes without a set that has a target photo are left out.
         """
-        queries, found = self.queries, {}
-        photos = queries.of_part(queries.photo_owner, part)
-        for size, sets in queries.sets.items():
-            owner = queries.touch_owner[sets[:, 0]]
-            rows = queries.of_part(owner, part)
-            own = (queries.own_photo[sets[rows]][:, :, None] == photos).any(1)
-            if ((owner[rows][:, None] == queries.photo_owner[photos]) & ~own).any():
-                scores = self.set_scores[size]
-                found[size] = self._table(scores, rows, owner, photos, own, f"{part} objects", "sets of grasps")
-        return found
+        queries = self.queries
+        tables = {
+            size: self._table(self.set_scores[size], sets, part, part, f"{part} objects", "sets of grasps")
+            for size, sets in queries.sets.items()
+            if len(queries.of_part(queries.touch_owner[sets[:, 0]], part))
+        }
+        return {size: self._shown(table) for size, table in tables.items() if table.has_target.any()}
 
     def _table(
         self,
         scores: NDArray[np.float32],
-        rows: NDArray[np.int64],
-        owner: NDArray[np.int64],
-        photos: NDArray[np.int64],
-        own: NDArray[np.bool_],
+        sets: Rows,
+        part: str | None,
+        columns: str | None,
         object_words: str,
         row_words: str,
     ) -> ScoreTable:
-        chosen, photo_owner = scores[np.ix_(rows, photos)], self.queries.photo_owner[photos]
-        table = ScoreTable(chosen, owner[rows], photo_owner, own, object_words, row_words)
+        queries = self.queries
+        owner = queries.touch_owner[sets[:, 0]]
+        rows, photos = queries.of_part(owner, part), queries.of_part(queries.photo_owner, columns)
+        own = (queries.own_photo[sets[rows]][:, :, None] == photos).any(1)
+        owners = owner[rows], queries.photo_owner[photos]
+        return ScoreTable(scores[np.ix_(rows, photos)], *owners, own, object_words, row_words)
+
+    def _shown(self, table: ScoreTable) -> ScoreTable:
         return table.with_own() if self.allows_own_photos else table
 
     def tables(self, with_threshold: bool) -> MethodScoreTables:
@@ -211,11 +206,6 @@ class MethodScores:
             threshold=self.pair_threshold.at if with_threshold else None,
             seed=self.seed,
         )
-
-    def scored_touches(self, part: str) -> ScoredTouches:
-        """Return the scores of the touches with the photos of one part, as posteriors and verification take them."""
-        table = self.touches(part, part)
-        return ScoredTouches(table.scores, table.touch_owner, table.photo_owner, table.own)
 
     @cached_property
     def posterior(self) -> Posterior | None:
@@ -248,15 +238,15 @@ def score_queries(
 ) -> MethodScores:
     """Score all queries with a fitted method, on one thread; `features` are those of all grasps."""
     touch, photo = features.touch[queries.touches], features.photo[queries.photos]
-    touch_encodings, touch_s = _timed(lambda: method.encode_touch(touch))
-    photo_encodings, photo_s = _timed(lambda: method.encode_photo(photo))
-    scores, score_s = _timed(lambda: method.score(touch_encodings, photo_encodings))
+    touch_encodings, touch_s = timed(lambda: method.encode_touch(touch))
+    photo_encodings, photo_s = timed(lambda: method.encode_photo(photo))
+    scores, score_s = timed(lambda: method.score(touch_encodings, photo_encodings))
     if type(method)._score_sets is Method._score_sets:  # the sum of single scores, which are computed
         sets = {size: sum_over_sets(scores, rows) for size, rows in queries.sets.items()}
     else:
         sets = {size: method.score_sets(touch_encodings, photo_encodings, rows) for size, rows in queries.sets.items()}
     query_s = [
-        _timed(lambda: method.score(method.encode_touch(touch[:1]), photo_encodings))[1] for _ in range(_QUERY_REPEATS)
+        timed(lambda: method.score(method.encode_touch(touch[:1]), photo_encodings))[1] for _ in range(_QUERY_REPEATS)
     ]
     seconds = {
         "fit": fit_s,
@@ -268,7 +258,8 @@ def score_queries(
     return MethodScores(queries, scores, sets, method.best_params, seconds, seed, allows_own_photos)
 
 
-def _timed(work: Callable[[], NDArray[np.float32]]) -> tuple[NDArray[np.float32], float]:
+def timed(work: Callable[[], T]) -> tuple[T, float]:
+    """Return the result of some work, and the seconds that it took."""
     start = time.perf_counter()
     result = work()
     return result, time.perf_counter() - start

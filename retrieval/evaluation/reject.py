@@ -5,13 +5,12 @@ objects: a random rival is dropped from the gallery with the row's own object. I
 higher by chance, so that an uninformative scorer would seem better than chance.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from retrieval.evaluation.queries import identification_trials
+from retrieval.evaluation.results import Rejection
 from retrieval.metrics.measure import Measure, object_weights, weight_below
 from retrieval.metrics.table import ScoreTable
 from retrieval.model.posterior import Posterior
@@ -21,28 +20,6 @@ _CURVE_POINTS = 200
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-
-
-@dataclass(frozen=True, eq=False)
-class RejectionMeasures:
-    """Rejection performance of a posterior on objects that it was not fitted on; rows of an object weigh as one.
-
-    Attributes:
-        auroc: Area under the ROC curve: how often the statistic of a row with its object in the gallery exceeds that of
-            a row without; ties count 1/2. Chance: 1/2.
-        balanced_accuracy: Mean of true accept rate and true reject rate; a row is accepted if "one of these" is at
-            least as likely as none, at even prior. Chance: 1/2.
-        false_accepts_at_95: False accept rate at the threshold with a true accept rate of 95 %. Chance: 0.95.
-        roc: [false accept rate, true accept rate], from accepting none to accepting all.
-        risk_coverage: [fraction answered, top-1 error rate among these], from the most confident answers to all. Half
-            of the queries are without their object.
-    """
-
-    auroc: Measure
-    balanced_accuracy: Measure
-    false_accepts_at_95: Measure
-    roc: list[list[float]]
-    risk_coverage: list[list[float]]
 
 
 def galleries(ratios: Floats, true: Bools, seed: int = 0) -> tuple[Floats, Floats]:
@@ -65,9 +42,10 @@ def statistic(gallery: Floats) -> Floats:
     return np.asarray(logsumexp(gallery, axis=1) - np.log(np.isfinite(gallery).sum(1)))
 
 
-def reject(posterior: Posterior, table: ScoreTable, *, seed: int = 0) -> RejectionMeasures:
+def reject(posterior: Posterior, table: ScoreTable, *, seed: int = 0) -> Rejection[Measure]:
     """Measure the rejection performance of a posterior on the scores of objects that it was not fitted on.
 
+    Objects have equal weight. Chance of `auroc` and `balanced_accuracy` is 1/2, of `false_accepts_at_95` 0.95.
     `seed` draws the galleries. Raises BadInput for fewer than three objects.
     """
     targets = table.with_targets
@@ -80,7 +58,7 @@ def reject(posterior: Posterior, table: ScoreTable, *, seed: int = 0) -> Rejecti
     def measure(values: Floats, chance: float) -> Measure:
         return Measure(values[:, None], targets.touch_owner, np.array([chance]), words)
 
-    return RejectionMeasures(
+    return Rejection(
         auroc=measure(_areas(present, absent, weights), 0.5),
         balanced_accuracy=measure(((present >= 0) + 1.0 - (absent >= 0)) / 2, 0.5),
         false_accepts_at_95=measure(false_accepts(present, absent, targets.touch_owner), TRUE_ACCEPTS),

@@ -2,17 +2,19 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import msgspec
 
 from _touch_retrieval.files import write_atomically
 from retrieval.errors import BadInput
 from retrieval.metrics.intervals import Difference, Summary
+from retrieval.metrics.measure import Measure
 
 SCHEMA_VERSION = 4
 """Schema version of results.json."""
 T = TypeVar("T")
+M = TypeVar("M", Measure, Summary)
 
 
 Summaries = dict[str, Summary]
@@ -46,12 +48,23 @@ class Confusion:
 
 
 @dataclass(frozen=True)
-class Rejection:
-    """Decisions that an object is not in the catalogue (`reject.RejectionMeasures`); curves of the first seed."""
+class Rejection(Generic[M]):
+    """Decisions that an object is not in the catalogue: measures of one training seed, or summaries of all.
 
-    auroc: Summary
-    false_accepts_at_95: Summary
-    balanced_accuracy: Summary
+    Attributes:
+        auroc: Area under the ROC curve: how often the statistic of a row with its object in the gallery exceeds that of
+            a row without; ties count 1/2.
+        false_accepts_at_95: False accept rate at the threshold with a true accept rate of 95 %.
+        balanced_accuracy: Mean of true accept rate and true reject rate; a row is accepted if "one of these" is at
+            least as likely as none, at even prior.
+        roc: [false accept rate, true accept rate] of the first seed, from accepting none to accepting all.
+        risk_coverage: [fraction answered, top-1 error rate among these] of the first seed, from the most confident
+            answers to all. Half of the queries are without their object.
+    """
+
+    auroc: M
+    false_accepts_at_95: M
+    balanced_accuracy: M
     roc: list[list[float]]
     risk_coverage: list[list[float]]
 
@@ -96,8 +109,8 @@ class Details:
     confusions: list[Confusion]
     calibration: dict[str, Any]
     reliability: dict[str, Any]
-    reject: Rejection | None
-    verification: dict[str, dict[str, VerificationRates]] | None
+    reject: Rejection[Summary] | None = None
+    verification: dict[str, dict[str, VerificationRates]] | None = None
 
 
 @dataclass(frozen=True)

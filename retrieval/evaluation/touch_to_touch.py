@@ -166,22 +166,18 @@ def with_common_frame(grasps: Sequence[Grasp], folder: Path, *, quiet: bool = Tr
             for finger, (touch, before) in enumerate(zip(grasp.touches, grasp.backgrounds, strict=True)):
                 path = folder / f"{grasp.grasp_id}-{finger}.png"
                 if not path.is_file():
-                    image = _on_common_frame(touch, before, common[finger])
-                    write_atomically(path, encode_image(np.clip(np.rint(255 * image), 0, 255).astype(np.uint8)))
+                    pressed, no_contact, shared = read_rgb(touch), read_rgb(before), common[finger]
+                    if not pressed.shape == no_contact.shape == shared.shape:
+                        raise DatasetError(
+                            f"{touch}, its no-contact frame and the first no-contact frame of the recording must have "
+                            f"the same size, got {pressed.shape}, {no_contact.shape} and {shared.shape}."
+                        )
+                    image = np.clip(np.rint(255 * (shared + pressed - no_contact)), 0, 255).astype(np.uint8)
+                    write_atomically(path, encode_image(image))
                 files.append(path)
             found.append(dataclasses.replace(grasp, touches=tuple(files), backgrounds=grasps[0].backgrounds))
             bar.advance()
     return found
-
-
-def _on_common_frame(touch: Path, before: Path, common: NDArray[np.float32]) -> NDArray[np.float32]:
-    pressed, no_contact = read_rgb(touch), read_rgb(before)
-    if not pressed.shape == no_contact.shape == common.shape:
-        raise DatasetError(
-            f"{touch}, its no-contact frame and the first no-contact frame of the recording must have the same size, "
-            f"got {pressed.shape}, {no_contact.shape} and {common.shape}."
-        )
-    return common + pressed - no_contact
 
 
 def _vectors(sequences: Sequences, towers: TowerEncoder, common: Sequence[Grasp], variant: str) -> dict[str, Vectors]:

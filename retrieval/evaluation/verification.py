@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from retrieval.evaluation.queries import MethodScores
+from retrieval.evaluation.queries import MethodScores, scored_touches
 from retrieval.evaluation.results import Rate, VerificationRates
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.verification import ERRORS_NEEDED, error_rate, objects_needed
@@ -50,9 +50,9 @@ def verification_errors(scores: MethodScores, features: Features, checkpoint: Ch
         The errors; None for fewer than three test objects, or for a model without posterior and fewer than three
         validation objects.
     """
-    queries, posterior, test = scores.queries, checkpoint.posterior, scores.scored_touches("test")
+    queries, posterior, test = scores.queries, checkpoint.posterior, scored_touches(scores.touches("test", "test"))
     if posterior is None:
-        validation = scores.scored_touches("validation")
+        validation = scored_touches(scores.touches("validation", "validation"))
         if len(np.unique(validation.photo_owner)) >= MIN_OBJECTS:
             posterior = fit_posterior(validation, seed=scores.seed)
     if posterior is None or len(np.unique(test.photo_owner)) < MIN_OBJECTS:

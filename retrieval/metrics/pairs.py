@@ -101,10 +101,6 @@ def reliability_bins(probability: ArrayLike, outcomes: ArrayLike) -> dict[str, A
         outcomes: (P,) 1 if the prediction is true, 0 if not; 1/n if n answers tie and one of them is right.
     """
     p, y = np.asarray(probability, dtype=np.float64), np.asarray(outcomes, dtype=np.float64)
-    if p.shape != y.shape or p.ndim != 1 or not len(p) or not ((p >= 0) & (p <= 1)).all():
-        raise BadInput(
-            f"probabilities must be between 0 and 1, and each needs one outcome; got shapes {p.shape} and {y.shape}"
-        )
     which = np.minimum((p * BINS).astype(int), BINS - 1)
     used, place, counts = np.unique(which, return_inverse=True, return_counts=True)
     mean_probability, frequency = (np.bincount(place, weights=values) / counts for values in (p, y))

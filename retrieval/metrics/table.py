@@ -25,7 +25,6 @@ class ScoreTable:
         column_words: The same for the columns.
 
     Raises:
-        BadInput: Shapes do not fit, or an own photo shows another object.
         NumericalError: A score is not finite: in descending order a NaN would come first.
     """
 
@@ -38,20 +37,12 @@ class ScoreTable:
     column_words: str = "photos"
 
     def __post_init__(self) -> None:
-        shape = (len(self.touch_owner), len(self.photo_owner))
-        if self.scores.shape != shape or self.own.shape != shape or self.own.dtype != bool or 0 in shape:
-            raise BadInput(
-                f"scores and own (bool) must have a row for each of the {shape[0]} touches and a column for each of "
-                f"the {shape[1]} photos, at least one each; got {self.scores.shape} and {self.own.shape}"
-            )
         bad = np.argwhere(~np.isfinite(self.scores))
         if len(bad):
             row, column = bad[0]
             raise NumericalError(
                 f"every score must be finite; row {row}, column {column} is {self.scores[row, column]}"
             )
-        if (self.own & ~self.relevant).any():
-            raise BadInput("a photo of a row's own grasp must show the row's object, but one does not: check the ids")
 
     @cached_property
     def relevant(self) -> NDArray[np.bool_]:

@@ -177,6 +177,6 @@ def objects_needed(far: float, groups: int = 1) -> int:
 
 def error_rate(value: float, trials: int) -> ErrorRate:
     """Return a rate with its interval for this number of independent trials (Clopper and Pearson 1934)."""
-    from retrieval.metrics.intervals import clopper_pearson  # imports scipy, which queries do not need
+    from retrieval.metrics.intervals import binomial_interval  # imports scipy, which queries do not need
 
-    return ErrorRate(value, *clopper_pearson(value * trials, trials, 0.95))
+    return ErrorRate(value, *binomial_interval(value * trials, trials))

@@ -191,7 +191,7 @@ def confusions(view: ProtocolView, name: str, details: Details) -> Iterator[Bloc
         yield Table(("object", "mistaken for", "of its touches, %"), rows, (note,), words=frozenset({1}))
 
 
-def rejects(view: ProtocolView, found: Mapping[str, Rejection]) -> Table | None:
+def rejects(view: ProtocolView, found: Mapping[str, Rejection[Summary]]) -> Table | None:
     """Return the measures of the decision whether the catalogue contains the object."""
     rows = [
         (view.label(name), *map(with_interval, (one.auroc, one.false_accepts_at_95, one.balanced_accuracy)))

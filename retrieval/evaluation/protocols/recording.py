@@ -17,15 +17,11 @@ _RULE = (
 )
 
 
-def _drawn(facts: RecordingFacts, seed: int) -> list[Split]:
-    return [make_split(facts.grasps, validation=0.15, test=0.15, seed=seed)]
-
-
 UNSEEN_OBJECTS = Protocol(
     None,
     "Unseen objects",
     f"{_RULE}The split is drawn.",
-    _drawn,
+    lambda facts, seed: [make_split(facts.grasps, validation=0.15, test=0.15, seed=seed)],
     METRICS,
     controls=dict.fromkeys(("permuted", "no_contact", "low_pass"), "late_fusion"),
     ceilings=dict.fromkeys(("touch_to_touch", "photo_to_photo"), "cca"),

@@ -85,14 +85,6 @@ def test_two_fits_with_one_seed_give_the_same_scores_bit_for_bit(name):
     assert again.best_params == fitted(name).best_params
 
 
-def test_equal_scores_are_exactly_at_chance_and_random_scores_are_close_to_it():
-    assert ranking_auc(np.zeros((len(TEST), len(TEST)), np.float32), TEST.owner) == 0.5
-    values = [
-        ranking_auc(fitted("chance", seed).score(*encodings(fitted("chance", seed))), TEST.owner) for seed in range(12)
-    ]
-    assert np.mean(values) == pytest.approx(0.5, abs=4 * np.std(values) / np.sqrt(len(values)))
-
-
 # Reranking depends on the whole gallery.
 @pytest.mark.parametrize("name", [name for name in METHODS if name != "retrieve_rerank"])
 def test_a_score_depends_on_its_touch_and_photo_only(name):

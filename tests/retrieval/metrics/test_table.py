@@ -25,13 +25,6 @@ def test_a_score_that_is_not_finite_is_refused_although_sorting_would_rank_a_nan
         table_of(scores, [0, 0, 1])
 
 
-def test_an_empty_table_and_an_own_photo_of_another_object_are_refused():
-    with pytest.raises(BadInput, match="at least one each"):
-        table_of(np.zeros((0, 3)), [], [0, 0, 1])
-    with pytest.raises(BadInput, match="check the ids"):
-        table_of(np.zeros((2, 2)), [0, 1], own=[[0, 1], [0, 0]])
-
-
 def test_a_measure_needs_a_finite_value_for_each_query():
     with pytest.raises(BadInput, match=r"values of shape \(2, 1\)"):
         Measure(np.zeros((3, 1)), np.array([0, 1]), np.array([0.5]), "")
