@@ -16,11 +16,6 @@ from robot.errors import DeviceError
 from tests.waiting import first_line, run_process, wait_until
 
 
-def readers():
-    """Return the running threads of links; those of websockets itself may end later."""
-    return [thread for thread in threading.enumerate() if thread.name.startswith("rosbridge ")]
-
-
 @contextlib.contextmanager
 def scripted(answer):
     """Run a websocket server; `answer(operation)` returns the replies, or None to break the connection."""
@@ -60,7 +55,7 @@ def reply_to(operation, **changes):
     return {"op": "service_response", "id": operation["id"], "values": {"x": 1}, "result": True} | changes
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, object(), {1, 2}])
+@pytest.mark.parametrize("value", [math.nan, object()])
 def test_values_that_json_cannot_express_are_not_sent(value):
     with pytest.raises(DeviceError, match="plain finite values"):
         encode({"op": "publish", "msg": value})
@@ -165,18 +160,17 @@ def test_a_connection_that_breaks_ends_every_wait_at_once():
 
 
 def test_a_link_can_be_closed_twice_and_unopened_and_leaves_no_thread():
-    link = RosbridgeLink("ws://127.0.0.1:1")
-    link.close()
-    with pytest.raises(DeviceError, match="is closed"):
-        link.check()
+    RosbridgeLink("ws://127.0.0.1:1").close()
     with scripted(lambda _: []) as (url, _):
-        for _ in range(3):  # several in one process
+        for _ in range(2):  # several in one process
             link = RosbridgeLink(url)
             link.open()
             link.check()
             link.close()
             link.close()
-            assert not readers()
+            assert not [thread for thread in threading.enumerate() if thread.name.startswith("rosbridge ")]
+            with pytest.raises(DeviceError, match="is closed"):
+                link.check()
 
 
 def test_nothing_published_on_a_lost_connection_is_sent_later():

@@ -65,12 +65,13 @@ def test_an_object_off_the_middle_is_pushed_until_both_fingers_hold_it():
 # Stiffness -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("stiffness_n_m", [1e3, 1e4, 1e5, 1e6, 1e7, 1e8, 1e9])
+@pytest.mark.parametrize("stiffness_n_m", [1e3, 1e5, 1e7, 1e9])
 def test_every_stiffness_ends_at_the_commanded_force_in_steps_of_ten_milliseconds(stiffness_n_m):
     motion = on_springs(stiffness_n_m * 1e-3, clearance=(2.0, 1.0))
     _, states = close(motion, 1.0, 1e-2)
     assert np.isfinite(states).all()
     assert motion.contact_forces(states[-1]) == pytest.approx((20.0, 20.0), rel=1e-4)
+    assert settle(motion) == pytest.approx((20e3 / stiffness_n_m,) * 2, rel=1e-12)
 
 
 def test_a_fast_oscillation_dies_out_within_long_steps():
@@ -82,11 +83,6 @@ def test_a_fast_oscillation_dies_out_within_long_steps():
 
 
 # Rest ------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("stiffness_n_mm", [1e-1, 1.0, 1e3, 1e6])
-def test_at_rest_each_finger_carries_the_force(stiffness_n_mm):
-    assert settle(on_springs(stiffness_n_mm)) == pytest.approx((20.0 / stiffness_n_mm,) * 2, rel=1e-12)
 
 
 # Force laws ------------------------------------------------------------------------------------------------

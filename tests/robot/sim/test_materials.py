@@ -30,12 +30,12 @@ def test_albedo_is_between_0_and_1_and_the_same_again():
 
 
 def test_colours_are_spread_evenly_over_hue_and_lightness():
-    colours = np.array([draw_appearance(np.random.default_rng(seed)).colour for seed in range(1500)])
+    colours = np.array([draw_appearance(np.random.default_rng(seed)).colour for seed in range(600)])
     lightness = (colours.max(axis=1) + colours.min(axis=1)) / 2
     counts = np.histogram(lightness, 7, (0.15, 0.85))[0]
-    assert counts.min() > 0.7 * 1500 / 7
+    assert counts.min() > 0.6 * 600 / 7
     strongest = np.bincount(colours.argmax(axis=1), minlength=3)
-    assert strongest.min() > 0.28 * 1500
+    assert strongest.min() > 0.27 * 600
 
 
 def test_a_label_is_a_rectangle_on_one_side_with_lines_of_print():

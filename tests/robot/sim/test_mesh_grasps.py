@@ -17,6 +17,7 @@ from robot.readings import Pose
 from robot.recording.folder import read_recording
 from robot.rig import load_rig
 from robot.sim.antipodal import find_grasps
+from robot.sim.objects import resting
 from robot.sim.objects.mesh import Mesh, mesh_object, read_mesh
 from robot.sim.objects.resting import UP, stable_up_directions
 from tests.meshes import BOTTLE, box, revolved, sphere, stl
@@ -32,6 +33,10 @@ def grasps_of(tmp_path, vertices, faces, up=UP):
     path = stl(tmp_path / "thing.stl", vertices, faces)
     obj = mesh_object(path, read_mesh(path), 0, up=up, relief="smooth")
     return obj.body.mesh, find_grasps(obj.body, SETTINGS, STROKE_MM)
+
+
+def mesh_rig(folder, seed=0, **settings):
+    return load_rig("sim", seed=seed, meshes=str(folder), contact_grid=[30, 40], **settings)
 
 
 def surface(mesh, per_mm2=0.3):
@@ -117,7 +122,7 @@ def test_a_bottle_is_grasped_at_its_body_and_its_neck_from_all_around(tmp_path):
 
 def test_a_box_that_is_too_wide_on_two_axes_is_grasped_when_it_rests_on_edge(tmp_path):
     assert not len(grasps_of(tmp_path, *box(150, 160, 60))[1])
-    rig = load_rig("sim", seed=0, meshes=str(tmp_path))
+    rig = mesh_rig(tmp_path)
     with rig:
         name = rig.object_ids(1)[0]
         rig.prepare(name, 0)
@@ -130,7 +135,7 @@ def test_a_box_that_is_too_wide_on_two_axes_is_grasped_when_it_rests_on_edge(tmp
 
 def test_an_object_that_no_allowed_force_lifts_is_reported_as_too_heavy(tmp_path):
     stl(tmp_path / "brick.stl", *box(60, 90, 180))
-    with load_rig("sim", seed=0, meshes=str(tmp_path)) as rig:
+    with mesh_rig(tmp_path) as rig:
         rig.prepare(rig.object_ids(1)[0], 0)
         scene = rig.sim_state.scene
         lead = dataclasses.replace(scene.obj.material, name="lead", density_kg_m3=11340.0, friction=0.3)
@@ -148,7 +153,7 @@ def test_an_object_that_no_allowed_force_lifts_is_reported_as_too_heavy(tmp_path
 def attempts(tmp_path_factory):
     folder = tmp_path_factory.mktemp("meshes")
     stl(folder / "box.stl", *box(60, 90, 180))
-    with load_rig("sim", seed=2, meshes=str(folder)) as rig:
+    with mesh_rig(folder, seed=2) as rig:
         runner, name, moves = AttemptRunner(rig, 2, rig.attempt), rig.object_ids(1)[0], []
         move = rig.arm._move_to
         rig.arm._move_to = lambda pose, speed: moves.append(pose) or move(pose, speed)
@@ -186,7 +191,7 @@ def test_a_tilted_hand_descends_next_to_the_object_moves_level_and_lifts_straigh
 def test_touch_agrees_with_the_photo(tmp_path):
     """A box of 60 mm by 90 mm: the opening is the width across which the jaws close."""
     stl(tmp_path / "box.stl", *box(60, 90, 120))
-    with load_rig("sim", seed=0, meshes=str(tmp_path), localisation_mm=[0.0, 0.0]) as rig:
+    with mesh_rig(tmp_path, localisation_mm=[0.0, 0.0]) as rig:
         name = rig.object_ids(1)[0]
         for number in range(4):
             attempt = AttemptRunner(rig, 0, rig.attempt).run(name, number)
@@ -202,7 +207,7 @@ def test_a_mallet_is_grasped_from_the_end_of_its_handle_and_not_through_its_head
     (handle, faces), (head, _) = box(20, 160, 80), box(120, 40, 80)
     vertices = np.concatenate([handle, head + np.array([0, 100, 0])])
     stl(tmp_path / "mallet.stl", vertices, np.concatenate([faces, faces + 8]))
-    with load_rig("sim", seed=0, meshes=str(tmp_path)) as rig:
+    with mesh_rig(tmp_path) as rig:
         name, approach_directions = rig.object_ids(1)[0], []
         for number in range(40):
             rig.prepare(name, number)
@@ -220,14 +225,15 @@ def three(folder):
     stl(folder / "a_box.stl", *box(40, 50, 70))
     stl(folder / "b_globe.stl", 80 * vertices, faces)
     stl(folder / "c_bar.stl", *box(30, 60, 50))
-    return functools.partial(load_rig, "sim", seed=1, meshes=str(folder))
+    return functools.partial(mesh_rig, folder, seed=1)
 
 
 def files(folder):
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_a_collection_skips_and_names_ungraspable_objects_and_continues(tmp_path):
+def test_a_collection_skips_and_names_ungraspable_objects_and_continues(tmp_path, monkeypatch):
+    monkeypatch.setattr(resting, "_MAX_POSES", 1)
     make_rig, settings = three(tmp_path / "meshes"), CollectSettings(grasps=2)
     tallies = collect(make_rig, tmp_path / "r", objects=3, seed=1, settings=settings)
     assert [each.accepted for each in tallies] == [2, 0, 2]

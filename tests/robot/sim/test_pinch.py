@@ -86,15 +86,6 @@ def test_a_foam_is_not_squeezed_to_nothing():
     assert pinch(thing(Slanted(), modulus_mpa=0.01), force_n=25.0).final_opening_mm >= 0.2 * 20
 
 
-def test_a_stiffer_object_touches_less_of_the_gel():
-    ball = draw_object(0, 0, family="egg", relief="smooth")
-    areas = []
-    for modulus in (0.1, 1.0, 1e5):
-        made = dataclasses.replace(ball, material=dataclasses.replace(ball.material, modulus_mpa=modulus, poisson=0.3))
-        areas.append(pinch(made, z_mm=0.5 * ball.body.upper[2], force_n=5.0).contact("a").area_mm2)
-    assert areas[0] > areas[1] > areas[2]
-
-
 @pytest.mark.parametrize(("factor", "held"), [(1.05, True), (0.95, False)])
 def test_friction_must_carry_the_weight_and_a_half(factor, held):
     friction, mass_kg = 0.5, 0.1
@@ -117,13 +108,10 @@ def test_contacts_that_are_far_apart_along_the_fingers_slip():
     assert made.slip_reason in ("the fingers press past each other", "the side is too steep")
 
 
-def test_an_object_next_to_the_fingers_is_missed():
+def test_an_object_next_to_the_fingers_or_under_one_is_missed():
     made = pinch(thing(Slanted(half_y_mm=5.0)), y_mm=30.0)
     assert made.miss_reason == "the object is not between the fingers"
     assert made.scene.passes["contact"] == 0
-
-
-def test_a_finger_lands_on_an_object_that_is_off_the_middle():
     made = pinch(thing(Slanted()), placement=Placement(x_mm=50.0))
     assert made.miss_reason == "a finger comes down on the object"
 
