@@ -40,10 +40,16 @@ def test_a_formula_gives_the_result_of_its_function(size):
     assert {OPERATIONS[name] for name in formula.code[:, 0]} == set(OPERATIONS)
 
 
-def test_exactly_rounded_operations_are_bitwise_equal():
+def test_exactly_rounded_operations_are_bitwise_equal_for_any_number():
+    def compared(a, b):
+        return np.maximum(np.minimum(a, 2), -2) + np.where(a > b, np.abs(a), b)
+
     operands = numbers(2, 1000)
-    for function in (lambda a, b: rounded_corner(a, b, 1.5), arctan2):
+    extreme = np.array([np.inf, -np.inf, 3.4e38, -3.4e38, 0.0, -0.0, 1e-45, 2.0, -2.0], np.float32)
+    for function in (lambda a, b: rounded_corner(a, b, 1.5), arctan2, compared):
         np.testing.assert_array_equal(evaluate_formula(trace_formula(function, 2), *operands)[0], function(*operands))
+    pairs = [each.ravel() for each in np.meshgrid(extreme, np.array([0.0, 3.0, -1e-45], np.float32))]
+    np.testing.assert_array_equal(evaluate_formula(trace_formula(compared, 2), *pairs)[0], compared(*pairs))
 
 
 # Against plain numpy -----------------------------------------------------------------------------------------
