@@ -1,7 +1,5 @@
 """Late interaction: cells of a tower's map, their vectors, and scores of every touch with every photo."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
@@ -78,21 +76,6 @@ def test_logits_of_every_pair_equal_those_of_single_pairs_and_those_in_numpy(mat
         torch.testing.assert_close(table[row], matcher.head(touch[row][None], photo), rtol=1e-5, atol=1e-5)
         numpy = matcher.head.scorer.logits(touch[row][None].numpy(), photo.numpy())
         np.testing.assert_allclose(numpy, table[row], rtol=1e-5, atol=1e-5)
-
-
-def test_partial_activations_without_cells_give_the_logit_without_late_interaction(matcher, images):
-    plain = Matcher(dataclasses.replace(CELLS, cell_dim=0), views=2).eval()
-    plain.load_state_dict({k: v for k, v in matcher.state_dict().items() if k in plain.state_dict()})
-    width = CELLS.pooled_width
-    with torch.inference_mode():
-        touch, photo = matcher.touch_features(images[0]), matcher.photo_features(images[1])
-        partials = matcher.touch_encoding(touch).partial, matcher.photo_encoding(photo).partial
-        found = matcher.head.all_logits(*(part[:, :width] for part in partials))
-        expected = plain.head.all_logits(
-            plain.touch_encoding(plain.touch_features(images[0])).partial,
-            plain.photo_encoding(plain.photo_features(images[1])).partial,
-        )
-    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
 
 
 def test_the_pooled_listwise_loss_is_that_of_the_matcher_without_cells_and_trains_no_cell(matcher, images):
