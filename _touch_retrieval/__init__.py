@@ -1,1 +1,1 @@
-"""Private helpers shared by `indexes`, `robot` and `retrieval`. Standard library only."""
+"""Private helpers shared by `indexes`, `robot` and `retrieval`. They need the standard library and msgspec."""

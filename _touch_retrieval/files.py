@@ -7,18 +7,17 @@ Only regular files are opened for reading: a pipe cannot block the reader, and n
 
 import errno
 import hashlib
-import json
-import math
 import os
 import secrets
 import shutil
 import stat
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
 from typing import Any, BinaryIO
+
+import msgspec
 
 
 @contextmanager
@@ -122,19 +121,14 @@ def read_json(path: str | Path, max_bytes: int = MAX_JSON_BYTES) -> Any:
     return parse_json(read_regular(path, max_bytes))
 
 
-def parse_json(text: str | bytes, *, finite: bool = False) -> Any:
-    """Return the document in a JSON text.
-
-    Args:
-        text: The JSON.
-        finite: Reject numbers that are not finite, which Python accepts: NaN, Infinity and 1e999.
+def parse_json(text: str | bytes) -> Any:
+    """Return the document in a JSON text in UTF-8.
 
     Raises:
-        ValueError: The text is not JSON, has a key twice, or is nested deeper than `MAX_DEPTH`.
+        ValueError: The text is not JSON, has a number that is not finite, or is nested deeper than `MAX_DEPTH`.
     """
-    number = _finite if finite else None
     try:
-        document = json.loads(text, object_pairs_hook=_object, parse_constant=number, parse_float=number)
+        document = msgspec.json.decode(text)
         _require_depth(document, MAX_DEPTH)
     except RecursionError as error:
         raise ValueError(f"it is nested deeper than {MAX_DEPTH} levels") from error
@@ -147,18 +141,3 @@ def _require_depth(document: Any, depth: int) -> None:
             raise RecursionError
         for inner in document.values() if isinstance(document, dict) else document:
             _require_depth(inner, depth - 1)
-
-
-def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    document = dict(pairs)
-    if len(document) < len(pairs):
-        (name, _), *_ = (Counter(name for name, _ in pairs)).most_common(1)
-        raise ValueError(f"it has the key {name!r} twice")
-    return document
-
-
-def _finite(text: str) -> float:
-    number = float(text)
-    if not math.isfinite(number):
-        raise ValueError(f"{text} is not a finite number")
-    return number

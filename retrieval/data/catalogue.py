@@ -237,17 +237,12 @@ def _no_photo_error(
     return DatasetError(f"no photo ({kinds}) in the catalogue {where}{others}{left_out}: {_LAYOUT}")
 
 
-_MetadataTable = dict[str, dict[str, Any]]
-
-
-def _read_metadata(file: Path, naming: Naming) -> tuple[_MetadataTable, _MetadataTable]:
+def _read_metadata(file: Path, naming: Naming) -> tuple[dict[str, dict[str, Any]], dict[str, dict[str, Any]]]:
     """Return the user's keys by object_id, and by photo path. Raises DatasetError with the number of a bad line."""
-    by_object: _MetadataTable = {}
-    by_photo: _MetadataTable = {}
+    by_object: dict[str, dict[str, Any]] = {}
+    by_photo: dict[str, dict[str, Any]] = {}
     try:
-        lines = read_regular(file).split(b"\n")
-    except FileNotFoundError:
-        return by_object, by_photo
+        lines = read_regular(file).split(b"\n") if os.path.lexists(file) else []
     except OSError as error:
         raise DatasetError(f"{file} cannot be read: {error.strerror}") from error
     for number, line in enumerate(lines, start=1):
@@ -266,11 +261,9 @@ def _read_metadata(file: Path, naming: Naming) -> tuple[_MetadataTable, _Metadat
 
 def _parse_line(line: bytes, naming: Naming) -> tuple[str, bool, dict[str, Any]]:
     """Return (photo path or object_id, whether it is a photo, the other keys)."""
-    row = parse_json(line.decode(), finite=True)
+    row = parse_json(line)
     if not isinstance(row, dict):
         raise ValueError("must be one JSON object in braces")
-    if b"\\u" in line and not is_utf8(row):
-        raise ValueError("contains a lone surrogate such as \\ud83d; write the whole character")
     keys = [key for key in ("file_name", "object_id") if key in row]
     if not keys:
         raise ValueError("must name a photo (file_name) or an object (object_id)")

@@ -20,11 +20,9 @@ from retrieval.data.picture_structure import check_structure
 from retrieval.data.resize import RgbImage, Samples, to_float
 from retrieval.errors import ImageError
 
-HEIC_EXTENSIONS = frozenset({".heic", ".heif", ".hif"})
-AVIF_EXTENSIONS = frozenset({".avif"})
 _AVIF_BRANDS = frozenset({b"avif", b"avis"})
 _HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
-EXTENSIONS = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}) | AVIF_EXTENSIONS | HEIC_EXTENSIONS
+EXTENSIONS = frozenset({".avif", ".bmp", ".heic", ".heif", ".hif", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
 MAX_PIXELS = 20_000_000
 """Maximum pixels of a decoded picture: 240 MB in float32. Larger JPEG files are decoded at 1/2, 1/4 or 1/8 size."""
 MAX_DRAFT_PIXELS = 160_000_000

@@ -69,7 +69,7 @@ class Naming:
         if self.text == FOLDER:
             return name.parts[0] if len(name.parts) > 1 else name.stem
         if self.text == STEM:
-            return without_number(name.stem) or None
+            return _NUMBER.sub("", name.stem) or None
         found = self._pattern.fullmatch(path.removesuffix(name.suffix)) or self._pattern.fullmatch(path)
         return found[OBJECT] if found else None
 
@@ -87,11 +87,6 @@ class Naming:
         return re.compile("".join(parts))
 
 
-def without_number(name: str) -> str:
-    """Return the name without a number at its end, and without the separator: "mug" of "mug_12"."""
-    return _NUMBER.sub("", name)
-
-
 def naming_warnings(photos: Mapping[str, int], naming: Naming) -> list[str]:
     """Return a warning sentence for each suspicious property of the object names, given their numbers of photos."""
     names, warnings = sorted(photos), []
@@ -101,7 +96,7 @@ def naming_warnings(photos: Mapping[str, int], naming: Naming) -> list[str]:
             f"object, with {sum(photos[name] for name in generic)} photo(s): if the objects' folders are below it, use "
             f"--objects-from '{{split}}/{{object}}/{{photo}}'"
         )
-    stem_of = {name: without_number(name) for name in names}
+    stem_of = {name: _NUMBER.sub("", name) for name in names}
     stems = Counter(stem_of.values())
     similar = [name for name, stem in stem_of.items() if stem and stems[stem] > 1]
     if naming.text != STEM and similar:

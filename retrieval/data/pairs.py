@@ -34,9 +34,6 @@ class PairBatch:
     photo_objects: NDArray[np.int64]
 
 
-_PhotoDraw = tuple[int, Path, float]
-
-
 class PairSampler:
     """Sampler of the paper's pairs: each touch with `positives` photos of its object and `negatives` of other objects.
 
@@ -111,7 +108,9 @@ class PairSampler:
             photo_objects=np.array([owners[photo] for photo in photos], dtype=np.int64),
         )
 
-    def _draw_photos(self, objects: list[int], rng: np.random.Generator, share: bool) -> Iterator[list[_PhotoDraw]]:
+    def _draw_photos(
+        self, objects: list[int], rng: np.random.Generator, share: bool
+    ) -> Iterator[list[tuple[int, Path, float]]]:
         """Yield the photos to pair with the touch of each object: (object, photo, label).
 
         With `share`, negatives are the batch's photos of its other objects; without other objects, of all objects.

@@ -319,13 +319,6 @@ def test_an_oversized_json_file_raises_fast_without_reading(folder, name):
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # kB
 
 
-def test_a_manifest_with_a_repeated_key_is_corrupt(folder):
-    path = folder / "manifest.json"
-    path.write_text(path.read_text().replace('"documents": [', '"documents": [], "documents": [', 1))
-    with pytest.raises(CorruptIndex, match="it has the key 'documents' twice"):
-        opened(folder)
-
-
 @pytest.mark.parametrize(
     ("expect", "words"),
     [

@@ -1,7 +1,7 @@
 """Pictures of a recording that look exchanged, mirrored, or as if their red and blue were exchanged.
 
-The reference is the recording itself: a minority is suspect. Notes report what cannot be found: exchanges of two
-fingers with similar gels, and of no-contact frames with touches if most touches have little contact.
+The reference is the recording itself: a minority is suspect. A note reports two fingers whose gels are too
+similar to find exchanges.
 """
 
 from collections.abc import Iterator, Sequence
@@ -133,13 +133,6 @@ def check_moments(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Fi
         no_contact, touched = (distance(frames, np.median(before, axis=0)) for frames in (before, during))
         far = _NOISE_TIMES * max(float(np.quantile(no_contact, 0.25)), _MIN_NOISE)
         suspects |= {both[row].grasp_id for row in np.flatnonzero((no_contact > far) & (touched < no_contact / 2))}
-        low_contact = int(((no_contact <= far) & (touched <= far)).sum())
-        if 2 * low_contact > len(both):
-            text = (
-                f"{low_contact} of {len(both)} touches of finger {ascii_lowercase[finger]} hardly differ from "
-                "the no-contact frame: swaps of the two cannot be found"
-            )
-            yield Finding("note", "unchecked-moments", text)
     names = [grasp.grasp_id for grasp in both if grasp.grasp_id in suspects]
     yield from findings_for("error", "swapped-moments", "touch and no-contact frame look swapped", names, both)
 
