@@ -23,7 +23,6 @@ moves nothing. The limits of the rig's file hold as for every arm and gripper. A
 
 import math
 import time
-from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, ClassVar
 
@@ -51,6 +50,8 @@ class OwnDevice(Actuator):
     """
 
     _methods: ClassVar[tuple[str, ...]]
+    _reading: ClassVar[tuple[str, type]]
+    """The program's method that reports its pose or state, and what it returns."""
     _program: Any = None
 
     def __init__(self, *, robot: str, settings: Mapping[str, Any], **others: Any) -> None:
@@ -64,7 +65,7 @@ class OwnDevice(Actuator):
             raise DeviceError(
                 f"{self.name} must have the methods {', '.join(self._methods)}; it lacks {', '.join(lacking)}"
             )
-        self._report()
+        self._read()
 
     def _close(self) -> None:
         try:
@@ -91,15 +92,18 @@ class OwnDevice(Actuator):
         if callable(getattr(self._program, method, None)):
             self._call(method)
 
-    @abstractmethod
-    def _report(self) -> object:
-        """Ask for the pose or the state."""
+    def _read(self) -> Any:
+        """Ask for the pose or the state; raise DeviceError if it is not one."""
+        method, kind = self._reading
+        return typed(self._call(method), kind, f"{method} of {self.name}", error=DeviceError)
 
 
 class OwnArm(OwnDevice, Arm):
     """An arm that a user's program moves; `robot` and `settings` are those of OwnDevice."""
 
     _methods = ("move_to", "pose", "stop")
+    _reading = "pose", Pose
+    _pose = OwnDevice._read
 
     def __init__(
         self,
@@ -118,7 +122,7 @@ class OwnArm(OwnDevice, Arm):
         """Move, then compare the reported pose with the requested one."""
         values = {"x_mm": pose.x_mm, "y_mm": pose.y_mm, "z_mm": pose.z_mm, "yaw_rad": pose.yaw_rad}
         self._call("move_to", **values, speed_mm_s=speed_mm_s)
-        reached = self._pose()
+        reached = self.pose()
         off_mm = math.dist(reached.as_tuple()[:3], pose.as_tuple()[:3])
         off_deg = math.degrees(abs(math.remainder(reached.yaw_rad - pose.yaw_rad, math.tau)))
         if off_mm > ARRIVED_MM or off_deg > ARRIVED_DEG:
@@ -129,12 +133,6 @@ class OwnArm(OwnDevice, Arm):
             )
         return reached
 
-    def _pose(self) -> Pose:
-        return typed(self._call("pose"), Pose, f"pose of {self.name}", error=DeviceError)
-
-    def _report(self) -> object:
-        return self._pose()
-
 
 class OwnGripper(OwnDevice, Gripper):
     """A gripper that a user's program moves, at the largest allowed speed when it opens.
@@ -143,6 +141,8 @@ class OwnGripper(OwnDevice, Gripper):
     """
 
     _methods = ("open", "grasp", "state", "stop")
+    _reading = "state", GripperState
+    _state = OwnDevice._read
 
     def __init__(
         self,
@@ -168,16 +168,10 @@ class OwnGripper(OwnDevice, Gripper):
             max_speed_mm_s=max_speed_mm_s,
         )
 
-    def _state(self) -> GripperState:
-        return typed(self._call("state"), GripperState, f"state of {self.name}", error=DeviceError)
-
     def _open(self, opening_mm: float) -> GripperState:
         self._call("open", opening_mm=opening_mm, speed_mm_s=self.max_speed_mm_s)
-        return self._state()
+        return self.state()
 
     def _grasp(self, force_n: float, speed_mm_s: float) -> GripperState:
         self._call("grasp", force_n=force_n, speed_mm_s=speed_mm_s)
-        return self._state()
-
-    def _report(self) -> object:
-        return self._state()
+        return self.state()

@@ -141,16 +141,11 @@ class RealSense(Camera):
                 frames = self._align.process(frames)
             colour = _copy_pixels(frames.get_color_frame(), "colour")
             raw = _copy_pixels(frames.get_depth_frame(), "depth") if depth else None
-        depth_m = None if raw is None else self._to_metres(raw)
-        if self._undistortion is not None:
-            colour = np.asarray(cv2.remap(colour, self._undistortion, None, cv2.INTER_LINEAR), np.uint8)
+        if (lens_map := self._undistortion) is not None:
+            colour = np.asarray(cv2.remap(colour, lens_map, None, cv2.INTER_LINEAR), np.uint8)
+            raw = None if raw is None else cv2.remap(raw, lens_map, None, cv2.INTER_NEAREST, borderValue=0)
+        depth_m = None if raw is None else np.where(raw > 0, raw * np.float32(self._scale_m), np.float32(np.nan))
         return RGBD(colour, depth_m, self._intrinsics, time_s)
-
-    def _to_metres(self, raw: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
-        """Return depth in metres, NaN where unknown."""
-        if self._undistortion is not None:
-            raw = cv2.remap(raw, self._undistortion, None, cv2.INTER_NEAREST, borderValue=0)
-        return np.where(raw > 0, raw * np.float32(self._scale_m), np.float32(np.nan)).astype(np.float32)
 
 
 def _undistortion(rs: Any, lens: Any) -> npt.NDArray[np.float32]:

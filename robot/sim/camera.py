@@ -111,8 +111,6 @@ class PinholeCamera:
     def pixels_around(self, corners: Array) -> Pixels:
         """Return the sorted pixels of the upright rectangle around a convex body with these corners (N, 3)."""
         x, y, forward = ((corners - self.position_mm) @ self.to_rig[:3, :3]).T
-        if forward.min() <= 0:  # part of it is behind the camera
-            return np.arange(self.px * self.px)
         spans = []
         for along in (y, x):
             place = along / forward * self.focal_px + self.px / 2

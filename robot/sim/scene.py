@@ -87,11 +87,7 @@ class Scene:
     """One object on the table and the grip on it.
 
     Attributes:
-        obj: the object.
-        placement: its pose on the table.
-        camera: the camera over the table.
         sensors: the gel of each finger, by letter; a finger without a gel is rigid.
-        hand: the gripper.
         grip: pose and force of the jaws; None before a grasp.
         seed: seed of light, noise and the error of the object's turn.
         outputs: names of the outputs that `run` computes.

@@ -64,13 +64,8 @@ class UsbCameraSettings(TypedSettings):
     Attributes:
         device: Path in /dev/v4l/by-id, or in by-path (the socket).
         allow_index: Whether `device` may be a number or a path such as /dev/video0.
-        width: Width in pixels.
-        height: Height in pixels.
-        fps: Frames/s.
         fourcc: Pixel format, such as "MJPG".
-        auto_exposure: Whether the exposure is automatic.
         exposure_ms: Exposure, if not automatic.
-        auto_white_balance: Whether the white balance is automatic.
         white_balance_k: Colour temperature, if not automatic.
         gain: Gain in the camera's own unit.
         led: Red, green and blue of a DIGIT, each 0 to 15.

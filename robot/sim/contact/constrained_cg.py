@@ -47,13 +47,9 @@ class Solution:
 
 @dataclass(frozen=True)
 class ContactProblem:
-    """Contact of a height map with an elastic surface.
+    """Contact of a height map with an elastic surface: a `load`, the sum of the pressures, or None and a `depth`.
 
-    Attributes:
-        operator: displacement of a pressure.
-        gap: (rows, cols) distance of the undeformed object, +inf where there is no object.
-        load: sum of the pressures; None for depth control.
-        depth: approach of the object for depth control.
+    `gap` (rows, cols) is the distance of the undeformed object, +inf where there is no object.
     """
 
     operator: Operator

@@ -92,7 +92,6 @@ class LedOptics:
     """Bars of near-field LEDs.
 
     Attributes:
-        bars: the bars, at least one.
         backdrops: the unpressed gel, one for each channel.
         mix: contribution of each bar (columns) to each channel (rows); each row adds up to 1.
         ambient: fraction of the light that comes from all directions (reflected inside the gel).

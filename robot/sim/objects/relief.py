@@ -21,7 +21,6 @@ class Relief:
     """One instance of a relief family.
 
     Attributes:
-        name: the family.
         amplitude_mm: greatest height or depth.
         pitch_mm: distance between elements.
         angle_rad: direction across which a directed pattern repeats (0: around the object).
