@@ -14,6 +14,7 @@ import itertools
 import json
 import math
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from retrieval.console.progress import Bar
 from robot.recording.folder import read_info
 from robot.rig import load_rig
 from robot.sim.rig import SimRig
-from robot.storage import LineFile, file_content, sync_threads, write_files
+from robot.storage import SYNC_THREADS, LineFile, file_content, write_files
 from robot.workers import Work, WorkerPool
 
 FAMILIES = ("relief", "shape")
@@ -106,7 +107,7 @@ def collect_pictures(
         missing = iter([name for name in names if name not in done])
         bar = stack.enter_context(Bar(f"collect {kind}", len(names), "objects", done=len(done)))
         workers = stack.enter_context(WorkerPool(jobs, make(), make))
-        threads = stack.enter_context(sync_threads())
+        threads = stack.enter_context(ThreadPoolExecutor(SYNC_THREADS))
         waiting = [(name, workers.submit(name, 0)) for name in itertools.islice(missing, workers.window)]
         while waiting:
             name, result = waiting.pop(0)

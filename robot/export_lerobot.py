@@ -83,9 +83,12 @@ def export_lerobot(recording: Recording, out: Path, progress: Progress | None = 
     columns = {moment: [f"touch_{each}{suffix}" for each in fingers] for moment, suffix in MOMENT_SUFFIXES.items()}
     recorded = {moment: [set(some) <= grasp.images().keys() for grasp in grasps] for moment, some in columns.items()}
     moments = [moment for moment, each in recorded.items() if all(each)]
-    cameras = [_Camera("photo", ["photo"] * len(moments))]
-    touches = zip(*(columns[moment] for moment in moments), strict=True)
-    cameras += [_Camera(f"touch_{finger}", list(each)) for finger, each in zip(fingers, touches, strict=True)]
+    suffixes = [MOMENT_SUFFIXES[moment] for moment in moments]
+    per_camera = {"photo": ["photo"] * len(moments)}
+    per_camera |= {f"touch_{each}": [f"touch_{each}{suffix}" for suffix in suffixes] for each in fingers}
+    first = grasps[0].images()
+    sizes = {name: _read_picture(recording.folder / first[each[0]]).shape[:2] for name, each in per_camera.items()}
+    cameras = [_Camera(name, each, sizes[name]) for name, each in per_camera.items()]
     numbers = [list(MOMENT_SUFFIXES).index(moment) for moment in moments]
     tasks = {name: number for number, name in enumerate(dict.fromkeys(grasp.object_id for grasp in grasps))}
     steps: list[dict[str, Any]] = []
@@ -93,18 +96,14 @@ def export_lerobot(recording: Recording, out: Path, progress: Progress | None = 
     with _new_folder(out) as folder:
         with contextlib.ExitStack() as videos:
             for camera in cameras:
-                camera.size = _read_picture(recording.folder / grasps[0].images()[camera.columns[0]]).shape[:2]
-                path = folder / VIDEO_PATH.format(video_key=camera.key, **_NUMBERS)
-                camera.add = videos.enter_context(_video(av, path, camera.size))
+                videos.enter_context(camera.video(av, folder))
             for episode, grasp in enumerate(grasps):
                 for step, moment_number in enumerate(numbers):
                     values = (step / FPS, step, episode, len(steps), tasks[grasp.object_id], moment_number)
                     steps.append(dict(zip(_STEP_COLUMNS, values, strict=True)))
                 for camera in cameras:
                     for column in camera.columns:
-                        frame = _letterbox(_read_picture(recording.folder / grasp.images()[column]), camera.size)
-                        camera.add(frame)
-                        camera.summaries.append(_summary(frame.reshape(-1, 3) / 255.0))
+                        camera.add(av, _read_picture(recording.folder / grasp.images()[column]))
                 episodes.append(_episode(episode, grasp, len(moments), cameras))
                 if progress is not None:
                     progress(episode + 1, len(grasps))
@@ -164,27 +163,6 @@ def _letterbox(picture: Picture, size: tuple[int, int]) -> Picture:
     return canvas
 
 
-@contextlib.contextmanager
-def _video(av: Any, path: Path, size: tuple[int, int]) -> Iterator[Any]:
-    """Open a new video of pictures (height, width) with key frames only; yield the function that adds a picture."""
-    path.parent.mkdir(parents=True)
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=FPS, options=_CODEC)
-        stream.height, stream.width = size
-        stream.pix_fmt = "yuv444p"
-        count = 0
-
-        def add(picture: Picture) -> None:
-            nonlocal count
-            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
-            frame.pts, frame.time_base = count, Fraction(1, FPS)
-            count += 1
-            container.mux(stream.encode(frame))
-
-        yield add
-        container.mux(stream.encode())
-
-
 def _summary(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return minimum, maximum, mean and mean square of values (n, c), (4, c)."""
     return np.stack([values.min(0), values.max(0), values.mean(0), np.square(values).mean(0)])
@@ -201,14 +179,34 @@ def _stats(summaries: Sequence[NDArray[np.float64]], count: int) -> dict[str, An
 
 
 class _Camera:
-    """A camera of the data set: its columns of a recording, step by step, its video and a summary of each frame."""
+    """A camera of the data set: its columns of a recording, step by step, and its video, with key frames only."""
 
-    size: tuple[int, int]
-    add: Callable[[Picture], None]
+    _encode: Callable[[Any], None]
 
-    def __init__(self, name: str, columns: Sequence[str]) -> None:
-        self.key, self.columns = f"observation.images.{name}", columns
+    def __init__(self, name: str, columns: Sequence[str], size: tuple[int, int]) -> None:
+        self.key, self.columns, self.size = f"observation.images.{name}", columns, size
         self.summaries: list[NDArray[np.float64]] = []
+
+    @contextlib.contextmanager
+    def video(self, av: Any, folder: Path) -> Iterator[None]:
+        """Open the video in the data set's folder; pictures can be added inside the block."""
+        path = folder / VIDEO_PATH.format(video_key=self.key, **_NUMBERS)
+        path.parent.mkdir(parents=True)
+        with av.open(str(path), "w") as container:
+            stream = container.add_stream("libx264", rate=FPS, options=_CODEC)
+            stream.height, stream.width = self.size
+            stream.pix_fmt = "yuv444p"
+            self._encode = lambda frame: container.mux(stream.encode(frame))
+            yield
+            self._encode(None)
+
+    def add(self, av: Any, picture: Picture) -> None:
+        """Add a picture to the video, scaled to its size."""
+        picture = _letterbox(picture, self.size)
+        frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+        frame.pts, frame.time_base = len(self.summaries), Fraction(1, FPS)
+        self._encode(frame)
+        self.summaries.append(_summary(picture.reshape(-1, 3) / 255.0))
 
 
 def _episode(episode: int, grasp: RecordedGrasp, length: int, cameras: Sequence[_Camera]) -> dict[str, Any]:

@@ -5,7 +5,7 @@ import fcntl
 import json
 import os
 from collections.abc import Iterator, Mapping
-from concurrent.futures import Executor, ThreadPoolExecutor, wait
+from concurrent.futures import Executor, wait
 from pathlib import Path
 from typing import Any
 
@@ -36,9 +36,8 @@ def storage_errors(folder: Path) -> Iterator[None]:
         raise StorageError(f"{where} could not be written: {reason}; earlier grasps are complete") from error
 
 
-def sync_threads() -> Executor:
-    """Return the threads of `write_files`, about as many as a grasp has files; the caller shuts them down."""
-    return ThreadPoolExecutor(8)
+SYNC_THREADS = 8
+"""Number of threads for `write_files`: about as many as a grasp has files."""
 
 
 def write_files(contents: Mapping[Path, bytes], threads: Executor) -> None:

@@ -89,25 +89,21 @@ def strongest_frames(path: Path, count: int) -> list[Frame]:
     Raises:
         ImporterError: The video cannot be decoded, or too few of its frames differ from the first.
     """
-    decoded = _decoded(path)
-    first = next(decoded, None)
-    if first is None:
-        raise ImporterError("its video contains no frame")
-    # Numbers differ, so frames are never compared; among equal changes the earlier frame is taken.
-    changes = (
-        (float(np.abs(frame.astype(np.int16) - first).mean()), -number, frame) for number, frame in enumerate(decoded)
-    )
-    strongest = heapq.nlargest(count, changes)
-    if len(strongest) < count or not strongest[-1][0]:
-        raise ImporterError(f"its video must have at least {count} frames that differ from the first one")
-    return [first, *(frame for _, _, frame in sorted(strongest, key=lambda entry: -entry[1]))]
-
-
-def _decoded(path: Path) -> Iterator[Frame]:
     av = import_extra("av", _WHAT)
     try:
         with av.open(str(path)) as video:
-            for frame in video.decode(video=0):
-                yield frame.to_ndarray(format="rgb24")
+            frames = (frame.to_ndarray(format="rgb24") for frame in video.decode(video=0))
+            first = next(frames, None)
+            if first is None:
+                raise ImporterError("its video contains no frame")
+            # Numbers differ, so frames are never compared; among equal changes the earlier frame is taken.
+            changes = (
+                (float(np.abs(frame.astype(np.int16) - first).mean()), -number, frame)
+                for number, frame in enumerate(frames)
+            )
+            strongest = heapq.nlargest(count, changes)
     except (av.error.FFmpegError, OSError, ValueError, IndexError) as error:
         raise ImporterError("its video cannot be decoded") from error
+    if len(strongest) < count or not strongest[-1][0]:
+        raise ImporterError(f"its video must have at least {count} frames that differ from the first one")
+    return [first, *(frame for _, _, frame in sorted(strongest, key=lambda entry: -entry[1]))]

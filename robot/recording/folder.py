@@ -19,6 +19,7 @@ import json
 import os
 import re
 from collections.abc import Iterator, Mapping, Set
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -29,6 +30,7 @@ from robot.errors import RecordingError
 from robot.gel_settings import UNKNOWN
 from robot.recording.grasp import RecordedGrasp, check_name
 from robot.storage import (
+    SYNC_THREADS,
     ImageSource,
     LineFile,
     complete_lines,
@@ -37,7 +39,6 @@ from robot.storage import (
     read_content,
     read_json_object,
     storage_errors,
-    sync_threads,
     write_files,
 )
 
@@ -180,7 +181,7 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
     """
 
     def __init__(self, folder: str | Path, info: Mapping[str, Any]) -> None:
-        self.folder, self._threads = Path(folder), sync_threads()
+        self.folder, self._threads = Path(folder), ThreadPoolExecutor(SYNC_THREADS)
         expected = full_info(info)
         _check_no_other_files(self.folder)
         with storage_errors(self.folder):

@@ -53,13 +53,10 @@ class HandEye:
 
     def save(self, path: Path) -> None:
         """Write the file completely or not at all; raise StorageError if this fails."""
-        document = {
-            "written": self.written.isoformat(),
-            "rigid": self.rigid.tolist(),
-            "residuals_mm": self.residuals_mm.tolist(),
-        }
+        numbers = {"rigid": self.rigid.tolist(), "residuals_mm": self.residuals_mm.tolist()}
+        document = json.dumps({"written": self.written.isoformat(), **numbers}, indent=1)
         with storage_errors(path.parent):
-            write_atomically(path, (json.dumps(document, indent=1) + "\n").encode())
+            write_atomically(path, f"{document}\n".encode())
 
 
 def fit_hand_eye(camera_mm: npt.ArrayLike, rig_mm: npt.ArrayLike, *, written: datetime | None = None) -> HandEye:

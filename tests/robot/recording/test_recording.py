@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import shutil
 import subprocess
 import sys
@@ -377,3 +378,14 @@ def test_a_path_that_is_not_a_file_is_refused_without_being_read_or_written(tmp_
         with pytest.raises((RecordingError, StorageError)):
             RecordingWriter(tmp_path, INFO)
         path.rmdir() if path.is_dir() else path.unlink()
+
+
+def test_a_full_disk_error_names_the_file(tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with RecordingWriter(tmp_path, INFO) as writer:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
+        try:
+            with pytest.raises(StorageError, match=r"1_photo\.png could not be written: File too large"):
+                writer.append("1", "mug", {**pictures(), "photo": pixels(height=40)})
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
