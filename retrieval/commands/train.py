@@ -73,8 +73,8 @@ def train(
             f"{found['validation_grasps']} grasps of {found['validation_objects']} other objects; always predicting "
             f"the more frequent class: {found['chance']:.3f}"
         )
-        parts = [f"{part} of {whole} {name}" for name, (part, whole) in found["accepted"].items()]
-        say(f"accepted: {', '.join(parts)}")
+        accepted = [f"{part} of {whole} {name}" for name, (part, whole) in found["accepted"].items()]
+        say(f"accepted: {', '.join(accepted)}")
         return
     from retrieval.training import distributed
     from retrieval.training.initial_weights import training_licences

@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -36,8 +37,7 @@ class Projections(nn.Module):
 
     def forward(self, features: Tensor, projection: nn.Linear) -> Tensor:
         """Return unit embeddings (B, dim) of features (B, F)."""
-        embedding: Tensor = projection(self.dropout(features))
-        return functional.normalize(embedding, dim=-1, eps=1e-6)
+        return functional.normalize(projection(self.dropout(features)), dim=-1, eps=1e-6)
 
     @torch.no_grad()
     def clamp_scale(self) -> None:
@@ -111,13 +111,11 @@ class ContrastiveEmbedding(Method):
 
     @torch.inference_mode()
     def _encode_touch(self, touch: Array) -> Array:
-        embeddings: Array = self._module(_tensor(self._touch, touch), self._module.touch).numpy()
-        return embeddings
+        return np.asarray(self._module(_tensor(self._touch, touch), self._module.touch).numpy())
 
     @torch.inference_mode()
     def _encode_photo(self, photo: Array) -> Array:
-        embeddings: Array = self._module(_tensor(self._photo, photo), self._module.photo).numpy()
-        return embeddings
+        return np.asarray(self._module(_tensor(self._photo, photo), self._module.photo).numpy())
 
     def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
         return self._scale * (touch_encodings @ photo_encodings.T)
