@@ -83,13 +83,13 @@ def train(
     try:
         settings = training_config(config, iterations, init=init)
         _show_licences(training_licences(recording, settings.training))
-        parts = read_split(split)
+        objects = read_split(split)
         if cluster:
             from retrieval.cluster.training import train_on_ray
 
-            checkpoint = train_on_ray(recording, out, settings, workers=workers or 2, split=parts)
+            checkpoint = train_on_ray(recording, out, settings, workers=workers or 2, split=objects)
         else:
-            checkpoint = train_matcher(recording, out, settings, split=parts)
+            checkpoint = train_matcher(recording, out, settings, split=objects)
         if distributed.rank():
             return
     finally:
