@@ -9,7 +9,7 @@ import torch
 import retrieval
 from retrieval.commands.main import main
 from retrieval.commands.options import training_config
-from retrieval.data.dataset import Split, load_grasps
+from retrieval.data.dataset import LICENCES, DataLicence, Split, load_grasps, recording_licence, stored_licences
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
 from retrieval.model.fusion import Matcher
@@ -234,7 +234,11 @@ def test_the_logit_is_only_the_scaled_cosine_of_the_projections(fitted):
 
 
 def test_a_better_baseline_is_stored_with_fitted_probabilities(recording, model, tmp_path, capsys):
-    start = dataclasses.replace(load_checkpoint(model), verification=calibration(accept=1.0, reject=-1.0))
+    start = load_checkpoint(model)
+    licences = {LICENCES: [dataclasses.asdict(DataLicence("another"))]}
+    start = dataclasses.replace(
+        start, verification=calibration(accept=1.0, reject=-1.0), provenance=start.provenance | licences
+    )
     store_checkpoint(start, tmp_path / "start.safetensors")
     out = tmp_path / "own.safetensors"
     files = ["--out", str(out), "--model", str(tmp_path / "start.safetensors")]
@@ -250,3 +254,4 @@ def test_a_better_baseline_is_stored_with_fitted_probabilities(recording, model,
     # Those of the start model are for its posterior; 12 objects are too few for new ones
     assert made.verification is None
     assert set(made.provenance["adapted_to"]) == {"source", "data_digest"}
+    assert stored_licences(made.provenance) == [DataLicence("another"), recording_licence(recording)]

@@ -50,9 +50,6 @@ def test_each_step_has_the_learning_rate_of_its_schedule_and_group(schedule, fac
     assert changes == pytest.approx([0.1 * factor for factor in factors], rel=1e-5)
     assert other.item() == pytest.approx(weight.item() / 2)
     assert (best.step, best.metrics) == (4, {})
-
-
-def test_every_schedule_starts_at_the_full_rate():
     assert {name: factor(0, 7) for name, factor in SCHEDULES.items()} == dict.fromkeys(SCHEDULES, 1.0)
 
 
@@ -78,24 +75,16 @@ def test_the_weights_of_the_best_step_are_restored_not_the_last():
     assert module[0].item() == validated[1] != validated[3]
 
 
-def power_cut(at):
-    """Return a loss that fails in step `at`."""
-
-    def loss(step, _):
-        if step == at:
-            raise RuntimeError("power cut")
-        return module[0].square().sum() - module[0].sum()
-
+def run(path, at=None, validations=3, **identity):
+    """Train, with a power cut in step `at`; the last `validations` of three validations are left."""
     module = torch.nn.ParameterList([torch.nn.Parameter(torch.zeros(1))])
-    return loss, module
-
-
-def run(path, at=None, validations=None, **identity):
-    loss, module = power_cut(at)
-    scores = iter([0.6, 0.9, 0.1][3 - validations if validations else 0 :])
-    validate = lambda: {"score": next(scores)}  # noqa: E731
+    scores = iter([0.6, 0.9, 0.1][3 - validations :])
     weights, best = descend(
-        Plan(6, 0.1, validate_every=2), loss, module, validate=validate, state=StateFile(path, identity)
+        Plan(6, 0.1, validate_every=2),
+        lambda step, _: (1 / 0 if step == at else 1) * module[0].square().sum() - module[0].sum(),
+        module,
+        validate=lambda: {"score": next(scores)},
+        state=StateFile(path, identity),
     )
     return weights, best, module[0].item()
 
@@ -104,7 +93,7 @@ def test_a_run_continues_from_its_state_with_the_bits_of_an_uninterrupted_run(tm
     """The best step may lie before the cut: its weights are in the state."""
     weights, best, last = run(tmp_path / "whole.safetensors")
     path = tmp_path / "cut.safetensors"
-    with pytest.raises(RuntimeError, match="power cut"):
+    with pytest.raises(ZeroDivisionError):
         run(path, at=5)
     assert run(path, validations=1) == (weights[4:], best, last)
     assert best.step == 4
@@ -112,7 +101,10 @@ def test_a_run_continues_from_its_state_with_the_bits_of_an_uninterrupted_run(tm
 
 
 def test_ctrl_c_ends_after_the_current_step_which_is_validated_and_stored(tmp_path):
-    state, (_, module) = StateFile(tmp_path / "s.safetensors", {}), power_cut(None)
+    state, module = (
+        StateFile(tmp_path / "s.safetensors", {}),
+        torch.nn.ParameterList([torch.nn.Parameter(torch.zeros(1))]),
+    )
 
     def loss(step, _):
         if step == 2:
@@ -128,7 +120,7 @@ def test_ctrl_c_ends_after_the_current_step_which_is_validated_and_stored(tmp_pa
 
 def test_the_state_of_another_run_is_an_error_or_replaced(tmp_path):
     path = tmp_path / "s.safetensors"
-    with pytest.raises(RuntimeError, match="power cut"):
+    with pytest.raises(ZeroDivisionError):
         run(path, at=5, config={"seed": 0})
     with pytest.raises(CheckpointError, match=r"another config; .* delete the file"):
         run(path, config={"seed": 1})

@@ -1,0 +1,282 @@
+"""Calibration: posterior, reference touches, and verification, whose rates hold over a whole sequence of grasps."""
+
+import dataclasses
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+
+from _touch_retrieval.documents import typed
+from retrieval.errors import BadInput
+from retrieval.model.posterior import SLOPE_BOUNDS, Posterior
+from retrieval.model.references import reference_similarity
+from retrieval.model.verification import (
+    ACCEPT,
+    ANOTHER_GRASP,
+    LEVELS,
+    MAX_GRASPS,
+    QUANTILES,
+    REJECT,
+    VerificationCalibration,
+)
+from retrieval.training.calibration import (
+    ScoredTouches,
+    fit_posterior,
+    fit_references,
+    fit_verification,
+    verification_sequences,
+)
+
+# Posterior -------------------------------------------------------------------------------------------------
+
+
+def normal_logits(objects, touches, photos, apart, alike, seed=0):
+    """Return log likelihood ratios of two normal distributions, calibrated as they are.
+
+    apart: distance of the distributions in standard deviations. alike: fraction of the noise of a touch that all
+    touches of its object have in common.
+    """
+    rng = np.random.default_rng(seed)
+    owner, photo_owner = np.repeat(np.arange(objects), touches), np.repeat(np.arange(objects), photos)
+    same = owner[:, None] == photo_owner
+    common = rng.normal(size=(objects, len(photo_owner)))[owner]
+    noise = math.sqrt(alike) * common + math.sqrt(1 - alike) * rng.normal(size=same.shape)
+    logits = apart * (noise + np.where(same, apart / 2, -apart / 2))
+    return ScoredTouches(logits, owner, photo_owner, np.zeros(same.shape, dtype=bool))
+
+
+def changed(scored, scale, shift):
+    return ScoredTouches(scale * scored.logits + shift, scored.touch_owner, scored.photo_owner, scored.own)
+
+
+def test_the_fit_recovers_planted_parameters():
+    true = normal_logits(300, 1, 1, apart=2.5, alike=0)
+    found = fit_posterior(changed(true, 4, 10))  # log ratio = logit / 4 - 10 / 4
+    assert found.slope == pytest.approx(1 / 4, rel=0.1)
+    for log_ratio in (-1.0, 0.0, 2.0):
+        assert found.slope * (4 * log_ratio + 10) + found.offset == pytest.approx(log_ratio, abs=0.3)
+    assert found.dependence == 1.0  # single grasps do not determine it
+
+
+def test_the_fit_recognises_independent_grasps_and_equal_ones():
+    apart = fit_posterior(normal_logits(100, 2, 1, apart=1.5, alike=0))
+    assert apart.dependence < 0.12
+    alike = fit_posterior(normal_logits(100, 2, 1, apart=1.5, alike=1))
+    assert alike.dependence > 0.9
+    assert (apart.slope, alike.slope) == pytest.approx((1, 1), abs=0.15)
+
+
+def test_logits_without_errors_have_a_finite_slope():
+    owner = np.arange(20)
+    scored = ScoredTouches(np.where(np.eye(20, dtype=bool), 5.0, -5.0), owner, owner, np.zeros((20, 20), dtype=bool))
+    found = fit_posterior(scored)
+    assert SLOPE_BOUNDS[0] < found.slope < 3
+    logits = [5.0] + [-5.0] * 18
+    assert 0.5 < found.probabilities_given(logits, found.mass(logits)).objects[0] < 1
+
+
+def test_a_photo_of_the_touchs_own_grasp_never_counts():
+    scored = normal_logits(30, 2, 2, apart=2, alike=0)
+    own = np.zeros_like(scored.own)
+    own[np.arange(60), np.arange(60)] = True
+    with_secret = np.where(own, 1e6, scored.logits)
+    hidden = ScoredTouches(with_secret, scored.touch_owner, scored.photo_owner, own)
+    plain = ScoredTouches(np.where(own, 0.0, scored.logits), scored.touch_owner, scored.photo_owner, own)
+    assert fit_posterior(hidden) == fit_posterior(plain)
+
+
+def test_two_objects_are_too_few_to_fit_on():
+    owner = np.array([0, 1])
+    with pytest.raises(BadInput, match="at least three objects"):
+        fit_posterior(ScoredTouches(np.eye(2), owner, owner, np.zeros((2, 2), dtype=bool)))
+
+
+# Reference touches -------------------------------------------------------------------------------------------
+
+
+def reference_touches(objects=10, touches=4, noise=0.3, photos=True, seed=0):
+    """Return embeddings around a direction of each object, and photos whose logits carry some information."""
+    rng = np.random.default_rng(seed)
+    owner = np.repeat(np.arange(objects), touches)
+    embeddings = rng.normal(size=(objects, 16))[owner] + 4 * noise * rng.normal(size=(len(owner), 16))
+    embeddings = (embeddings / np.linalg.norm(embeddings, axis=1, keepdims=True)).astype(np.float32)
+    photo_owner = np.arange(objects if photos else 0)
+    logits = rng.normal(size=(len(owner), len(photo_owner))) + (owner[:, None] == photo_owner)
+    return ScoredTouches(logits, owner, photo_owner, np.zeros(logits.shape, bool), embeddings)
+
+
+def test_near_touches_get_a_large_weight_and_noise_a_small_one():
+    near, far = (fit_references(reference_touches(noise=noise)) for noise in (0.1, 50.0))
+    assert near.touch_only.slope > 5 > far.touch_only.slope
+    assert near.weight * near.with_photos.slope > 5 * far.weight * far.with_photos.slope
+    assert (near.objects, near.touches) == (10, 20)  # the second half of four touches each
+
+
+def test_without_photos_only_the_touches_are_fitted():
+    found = fit_references(reference_touches(photos=False))
+    assert found.with_photos is None
+    assert found.weight is None
+    assert found.touch_only.slope > 1
+
+
+def test_too_few_objects_touches_or_dimensions_give_no_calibration():
+    assert fit_references(reference_touches(objects=2)) is None
+    assert fit_references(reference_touches(touches=1)) is None
+    touches = reference_touches()
+    assert fit_references(dataclasses.replace(touches, touch_embeddings=touches.touch_embeddings[:, :0])) is None
+
+
+@pytest.mark.parametrize("references", [1, 3])
+def test_one_reference_and_three_are_both_calibrated(references):
+    """On other objects, the mean probability of the best object equals its accuracy."""
+    calibration = fit_references(reference_touches(objects=80, touches=8, noise=0.2, photos=False))
+    others = reference_touches(objects=80, touches=8, noise=0.2, photos=False, seed=1)
+    embeddings = others.touch_embeddings.reshape(80, 8, -1)
+    shown, queries = embeddings[:, :references].reshape(80 * references, -1), embeddings[:, 4:].reshape(320, -1)
+    near = reference_similarity(queries @ shown.T, np.arange(80) * references)
+    ratios = np.array([calibration.touch_only.log_ratio(row, 1) for row in near])
+    likelihoods = np.exp(ratios - ratios.max(1, keepdims=True))
+    confidence = (likelihoods.max(1) / likelihoods.sum(1)).mean()
+    accuracy = (ratios.argmax(1) == np.repeat(np.arange(80), 4)).mean()
+    assert confidence == pytest.approx(accuracy, abs=0.1)
+
+
+# Verification ------------------------------------------------------------------------------------------------
+
+
+POSTERIOR = Posterior(slope=1.0, offset=-2.0, dependence=0.5)
+EMBEDDING_DIM = 4
+
+
+def scored_objects(objects, seed, grasps=MAX_GRASPS + 1):
+    """Return match logits of touches with one photo of each grasp: 3 for the own object, 0 for others, noise of 2.
+
+    All grasps of an object share part of the noise with each photo's object, as in reality.
+    """
+    rng = np.random.default_rng(seed)
+    owner = np.repeat(np.arange(objects), grasps)
+    of_objects = rng.normal(size=(objects, objects)) * 1.5
+    logits = of_objects[owner][:, owner] + rng.normal(size=(len(owner), len(owner))) * 1.3
+    logits += 3.0 * (owner[:, None] == owner)
+    embeddings = rng.normal(size=(len(owner), EMBEDDING_DIM))
+    return ScoredTouches(logits, owner, owner, np.eye(len(owner), dtype=bool), embeddings, embeddings)
+
+
+def plain_sequences(scored, seed=3):
+    """Return log likelihood ratios (S, O) after 1 to MAX_GRASPS grasps of each object, by plain loops."""
+    rng = np.random.default_rng(seed)
+    objects = np.unique(scored.touch_owner)
+    found, true = [], []
+    for name in objects:
+        touches = rng.permutation(np.flatnonzero(scored.touch_owner == name))[:MAX_GRASPS]
+        rows = []
+        for count in range(1, MAX_GRASPS + 1):
+            weight = POSTERIOR.weight(count)
+            row = []
+            for other in objects:
+                photos = [
+                    photo
+                    for photo in np.flatnonzero(scored.photo_owner == other)
+                    if not scored.own[touches[:count], photo].any()
+                ]
+                sums = scored.logits[np.ix_(touches[:count], photos)].sum(0)
+                row.append(np.log(np.mean(np.exp(weight * sums))) + POSTERIOR.offset)
+            rows.append(row)
+        found.append(rows)
+        true.append(name)
+    return np.array(found), np.array(true)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    return fit_verification([scored_objects(100, seed=0)], POSTERIOR)
+
+
+def test_the_stated_false_accept_rate_holds_on_other_objects_whenever_the_decision_falls(fitted):
+    """The naive quantile of single grasps, applied after each grasp, accepts more impostors over a sequence."""
+    ratios, true = plain_sequences(scored_objects(60, seed=1))
+    bounds = fitted.bounds(0.02)
+    impostor = np.ones(ratios[:, 0].shape, dtype=bool)
+    impostor[np.arange(len(true)), true] = False
+    accepted = (ratios.max(1) >= bounds.accept)[impostor].mean()
+    assert 0.01 <= accepted <= 0.03
+    genuine = (ratios.max(1)[np.arange(len(true)), true] < bounds.accept).mean()
+    assert bounds.false_rejects.low <= genuine <= bounds.false_rejects.high
+    naive = np.quantile(ratios[:, 0][impostor], 0.98)
+    assert (ratios.max(1) >= naive)[impostor].mean() > 0.03
+
+
+def test_a_rate_that_the_objects_cannot_support_is_refused_with_the_number_that_would():
+    small = fit_verification([scored_objects(20, seed=2)], POSTERIOR)  # 190 pairs: 0.158, rounded up
+    with pytest.raises(BadInput, match=r"0\.1 needs 25 validation objects; the model has 20, enough for 0\.16"):
+        small.bounds(0.1)  # 30 errors need 300 pairs, which 25 objects have
+    assert small.bounds(0.2).false_accepts.value == 0.2
+
+
+@pytest.mark.parametrize("objects", [21, 50, 200])
+def test_the_rate_that_a_refusal_proposes_is_supported(fitted, objects):
+    calibration = dataclasses.replace(fitted, group_sizes=(objects,))
+    with pytest.raises(BadInput) as refused:
+        calibration.bounds(1e-4)
+    calibration.bounds(float(re.search(r"enough for ([\d.]+)", str(refused.value))[1]))
+
+
+@pytest.mark.parametrize("far", [0, 1, -0.1, 0.6, float("nan"), None])
+def test_an_impossible_rate_is_refused(fitted, far):
+    with pytest.raises(BadInput, match=r"must be above 0 and at most 0\.5"):
+        fitted.bounds(far)
+
+
+@pytest.mark.parametrize(
+    ("ratios", "decision"),
+    [
+        ([5.0], ACCEPT),
+        ([0.0], ANOTHER_GRASP),
+        ([-9.0], REJECT),
+        ([0.0, 5.0], ACCEPT),
+        ([5.0, -9.0], ACCEPT),  # it was accepted after the first grasp
+        ([0.0, 0.0, 0.0, 0.0], REJECT),  # no further grasp is possible
+    ],
+)
+def test_a_decision_follows_the_two_bounds(fitted, ratios, decision):
+    bounds = dataclasses.replace(fitted.bounds(0.05), accept=4.0, reject=-4.0)
+    assert bounds.decide(np.array(ratios)) == decision
+
+
+def test_similar_impostors_are_the_objects_with_the_most_similar_photos():
+    scored = scored_objects(40, seed=5)
+    owner = scored.photo_owner
+    embeddings = np.eye(20)[owner // 2]  # objects 2 k and 2 k + 1 look alike
+    scored.logits[scored.touch_owner[:, None] // 2 == owner // 2] += 3.0
+    bounds = fit_verification([dataclasses.replace(scored, photo_embeddings=embeddings)], POSTERIOR).bounds(0.1)
+    assert bounds.similar_false_accepts.value > 3 * bounds.false_accepts.value
+
+
+def test_too_few_objects_or_grasps_give_no_calibration():
+    assert fit_verification([scored_objects(19, seed=0)], POSTERIOR) is None
+    assert fit_verification([scored_objects(30, seed=0, grasps=MAX_GRASPS)], POSTERIOR) is None
+
+
+def test_objects_of_two_groups_are_not_compared_with_each_other():
+    """Two folds of `retrieve adapt` have different maps, whose logits are not on one scale."""
+    first, second = scored_objects(50, seed=0), scored_objects(50, seed=6)
+    both = fit_verification([first, second], POSTERIOR)
+    assert (both.group_sizes, both.objects, both.pairs) == ((50, 50), 100, 2 * 50 * 49 // 2)
+    expected = [verification_sequences(part, POSTERIOR) for part in (first, second)]
+    level = np.quantile(np.concatenate([part.impostor.ravel() for part in expected]), 0.95)
+    assert both.bounds(0.05).accept == pytest.approx(level, abs=0.02)
+    with pytest.raises(BadInput, match=r"0\.01 needs 111 validation objects; the model has 100"):
+        both.bounds(0.01)  # 3,000 pairs: two groups of 55.5 objects
+
+
+def test_the_document_of_a_calibration_gives_the_same_calibration(fitted):
+    document = json.loads(json.dumps(dataclasses.asdict(fitted)))
+    assert typed(document, VerificationCalibration, "verification", complete=True) == fitted
+    assert len(document["impostors"]) == len(LEVELS)
+    assert len(document["similar"]) == len(QUANTILES)
+    with pytest.raises(BadInput, match="verification must have"):
+        VerificationCalibration(**document | {"impostors": [1.0]})
+    with pytest.raises(BadInput, match=r"verification.*objects"):
+        VerificationCalibration(**document | {"group_sizes": [3]})
