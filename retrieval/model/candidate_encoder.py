@@ -1,10 +1,9 @@
 """Candidate encoder: embeddings for candidate search that predict the order of the match logits.
 
-An embedding trained by a contrastive loss orders photos differently from the fusion head: the photo that the head ranks
-first may have a low rank in that order. The two small networks here are distilled from the head
-(`retrieval.training.distil`). They read partial activations, so an index gets new embeddings without encoding a
-photo again. With `candidate_linear`, some output components are linear in the contrastive embeddings. They start as
-principal axes, which carry nearly all of the logit's cosine, and are trained too.
+A contrastive embedding orders photos differently from the fusion head. The two small networks here are distilled from
+the head (`retrieval.training.distil`) and read partial activations. With `candidate_linear`, some output components are
+linear in the contrastive embeddings. They start as principal axes, which carry nearly all of the logit's cosine, and
+are trained too.
 """
 
 from typing import NamedTuple, Self

@@ -86,9 +86,7 @@ def fingerprint(checkpoint: CheckpointInfo) -> dict[str, str]:
 
 
 def read_checkpoint_info(path: Path) -> CheckpointInfo:
-    """Read the header of a checkpoint.
-
-    The weights are neither read nor checked. A caller that knows the file's digest compares it.
+    """Read the header of a checkpoint; its weights are neither read nor checked.
 
     Raises:
         CheckpointError: The file is missing, or not a checkpoint of this version.

@@ -1,9 +1,8 @@
 """Forward pass of the towers in batches: images to partial activations and embeddings.
 
-Inference runs the towers in another form than training: batch normalisation folded into the preceding convolution, and
-weights laid out with channels last. The arithmetic is float32 on every machine. bfloat16 hardware would move the
-partial activations of the shipped checkpoint by up to an eighth of the largest, and a query would then not match an
-index that was built elsewhere.
+Inference folds batch normalisation into the preceding convolution and lays weights out with channels last. The
+arithmetic is float32: bfloat16 would move the partial activations of the shipped checkpoint by up to an eighth of the
+largest, and a query would not match an index that was built elsewhere.
 """
 
 import copy
@@ -164,11 +163,7 @@ def default_device() -> torch.device:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Make PyTorch compute only on the calling thread.
-
-    PyTorch's workers wait for each other many times a step. If another program takes the core of one worker, all others
-    spin: milliseconds become hundreds.
-    """
+    """Make PyTorch compute only on the calling thread: if another program takes a worker's core, all others spin."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -180,13 +175,10 @@ def one_thread() -> Iterator[None]:
 def autocast(device: torch.device, precision: str) -> AbstractContextManager[Any]:
     """Return the context for the towers' arithmetic in training.
 
-    Args:
-        device: Where the towers compute.
-        precision: "float32", "bfloat16", or "auto": bfloat16 if the hardware multiplies it, else float32. A CPU
-            without such instructions emulates bfloat16, ten times slower than float32.
+    precision: "float32", "bfloat16", or "auto": bfloat16 if the device multiplies it in hardware, else float32.
 
     Raises:
-        ConfigError: `precision` is bfloat16 and the device only emulates it.
+        ConfigError: `precision` is bfloat16 and the device only emulates it, ten times slower than float32.
     """
     fast = has_fast_bfloat16(device)
     if precision == "bfloat16" and not fast:

@@ -1,7 +1,6 @@
 """One guard for forks: a process forks when no touch is read or encoded, and the child starts without open sessions.
 
-A fork copies the locks of the computing libraries in their current state, and none of their threads. In the child
-nobody releases a lock that another thread held, and a library that waits for its threads waits for ever.
+A fork copies locks of libraries that other threads hold, but not the threads that would release them.
 """
 
 import os
@@ -18,11 +17,7 @@ MAX_FORK_WAIT_S = 10.0
 
 
 class ForkGuard:
-    """Delays a fork until no touch is read or encoded, and closes sessions before it.
-
-    Attributes:
-        sessions: Objects with threads of their own, which `close` ends before a fork; their next use starts new ones.
-    """
+    """Delays a fork until no touch is read or encoded, and closes `sessions`, which have threads, before it."""
 
     def __init__(self) -> None:
         self.sessions: WeakSet[Any] = WeakSet()
@@ -44,8 +39,7 @@ class ForkGuard:
     def before(self) -> None:
         """Wait for computations to end, block new ones until the fork is done, and close the sessions.
 
-        Threads that computed must also be gone: a thread that Python has joined still returns its memory for a while,
-        under an allocator's lock.
+        A thread that Python has joined still returns its memory for a while, under an allocator's lock.
         """
         self._idle.acquire()
         deadline = time.monotonic() + MAX_FORK_WAIT_S

@@ -2,8 +2,7 @@
 
 An index stores the partial activations of photos as float16, and the vectors of cells as 8-bit integers: a cell's
 vector has unit length, so a component c is stored as round(127 c), with an error of at most 1/254. Arithmetic is in
-float32. Photos are scored in blocks. The head's layers after the partial activations are one matrix product for all
-photos of a block. The rest is done in place, so the product takes most of the time.
+float32, in blocks of photos.
 """
 
 from collections.abc import Mapping
@@ -80,8 +79,8 @@ Partials = NDArray[np.floating[Any]] | StoredPartials
 def as_float32(values: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
     """Return `values` in float32, exactly.
 
-    Partial activations are finite float16. numpy converts these one by one, which takes longer than the arithmetic on
-    them. Shifting the five exponent bits and ten fraction bits gives the number divided by 2^112, also for subnormals.
+    numpy converts float16 one by one, which takes longer than the arithmetic on them. Shifting the exponent and
+    fraction bits gives the number divided by 2^112, also for subnormals.
     """
     if values.dtype != np.float16:
         return np.ascontiguousarray(values, dtype=np.float32)

@@ -1,9 +1,8 @@
 """Late interaction: cells of the gel images against cells of a photo (Khattab and Zaharia, SIGIR 2020, eq. 3).
 
-A tower divides an image into a grid of cells (`Tower.divide`), and a small network maps each cell to a vector. The
-score of a touch with a photo is a sum over the cells of the touch. Each adds its largest inner product with a cell of
-the photo. Vectors of photo cells have unit length. The length of a touch cell's vector is its weight. The weight is
-learned, so that cells without contact count little. Scores of several grasps add up.
+A tower divides an image into a grid of cells (`Tower.divide`), and a small network maps each cell to a vector. Each
+cell of a touch adds its largest inner product with a cell of the photo to the score. Vectors of photo cells have unit
+length; the length of a touch cell's vector is its learned weight, so that cells without contact count little.
 """
 
 from torch import Tensor, nn

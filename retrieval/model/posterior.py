@@ -35,7 +35,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import ArrayLike, NDArray
 
-from _touch_retrieval.documents import check_fields, typed
+from _touch_retrieval.documents import check_fields
 from retrieval.errors import BadInput, NumericalError
 
 Floats = NDArray[np.float64]
@@ -211,11 +211,6 @@ class Posterior:
     def to_dict(self) -> dict[str, Any]:
         """Return a plain dictionary, as stored in checkpoints."""
         return asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: Any) -> "Posterior":
-        """Inverse of `to_dict`. Raises BadInput for anything else."""
-        return typed(data, cls, "posterior", complete=True, error=BadInput)
 
 
 def require_prior(none_prior: float) -> None:

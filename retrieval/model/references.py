@@ -16,7 +16,6 @@ independent evidence. Each ratio is converted to the logit of an object with pho
 then ranks all objects of a catalogue and gives their probabilities, with photos, references or both.
 """
 
-import dataclasses
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -24,7 +23,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from _touch_retrieval.documents import check_fields, typed
+from _touch_retrieval.documents import check_fields
 from retrieval.errors import BadInput
 from retrieval.model.posterior import Posterior
 
@@ -60,15 +59,6 @@ class ReferenceCalibration:
         check_fields(self, "references", BadInput)
         if (self.weight is None) != (self.with_photos is None):
             raise BadInput("weight and with_photos must both be present or both be absent; one of them is missing")
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return a plain dictionary, as stored in checkpoints."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: Any) -> "ReferenceCalibration":
-        """Inverse of `to_dict`. Raises BadInput for anything else."""
-        return typed(data, cls, "references", complete=True, error=BadInput)
 
 
 def unit_embeddings(partials: NDArray[np.floating[Any]], columns: slice) -> Floats:

@@ -45,12 +45,7 @@ _NESTING_HINT = "one grasp is a list with an image for each finger, several gras
 
 @dataclass(frozen=True, eq=False)
 class InputImage:
-    """An input image that is not read yet.
-
-    Attributes:
-        image: The image.
-        name: Its name in answers and messages; for a file, the path.
-    """
+    """An image that is not read yet, and its name in answers and messages; for a file, the path."""
 
     image: AnyImage
     name: str
@@ -59,12 +54,8 @@ class InputImage:
 def read_image(image: AnyImage, name: str) -> RgbImage:
     """Return an image of any form as (H, W, 3) float32 RGB in 0..1, the same for all forms of a picture.
 
-    Args:
-        image: The image. Arrays must be uint8: the range of other types would have to be guessed.
-        name: Its name in messages, if it is not a file.
-
     Raises:
-        ImageError: The image is not readable.
+        ImageError: The image is not readable. `name` is its name in the message, if it is not a file.
     """
     if isinstance(image, str | os.PathLike):
         return read_rgb(os.fspath(image))

@@ -5,10 +5,9 @@
     another grasp    otherwise
 
 The ratio compares "this object" with "an object that the catalogue lacks" (`retrieval.model.posterior`). This is a
-sequential test between two bounds (Wald 1945). Wald's own bounds need exact ratios of independent grasps. Here `a` and
-`b` are quantiles over sequences of grasps of validation objects. The largest ratio over MAX_GRASPS grasps exceeds `a`
-for the fraction `far` of the impostors; fewer grasps give no higher rate. The bound `b` causes additional false
-rejects. They are at most a tenth of those that `a` causes, or MIN_EARLY_REJECTS if that is larger.
+sequential test between two bounds (Wald 1945), which are quantiles over sequences of grasps of validation objects. The
+largest ratio over MAX_GRASPS grasps exceeds `a` for the fraction `far` of the impostors. The bound `b` causes
+additional false rejects: at most a tenth of those that `a` causes, or MIN_EARLY_REJECTS if that is larger.
 
 An impostor is a false claim: the expected object is any other object than that in the hand, or the one whose photos are
 most similar to it. Both kinds are measured.
@@ -62,11 +61,9 @@ class DecisionBounds:
         reject: Largest log likelihood ratio that rejects before the last grasp.
         false_accepts: The requested false-accept rate, for random impostors.
         similar_false_accepts: The false-accept rate if the expected object is the one most similar to the object in the
-            hand. It is valid for a catalogue with as many objects as one group of validation objects
-            (`VerificationCalibration.group_sizes`).
+            hand, in a catalogue with as many objects as one group of validation objects.
         false_rejects: False-reject rate after all `MAX_GRASPS` grasps.
-        accepted: Fraction of genuine sequences that reach `accept` within 1, 2, ... grasps. It ignores early
-            rejections.
+        accepted: Fraction of genuine sequences that reach `accept` within 1, 2, ... grasps.
     """
 
     accept: float

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 from typing import NoReturn
@@ -320,7 +321,7 @@ class Searcher:
                 "unscored_probability": probabilities.unscored,
             }
             if (references := manifest.about.get(REFERENCE_ROWS)) and self.checkpoint.references is not None:
-                formula[REFERENCE_ROWS] = {**references, "calibration": self.checkpoint.references.to_dict()}
+                formula[REFERENCE_ROWS] = {**references, "calibration": asdict(self.checkpoint.references)}
         sharding = {"shards": len(manifest.shards)} if isinstance(manifest, ShardedManifest) else {}
         return QueryResult(
             touches=[[image.name for image in grasp] for grasp in grasps],

@@ -49,11 +49,7 @@ class Decoders:
         self._small, self._large = asyncio.Semaphore(PROCESSES), asyncio.Semaphore(1)
 
     async def start(self) -> None:
-        """Start the processes, so that the first query does not wait for them.
-
-        Raises:
-            RetrievalError: A process cannot be started.
-        """
+        """Start the processes, so that the first query does not wait for them. Raises RetrievalError."""
         self._idle += [_Process() for _ in range(PROCESSES)]
         await asyncio.gather(*(asyncio.to_thread(process.wait_until_ready) for process in self._idle))
 
@@ -63,13 +59,9 @@ class Decoders:
         await asyncio.gather(*self._ending, *(asyncio.to_thread(process.end) for process in idle))
 
     async def read(self, named_files: Sequence[tuple[str, bytes]], px: int) -> list[GelImage]:
-        """Decode pictures to the input size of the model.
+        """Decode pictures, each given by its name and file, to `px` x `px` pixels.
 
         Large pictures are decoded only after the sizes of all pictures are known.
-
-        Args:
-            named_files: Name (for messages) and file content of each picture.
-            px: `touch_px` of the model.
 
         Raises:
             ImageError: A picture cannot be used; the first one is reported.

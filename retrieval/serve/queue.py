@@ -48,12 +48,9 @@ class Queue:
     async def submit(
         self, work: Callable[[ServedGeneration], Result], request: Request, pictures: RequestPictures | None = None
     ) -> Result:
-        """Decode `pictures`, then run `work` with the generation that is served when it starts.
+        """Decode `pictures`, then run `work` in a worker thread with the generation that is served when it starts.
 
-        Args:
-            work: Function of the generation; it runs in a worker thread.
-            request: The request, to notice that the client disconnects; its body must have been read.
-            pictures: Pictures to decode first.
+        The body of the request must have been read.
 
         Raises:
             HttpProblem: The queue is full, the client disconnects or the deadline passes.

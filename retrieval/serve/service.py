@@ -39,9 +39,7 @@ class GraspResult:
 
 @dataclass(frozen=True)
 class LiveRig:
-    """Functions of a rig (`retrieval.serve.rig`), callable from any thread.
-
-    Both may raise any exception; the user gets its message.
+    """Functions of a rig, callable from any thread; they may raise any exception, whose message the user gets.
 
     Attributes:
         sensors: Name of a sensor -> function that returns its newest picture as a JPEG file.

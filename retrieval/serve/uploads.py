@@ -37,15 +37,7 @@ _CLOSE = {"connection": "close"}  # the rest of the body is not read
 
 
 class BodyLimit:
-    """Middleware that limits request bodies: the size for the path, the time to arrive, and the concurrent total.
-
-    Args:
-        app: The next application.
-        seconds: Time limit for a body to arrive.
-
-    Attributes:
-        held_bytes: Total size of the bodies in memory.
-    """
+    """Middleware that limits request bodies: size for the path, `seconds` to arrive, and the total of all bodies."""
 
     def __init__(self, app: ASGIApp, seconds: float) -> None:
         self.app, self.seconds, self.held_bytes = app, seconds, 0
@@ -164,16 +156,9 @@ def json_body(model: type[BaseModel]) -> dict[str, Any]:
 
 @dataclass(eq=False)
 class RequestPictures:
-    """The image files of a request, and the decoded images after `Queue.submit`.
+    """The image files of a request: of each finger of each grasp, and the no-contact frame of each finger, if any.
 
-    Attributes:
-        files: One file for each finger of each grasp.
-        background: One no-contact frame for each finger; None without them.
-        images: The decoded `files`.
-        frames: The decoded `background`.
-
-    Raises:
-        HttpProblem: There are more than `MAX_PICTURES`.
+    images, frames: the decoded files, after `Queue.submit`. Raises HttpProblem for more than `MAX_PICTURES`.
     """
 
     files: Sequence[Sequence[bytes]]

@@ -246,9 +246,8 @@ def _grid_means(maps: Tensor, cells: int) -> Tensor:
 def without_autocast(images: Tensor) -> AbstractContextManager[Any]:
     """Return a context that computes the first layers in float32, even if the others use bfloat16.
 
-    Gels differ by a few grey levels, which rounding an image to bfloat16 removes. The gradient of MobileNetV2 in
-    bfloat16 then has a cosine of 0.75 with the gradient in float32, and of 0.96 with the layers up to stride 4 in
-    float32.
+    Gels differ by a few grey levels, which rounding to bfloat16 removes: the gradient of MobileNetV2 then has a cosine
+    of 0.75 with that in float32, and of 0.96 with the layers up to stride 4 in float32.
     """
     if torch.is_autocast_enabled(images.device.type):
         return torch.autocast(images.device.type, enabled=False)
@@ -256,10 +255,7 @@ def without_autocast(images: Tensor) -> AbstractContextManager[Any]:
 
 
 def stage_statistics(maps: Iterable[Tensor]) -> Tensor:
-    """Return mean, standard deviation and maximum over each map (B, C, H, W), concatenated: (B, 3 * all C).
-
-    The mean dilutes a feature that covers a small part of an image; deviation and maximum preserve it.
-    """
+    """Return mean, standard deviation and maximum over each map (B, C, H, W), concatenated: (B, 3 * all C)."""
     parts = []
     for x in maps:
         # Not the root of the variance, whose slope is infinite if a map is constant; the slope of `std` is 0 then.

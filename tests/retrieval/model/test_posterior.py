@@ -7,6 +7,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from _touch_retrieval.documents import typed
 from retrieval.errors import BadInput, NumericalError
 from retrieval.model.posterior import MAX_GRASPS, EvidenceMass, Posterior, require_prior
 
@@ -158,4 +159,4 @@ def test_a_logit_that_is_not_finite_and_an_invalid_prior_are_refused():
 )
 def test_forged_numbers_are_refused(change):
     with pytest.raises(BadInput, match=r"posterior(\.\w+ (must be|must fit|is not)| has no setting)"):
-        Posterior.from_dict(ADDING.to_dict() | change)
+        typed(ADDING.to_dict() | change, Posterior, "posterior", complete=True, error=BadInput)

@@ -1,10 +1,12 @@
 """Calibration of reference touches, by hand."""
 
 import math
+from dataclasses import asdict
 
 import numpy as np
 import pytest
 
+from _touch_retrieval.documents import typed
 from retrieval.errors import BadInput
 from retrieval.model.references import SHARPNESS, ReferenceCalibration, reference_similarity
 from tests.reference_model import REFERENCE_CALIBRATION
@@ -34,4 +36,4 @@ def test_several_references_are_averaged_as_likelihoods():
 )
 def test_an_invalid_calibration_is_refused(change):
     with pytest.raises(BadInput):
-        ReferenceCalibration.from_dict(REFERENCE_CALIBRATION.to_dict() | change)
+        typed(asdict(REFERENCE_CALIBRATION) | change, ReferenceCalibration, complete=True, error=BadInput)

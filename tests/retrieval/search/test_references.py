@@ -7,6 +7,7 @@ import re
 import numpy as np
 import pytest
 
+from _touch_retrieval.documents import typed
 from indexes.errors import CorruptIndex
 from indexes.store.folder import IndexStore
 from retrieval.errors import BadInput
@@ -123,7 +124,7 @@ def test_the_result_has_the_reference_calibration_and_reads_back(
     result = query_new_index(catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[0]][2])
     references = result.posterior["references"]
     assert (references["touches"], references["objects"]) == (8, 4)
-    assert ReferenceCalibration.from_dict(references["calibration"]) == REFERENCE_CALIBRATION
+    assert typed(references["calibration"], ReferenceCalibration, complete=True) == REFERENCE_CALIBRATION
     document = json.loads(json.dumps(result.to_dict()))
     assert QueryResult.from_dict(document).to_dict() == result.to_dict()
 
