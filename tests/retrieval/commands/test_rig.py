@@ -60,45 +60,42 @@ POINTS = """camera_x_mm,camera_y_mm,camera_z_mm,rig_x_mm,rig_y_mm,rig_z_mm
 """
 
 
-def test_a_calibration_is_fitted_printed_and_written(here, capsys):
+def test_a_calibration_is_fitted_printed_and_written_over_an_earlier_one_and_no_photo(here, capsys):
     (here / "points.csv").write_text(POINTS)
+    (here / "hand_eye.json").write_text("earlier")
     assert main(["rig", "calibrate", "points.csv"]) == 0
     output = capsys.readouterr().err.splitlines()
     assert output[0] == "residuals: mean 0.0 mm, maximum 0.0 mm"
     assert output[-1] == "hand_eye.json: fitted to 6 points; set hand_eye to this file under [camera]"
     rigid = json.loads((here / "hand_eye.json").read_text())["rigid"]
     assert [row[3] for row in rigid] == pytest.approx([0, 0, 800, 1], abs=1e-6)
-
-
-def test_a_calibration_overwrites_an_earlier_calibration_and_no_photo(here, capsys):
-    (here / "points.csv").write_text(POINTS)
-    for _ in range(2):
-        assert main(["rig", "calibrate", "points.csv"]) == 0
     (here / "photo.png").write_bytes(b"\x89PNG")
     assert main(["rig", "calibrate", "points.csv", "--out", "photo.png"]) == 2
     assert "photo.png must be named *.json" in capsys.readouterr().err
     assert (here / "photo.png").read_bytes() == b"\x89PNG"
 
 
+def scaled(*factors):
+    """Return POINTS with scaled coordinates of the camera."""
+    heading, *lines = POINTS.splitlines()
+    rows = ([float(value) for value in line.split(",")] for line in lines)
+    wrong = [[*(value * each for value, each in zip(row, factors, strict=False)), *row[3:]] for row in rows]
+    return "\n".join([heading, *(",".join(map(str, row)) for row in wrong)])
+
+
 @pytest.mark.parametrize(
-    ("scale", "code", "reason"), [((0.001, 0.001, 0.001), 2, "must be in mm"), ((1, 1, -1), 1, "mirrored")]
+    ("content", "code", "reason"),
+    [
+        ("a,b\n1,2\n", 2, "camera_x_mm"),
+        (scaled(0.001, 0.001, 0.001), 2, "must be in mm"),
+        (scaled(1, 1, -1), 1, "mirrored"),
+    ],
+    ids=["no points", "metres", "mirrored"],
 )
-def test_a_calibration_in_metres_or_with_large_residuals_is_not_written(here, capsys, scale, code, reason):
-    lines = POINTS.splitlines()
-    rows = [[float(value) for value in line.split(",")] for line in lines[1:]]
-    wrong = [
-        ",".join(map(str, [value * each for value, each in zip(row[:3], scale, strict=True)] + row[3:])) for row in rows
-    ]
-    (here / "points.csv").write_text("\n".join([lines[0], *wrong]))
+def test_points_without_a_calibration_are_refused_with_the_reason(here, capsys, content, code, reason):
+    (here / "points.csv").write_text(content)
     assert main(["rig", "calibrate", "points.csv"]) == code
     assert reason in capsys.readouterr().err
-    assert not (here / "hand_eye.json").exists()
-
-
-def test_a_file_without_points_is_wrong_use(here, capsys):
-    (here / "points.csv").write_text("a,b\n1,2\n")
-    assert main(["rig", "calibrate", "points.csv"]) == 2
-    assert "camera_x_mm" in capsys.readouterr().err
     assert not (here / "hand_eye.json").exists()
 
 
