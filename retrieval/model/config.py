@@ -35,19 +35,16 @@ class MatcherConfig:
         fingers: Gel images in one touch. Training takes the number from the recording.
         hidden: Width of the fusion head.
         dropout: Dropout probability in the fusion head.
-        standardise: Centre and scale the features by their statistics over the training batches. Towers trained from
-            random weights then leave the plateau at chance. The paper does not do this.
+        standardise: Centre and scale the features by their statistics over the training batches. Not in the paper.
         embedding_dim: Length of the unit embeddings for candidate search.
-        candidate_width: Hidden units of the candidate encoder (`retrieval.model.candidate_encoder`), which maps partial
-            activations to embeddings after training. 0: search uses the contrastive embeddings.
-        candidate_linear: Number of the embedding_dim components that are linear in the contrastive embedding. Requires
-            `cosine`.
+        candidate_width: Hidden units of the candidate encoder (`retrieval.model.candidate_encoder`); 0 for none.
+        candidate_linear: Components of its embeddings that are linear in the contrastive embedding; requires `cosine`.
         projection_hidden: Hidden units of the projections to the contrastive embeddings. 0: the projections are linear.
-        cell_dim: Length of a cell's vector in the late interaction that is added to the match logit
-            (`retrieval.model.late_interaction`); needs tower_output "stages". 0: no late interaction, as in the paper.
+        cell_dim: Length of a cell's vector in the late interaction (`retrieval.model.late_interaction`), which needs
+            tower_output "stages". 0: no late interaction, as in the paper.
         touch_cells: Cells along each side of a gel image.
         photo_cells: Cells along each side of the last view of a photo.
-        cosine: Add the scaled cosine of the contrastive embeddings to the match logit. The paper does not do this.
+        cosine: Add the scaled cosine of the contrastive embeddings to the match logit. Not in the paper.
         photo_tower: Backbone of the photo tower, if not empty; `tower` is then that of the touch tower.
     """
 
@@ -103,11 +100,9 @@ class TrainingConfig:
 
     Attributes:
         init: Initial weights of the towers: "random", "imagenet", "shipped", "gel" or the path of a state dict.
-        init_touch: Initial weights of the touch tower, if not empty. For concatenated towers the part "init" stands for
-            the value of `init`.
+        init_touch: Initial weights of the touch tower, if not empty. The part "init" stands for the value of `init`.
         init_photo: The same for the photo tower.
-        start: Checkpoint of `retrieve train` whose towers and head the training continues from, if not empty, such as
-            one with frozen towers. It replaces the initial weights.
+        start: Checkpoint whose towers and head the training continues from, if not empty, instead of initial weights.
         iterations: Optimiser steps.
         touches_per_batch: Touches in a batch. Each forms pairs with its positives and negatives.
         positives_per_touch: Photos of the touch's object in a batch.
@@ -115,12 +110,11 @@ class TrainingConfig:
         learning_rate: Learning rate of the optimiser.
         tower_rate: Ratio of the towers' learning rate to that of the other layers.
         schedule: Name of a learning rate schedule in `SCHEDULES`.
-        weights: Weights of the losses that are added to the match loss (`retrieval.model.losses.LOSSES`). Configuration
-            files name them `contrastive_weight` and so on.
+        weights: Weights of the losses that are added to the match loss (`retrieval.model.losses.LOSSES`); in files
+            `contrastive_weight` and so on.
         shuffle_fingers: Permute the fingers of a touch randomly, like a grip from the other side. Not in the paper.
-        negatives: "dataset" draws the negatives of a touch from all photos of other objects, as in the paper. "batch"
-            takes them from the photos of the batch, so half as many are encoded (`PairSampler`). "auto" is "batch" if
-            towers are trained.
+        negatives: "dataset" draws the negatives of a touch from all photos of other objects, as in the paper, "batch"
+            from the photos of the batch, so half as many are encoded. "auto" is "batch" if towers are trained.
         freeze_batch_norm: Keep the batch statistics of the initial weights.
         freeze_towers: Train only the layers after the towers. Every image is then encoded once per training run.
         freeze_stem: Keep the first layers of the towers (`Tower.stem_layers`) frozen if the towers are trained.
@@ -131,8 +125,7 @@ class TrainingConfig:
         validate_every: Steps between two validations.
         precision: "float32", "bfloat16" or "auto" (`retrieval.model.encode.autocast`).
         seed: Seed of all random choices.
-        workers: Processes that decode images, if towers are trained; "auto" for one per core with a GPU, and none on a
-            CPU, whose cores the towers use.
+        workers: Processes that decode images, if towers are trained; "auto": one per core with a GPU, none on a CPU.
     """
 
     init: str = "imagenet"
@@ -184,10 +177,7 @@ class TrainingConfig:
         return any(weight > 0 for name, weight in self.weights.items() if name not in LOGIT_LOSSES)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a plain dictionary, as in a TOML file, without `workers`.
-
-        Each loss weight is a setting of its own, `<loss>_weight`.
-        """
+        """Return a plain dictionary, as in a TOML file, without `workers`; each weight is a setting `<loss>_weight`."""
         table: dict[str, Any] = {}
         for name, value in dataclasses.asdict(self).items():
             if name == "weights":

@@ -184,23 +184,13 @@ class Posterior:
         return PosteriorProbabilities(math.exp(none - whole), posteriors, math.exp(mass.unscored - whole), if_present)
 
     def more_grasps(self, logit: float, objects: int, grasps: int, none_prior: float = NONE_PRIOR) -> int | None:
-        """Estimate how many more grasps make the best object more likely than "none of these".
+        """Estimate how many more grasps make the best object, with logit l, more likely than "none of these".
 
-        More grasps are assumed to resemble the g made so far: the same mean match logit, so the summed logit of n
-        grasps is n / g * l. The best object is more likely than "none of these" from the first n on that satisfies
+        They are assumed to have the mean match logit of the g grasps so far. n grasps suffice if
 
             slope * n / (1 + dependence * (n - 1)) * l / g + offset  >  log objects + log (p / (1 - p))
 
-        The term with l is at most 1 / dependence times its value at n = 1 (trials: docs/measurements/answers.md).
-
-        Args:
-            logit: Logit l of the best object, which is not more likely than none yet.
-            objects: Number of objects in the catalogue.
-            grasps: Number of grasps so far, g.
-            none_prior: p, more than 0.
-
-        Returns:
-            The number of further grasps, n - g; None if `MAX_GRASPS` in total do not suffice.
+        (trials: docs/measurements/answers.md). None if `MAX_GRASPS` in total do not suffice; the prior p is above 0.
         """
         needed = math.log(objects) + math.log(none_prior) - math.log1p(-none_prior) - self.offset
         for total in range(grasps + 1, MAX_GRASPS + 1):

@@ -66,11 +66,7 @@ class Generations:
         gc.collect()  # free reference cycles of the previous generation
 
     async def watch(self) -> None:
-        """Open each new generation.
-
-        If a generation cannot be opened, the failure is logged, again every `_RETRY_S`, and the previous generation
-        continues to answer.
-        """
+        """Open each new generation; if that fails, log it, try again after `_RETRY_S`, and keep the previous one."""
         pause_s = self._settings.poll_s
         while True:
             await asyncio.sleep(pause_s)

@@ -75,11 +75,7 @@ class ServiceSettings:
 
     @property
     def threads(self) -> int:
-        """Number of threads for the computation of one request.
-
-        One core stays free for the event loop, which otherwise answers late. The threads of one computation wait for
-        each other, so a busy core delays all of them.
-        """
+        """Number of threads for the computation of one request; one core stays free for the event loop."""
         return max(1, ((os.cpu_count() or 1) - 1) // self.workers)
 
     @property

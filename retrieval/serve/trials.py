@@ -21,7 +21,7 @@ CHOICES = 10
 
 @dataclass(frozen=True)
 class Trial:
-    """One trial: the grasp whose touch is shown, the photos to choose from, and the number from 1 of the right one."""
+    """The grasp whose touch is shown, the photos to choose from, and the number from 1 of the right one."""
 
     grasp: Grasp
     photos: tuple[Path, ...]

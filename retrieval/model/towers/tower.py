@@ -51,11 +51,7 @@ class Tower(nn.Module):
     std: Tensor
 
     def __init__(self, output: str = "pooled") -> None:
-        """Make the parts that all towers have; a subclass makes its layers.
-
-        Args:
-            output: `MatcherConfig.tower_output`.
-        """
+        """Make the parts that all towers have for a `MatcherConfig.tower_output`; a subclass makes its layers."""
         super().__init__()
         self.output = output
         self.cells = 0
@@ -136,9 +132,8 @@ class Tower(nn.Module):
 
         Args:
             init: "random" leaves the tower as built. "imagenet" loads the published weights, "shipped" those of
-                `shipped`, "gel" the file `gel_tower`. Anything else is the path of a .pth, .pt or .safetensors state
-                dict with the tower's key names, which for our own towers are torchvision's. Concatenated towers take
-                one value for all, or one each, joined by `TOWER_SEPARATOR`.
+                `shipped`, "gel" the file `gel_tower`. Anything else is the path of a state dict with the tower's key
+                names. Concatenated towers take one value for all, or one each, joined by `TOWER_SEPARATOR`.
             shipped: Returns the state dict for "shipped".
 
         Raises:
@@ -222,9 +217,8 @@ def build_tower(name: str, output: str = "pooled") -> Tower:
 
     Args:
         name: A row of `TOWERS`, or "module:Class" of an imported module.
-        output: "pooled" gives the globally averaged features of the last stage; "classes" keeps the 1000-way linear
-            layer of ImageNet checkpoints, whose outputs the paper concatenates; "stages" gives mean, deviation and
-            maximum over the maps of several stages, from edges to parts.
+        output: "pooled": averages of the last stage; "classes": the 1000-way layer of ImageNet checkpoints, as in the
+            paper; "stages": mean, deviation and maximum over the maps of several stages.
 
     Raises:
         ConfigError: The name is unknown.
