@@ -15,8 +15,7 @@ MISSING = -1.0
 class FakeVideoDevice:
     """A USB camera that counts its pictures. `open` replaces cv2.VideoCapture and adds to `captures`.
 
-    Faults are the attributes `busy`, `dead`, `frozen`, `damaged` (number of pictures that do not decode) and `hangs`
-    (an event that the driver waits for).
+    Faults are the attributes `busy`, `dead`, `frozen` and `damaged` (number of pictures that do not decode).
 
     Attributes:
         fps: Pictures per second.
@@ -33,7 +32,6 @@ class FakeVideoDevice:
         self.values = {cv2.CAP_PROP_FOURCC: float(cv2.VideoWriter.fourcc(*"YUYV")), cv2.CAP_PROP_FPS: 15.0}
         self.busy = self.dead = self.frozen = False
         self.damaged = self.pictures = 0
-        self.hangs = None
         self.captures, self.written = [], []
 
     def open(self, path, backend=None):
@@ -76,8 +74,6 @@ class FakeCapture:
 
     def grab(self):
         camera = self.camera
-        if camera.hangs is not None:
-            camera.hangs.wait()
         if camera.dead or self.released:
             return False
         now = time.monotonic()

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from robot.collection import CollectSettings, collect
-from robot.devices import Camera, TactileSensor
+from robot.devices import Camera, TactileSensor, VirtualDevice
 from robot.readings import RGBD, Frame, Intrinsics
 from robot.recording.folder import read_recording
 from robot.rig import load_rig
@@ -67,39 +67,30 @@ hold_s = 0.1
 """
 
 
-class FolderSensor(TactileSensor):
+class FolderSensor(VirtualDevice, TactileSensor):
     """Shows the pictures of a folder in the order of their names, 30 in a second, again and again."""
 
     def __init__(self, *, finger: str, path: str, clock=time.monotonic):
         super().__init__(f"gel {finger}", finger, clock=clock)
-        self.path, self.pictures = Path(path), []
+        self.path = Path(path)
 
     def _connect(self):
         self.pictures = [cv2.imread(str(each))[..., ::-1].copy() for each in sorted(self.path.iterdir())]
-
-    def _close(self):
-        self.pictures = []
 
     def _read(self):
         number = math.floor(30 * self.clock())
         return Frame(self.pictures[number % len(self.pictures)], number / 30)
 
 
-class RecordedCamera(Camera):
-    """Shows the next photo of a recording, with its depth, at each read; `seek` chooses one."""
+class RecordedCamera(VirtualDevice, Camera):
+    """Shows the next photo of a recording, with its depth, at each read."""
 
     def __init__(self, *, path: str, extrinsics, fx: float, fy: float, cx: float, cy: float, clock=time.monotonic):
         super().__init__("recorded camera", extrinsics, clock=clock)
-        self.path, self.lens, self.grasps, self.next = Path(path), Intrinsics(fx, fy, cx, cy), [], 0
-
-    def seek(self, number):
-        self.next = number
+        self.path, self.lens = Path(path), Intrinsics(fx, fy, cx, cy)
 
     def _connect(self):
         self.grasps, self.next = read_recording(self.path).grasps, 0
-
-    def _close(self):
-        self.grasps = []
 
     def _read(self, depth):
         grasp = self.grasps[self.next % len(self.grasps)]

@@ -37,11 +37,8 @@ def plug_camera(roots, name, number, label, index="0"):
         (dev / "v4l" / "by-id" / name).symlink_to(dev / f"video{number}")
 
 
-def test_with_nothing_connected_and_nothing_installed_nothing_is_found(tmp_path):
+def test_cameras_are_found_by_their_stable_names_with_their_own_labels(roots, tmp_path):
     assert discover.discover(tmp_path / "none", tmp_path / "none") == []
-
-
-def test_cameras_are_found_by_their_stable_names_with_their_own_labels(roots):
     plug_camera(roots, "usb-Maker_Webcam_12-video-index0", 0, "Webcam 12: Webcam")
     plug_camera(roots, "usb-Maker_Webcam_12-video-index1", 1, "Webcam 12: Webcam", index="1")
     name = str(roots[0] / "v4l" / "by-id" / "usb-Maker_Webcam_12-video-index0")

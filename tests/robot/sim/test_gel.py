@@ -36,7 +36,7 @@ def dome(field=SMALL, radius_mm=6.0, depth_mm=1.0):
 # Surfaces --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("grid", [(24, 32), (12, 16), (48, 64), (30, 20)])
+@pytest.mark.parametrize("grid", [(24, 32), (12, 16), (30, 40)])
 def test_the_slopes_of_a_plane_are_right_on_every_grid(grid):
     field = Field(grid[0], grid[1], 1.0)
     x, y = field.positions()

@@ -18,7 +18,7 @@ from robot.recording.folder import read_recording
 from robot.rig import load_rig
 from robot.sim.antipodal import find_grasps
 from robot.sim.objects import resting
-from robot.sim.objects.mesh import Mesh, mesh_object, read_mesh
+from robot.sim.objects.mesh import mesh_object, read_mesh
 from robot.sim.objects.resting import UP, stable_up_directions
 from tests.meshes import BOTTLE, box, revolved, sphere, stl
 
@@ -57,13 +57,6 @@ def test_a_box_rests_on_its_six_sides_upright_first_then_the_most_stable():
     np.testing.assert_allclose(np.sort(np.abs(ups[1:5]), axis=1), np.tile([0, 0, 1], (4, 1)), atol=1e-9)
     np.testing.assert_allclose([abs(up[0]) for up in ups[1:5]], [1, 1, 0, 0], atol=1e-9)  # the largest sides
     np.testing.assert_allclose(ups[5], [0, 0, -1], atol=1e-9)
-
-
-def test_the_centre_of_mass_is_that_of_the_solid_at_any_position():
-    (vertices, faces), away = box(60, 90, 180), [500, -7, 90]
-    np.testing.assert_allclose(Mesh(vertices + np.array(away), faces).solid.center_mass, away, atol=1e-9)
-    cone = Mesh(*revolved([(30, 0), (0.001, 80)]))
-    np.testing.assert_allclose(cone.solid.center_mass, [0, 0, 20], atol=0.01)  # a quarter of its height
 
 
 # Grasps -----------------------------------------------------------------------------------------------------
