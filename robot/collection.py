@@ -72,16 +72,7 @@ class CollectSettings:
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress of a collection.
-
-    Attributes:
-        objects: Number of objects.
-        objects_done: Objects that need no further attempt.
-        grasps_target: Number of accepted grasps to collect, over all objects.
-        grasps_done: Accepted grasps, plus the missing ones of objects that need no further attempt.
-        accepted: Accepted grasps.
-        attempts: Attempts so far.
-    """
+    """Counts of a collection; `grasps_done` includes the missing grasps of objects that need no further attempt."""
 
     objects: int
     objects_done: int

@@ -95,13 +95,9 @@ class Intrinsics:
 
 @dataclass(frozen=True, eq=False)
 class RGBD:
-    """A camera picture with or without depth.
+    """A camera picture: (H, W, 3) uint8 RGB; time of exposure; perhaps depth, which requires intrinsics.
 
-    Attributes:
-        colour: (H, W, 3) uint8 RGB.
-        depth_m: (H, W) float32 depth along the optical axis in METRES, NaN where unknown; None without depth.
-        intrinsics: Required for a picture with depth; None if unknown.
-        time_s: Time of exposure.
+    Depth is (H, W) float32 along the optical axis in METRES, NaN where unknown.
     """
 
     colour: npt.NDArray[np.uint8]
@@ -112,13 +108,10 @@ class RGBD:
 
 @dataclass(frozen=True)
 class GripperState:
-    """State of the gripper.
+    """Distance between the fingers, force on each finger, and status.
 
-    Attributes:
-        opening_mm: Distance between the fingers.
-        force_n: Force on each finger.
-        status: "holding": an object is clamped. "no_part": the jaws closed without contact. "part_lost": the clamped
-            object has slipped out. Else "idle" or "moving".
+    "holding": an object is clamped. "no_part": the jaws closed without contact. "part_lost": the clamped object has
+    slipped out. Else "idle" or "moving".
     """
 
     opening_mm: float

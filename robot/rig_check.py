@@ -19,25 +19,14 @@ from robot.errors import RobotError
 from robot.rig import Rig
 
 JAW_MM, ARM_MM, ARM_MM_S = 5.0, 10.0, 20.0
-MEASURE_S = 2.0
-"""Duration of the frame rate measurement in s."""
-
-_POLL_S = 0.002
+MEASURE_S, _POLL_S = 2.0, 0.002
 _REPEATS = 20
 """Number of state queries for the response time, and of paired gel reads for the skew."""
 
 
 @dataclass(frozen=True)
 class DeviceReport:
-    """Result of the check of one device.
-
-    Attributes:
-        device: Name of the device.
-        role: "arm", "gripper", "gel", "camera" or "skew".
-        measured: Measured figures by name, as text with units.
-        refused: Settings that the device refused, each with the requested and the actual value.
-        failure: Error message, or None if the device works.
-    """
+    """Result of the check of one device: measured figures, refused settings, and the error message of a failure."""
 
     device: str
     role: str

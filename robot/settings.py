@@ -63,15 +63,9 @@ def build_named(
     default: str | None = None,
     **arguments: Any,
 ) -> _T:
-    """Return an object of the class that a table names, built from the table's other keys.
+    """Return an object of the class that a table names by `key`, built from its other keys (`build`).
 
-    Args:
-        registry: Classes by name.
-        table: A table of a rig's file; the value of `key` is the name.
-        key: The key.
-        where: Name of the table in messages.
-        default: Name to use if the table has none; None if the key is required.
-        arguments: Passed to `build`.
+    Without `default`, the key is required.
 
     Raises:
         UnknownName: The registry lacks this name; the message lists the known ones.

@@ -31,19 +31,17 @@ _OUTCOME_FROM: Mapping[str, Outcome] = {"holding": "held", "no_part": "missed", 
 
 @dataclass(frozen=True)
 class GraspAttempt:
-    """Result of one attempt, picklable.
+    """Result of one attempt, picklable; times count from the photo.
 
     Attributes:
         object_id: The object.
         number: Number of the attempt at this object.
-        outcome: "held", "missed" or "slipped", as the gripper reports after the lift. Without images: "no_plan", or
-            "ungraspable" if no further attempt can succeed.
-        images: Content of JPEG and PNG files by key (photo, touch_a, touch_a_before, ...).
+        outcome: As the gripper reports after the lift. Without images: "no_plan", or "ungraspable" if no further
+            attempt can succeed.
+        images: Content of JPEG and PNG files by column.
         fields: Further fields of the recorded grasp.
-        fit: The plan's description of the object, for the log.
+        fit: The plan's description of the object.
         reason: Message of the PlanError, if any.
-        touch_time_s: Time from the photo to the gel images of the closed jaws.
-        duration_s: Time from the photo to the end.
     """
 
     object_id: str

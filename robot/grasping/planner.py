@@ -17,10 +17,7 @@ from robot.sight.cylinder import CylinderFit, fit_cylinder
 class CylinderPlanner(GraspPlanner):
     """The planner of the paper: fit a cylinder to the depth picture and pinch it from above (`plan_grasp`).
 
-    If the rig has an `object_fit`, it replaces the fit.
-
-    Args:
-        search_margin_mm: Width of the border around the workspace that is searched for objects too.
+    The rig's `object_fit` replaces the fit. A border of `search_margin_mm` around the workspace is searched too.
     """
 
     def __init__(self, *, search_margin_mm: NonNegative = 150.0) -> None:

@@ -248,17 +248,16 @@ class _Topics:
 
 @dataclass
 class _Scan:
-    """Times and numbers from one bag.
+    """Times and numbers from one bag, by topic and message.
 
     Attributes:
-        times: Topic -> when the bag recorded its messages, in ns; images that cannot be decoded are left out.
-        values: Topic of grasp or object -> its messages' values.
+        times: When the bag recorded each message, in ns; images that cannot be decoded are left out.
+        values: Messages of the topics grasp and object.
         openings_mm: Opening in each message of the gripper; NaN if it has no positions.
         forces_n: Force in each message of the gripper; NaN if it has no efforts.
-        changes: Topic of a finger -> mean change of each gel image from the first one, in grey levels.
+        changes: Mean change of each gel image from the first one, in grey levels.
         changed: The same as a fraction of the area; empty if a topic marks the grasps.
         unreadable: Number of gel images that cannot be decoded or have another size.
-        first_ns: When the first message was recorded.
     """
 
     times: dict[str, "array[int]"] = field(default_factory=lambda: defaultdict(lambda: array("q")))

@@ -36,10 +36,8 @@ class TablePlane:
 class Rays:
     """Rays of all pixels: a pixel's point is the camera's position + depth_mm * direction.
 
-    Attributes:
-        x: (W,) x of each column's ray in the camera's frame, at depth 1.
-        y: (H,) y of each row's ray in the camera's frame, at depth 1.
-        pose: (4, 4) camera frame to rig frame, mm.
+    x (W,) and y (H,) are those of a column's and a row's ray in the camera's frame, at depth 1; pose (4, 4), in mm, is
+    from the camera's frame to the rig's.
     """
 
     x: npt.NDArray[np.float32]
@@ -118,13 +116,7 @@ def _heights(plane: Array, points: Array) -> Array:
 def find_object_points(
     depth_mm: Depth, rays: Rays, table: TablePlane, region: Region | None = None
 ) -> tuple[Array, bool]:
-    """Find the largest connected object above the table.
-
-    Args:
-        depth_mm: (H, W) depth, NaN where unknown.
-        rays: Rays of the pixels.
-        table: The table.
-        region: Box in the rig's frame; its x and y limit the search. None for no limit.
+    """Find the largest connected object above the table; the x and y of `region` limit the search.
 
     Returns:
         Its points (N, 3) in mm, z above the table, and whether it touches the picture's border.

@@ -52,18 +52,12 @@ fits; `_GUESS_MM` for a box whose top is not visible.
 
 @dataclass(frozen=True)
 class CylinderFit:
-    """An upright cylinder in the rig's frame, and the footprint of the object. Lengths in mm.
+    """An upright cylinder on the table in the rig's frame, and the footprint of the object.
 
     Attributes:
-        x_mm: x of the centre.
-        y_mm: y of the centre.
-        height_mm: Height above the table.
-        radius_mm: Radius.
         error_mm: Standard error of the centre, without the error of the camera calibration.
         method: Method of the fit; see the top of the file.
         half_mm: Half sizes of the footprint along `yaw_rad` and across; both are the radius for a round object.
-        yaw_rad: Direction of the footprint's axis.
-        points: Number of points.
         arc_deg: Visible arc of the circle, for the method "circle".
         notes: Remarks for the user.
     """

@@ -39,13 +39,7 @@ _MAX_CLOCK_ERROR = timedelta(days=1)
 
 @dataclass(frozen=True, eq=False)
 class HandEye:
-    """A hand-eye calibration.
-
-    Attributes:
-        rigid: (4, 4) rotation and translation from camera to rig, mm.
-        residuals_mm: (N,) distances between the mapped camera points and the rig points.
-        written: Time of the calibration, in UTC.
-    """
+    """A hand-eye calibration: (4, 4) motion from camera to rig in mm, and the (N,) distances of the mapped points."""
 
     rigid: Points
     residuals_mm: Points
