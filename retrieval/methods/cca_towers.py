@@ -1,4 +1,4 @@
-"""CCA of concatenated towers (`retrieval.training.cca_towers`), as `retrieve adapt` fits it."""
+"""CCA of concatenated towers (`retrieval.training.cca`), as `retrieve adapt` fits it."""
 
 from contextlib import suppress
 from typing import TYPE_CHECKING
@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 from retrieval.errors import BadInput
 from retrieval.methods.method import Array, Method
 from retrieval.training.calibration import fit_posterior
-from retrieval.training.cca import unit_rows
-from retrieval.training.cca_towers import fit_projections, select_settings, tower_widths
+from retrieval.training.cca import fit_projections, select_settings, tower_widths, unit_rows
 from retrieval.training.selection import held_out_folds
 
 if TYPE_CHECKING:

@@ -3,7 +3,7 @@
 Touches are encoded by the frozen towers of the start model (pretrained on relief in simulation), by the gel tower of
 the package (`retrieval.model.towers.weights.gel_tower`) and by a published tower (pretrained on photos); photos by the
 tower of the start model and by the published one. The photo tower of a shipped model is left out, since it has seen
-simulated photos only. The fit to these features is linear (`retrieval.training.cca_towers`).
+simulated photos only. The fit to these features is linear (`retrieval.training.cca`).
 
 Every reported number comes from objects that were left out of the fit. On a similar sensor the start model is better
 than a fit to a few objects: it is then kept, with new calibrations.
@@ -47,7 +47,7 @@ from retrieval.model.towers import TOWER_SEPARATOR
 from retrieval.model.towers.tower import Tower
 from retrieval.model.towers.weights import GEL
 from retrieval.training.calibration import ScoredTouches, score_touches, with_calibrations, with_gel_check
-from retrieval.training.cca_towers import (
+from retrieval.training.cca import (
     MAX_CALIBRATION_TOUCHES,
     CcaSelection,
     select_settings,
@@ -57,11 +57,8 @@ from retrieval.training.features import Features, FrozenFeatures, encode_recordi
 from retrieval.training.initial_weights import checkpoint_licences
 from retrieval.training.selection import held_out_folds
 
-PRESET = "adapt"
 PUBLISHED_TOWER = "mobilenet_v2"
 """Published tower that is combined with the towers of the start model, and backbone of the gel tower."""
-NO_TOWER = "none"
-"""Value of `init` for no published tower."""
 GALLERY = 9
 """Approximate number of objects of a fold, which are the candidates of its touches."""
 MIN_OBJECTS = 6
@@ -131,11 +128,9 @@ def adapt(
         start = load_checkpoint(start or shipped_model(min(fingers, 2)))
     if split is not None:
         grasps = [grasp for grasp in grasps if grasp.object_id not in split.test]
-    config = config_for(start, fingers, init)
+    config, matcher = combined_matcher(start, fingers, init)
     seed = config.training.seed
     folds = draw_folds(grasps, seed)
-    matcher = Matcher(config.matcher, len(config.preprocessing.views)).eval()
-    load_towers(matcher, start, init)
     encode = partial(encode_recording, grasps, cache=None, quiet=quiet)
     features = encode(matcher, config)
     low_pass = encode(matcher, config, touch_variant="low_pass", photo_features_from=features)
@@ -198,37 +193,35 @@ def adapt(
 # The combined towers ---------------------------------------------------------------------------------------
 
 
-def config_for(start: Checkpoint, fingers: int, init: str) -> Config:
-    """Return the preset with the towers of the fit; with `init` "none" those of the start model only."""
-    preset, source = load_config(PRESET), start.config.matcher
+def combined_matcher(start: Checkpoint, fingers: int, init: str) -> tuple[Config, Matcher]:
+    """Return the configuration and a matcher with the towers of the fit; `init` as for `adapt`."""
+    preset, source, sources = load_config("adapt"), start.config.matcher, _tower_sources(start, init)
     names = {start.matcher.touch_tower: source.tower, start.matcher.photo_tower: source.photo_tower or source.tower}
     touch, photo = (
         TOWER_SEPARATOR.join(PUBLISHED_TOWER if isinstance(part, str) else names[part] for part in parts)
-        for parts in _tower_sources(start, init)
+        for parts in sources
     )
-    matcher = dataclasses.replace(
+    settings = dataclasses.replace(
         preset.matcher, tower=touch, photo_tower=photo, tower_output=source.tower_output, fingers=fingers
     )
     training = dataclasses.replace(preset.training, init="random", init_touch="", init_photo="")
-    return dataclasses.replace(preset, matcher=matcher, training=training)
-
-
-def load_towers(matcher: Matcher, start: Checkpoint, init: str) -> None:
-    """Load the weights of the towers of `config_for`; `init` are those of the published tower, or "none"."""
-    for tower, sources in zip((matcher.touch_tower, matcher.photo_tower), _tower_sources(start, init), strict=True):
-        parts = [part for one in sources for part in ([one] if isinstance(one, str) else one.backbones)]
-        for backbone, source in zip(tower.backbones, parts, strict=True):
-            if isinstance(source, str):
-                backbone.initialise(source)
+    config = dataclasses.replace(preset, matcher=settings, training=training)
+    matcher = Matcher(config.matcher, len(config.preprocessing.views)).eval()
+    for tower, parts in zip((matcher.touch_tower, matcher.photo_tower), sources, strict=True):
+        backbones = [each for part in parts for each in ([part] if isinstance(part, str) else part.backbones)]
+        for backbone, weights in zip(tower.backbones, backbones, strict=True):
+            if isinstance(weights, str):
+                backbone.initialise(weights)
             else:
-                backbone.load_state_dict(source.state_dict())
+                backbone.load_state_dict(weights.state_dict())
+    return config, matcher
 
 
 def _tower_sources(start: Checkpoint, init: str) -> tuple[list[Tower | str], list[Tower | str]]:
     """Return the parts of the touch tower and of the photo tower: towers of the start model, or initial weights."""
     touch: list[Tower | str] = [start.matcher.touch_tower]
     photo: list[Tower | str] = [start.matcher.photo_tower]
-    if init == NO_TOWER:
+    if init == "none":
         return touch, photo
     if start.config.matcher.tower_output == "stages":  # as the features of the gel tower
         touch.append(GEL)

@@ -329,10 +329,6 @@ class WeightedLosses(nn.Module):
         dim = matcher.config.embedding_dim
         self.terms = nn.ModuleList(LOSSES.load(name)(dim, objects) for name in self.weights)
 
-    def forward(self, batch: EncodedBatch) -> list[Tensor]:
-        """Return the weighted losses (scalars) of a batch."""
-        return [weight * term(batch) for weight, term in zip(self.weights.values(), self.terms, strict=True)]
-
     def clamp(self) -> None:
         """Clamp the losses' parameters to their ranges."""
         for term in self.terms:
@@ -347,9 +343,10 @@ def batch_loss(
     arrays = batch.touch_index, batch.photo_index, batch.labels, batch.touch_objects, batch.photo_objects
     touch_index, photo_index, labels, *objects = (torch.from_numpy(array).to(touch_features.device) for array in arrays)
     touch, photo = matcher.touch_encoding(touch_features), matcher.photo_encoding(photo_features)
+    encoded = EncodedBatch(matcher, touch, photo, *objects)
     loss = match_loss(matcher.head(touch.partial[touch_index], photo.partial[photo_index]), labels)
-    for term in losses(EncodedBatch(matcher, touch, photo, *objects)):
-        loss = loss + term
+    for weight, term in zip(losses.weights.values(), losses.terms, strict=True):
+        loss = loss + weight * term(encoded)
     return loss
 
 

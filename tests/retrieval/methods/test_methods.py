@@ -11,7 +11,7 @@ from retrieval.methods import CHANCE, METHODS, cca_towers
 from retrieval.methods.cca import Cca
 from retrieval.methods.method import Method, MethodSettings
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
-from retrieval.training.cca_towers import GRID, CcaSettings, TowerWidths, fit_projections, select_settings, tower_widths
+from retrieval.training.cca import GRID, CcaSettings, TowerWidths, fit_projections, select_settings, tower_widths
 from retrieval.training.features import Features
 from retrieval.training.selection import ranking_auc
 

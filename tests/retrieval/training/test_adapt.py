@@ -14,9 +14,9 @@ from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
 from retrieval.model.fusion import Matcher
 from retrieval.model.towers.tower import build_tower
-from retrieval.training.adapt import accuracies, adapt, config_for, draw_folds, fit_folds, load_towers
+from retrieval.training.adapt import accuracies, adapt, combined_matcher, draw_folds, fit_folds
 from retrieval.training.calibration import ScoredTouches, fit_posterior, fit_verification, verification_sequences
-from retrieval.training.cca_towers import GRID, CcaSettings, TowerWidths, fit_projections, select_settings
+from retrieval.training.cca import GRID, CcaSettings, TowerWidths, fit_projections, select_settings
 from retrieval.training.features import Features
 from retrieval.training.initial_weights import build_matcher
 from tests.verification import calibration
@@ -129,8 +129,7 @@ def test_the_preset_builds_the_same_towers_as_adapt_with_the_shipped_model(publi
     preset = training_config("adapt", None, init=str(published))
     preset = dataclasses.replace(preset, matcher=dataclasses.replace(preset.matcher, fingers=1))
     start = load_checkpoint(retrieval.shipped_model(1))
-    expected = Matcher(config_for(start, 1, str(published)).matcher, 2)
-    load_towers(expected, start, str(published))
+    expected = combined_matcher(start, 1, str(published))[1]
     made = build_matcher(preset)
     for side in ("touch_tower", "photo_tower"):
         for name, tensor in getattr(expected, side).state_dict().items():
@@ -141,8 +140,7 @@ def test_the_preset_builds_the_same_towers_as_adapt_with_the_shipped_model(publi
 
 def test_touches_are_encoded_by_the_shipped_the_gel_and_the_published_tower_and_photos_by_the_last(published):
     start = load_checkpoint(retrieval.shipped_model(1))
-    matcher = Matcher(config_for(start, 1, str(published)).matcher)
-    load_towers(matcher, start, str(published))
+    matcher = combined_matcher(start, 1, str(published))[1]
     gel, added = build_tower("mobilenet_v2", "stages"), build_tower("mobilenet_v2", "stages")
     gel.initialise("gel")
     added.initialise(str(published))
