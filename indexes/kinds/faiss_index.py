@@ -18,8 +18,6 @@ POINTS_PER_CENTRE = 39
 """Smallest number of training vectors of each centre that FAISS accepts without a warning."""
 MAX_NUMPY_SCORES = 1 << 14
 """Largest number of scores of an exact search by numpy. It takes less than a millisecond, the import of FAISS 25."""
-ADDED_ROWS = 1 << 16
-"""Vectors passed to FAISS at once."""
 
 
 def load_faiss() -> Any:
@@ -95,8 +93,7 @@ class FaissIndex(VectorIndex):
         with faiss_call(f"building {self.kind}", threads):
             if not self._structure.is_trained:
                 self._structure.train(self.vectors)
-            for start in range(0, self.count, ADDED_ROWS):
-                self._structure.add(self.vectors[start : start + ADDED_ROWS])
+            self._structure.add(self.vectors)
 
     def _search(self, queries: Floats, k: int) -> tuple[Floats, RowNumbers]:
         if self.exact and len(queries) * self.count <= MAX_NUMPY_SCORES:

@@ -171,11 +171,9 @@ def check_unit(vectors: object, *, dim: int | None = None, names: Sequence[str] 
     norms = row_norms(table)
     bad = np.flatnonzero(~(np.abs(norms - 1.0) <= NORM_TOLERANCE))
     if len(bad):
-        number = int(bad[0])
-        name = names[number] if names else str(number)
+        name = names[bad[0]] if names else str(bad[0])
         more = f" ({len(bad) - 1} more like it)" if len(bad) > 1 else ""
-        fault = _fault(table[number], float(norms[number]))
-        raise VectorError(f"{what} {name!r}: the norm must be 1 within {NORM_TOLERANCE}; {fault}{more}")
+        raise VectorError(f"{what} {name!r}: the norm must be 1 within {NORM_TOLERANCE}; got {norms[bad[0]]:.6g}{more}")
     return table
 
 
@@ -193,11 +191,3 @@ def row_norms(table: Floats) -> NDArray[np.float64]:
         block = table[start : start + BLOCK_ROWS].astype(np.float64)
         norms[start : start + BLOCK_ROWS] = np.sqrt(np.einsum("nd,nd->n", block, block))
     return norms
-
-
-def _fault(row: Floats, norm: float) -> str:
-    if np.isnan(row).any():
-        return "it has NaN (not a number)"
-    if np.isinf(row).any():
-        return "it has an infinite component"
-    return "the vector is zero" if norm == 0.0 else f"got {norm:.6g}"

@@ -20,7 +20,7 @@ current and complete; the next writer deletes the unfinished files.
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from os import getpid
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from _touch_retrieval import files
 from _touch_retrieval.files import read_regular
 from indexes.errors import AGAIN, CorruptIndex, NoIndex, WriteFailed
 from indexes.kinds.vector_index import Floats
-from indexes.store.generation import Arrays, Generation, Measure, check_fingerprint, read_generation, write_generation
+from indexes.store.generation import Arrays, Generation, Measure, read_generation, write_generation
 from indexes.store.locking import writer_lock
 from indexes.store.manifest import Manifest
 from indexes.store.rows import Row
@@ -48,7 +48,7 @@ class IndexStore:
     >>> blocks = [{"embeddings": np.eye(2, dtype=np.float32)}]
     >>> store.write(rows, blocks, fingerprint={"checkpoint": "abc"}).generation
     'gen-000001'
-    >>> store.open(expect={"checkpoint": "abc"}).count
+    >>> store.open().count
     2
     """
 
@@ -60,7 +60,6 @@ class IndexStore:
         *,
         name: str | None = None,
         verify: bool = True,
-        expect: Mapping[str, str] | None = None,
         threads: int | None = None,
     ) -> Generation:
         """Open and check a generation.
@@ -68,24 +67,21 @@ class IndexStore:
         Args:
             name: Its name; None for the current generation.
             verify: Compare the SHA-256 of the files; sizes are always checked.
-            expect: Required values of the fingerprint.
             threads: Number of threads of a search; None for the library's own setting.
 
         Raises:
             NoIndex: There is no index.
             CorruptIndex: A file is missing or damaged.
             UnsupportedFormat: The index has another format.
-            MismatchedIndex: The fingerprint has other values.
         """
         requested = name or self.current()
         try:
-            generation = self._read(requested, verify, threads)
+            return read_generation(self.path / requested, verify=verify, threads=threads)
         except CorruptIndex:
             if name is not None or self.current() == requested:
                 raise
-            generation = self._read(self.current(), verify, threads)  # a writer replaced it while it was being read
-        check_fingerprint(self.path, generation.manifest.fingerprint, expect or {})
-        return generation
+            # A writer replaced it while it was being read.
+            return read_generation(self.path / self.current(), verify=verify, threads=threads)
 
     def current(self) -> str:
         """Return the name of the current generation, from CURRENT."""
@@ -140,7 +136,7 @@ class IndexStore:
             documents: Name to JSON document or array.
             queries: Unit vectors (Q, d) to measure recall with; None to draw them near the embeddings.
             measure: Returns further entries of `about` from the written index and arrays.
-            fingerprint: Origin of the vectors, compared by `IndexStore.open(expect=...)`.
+            fingerprint: Digests of what made the vectors (`check_fingerprint`).
             about: Further entries of the manifest.
             software: Version of the writing software.
             threads: Number of threads; None for the library's own setting.
@@ -183,7 +179,8 @@ class IndexStore:
                 yield folder, name
                 folder.rename(self.path / name)
             except BaseException:
-                _discard(folder)
+                with suppress(OSError):  # else the next writer deletes it
+                    files.remove_folder(folder)
                 raise
             files.sync(self.path)
             files.write_atomically(self.path / "CURRENT", f"{name}\n".encode())
@@ -195,16 +192,8 @@ class IndexStore:
         """Delete old generations, except the two before `name`, which readers may be opening."""
         for number in self._numbers():
             if number < int(name.removeprefix("gen-")) - 2:
-                _discard(self.path / f"gen-{number:06d}")
-
-    def _read(self, name: str, verify: bool, threads: int | None) -> Generation:
-        folder = self.path / name
-        if not folder.is_dir():
-            raise CorruptIndex(f"{self.path}: the generation {name} is missing; {AGAIN}")
-        generation = read_generation(folder, verify=verify, threads=threads)
-        if generation.name != name:
-            raise CorruptIndex(f"{folder}: the manifest belongs to {generation.name}; {AGAIN}")
-        return generation
+                with suppress(OSError):  # else the next writer deletes it
+                    files.remove_folder(self.path / f"gen-{number:06d}")
 
     def _numbers(self) -> list[int]:
         found = (GENERATION.fullmatch(path.name) for path in self.path.iterdir())
@@ -214,14 +203,6 @@ class IndexStore:
         """Delete the unfinished files and folders of killed writers."""
         for path in self.path.glob(".CURRENT.*.tmp"):
             path.unlink()
-        for path in [path for path in self.path.iterdir() if UNFINISHED_FOLDER.fullmatch(path.name)]:
-            if path.is_dir() and not path.is_symlink():
+        for path in list(self.path.iterdir()):
+            if UNFINISHED_FOLDER.fullmatch(path.name) and path.is_dir() and not path.is_symlink():
                 files.remove_folder(path)
-
-
-def _discard(folder: Path) -> None:
-    """Delete a folder; if that fails, leave it to the next writer."""
-    try:
-        files.remove_folder(folder)
-    except OSError:
-        return

@@ -24,7 +24,8 @@ from indexes.errors import (
 )
 from indexes.kinds.measure import measured_recall
 from indexes.kinds.vector_index import Floats, VectorIndex, check_unit
-from indexes.store.manifest import Manifest, check_files, file_checksums, read_manifest, write_manifest
+from indexes.store.manifest import FORMAT, FileChecksum, Manifest, check_files, encode_document, read_manifest
+from indexes.store.manifest import NAME as MANIFEST
 from indexes.store.rows import Row, Rows, read_rows, write_rows
 
 EMBEDDINGS, STRUCTURE = "embeddings", "vectors.faiss"
@@ -67,11 +68,6 @@ class Generation:
     ) -> None:
         self.folder, self.manifest, self.rows, self.documents, self.index = folder, manifest, rows, documents, index
         self.arrays, self.embeddings = dict(arrays), index.vectors
-
-    @property
-    def name(self) -> str:
-        """The generation's name, such as gen-000007."""
-        return self.manifest.generation
 
     @property
     def count(self) -> int:
@@ -140,9 +136,12 @@ def write_generation(
         objects=len({row.object_id for row in rows}),
         arrays=sorted(arrays.keys() - {EMBEDDINGS}),
         documents=sorted(documents),
-        files=file_checksums(folder),
+        files={
+            path.name: FileChecksum(path.stat().st_size, files.file_digest(path)) for path in sorted(folder.iterdir())
+        },
     )
-    write_manifest(folder, manifest)
+    with files.durable_file(folder / MANIFEST) as file:
+        file.write(encode_document(manifest, FORMAT))
     files.sync(folder)
     return manifest
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any, TypeVar
 from msgspec import Meta
 
 from _touch_retrieval.documents import typed
-from _touch_retrieval.files import durable_file, file_digest, open_regular, read_json
+from _touch_retrieval.files import file_digest, open_regular, read_json
 from indexes.errors import AGAIN, CorruptIndex, UnsupportedFormat
 
 FORMAT = 7
@@ -68,12 +68,6 @@ class Manifest:
     files: dict[FileName, FileChecksum]
 
 
-def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Write the file, with a digest of its content at the end."""
-    with durable_file(folder / NAME) as handle:
-        handle.write(encode_document(manifest, FORMAT))
-
-
 def read_manifest(folder: Path) -> Manifest:
     """Return the manifest of a generation's folder. Raises `CorruptIndex` or `UnsupportedFormat`."""
     return read_document(folder / NAME, FORMAT, Manifest)
@@ -118,11 +112,6 @@ def read_document(path: Path, version: int, kind: type[T]) -> T:
         return typed(content, kind, path.stem)
     except ValueError as error:
         raise CorruptIndex(f"{path}: the file was altered ({error}); {AGAIN}") from error
-
-
-def file_checksums(folder: Path) -> dict[str, FileChecksum]:
-    """Return the size and SHA-256 of every file in a folder."""
-    return {path.name: FileChecksum(path.stat().st_size, file_digest(path)) for path in sorted(folder.iterdir())}
 
 
 def check_files(folder: Path, manifest: Manifest, *, verify: bool) -> None:

@@ -103,10 +103,7 @@ def read_sharded_manifest(folder: Path) -> ShardedManifest:
     path = folder / NAME
     if not path.exists():
         raise NoIndex(f"{folder}: there is no sharded index here; run `retrieve build-index --shards` first")
-    manifest = read_document(path, FORMAT, ShardedManifest)
-    if len({shard.folder for shard in manifest.shards}) < len(manifest.shards):
-        raise CorruptIndex(f"{path}: every shard must have its own folder, but two have the same; {AGAIN}")
-    return manifest
+    return read_document(path, FORMAT, ShardedManifest)
 
 
 def open_shard(index: Path, entry: ShardEntry, *, threads: int | None = None) -> Generation:

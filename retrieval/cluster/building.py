@@ -10,7 +10,7 @@ If Ray has GPUs, each process has a GPU of its own, and the towers run there.
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,14 +25,6 @@ from retrieval.model.encode import default_device
 
 RELEASE_TIMEOUT_S = 60.0
 """Longest wait for a lost process to release its shard's lock."""
-
-
-class BuildWorkerPool(NamedTuple):
-    """Number of concurrent processes, and the CPUs and GPUs that each requests from Ray."""
-
-    processes: int
-    cpus: int
-    gpus: int
 
 
 class ShardBuildWorker:
@@ -73,11 +65,19 @@ def ray_runner(cpus: int | None = None, workers: int | None = None) -> ShardRunn
     def run(jobs: Sequence[ShardJob], checkpoint: Checkpoint) -> Iterator[ShardBuild]:
         with ray_session(cpus) as ray:
             ray.data.DataContext.get_current().enable_progress_bars = False
+            processes, pool = ray_worker_pool(ray)
             try:
-                for result in _results(ray, jobs, checkpoint, workers):
-                    if isinstance(result, Exception):
-                        raise result
-                    yield result
+                built = ray.data.from_items([{"job": job} for job in jobs], override_num_blocks=len(jobs)).map_batches(
+                    ShardBuildWorker,
+                    batch_size=1,
+                    compute=ray.data.ActorPoolStrategy(min_size=1, max_size=min(len(jobs), workers or processes)),
+                    fn_constructor_args=(checkpoint.path.resolve(), bool(pool["num_gpus"])),
+                    **pool,
+                )
+                for row in built.iter_rows():
+                    if isinstance(row["built"], Exception):
+                        raise row["built"]
+                    yield row["built"]
             except (RetrievalError, IndexesError):
                 raise
             except Exception as error:  # the exceptions of Ray have no common base
@@ -88,36 +88,20 @@ def ray_runner(cpus: int | None = None, workers: int | None = None) -> ShardRunn
     return run
 
 
-def _results(
-    ray: Any, jobs: Sequence[ShardJob], checkpoint: Checkpoint, workers: int | None
-) -> Iterator[ShardBuild | RetrievalError | IndexesError]:
-    items, pool = [{"job": job} for job in jobs], ray_worker_pool(ray)
-    built = ray.data.from_items(items, override_num_blocks=len(items)).map_batches(
-        ShardBuildWorker,
-        batch_size=1,
-        compute=ray.data.ActorPoolStrategy(min_size=1, max_size=min(len(items), workers or pool.processes)),
-        num_cpus=pool.cpus,
-        num_gpus=pool.gpus,
-        fn_constructor_args=(checkpoint.path.resolve(), bool(pool.gpus)),
-    )
-    for row in built.iter_rows():
-        yield row["built"]
+def ray_worker_pool(ray: Any) -> tuple[int, dict[str, int]]:
+    """Return the number of processes for a Ray cluster, and the CPUs and GPUs that each requests.
 
-
-def ray_worker_pool(ray: Any) -> BuildWorkerPool:
-    """Return the worker pool of a Ray cluster.
-
-    It has one process for each GPU. Each requests the same number of CPUs, which read and decode: the smallest number
-    of CPUs per GPU of any machine that has GPUs. Without a GPU that PyTorch can use, it has a process for each CPU.
+    There is a process for each GPU. Each requests the same number of CPUs, which read and decode: the smallest number
+    of CPUs per GPU of any machine that has GPUs. Without a GPU that PyTorch can use, there is a process for each CPU.
     """
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     gpu_nodes = [node for node in nodes if node.get("GPU", 0) >= 1]
     if gpu_nodes and ray.get(ray.remote(num_cpus=0, num_gpus=1)(_has_gpu).remote()):
         cpus = min(int(node.get("CPU", 1) / node["GPU"]) for node in gpu_nodes)
-        return BuildWorkerPool(sum(int(node["GPU"]) for node in gpu_nodes), max(1, cpus), 1)
+        return sum(int(node["GPU"]) for node in gpu_nodes), {"num_cpus": max(1, cpus), "num_gpus": 1}
     if gpu_nodes:
         say("Ray has GPUs, but PyTorch cannot use them there; CPUs embed the photos")
-    return BuildWorkerPool(max(1, int(sum(node.get("CPU", 0) for node in nodes))), 1, 0)
+    return max(1, int(sum(node.get("CPU", 0) for node in nodes))), {"num_cpus": 1, "num_gpus": 0}
 
 
 def _has_gpu() -> bool:

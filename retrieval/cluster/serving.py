@@ -15,23 +15,23 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-from msgspec import Meta
 from threadpoolctl import threadpool_limits
 
-from _touch_retrieval.documents import Count, Positive, check_fields
 from indexes.errors import IndexesError
 from indexes.store.generation import check_fingerprint
 from indexes.store.sharded import ShardedManifest, ShardEntry, open_shard
 from retrieval.console.output import say
-from retrieval.errors import BadInput, IncompleteSearch, RetrievalError
+from retrieval.errors import IncompleteSearch, RetrievalError
 from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint
 from retrieval.search.opening import checkpoint_of
 from retrieval.search.shard import FolderShard, Shards
 
 OWNERS = "touch-retrieval"
 APPLICATION = re.compile(r"shard-\d+-of-\d+-[0-9a-f]{16}-([0-9a-f]{8})")
+ONGOING_REQUESTS = 4
+"""Largest number of concurrent requests of a replica."""
 RETRY_S, MIN_RESULT_TIMEOUT_S = 0.05, 0.005
 """Pause before a call to a lost replica is repeated, and shortest timeout for a result that may be available."""
 
@@ -43,18 +43,12 @@ class ReplicaSettings:
     Attributes:
         replicas: Number of replicas of each shard.
         cpus: CPUs that Ray reserves for each replica.
-        max_ongoing_requests: Largest number of concurrent requests of a replica.
         wait_s: Longest wait for an answer, in seconds.
     """
 
-    replicas: Count = 1
-    cpus: Positive = 0.5
-    max_ongoing_requests: Count = 4
-    wait_s: Annotated[float, Meta(gt=0, le=86_400)] = 5.0
-
-    def __post_init__(self) -> None:
-        """Check the values. Raises BadInput."""
-        check_fields(self, "", BadInput)
+    replicas: int = 1
+    cpus: float = 0.5
+    wait_s: float = 5.0
 
 
 class OwnerActor:
@@ -96,25 +90,21 @@ class RayShards(Shards):
     def call(self, shards: Sequence[ShardEntry], method: str, *arguments: Any) -> list[Any]:
         """As `Shards.call`, with all shards at once. Raises IncompleteSearch if a shard does not answer."""
         until = time.monotonic() + self._settings.wait_s
-        waiting = [(entry, self._send(entry, method, arguments)) for entry in shards]
-        results, missing = [], []
+        waiting = [(entry, self._handles[entry.folder].call.remote(method, *arguments)) for entry in shards]
+        results, missing = list[Any](), list[str]()
         for entry, response in waiting:
             result = self._result(entry, response, method, arguments, until)
+            if isinstance(result, Exception):
+                raise result
             if result is None:
                 missing.append(entry.folder)
-            elif isinstance(result, Exception):
-                raise result
-            else:
-                results.append(result)
+            results.append(result)
         if missing:
             raise IncompleteSearch(
                 f"no answer within {self._settings.wait_s:g} s from {', '.join(missing)}; try again, or raise "
                 "--shard-timeout"
             )
         return results
-
-    def _send(self, entry: ShardEntry, method: str, arguments: Sequence[Any]) -> Any:
-        return self._handles[entry.folder].call.remote(method, *arguments)
 
     def _result(self, entry: ShardEntry, response: Any, method: str, arguments: Sequence[Any], until: float) -> Any:
         """Return the result of a shard, with a retry if its replica was lost; None if it does not answer in time."""
@@ -131,7 +121,7 @@ class RayShards(Shards):
                 if time.monotonic() + RETRY_S > until:
                     return None
                 time.sleep(RETRY_S)
-                response = self._send(entry, method, arguments)
+                response = self._handles[entry.folder].call.remote(method, *arguments)
 
 
 class Deployments:
@@ -172,7 +162,7 @@ class Deployments:
         names = {entry.folder: f"{entry.folder}-{entry.sha256[:16]}-{self._owner_id}" for entry in manifest.shards}
         self._close_handles()
         with self._lock:
-            self._deploy(names, str(Path(index).resolve()), manifest, stored)
+            self._deploy(names, str(Path(index).resolve()), manifest, str(stored.path.resolve()))
             self._users.update(names.values())
             for name in set(names.values()) - set(self._handles):
                 # Create its router now: concurrent first calls would create several, and only one could be shut down.
@@ -205,42 +195,33 @@ class Deployments:
             if match and match[1] not in owners:
                 self._ray.serve.delete(name, _blocking=False)
 
-    def _deploy(self, names: dict[str, str], index: str, manifest: ShardedManifest, stored: CheckpointInfo) -> None:
+    def _deploy(self, names: dict[str, str], index: str, manifest: ShardedManifest, model: str) -> None:
         serve, settings = self._ray.serve, self._settings
         deployed = serve.status().applications
-        entries = [entry for entry in manifest.shards if names[entry.folder] not in deployed]
-        model = str(stored.path.resolve())
         deployment = serve.deployment(
             ShardReplica,
             name="shard",
             num_replicas=settings.replicas,
-            max_ongoing_requests=settings.max_ongoing_requests,
+            max_ongoing_requests=ONGOING_REQUESTS,
             ray_actor_options={"num_cpus": settings.cpus},
             health_check_period_s=2,
             health_check_timeout_s=10,
             graceful_shutdown_timeout_s=10,
         )
         targets = [
-            serve.RunTarget(
-                deployment.bind(index, entry, model),
-                name=names[entry.folder],
-                route_prefix=None,
-            )
-            for entry in entries
+            serve.RunTarget(deployment.bind(index, entry, model), name=names[entry.folder], route_prefix=None)
+            for entry in manifest.shards
+            if names[entry.folder] not in deployed
         ]
-        if targets:
-            needed, free = (
-                settings.cpus * settings.replicas * len(targets),
-                self._ray.available_resources().get("CPU", 0.0),
-            )
-            if needed > free:
-                say(
-                    f"{len(targets)} shards need {needed:g} CPUs, but only {free:g} are free in Ray: they wait for more"
-                )
-            try:
-                serve.run_many(targets)
-            except RuntimeError as error:
-                raise RetrievalError(f"{index}: Ray could not start the shards ({error})") from error
+        if not targets:
+            return
+        needed = settings.cpus * settings.replicas * len(targets)
+        if needed > (free := self._ray.available_resources().get("CPU", 0.0)):
+            say(f"{len(targets)} shards need {needed:g} CPUs, but only {free:g} are free in Ray: they wait for more")
+        try:
+            serve.run_many(targets)
+        except RuntimeError as error:
+            raise RetrievalError(f"{index}: Ray could not start the shards ({error})") from error
 
     def _release(self, names: Sequence[str]) -> None:
         with self._lock:

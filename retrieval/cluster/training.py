@@ -11,7 +11,7 @@ from typing import Any
 from retrieval.cluster.session import ray_session
 from retrieval.console.output import say
 from retrieval.data.dataset import Split
-from retrieval.errors import BadInput, JobInterrupted, RetrievalError
+from retrieval.errors import JobInterrupted, RetrievalError
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable
 from retrieval.model.config import Config
 from retrieval.training.train import train
@@ -40,19 +40,12 @@ def train_on_ray(
         cpus: CPUs of a Ray that is started here; None for all.
 
     Raises:
-        BadInput: Ray is not installed, or `workers` is less than 1.
+        BadInput: Ray is not installed.
         RetrievalError: Training fails, or ranks are lost repeatedly.
         JobInterrupted: The user stopped the training.
     """
-    if workers < 1:
-        raise BadInput(f"workers must be 1 or more; got {workers}")
     require_writable(out)
-    settings = {
-        "recording": recording.resolve(),
-        "out": out.resolve(),
-        "config": config,
-        "split": split,
-    }
+    settings = {"recording": recording.resolve(), "out": out.resolve(), "config": config, "split": split}
     with ray_session(cpus) as ray, tempfile.TemporaryDirectory() as notes:
         from ray.train import FailureConfig, RunConfig, ScalingConfig, TrainingFailedError
         from ray.train.torch import TorchTrainer

@@ -169,7 +169,13 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
             **contents.references.about,
         }
         current, why = _current(store, checkpoint)
-        is_written = current is None or _differs(current, checkpoint, options, contents, about)
+        is_written = (
+            current is None
+            or (current.fingerprint, current.kind) != (fingerprint(checkpoint), options.kind)
+            # Compare `REFERENCE_ROWS` even if it is not in `about`: all references may have been removed.
+            or any(current.about.get(key) != about.get(key) for key in (REFERENCE_ROWS, *about))
+            or current.files[TEXT].sha256 != hashlib.sha256(encode_rows(contents.rows)).hexdigest()
+        )
         if current is not None and not is_written:
             try:
                 store.open(name=current.generation)
@@ -191,19 +197,6 @@ def _current(store: IndexStore, checkpoint: Checkpoint) -> tuple[Manifest | None
     before, now = current.fingerprint, fingerprint(checkpoint)
     changed = " and the ".join(name for key, name in PARTS.items() if before.get(key) != now[key])
     return current, f"The {changed} changed since version {current.software}." if changed else ""
-
-
-def _differs(
-    manifest: Manifest, checkpoint: Checkpoint, options: BuildOptions, contents: IndexContents, about: dict[str, Any]
-) -> bool:
-    """Whether a new generation would differ from the current one."""
-    return (
-        manifest.fingerprint != fingerprint(checkpoint)
-        or manifest.kind != options.kind
-        # Compare `REFERENCE_ROWS` even if it is not in `about`: all references may have been removed.
-        or any(manifest.about.get(key) != about.get(key) for key in (REFERENCE_ROWS, *about))
-        or manifest.files[TEXT].sha256 != hashlib.sha256(encode_rows(contents.rows)).hexdigest()
-    )
 
 
 def _write(

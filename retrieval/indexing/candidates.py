@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from indexes.kinds.vector_index import Floats, RowNumbers, VectorIndex
+from indexes.kinds.vector_index import Floats, VectorIndex
 from retrieval.console.progress import Bar
 from retrieval.metrics.intervals import binomial_interval
 from retrieval.model.checkpoint import Checkpoint
-from retrieval.model.fusion_scorer import FusionScorer, Partials
+from retrieval.model.fusion_scorer import Partials
 
 TARGET = 0.99
 """Agreement@k that the chosen number of candidates reaches."""
@@ -70,7 +70,13 @@ def measure_candidates(
         if hits / len(queries) >= TARGET:
             break
     if k < photos:
-        ms = _search_ms(scorer, touches[:TIMED_QUERIES], queries, index, partials, k)
+        taken = []
+        for number in range(min(TIMED_QUERIES, len(touches))):
+            start = time.perf_counter()
+            rows = np.sort(index.candidates(queries[number : number + 1], k)[0])
+            scorer.logits(touches[number : number + 1], partials, rows)
+            taken.append(time.perf_counter() - start)
+        ms = 1e3 * median(taken)
     return {
         "k": k,
         "top1_agreement": hits / len(queries),
@@ -80,19 +86,6 @@ def measure_candidates(
         "exhaustive_ms": exhaustive_ms,
         "photos": photos,
     }
-
-
-def _search_ms(
-    scorer: FusionScorer, touches: Floats, queries: Floats, index: VectorIndex, partials: Partials, k: int
-) -> float:
-    """Return the median milliseconds of candidate search and reranking, one touch at a time."""
-    taken = []
-    for number in range(len(touches)):
-        start = time.perf_counter()
-        rows: RowNumbers = np.sort(index.candidates(queries[number : number + 1], k)[0])
-        scorer.logits(touches[number : number + 1], partials, rows)
-        taken.append(time.perf_counter() - start)
-    return 1e3 * median(taken)
 
 
 def kept_measurement(before: Mapping[str, Any] | None, photos: int, encoded: int) -> dict[str, Any] | None:

@@ -87,10 +87,11 @@ class CatalogueFiles:
         return "" if record is None else record.digest
 
     def read(self, path: str) -> tuple[FileRecord, bytes]:
-        """Read a file. Raises ImageError."""
+        """Read a file, which becomes known. Raises ImageError."""
         status = self._status(path)  # before reading: if the file changes now, the next build reads it again
         content = self._catalogue.read(path)
-        return FileRecord(*status, hashlib.sha256(content).hexdigest()), content
+        self.known[path] = record = FileRecord(*status, hashlib.sha256(content).hexdigest())
+        return record, content
 
     def save(self) -> None:
         """Store the records of all files that are old enough, in place of those of the earlier build."""
@@ -208,17 +209,6 @@ class Codes:
     encoded: int = 0
 
 
-@dataclass
-class _Batch:
-    """What a thread made of some items: what it read, and the codes of new contents, or why there is none, by key."""
-
-    keys: dict[Paths, str] = field(default_factory=dict)
-    files: dict[str, FileRecord] = field(default_factory=dict)
-    skipped: list[SkippedPhoto] = field(default_factory=list)
-    codes: dict[str, bytes] = field(default_factory=dict)
-    unusable: dict[str, str] = field(default_factory=dict)
-
-
 def find_codes(items: Sequence[Paths], encoder: Encoder, files: CatalogueFiles, cache: Cache, quiet: bool) -> Codes:
     """Store the codes of photos or touches in the cache of the index, each content once.
 
@@ -232,39 +222,35 @@ def find_codes(items: Sequence[Paths], encoder: Encoder, files: CatalogueFiles, 
     Raises:
         NumericalError: A partial activation exceeds float16.
     """
-    stored, claim, found, unread = cache.keys(encoder.model), Lock(), Codes(), list[Paths]()
-    for paths in items:
-        key = encoder.key(files.digest(path) for path in paths)
-        if key in stored:
-            found.keys[paths] = key
-        else:
-            unread.append(paths)
+    stored, claim, found = cache.keys(encoder.model), Lock(), Codes()
+    known = {paths: encoder.key(map(files.digest, paths)) for paths in items}
+    found.keys = {paths: key for paths, key in known.items() if key in stored}
+    unread = [paths for paths in items if paths not in found.keys]
     if not unread:
         return found
     encode, unusable = encoder.start(len(unread)), dict[str, str]()
 
-    def process(some: Sequence[Paths]) -> _Batch:
-        batch, inputs, new = _Batch(), list[Any](), dict[str, Paths]()
+    def process(some: Sequence[Paths]) -> dict[str, bytes]:
+        """Read items, and return the codes of new contents."""
+        inputs, new = list[Any](), dict[str, Paths]()
         for paths in some:
             try:
-                read = {path: files.read(path) for path in paths}
+                records, contents = zip(*map(files.read, paths), strict=True)
             except ImageError as error:
-                batch.skipped.append(SkippedPhoto(paths[0], error.reason))
+                found.skipped.append(SkippedPhoto(paths[0], error.reason))
                 continue
-            batch.files.update({path: record for path, (record, _) in read.items()})
-            batch.keys[paths] = key = encoder.key(record.digest for record, _ in read.values())
+            found.keys[paths] = key = encoder.key(record.digest for record in records)
             with claim:
                 is_new = key not in stored
                 stored.add(key)
             if is_new:
                 try:
-                    inputs.append(encoder.decode([content for _, content in read.values()], paths))
+                    inputs.append(encoder.decode(contents, paths))
                     new[key] = paths
                 except ImageError as error:
-                    batch.unusable[key] = error.reason
+                    unusable[key] = error.reason
         codes = encode(inputs, list(new.values())) if new else ()
-        batch.codes = {key: code.tobytes() for key, code in zip(new, codes, strict=True)}
-        return batch
+        return {key: code.tobytes() for key, code in zip(new, codes, strict=True)}
 
     with (
         Bar("embed", len(unread), encoder.what, quiet=quiet) as bar,
@@ -272,18 +258,15 @@ def find_codes(items: Sequence[Paths], encoder: Encoder, files: CatalogueFiles, 
         one_thread(),
     ):
         try:
-            for batch in map_in_order(pool, process, batches(unread, encoder.batch), 2 * threads):
-                cache.add(batch.codes)
-                files.known |= batch.files
-                found.keys |= batch.keys
-                found.skipped += batch.skipped
-                found.encoded += len(batch.codes)
-                unusable |= batch.unusable
-                bar.advance(len(batch.keys) + len(batch.skipped))
+            for codes in map_in_order(pool, process, batches(unread, encoder.batch), 2 * threads):
+                cache.add(codes)
+                found.encoded += len(codes)
+                bar.advance(min(encoder.batch, len(unread) - bar.done))
         finally:
             pool.shutdown(cancel_futures=True)
     for paths in [paths for paths, key in found.keys.items() if key in unusable]:
         found.skipped.append(SkippedPhoto(paths[0], unusable[found.keys.pop(paths)]))
+    found.skipped.sort(key=lambda item: item.path)
     return found
 
 

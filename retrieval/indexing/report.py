@@ -109,17 +109,12 @@ class BuildReport:
         yield from _list_lines("remark(s)", self.notes)
         yield from _list_lines("file(s) ignored, not images", self.ignored, FEW)
         yield from _list_lines("photo(s) skipped", [f"{item.path}: {item.reason}" for item in self.skipped])
-        if self.without_photo:
-            yield f"warning: {self.missing()}"
-
-    def missing(self) -> str:
-        """Return a sentence with the number and names of the objects without a photo."""
-        count = len(self.without_photo)
-        more = f" and {count - SHOWN} more (--json lists them all)" if count > SHOWN else ""
-        return (
-            f"{count} of {self.objects + count} objects are not in the index, because none of their images can be "
-            f"read: {', '.join(self.without_photo[:SHOWN])}{more}"
-        )
+        if count := len(self.without_photo):
+            more = f" and {count - SHOWN} more (--json lists them all)" if count > SHOWN else ""
+            yield (
+                f"warning: {count} of {self.objects + count} objects are not in the index, because none of their "
+                f"images can be read: {', '.join(self.without_photo[:SHOWN])}{more}"
+            )
 
 
 def _list_lines(what: str, items: Sequence[str], shown: int = SHOWN) -> Iterator[str]:

@@ -38,10 +38,6 @@ class NearestReference:
     cosine: float
     adds: float | None
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return a plain dictionary for JSON."""
-        return {**asdict(self), "touch": list(self.touch)}
-
 
 _MATCH_FIELDS = ("rank", "object_id", "logit", "probability", "probability_if_present", "photo", "metadata")
 
@@ -82,7 +78,7 @@ class Match:
     def to_dict(self) -> dict[str, Any]:
         """Return a plain dictionary for JSON, without the absolute path: the document names the catalogue once."""
         document = {name: getattr(self, name) for name in _MATCH_FIELDS}
-        return document if self.reference is None else {**document, "reference": self.reference.to_dict()}
+        return document if self.reference is None else {**document, "reference": asdict(self.reference)}
 
 
 @dataclass(frozen=True)

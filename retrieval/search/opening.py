@@ -30,8 +30,6 @@ def find_index(choice: str | None) -> tuple[Path, str]:
         BadInput: There is no index.
     """
     if choice is not None:
-        if Path(choice).is_file():
-            raise BadInput(f"{choice} is a file; an index is a folder, which `retrieve build-index` writes")
         return Path(choice), "given"
     if (INDEX / "CURRENT").is_file() or is_sharded(INDEX):
         return INDEX, "in this folder"

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import asdict
 from pathlib import Path
-from types import TracebackType
-from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +33,7 @@ from retrieval.search.answer import (
 )
 from retrieval.search.objects import Objects
 from retrieval.search.opening import OpenShards, open_index
-from retrieval.search.shard import FolderShard, ShardQuery, ShardResult, Shards
+from retrieval.search.shard import FolderShard, ShardResult, Shards
 
 
 class Searcher:
@@ -62,7 +61,6 @@ class Searcher:
         compares_contact = check is not None and check.level_above is not None
         self.reader = TouchReader(checkpoint.config, encoder, compares_contact)
         self.catalogue = Path(self.manifest.about["catalogue"])
-        self._closed = False
 
     @classmethod
     def open(
@@ -101,15 +99,8 @@ class Searcher:
 
     def close(self) -> None:
         """Release the index and the model; running queries continue. A second call does nothing."""
-        self._closed = True
         for name in ("shard", "encoder", "reader", "scorer"):
             vars(self).pop(name, None)
-
-    def __reduce__(self) -> NoReturn:
-        raise BadInput(
-            "a Searcher cannot be pickled: it has opened files and a model. Open the index in each process: "
-            f"retrieval.open({str(self.index)!r})"
-        )
 
     @property
     def generation(self) -> Generation:
@@ -133,9 +124,7 @@ class Searcher:
         self._snapshot()  # refuses a closed searcher
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def query(
@@ -205,7 +194,9 @@ class Searcher:
             span = slice(start, start := start + len(grasps))
             classes, result = shown[span], None
             if _fault(classes) is None:
-                query = ShardQuery(codes.embeddings[span][classes == CONTACT], codes.partials[span][classes == CONTACT])
+                query = EncodedTouches(
+                    codes.embeddings[span][classes == CONTACT], codes.partials[span][classes == CONTACT]
+                )
                 result = opened.shard.search(query, top, candidates)
             clock.add({stage: result.timing_ms[stage] if result else 0.0 for stage in ("candidates", "rerank")})
             found.append((classes.tolist(), result))
@@ -281,9 +272,8 @@ class Searcher:
 
     def _snapshot(self) -> Searcher:
         """Return a copy with references to all resources, so that `close` in another thread cannot break a query."""
-        opened = object.__new__(type(self))
-        vars(opened).update(vars(self))
-        if opened._closed:
+        opened = copy(self)
+        if "shard" not in vars(opened):
             raise BadInput(f"this searcher of {self.index} is closed; open the index again")
         return opened
 

@@ -11,7 +11,6 @@ include the best of the catalogue, and the sums of the shards add up to the sums
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +21,7 @@ from indexes.store.sharded import ShardedManifest
 from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_scorer
 from retrieval.model.fusion_scorer import StoredPartials
 from retrieval.model.posterior import EvidenceMass
-from retrieval.model.touch_reader import Stopwatch
+from retrieval.model.touch_reader import EncodedTouches, Stopwatch
 from retrieval.search.answer import NearestReference
 from retrieval.search.objects import ListedPhoto, Objects, Rows, Similarities, listed_photo
 
@@ -32,13 +31,6 @@ MIN_COMPLETED_OBJECTS = 20
 MIN_SUM_NORM = 1e-5
 """A sum of unit embeddings with a smaller norm is only rounding error."""
 Floats = NDArray[np.float32]
-
-
-class ShardQuery(NamedTuple):
-    """Grasps with contact of one object: embeddings (G, embedding_dim), partials (G, touch_partial_width); G > 0."""
-
-    embeddings: Floats
-    partials: Floats
 
 
 class RankedObject(NamedTuple):
@@ -78,8 +70,7 @@ class Page(NamedTuple):
 class FolderShard:
     """The photos of one generation of an index folder, opened in this process.
 
-    Its index finds candidates, and the model's head reranks them. Threads may search at once. Only `page` with words
-    may block: the first call reads the text of all rows, and other calls wait for it.
+    Its index finds candidates, and the model's head reranks them. Threads may search at once.
 
     Args:
         generation: The opened generation.
@@ -95,13 +86,12 @@ class FolderShard:
         self.generation, self.manifest, self.scorer = generation, generation.manifest, read_scorer(stored)
         self.objects = Objects(generation, stored, self.scorer.cosine_columns)
         self._has_embeddings, self._is_calibrated = stored.config.has_embeddings, stored.posterior is not None
-        self._lock = Lock()
 
-    def search(self, query: ShardQuery, top: int, candidates: int | None) -> ShardResult:
+    def search(self, query: EncodedTouches, top: int, candidates: int | None) -> ShardResult:
         """Return the best objects for the grasps of a query, and the evidence mass of all objects.
 
         Args:
-            query: The grasps.
+            query: Grasps with contact of one object, at least one.
             top: Number of objects to return.
             candidates: Number of photos to rerank, raised to `top` if smaller. Default: the number that was measured
                 when the index was built.
@@ -169,8 +159,7 @@ class FolderShard:
         if object_id is not None:
             found = np.flatnonzero(rows.objects == rows.find_object(object_id))
         if words:
-            with self._lock:
-                texts = self._texts
+            texts = self._texts
             found = np.array([row for row in found if all(word in texts[row] for word in words)], dtype=np.int64)
         return Page(len(found), [listed_photo(rows[int(row)]) for row in found[offset : offset + limit]])
 
@@ -241,9 +230,18 @@ class Shards:
         """Return the results of a method of `FolderShard` for some shards."""
         return [getattr(shard, method)(*arguments) for shard in shards]
 
-    def search(self, query: ShardQuery, top: int, candidates: int | None) -> ShardResult:
+    def search(self, query: EncodedTouches, top: int, candidates: int | None) -> ShardResult:
         """As `FolderShard.search`; each shard reranks `candidates` photos."""
-        return merge_results(self.call(self.shards, "search", query, top, candidates), top)
+        results: list[ShardResult] = self.call(self.shards, "search", query, top, candidates)
+        best = [one for result in results for one in result.best]
+        masses = [result.mass for result in results if result.mass is not None]
+        return ShardResult(
+            sum(result.photos for result in results),
+            sum(result.objects for result in results),
+            sorted(best, key=lambda one: (-one.logit, one.photo.object_id))[:top],
+            EvidenceMass.merged(masses) if masses else None,
+            {stage: max(result.timing_ms[stage] for result in results) for stage in results[0].timing_ms},
+        )
 
     def photos(self, paths: Sequence[str]) -> list[ListedPhoto | None]:
         """As `FolderShard.photos`."""
@@ -259,22 +257,3 @@ class Shards:
             total += found.total
             photos += found.photos
         return Page(total, photos)
-
-
-def merge_results(results: Sequence[ShardResult], top: int) -> ShardResult:
-    """Merge the results of several shards.
-
-    Args:
-        results: Results of at least one shard.
-        top: Number of objects to return.
-    """
-    best = sorted((one for result in results for one in result.best), key=lambda one: (-one.logit, one.photo.object_id))
-    masses = [result.mass for result in results if result.mass is not None]
-    stages = dict.fromkeys(stage for result in results for stage in result.timing_ms)
-    return ShardResult(
-        sum(result.photos for result in results),
-        sum(result.objects for result in results),
-        best[:top],
-        EvidenceMass.merged(masses) if masses else None,
-        {stage: max(result.timing_ms.get(stage, 0.0) for result in results) for stage in stages},
-    )

@@ -52,7 +52,7 @@ def _nan_vector() -> HardCase:
     vectors = _axes()
     vectors[1, 0] = np.nan
     order = np.argsort(vectors @ _axes()[0])[::-1]
-    ours, holds = error_of(lambda: check_unit(vectors, names=["mug", "cup", "jar"]), "'cup'", "NaN")
+    ours, holds = error_of(lambda: check_unit(vectors, names=["mug", "cup", "jar"]), "'cup'", "nan")
     naive = f"argsort ranks photos {_text(order)}: the NaN is best"
     return HardCase(_UNIT, "one of three photos is NaN", "error that names it", naive, ours, holds, order[0] != 1)
 
@@ -64,7 +64,7 @@ def _nan_query() -> HardCase:
     structure = faiss.IndexFlatIP(3)
     structure.add(_axes())
     found = structure.search(query, 2)[1][0]
-    ours, holds = error_of(lambda: indexes.build(_axes()).search(query, 2), "query '0'", "NaN")
+    ours, holds = error_of(lambda: indexes.build(_axes()).search(query, 2), "query '0'", "nan")
     naive = f"FAISS returns rows {_text(found)}, and row -1 of a list is its last photo"
     return HardCase(_UNIT, "a query is NaN", "error that names it", naive, ours, holds, bool((found >= 0).all()))
 
@@ -73,7 +73,7 @@ def _zero_vector() -> HardCase:
     vectors = _axes()
     vectors[2] = 0.0
     cosine = float((vectors[2] / np.linalg.norm(vectors[2])) @ _axes()[0])
-    ours, holds = error_of(lambda: indexes.build(vectors), "'2'", "zero")
+    ours, holds = error_of(lambda: indexes.build(vectors), "'2'", "got 0")
     return HardCase(
         _UNIT, "one vector is zero", "error that names it", f"cosine {cosine}", ours, holds, math.isfinite(cosine)
     )

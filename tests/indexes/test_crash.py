@@ -14,7 +14,7 @@ import pytest
 
 from _touch_retrieval import files
 from indexes.errors import LockedIndex, NoIndex, WriteFailed
-from indexes.store import generation, locking
+from indexes.store import folder, generation, locking
 from indexes.store.folder import IndexStore
 from tests.indexes.test_store import filled, names, rows_of
 from tests.waiting import first_line, run_process
@@ -190,15 +190,15 @@ def test_a_failing_disk_step_gives_one_error_and_a_complete_index(tmp_path, monk
 def test_an_interrupted_writer_cleans_up_and_releases_the_lock(tmp_path, monkeypatch):
     filled(tmp_path)
 
-    def interrupted(folder, manifest):
+    def interrupted(content, version):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(generation, "write_manifest", interrupted)
+        patch.setattr(generation, "encode_document", interrupted)
         with pytest.raises(KeyboardInterrupt):
             filled(tmp_path, 5)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["CURRENT", "LOCK", "gen-000001"]
-    assert filled(tmp_path, 5).name == "gen-000002"
+    assert filled(tmp_path, 5).folder.name == "gen-000002"
 
 
 def test_a_writer_killed_before_the_first_switch_does_not_block_the_next(tmp_path, monkeypatch):
@@ -259,22 +259,22 @@ def test_a_disk_without_locks_is_not_reported_as_locked(tmp_path, monkeypatch):
 
 def test_a_generation_replaced_while_it_is_being_opened_is_read_again(tmp_path, monkeypatch):
     filled(tmp_path)
-    store, real, turns = IndexStore(tmp_path), IndexStore._read, []
+    real, turns = folder.read_generation, []
 
-    def slow(self, name, verify, threads):
+    def slow(path, **options):
         if not turns:
-            turns.append(name)
+            turns.append(path.name)
             for _ in range(4):
                 filled(tmp_path, 6)  # deletes the generation that is being read
-        return real(self, name, verify, threads)
+        return real(path, **options)
 
-    monkeypatch.setattr(IndexStore, "_read", slow)
-    assert store.open().count == 6
+    monkeypatch.setattr(folder, "read_generation", slow)
+    assert IndexStore(tmp_path).open().count == 6
     assert turns == ["gen-000001"]
 
 
 def test_generation_numbers_skip_one_that_never_became_current(tmp_path):
     filled(tmp_path)
     (tmp_path / "gen-000005").mkdir()
-    assert filled(tmp_path).name == "gen-000006"
+    assert filled(tmp_path).folder.name == "gen-000006"
     assert list(IndexStore(tmp_path).open().rows) == rows_of(names(20))

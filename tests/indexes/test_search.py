@@ -122,7 +122,14 @@ def test_an_invalid_number_of_results_raises(built, k):
 
 @pytest.mark.parametrize(
     ("value", "words"),
-    [(np.nan, "NaN"), (np.inf, "infinite"), (0.0, "zero"), (1e30, "got 4e"), (0.26, "got 1.04"), (1e-30, "got 4e-30")],
+    [
+        (np.nan, "nan"),
+        (np.inf, "inf"),
+        (0.0, "got 0"),
+        (1e30, "got 4e"),
+        (0.26, "got 1.04"),
+        (1e-30, "got 4e-30"),
+    ],
 )
 def test_a_vector_that_is_not_a_unit_vector_is_named(value, words):
     vectors = unit(3)

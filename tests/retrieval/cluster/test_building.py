@@ -80,13 +80,16 @@ def nodes(*resources):
 def test_there_are_as_many_processes_as_gpus_or_else_cpus(capsys):
     from retrieval.cluster.building import ray_worker_pool
 
-    assert ray_worker_pool(nodes({"CPU": 4.0}, {"CPU": 8.0})()) == (12, 1, 0)
-    assert ray_worker_pool(nodes({"memory": 1.0})()) == (1, 1, 0)
+    assert ray_worker_pool(nodes({"CPU": 4.0}, {"CPU": 8.0})()) == (12, {"num_cpus": 1, "num_gpus": 0})
+    assert ray_worker_pool(nodes({"memory": 1.0})()) == (1, {"num_cpus": 1, "num_gpus": 0})
     mixed = nodes({"CPU": 64.0}, {"CPU": 16.0, "GPU": 2.0}, {"CPU": 30.0, "GPU": 4.0})
-    assert ray_worker_pool(mixed()) == (6, 7, 1)  # from the machine with the fewest CPUs for each GPU
-    assert ray_worker_pool(nodes({"CPU": 2.0, "GPU": 8.0})()) == (8, 1, 1)
+    assert ray_worker_pool(mixed()) == (
+        6,
+        {"num_cpus": 7, "num_gpus": 1},
+    )  # from the machine with the fewest CPUs for each GPU
+    assert ray_worker_pool(nodes({"CPU": 2.0, "GPU": 8.0})()) == (8, {"num_cpus": 1, "num_gpus": 1})
     assert not capsys.readouterr().err
-    assert ray_worker_pool(mixed(has_gpus=False)) == (110, 1, 0)
+    assert ray_worker_pool(mixed(has_gpus=False)) == (110, {"num_cpus": 1, "num_gpus": 0})
     assert "PyTorch cannot use them there; CPUs embed the photos" in capsys.readouterr().err
 
 
@@ -103,14 +106,17 @@ def test_each_process_of_the_pool_requests_its_own_gpu(catalogue, model, tmp_pat
             import ray
 
             gpus = ray.get_runtime_context().get_accelerator_ids()["GPU"]
-            (reports / job.folder).write_text(f"{gpus} {os.environ['CUDA_VISIBLE_DEVICES']} {torch.get_num_threads()}")
+            (reports / job.folder.name).write_text(
+                f"{gpus} {os.environ['CUDA_VISIBLE_DEVICES']} {torch.get_num_threads()}"
+            )
             return super()._build(job)
 
     monkeypatch.delenv("OMP_NUM_THREADS")
     monkeypatch.setenv("RAY_OVERRIDE_RESOURCES", '{"CPU": 4, "GPU": 2}')
     checkpoint = load_checkpoint(model)
     with ray_session() as ray:
-        assert (ray.cluster_resources()["GPU"], building.ray_worker_pool(ray)) == (2, (4, 1, 0))
+        assert ray.cluster_resources()["GPU"] == 2
+        assert building.ray_worker_pool(ray) == (4, {"num_cpus": 1, "num_gpus": 0})
         assert "PyTorch cannot use them there" in capsys.readouterr().err
         monkeypatch.setattr(building, "_has_gpu", lambda: True)
         monkeypatch.setattr(building, "ShardBuildWorker", ReportingWorker)

@@ -102,7 +102,7 @@ from indexes.store.sharded import read_sharded_manifest
 from retrieval.cluster.serving import ShardReplica
 from threadpoolctl import threadpool_info
 manifest = read_sharded_manifest(Path(sys.argv[1]))
-replica = ShardReplica(sys.argv[1], manifest.shards[0], dict(manifest.fingerprint), sys.argv[2])
+replica = ShardReplica(sys.argv[1], manifest.shards[0], sys.argv[2])
 print(*(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"))
 """
 

@@ -70,11 +70,6 @@ def test_an_error_of_a_rank_is_raised_as_a_clear_error(recording, tmp_path):
         train_on_ray(recording, tmp_path / "m.safetensors", config, workers=1)
 
 
-def test_workers_are_one_or_more(recording, tmp_path):
-    with pytest.raises(BadInput, match="workers must be 1 or more; got 0"):
-        train_on_ray(recording, tmp_path / "m.safetensors", TINY, workers=0)
-
-
 @pytest.mark.parametrize("options", [["--cluster", "--task", "grasp-success"], ["--workers", "2"]])
 def test_cluster_options_are_only_for_matchers_on_a_cluster(options, recording, tmp_path, capsys):
     assert main(["train", str(recording), "--out", str(tmp_path / "m.safetensors"), *options]) == 2

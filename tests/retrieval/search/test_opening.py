@@ -20,12 +20,6 @@ def _in_an_empty_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-def test_a_file_in_place_of_an_index_raises(tmp_path):
-    (tmp_path / "model.safetensors").touch()
-    with pytest.raises(BadInput, match=r"model\.safetensors is a file; an index is a folder"):
-        find_index(str(tmp_path / "model.safetensors"))
-
-
 def test_shipped_models_are_selected_by_their_number_of_fingers():
     assert find_model("shipped")[0] == shipped_model()
     assert find_model("shipped-one-finger")[0] == shipped_model(1)

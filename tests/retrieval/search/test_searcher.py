@@ -1,8 +1,6 @@
 """A searcher in a long-running process: arrays, several objects at once, threads, forks and closing."""
 
-import copy
 import os
-import pickle
 import shutil
 import signal
 import threading
@@ -101,12 +99,6 @@ def test_a_closed_searcher_raises_and_can_be_closed_twice(index, touch):
     with pytest.raises(BadInput, match="is closed"), searcher:
         pass
     searcher.close()
-
-
-def test_pickling_a_searcher_raises_with_a_remedy(searcher):
-    for attempt in (pickle.dumps, copy.copy, copy.deepcopy):
-        with pytest.raises(BadInput, match=r"cannot be pickled.*Open the index in each process: retrieval\.open\('"):
-            attempt(searcher)
 
 
 def test_a_running_query_finishes_when_the_searcher_is_closed(index, touch, monkeypatch):

@@ -17,7 +17,7 @@ from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.posterior import EvidenceMass, Posterior
 from retrieval.search.objects import ListedPhoto
 from retrieval.search.searcher import Searcher
-from retrieval.search.shard import RankedObject, ShardResult, merge_results
+from retrieval.search.shard import RankedObject, ShardResult, Shards
 from tests.retrieval.search.test_search import give_posterior
 
 NUMBERS = ("logit", "probability", "probability_if_present")
@@ -110,7 +110,9 @@ def scored(*objects, mass=None, photos=10):
 
 
 def test_merged_objects_are_ordered_by_logit_then_by_name():
-    found = merge_results([scored(("tin", 2.0), ("cup", 1.0)), scored(("mug", 2.0), ("jar", 0.5), photos=30)], top=3)
+    results = [scored(("tin", 2.0), ("cup", 1.0)), scored(("mug", 2.0), ("jar", 0.5), photos=30)]
+    shards = [SimpleNamespace(search=lambda *_, result=result: result) for result in results]
+    found = Shards(None, shards).search(None, 3, None)
     assert [one.photo.object_id for one in found.best] == ["mug", "tin", "cup"]
     assert (found.photos, found.objects) == (40, 4)
     assert found.timing_ms == {"candidates": 1.0, "rerank": 3.0}
@@ -295,12 +297,13 @@ def test_an_invalid_number_of_shards_or_an_index_folder_raises(catalogue, model,
 def test_a_failure_of_ray_ends_the_build_with_a_clear_error(catalogue, model, tmp_path, monkeypatch):
     building = pytest.importorskip("retrieval.cluster.building")
 
-    def failing(*arguments):
+    def failing(*arguments, **options):
         raise KeyError("ObjectRef(00ff)")
 
-    parts = SimpleNamespace(data=SimpleNamespace(DataContext=SimpleNamespace(get_current=SimpleNamespace)))
+    context = SimpleNamespace(get_current=SimpleNamespace)
+    parts = SimpleNamespace(data=SimpleNamespace(DataContext=context, from_items=failing, ActorPoolStrategy=dict))
     monkeypatch.setattr(building, "ray_session", lambda cpus: nullcontext(parts))
-    monkeypatch.setattr(building, "_results", failing)
+    monkeypatch.setattr(building, "ray_worker_pool", lambda ray: (1, {"num_gpus": 0}))
     with pytest.raises(RetrievalError, match=r"KeyError: .*same command again to continue"):
         build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=building.ray_runner(1, 1))
 
@@ -312,7 +315,7 @@ def test_a_missing_shard_or_the_generation_of_another_one_is_corrupt(catalogue_c
     _, cluster = catalogue_copy
     first, second = read_sharded_manifest(cluster).shards[:2]
     shutil.rmtree(cluster / first.folder / first.generation)
-    with pytest.raises(CorruptIndex, match=f"{first.folder}: the generation {first.generation} is missing"):
+    with pytest.raises(CorruptIndex, match=f"{first.folder}/{first.generation}/.*build-index"):
         Searcher.open(cluster)
     shutil.copytree(cluster / second.folder / second.generation, cluster / first.folder / first.generation)
     with pytest.raises(CorruptIndex, match=r"is not the generation that .* lists"):

@@ -12,7 +12,7 @@ def test_pages_contain_every_photo_once_in_index_order(client, searcher):
     found, offset = [], 0
     while offset is not None:
         page = client.get("/v1/catalogue", params={"offset": offset, "limit": 7}).json()
-        assert (page["total"], page["offset"], page["generation"]) == (24, offset, searcher.generation.name)
+        assert (page["total"], page["offset"], page["generation"]) == (24, offset, searcher.manifest.generation)
         found, offset = found + page["items"], page["next"]
     assert [item["id"] for item in found] == [row.path for row in searcher.generation.rows]
     assert client.get("/v1/catalogue", params={"offset": 500}).json()["items"] == []
@@ -53,4 +53,4 @@ def test_names_outside_the_index_are_unknown(client, name):
 def test_index_route_describes_the_index(client, searcher):
     info = client.get("/v1/index").json()
     assert (info["photos"], info["objects"], info["fingers"]) == (24, 8, 2)
-    assert (info["generation"], info["can_grasp"], info["sensors"]) == (searcher.generation.name, False, [])
+    assert (info["generation"], info["can_grasp"], info["sensors"]) == (searcher.manifest.generation, False, [])
