@@ -83,10 +83,8 @@ def test_there_are_as_many_processes_as_gpus_or_else_cpus(capsys):
     assert ray_worker_pool(nodes({"CPU": 4.0}, {"CPU": 8.0})()) == (12, {"num_cpus": 1, "num_gpus": 0})
     assert ray_worker_pool(nodes({"memory": 1.0})()) == (1, {"num_cpus": 1, "num_gpus": 0})
     mixed = nodes({"CPU": 64.0}, {"CPU": 16.0, "GPU": 2.0}, {"CPU": 30.0, "GPU": 4.0})
-    assert ray_worker_pool(mixed()) == (
-        6,
-        {"num_cpus": 7, "num_gpus": 1},
-    )  # from the machine with the fewest CPUs for each GPU
+    # The CPUs are those of the machine with the fewest for each GPU.
+    assert ray_worker_pool(mixed()) == (6, {"num_cpus": 7, "num_gpus": 1})
     assert ray_worker_pool(nodes({"CPU": 2.0, "GPU": 8.0})()) == (8, {"num_cpus": 1, "num_gpus": 1})
     assert not capsys.readouterr().err
     assert ray_worker_pool(mixed(has_gpus=False)) == (110, {"num_cpus": 1, "num_gpus": 0})
@@ -106,9 +104,8 @@ def test_each_process_of_the_pool_requests_its_own_gpu(catalogue, model, tmp_pat
             import ray
 
             gpus = ray.get_runtime_context().get_accelerator_ids()["GPU"]
-            (reports / job.folder.name).write_text(
-                f"{gpus} {os.environ['CUDA_VISIBLE_DEVICES']} {torch.get_num_threads()}"
-            )
+            visible, threads = os.environ["CUDA_VISIBLE_DEVICES"], torch.get_num_threads()
+            (reports / job.folder.name).write_text(f"{gpus} {visible} {threads}")
             return super()._build(job)
 
     monkeypatch.delenv("OMP_NUM_THREADS")
