@@ -220,9 +220,7 @@ def test_manifests_of_other_software_raise_a_clear_error(folder, fields, error, 
         opened(folder)
 
 
-@pytest.mark.parametrize(
-    "text", ["[]", "null", "[" * 100_000], ids=["list", "null", "deep"]
-)
+@pytest.mark.parametrize("text", ["[]", "null", "[" * 100_000], ids=["list", "null", "deep"])
 def test_a_manifest_that_is_not_one_object_is_corrupt(folder, text):
     (folder / "manifest.json").write_text(text)
     with pytest.raises(CorruptIndex, match=r"manifest\.json: must be"):
