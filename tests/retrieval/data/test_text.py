@@ -22,7 +22,7 @@ def test_a_lone_surrogate_in_a_recording_is_refused_with_its_line(recording, tmp
     line = (recording / "metadata.jsonl").read_text().splitlines()[0]
     row = {**json.loads(line), "object_id": f"mug{HALF}"}
     (tmp_path / "metadata.jsonl").write_text(f"{line}\n{json.dumps({**row, 'grasp_id': 'other'})}\n")
-    with pytest.raises(RecordingError, match=r"metadata.jsonl, line 2: must be"):
+    with pytest.raises(RecordingError, match=r"metadata.jsonl, line 2: it must be"):
         read_recording(tmp_path)
 
 
