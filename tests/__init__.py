@@ -8,9 +8,9 @@
     synthetic_evaluation, reference_model       synthetic results, and a model with reference calibration
     miniatures, real_data_sets, data            small public data sets, and the folder of real ones
     emulators                                   a WSG-50 and a Sawyer as programs, based on the facts of the drivers
-    emulated_rig                                hundreds of grasps with the real drivers and injected faults
+    emulated_rig                                the real drivers with emulated devices and injected faults
     fake_rig, own_rig, replay_rig, views, meshes    rigs, depth pictures and solids from formulas and from files
-    fake_video, wsg50_bench, wsg50_packets      fake cameras and a fake gripper
+    fake_video, wsg50_bench                     fake cameras, and the gripper's driver with its emulator
     oracle, documents, pages                    expected search results; parsers of documents and pages
     verification                                a calibration of verifications with given bounds
     hard_case                                   one stiff or extreme input

@@ -9,7 +9,7 @@ import pytest
 from robot.drivers.wsg50 import codec
 from robot.drivers.wsg50.codec import CommandId, GraspingState, Packet, Status, SystemState, WireError, decode, encode
 
-PACKETS = {  # from the gripper's manual and from the tests of a public driver: (bytes, packet)
+PACKETS = {  # from the gripper's manual and from the tests of a public driver: bytes, packet
     "AA AA AA 01 00 00 E8 10": Packet(0x01),
     "AA AA AA 01 02 00 12 34 6D 66": Packet(0x01, b"\x12\x34"),
     "AA AA AA 20 02 00 00 00 B3 FD": Packet(0x20, b"\x00\x00"),

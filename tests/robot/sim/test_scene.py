@@ -35,7 +35,7 @@ MISS = Grip(Pose(140.0, 0.0, MIDDLE_MM, 0.3), force_n=12.0)
 @pytest.mark.parametrize(
     ("outputs", "changes", "passes"),
     [
-        (ALL, {}, "view photo depth 2*turn 2*wall 2*contact 2*gel 2*background"),
+        (sorted(ALL), {}, "view photo depth 2*turn 2*wall 2*contact 2*gel 2*background"),
         ([], {}, ""),
         (["photo"], {}, "view photo"),
         (["depth"], {}, "view depth"),
