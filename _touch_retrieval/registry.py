@@ -3,7 +3,7 @@
 import hashlib
 import inspect
 import sys
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Mapping
 from importlib import import_module
 from operator import attrgetter
 from typing import Any, Generic, TypeVar, cast
@@ -11,7 +11,7 @@ from typing import Any, Generic, TypeVar, cast
 T = TypeVar("T")
 
 
-class Registry(Collection[str], Generic[T]):
+class Registry(dict[str, str], Generic[T]):
     """Named classes or functions of one kind, imported on first use.
 
     A package adds a name with an entry point of the group `touch_retrieval.<kind>`:
@@ -19,7 +19,7 @@ class Registry(Collection[str], Generic[T]):
         [project.entry-points."touch_retrieval.methods"]
         my_method = "my_package.my_module:MyMethod"
 
-    `module:Class` is also a name and needs no entry point. The collection contains the built-in names; `names()`
+    `module:Class` is also a name and needs no entry point. The dictionary contains the built-in names; `names()`
     returns all names.
 
     Names in files (checkpoints, indexes) are untrusted, so `load` imports no module for `module:Class`: the module
@@ -38,29 +38,21 @@ class Registry(Collection[str], Generic[T]):
             error: Exception type for an unknown or unusable name.
             base: "module:Class"; each entry is a subclass or an instance of it. None for entries that are functions.
         """
-        self.noun, self.group, self.table = noun, f"touch_retrieval.{kind}", table
+        super().__init__(table)
+        self.noun, self.group = noun, f"touch_retrieval.{kind}"
         self._error, self._base = error, base
 
     def __repr__(self) -> str:
         return f"<registry of {self.group.rpartition('.')[2]}>"
 
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.table)
-
-    def __len__(self) -> int:
-        return len(self.table)
-
-    def __contains__(self, name: object) -> bool:
-        return name in self.table
-
     def names(self) -> list[str]:
         """Return the built-in names, then the names that installed packages add."""
-        return list(dict.fromkeys([*self.table, *sorted(self._installed())]))
+        return list(dict.fromkeys([*self, *sorted(self._installed())]))
 
     def load(self, name: str) -> T:
         """Return the entry with this name. Raises the registry's error if it is unknown or unusable."""
-        if name in self.table:
-            return cast(T, _imported(self.table[name]))
+        if name in self:
+            return cast(T, _imported(self[name]))
         place = self._installed().get(name)
         if place is None:
             place, (module, _, attribute) = name, name.partition(":")
@@ -87,7 +79,7 @@ class Registry(Collection[str], Generic[T]):
         if not isinstance(choice, str):
             place = f"{getattr(choice, '__module__', None)}:{getattr(choice, '__qualname__', None)}"
             self._checked(place, choice)
-            for name, known in {**self._installed(), **self.table}.items():
+            for name, known in {**self._installed(), **self}.items():
                 if known == place:
                     return name
             choice = place
@@ -99,7 +91,7 @@ class Registry(Collection[str], Generic[T]):
                     f"{self.noun} {choice!r} cannot be imported ({error}); install its package, or add its folder to "
                     "PYTHONPATH"
                 ) from error
-        if choice not in self.table:
+        if choice not in self:
             self.load(choice)
         return choice
 

@@ -137,10 +137,6 @@ def crop_square(image: Samples, box: PixelBox, side: float) -> Samples:
     return whole
 
 
-def _crop(image: Samples, box: PixelBox) -> Samples:
-    return crop_square(image, box, _CROP_MARGIN * max(box.right - box.left, box.bottom - box.top))
-
-
 def _zoom(image: Samples, box: PixelBox) -> Samples:
     return crop_square(image, box, _ZOOM_FRACTION * min(image.shape[:2]))
 
@@ -152,7 +148,7 @@ def _grey(image: Samples, box: PixelBox) -> Samples:
 
 VIEWS: dict[str, Callable[[Samples, PixelBox], Samples]] = {
     "whole": lambda image, box: image,
-    "crop": _crop,
+    "crop": lambda image, box: crop_square(image, box, _CROP_MARGIN * max(box.right - box.left, box.bottom - box.top)),
     "zoom": _zoom,
     "grey": _grey,
 }
