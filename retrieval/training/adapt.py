@@ -262,11 +262,8 @@ def accuracies(scores: Sequence[NDArray[np.float32]], folds: Sequence[Features])
     """Return the accuracy of each touch of each fold with one random photo of each object of the fold.
 
     "top1" is whether the photo of the touched object ranks first; 1/m if m photos tie. "pair_accuracy" is the fraction
-    of the other objects' photos with a lower score; ties count 1/2.
-
-    Args:
-        scores: For each fold, (n, n) of every touch with every photo.
-        folds: The grasps of each fold.
+    of the other objects' photos with a lower score; ties count 1/2. `scores` of a fold (n, n) are of every touch with
+    every photo.
     """
     names = sorted({name for fold in folds for name in fold.object_ids})
     parts: dict[str, list[Measure]] = {"top1": [], "pair_accuracy": []}

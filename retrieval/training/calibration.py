@@ -473,14 +473,10 @@ def with_calibrations(
     *,
     seed: int = 0,
 ) -> Checkpoint:
-    """Return the checkpoint with calibrations.
+    """Return the checkpoint with calibrations on touches of objects outside the fit, of one matcher or several.
 
-    Args:
-        checkpoint: The checkpoint.
-        scored: Touches of objects outside the fit, of one matcher or several.
-        pooled: The same without late interaction, for an index without cells; empty for a model without cells.
-        verified: Touches for verification. Default: `scored`.
-        seed: Seed of the trials.
+    `pooled` are the touches without late interaction, for an index without cells; empty for a model without cells.
+    `verified` are those for verification, by default `scored`.
     """
     posterior = fit_posterior(*scored, seed=seed)
     checkpoint = dataclasses.replace(

@@ -49,11 +49,18 @@ from retrieval.model.towers.tower import Tower
 from retrieval.training import distributed
 from retrieval.training.augmentation import augment_photos, augment_touches
 
-# Batches ---------------------------------------------------------------------------------------------------
-
-
+T = TypeVar("T")
+TOUCH_VARIANTS = ("touch", "low_pass", "no_contact")
+"""Inputs of the touch tower: gel images; low-pass gel images (8 x 6); no-contact frames."""
+PHOTO_VARIANTS = ("photo", "margin")
+"""Inputs of the photo tower: whole photos; only the margin, which rarely shows the object."""
+_MARGIN_DIVISOR = 8  # the margin is 1 / _MARGIN_DIVISOR of each side
+_BATCH, _CHUNK = 32, 64
+_FORMAT = 1  # raised if the features of the same images change
 _KEEP_BYTES = 4 << 30
 """Memory for decoded photos, and for decoded gel images, of all workers together."""
+
+# Batches ---------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -214,9 +221,6 @@ def _encoded(
     return touch, photo
 
 
-_CHUNK = 64
-
-
 @torch.inference_mode()
 def recorded_features(
     matcher: Matcher, source: FeatureSource, grasps: Sequence[Grasp], *, what: str, quiet: bool = False
@@ -240,26 +244,9 @@ def recorded_features(
 # Recordings ------------------------------------------------------------------------------------------------
 
 
-T = TypeVar("T")
-
-TOUCH_VARIANTS = ("touch", "low_pass", "no_contact")
-"""Inputs of the touch tower: gel images; low-pass gel images (8 x 6); no-contact frames."""
-PHOTO_VARIANTS = ("photo", "margin")
-"""Inputs of the photo tower: whole photos; only the margin, which rarely shows the object."""
-_MARGIN_DIVISOR = 8  # the margin is 1 / _MARGIN_DIVISOR of each side
-_BATCH = 32
-_FORMAT = 1  # raised if the features of the same images change
-
-
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Tower features of G grasps, one row each.
-
-    Attributes:
-        grasp_ids: Id of each grasp.
-        object_ids: Object of each grasp.
-        touch: (G, fingers, F_touch) float32.
-        photo: (G, F_photo) float32, of the photo taken before the grasp.
+    """Tower features of G grasps: of touches (G, fingers, F_touch), and of the photos taken before (G, F_photo).
 
     Raises:
         NumericalError: A feature is not finite.

@@ -67,14 +67,8 @@ def train_gate(
 
     A quarter of the objects are for validation. Training takes half a minute, plus 15 ms for each grasp.
 
-    Args:
-        recording: Folder of the recording.
-        out: File of the gate (.safetensors).
-        iterations: Number of steps.
-        seed: The same seed gives the same gate.
-        settings: By default, the gate uses the frame after the lift, or the frame during the grasp if any grasp lacks
-            the former.
-        quiet: No progress on stderr.
+    By default, the gate uses the frame after the lift, or the frame during the grasp if any grasp lacks the former. The
+    same seed gives the same gate.
 
     Returns:
         The metrics in the file: the frame that the gate uses; "train_grasps", "train_held", "validation_grasps" and

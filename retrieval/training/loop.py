@@ -76,12 +76,10 @@ class TrainingInterrupted(JobInterrupted):
 
 @dataclass(frozen=True)
 class StateFile:
-    """The file of an unfinished run: all weights, those of the best step, the optimiser, and the step.
+    """The file of an unfinished run (`state_path`): all weights, those of the best step, the optimiser, and the step.
 
-    Attributes:
-        path: The file (`state_path`).
-        identity: All that determines the run, in JSON types; a run with another identity cannot be continued.
-        is_replaceable: Whether a state that cannot be continued is replaced.
+    `identity` is all that determines the run, in JSON types. The state of a run with another identity cannot be
+    continued; it is replaced if it `is_replaceable`.
     """
 
     path: Path
