@@ -45,13 +45,7 @@ class SkippedPhoto:
 
 @dataclass(frozen=True, slots=True)
 class CataloguePhoto:
-    """One photo of a catalogue.
-
-    Attributes:
-        path: Path relative to the catalogue.
-        object_id: The object that the photo shows.
-        metadata: The user's own keys and values.
-    """
+    """One photo of a catalogue: its path relative to the catalogue, its object, and the user's own keys and values."""
 
     path: str
     object_id: str
@@ -60,13 +54,7 @@ class CataloguePhoto:
 
 @dataclass(frozen=True, slots=True)
 class CatalogueTouch:
-    """One touch of a catalogue.
-
-    Attributes:
-        object_id: The touched object.
-        paths: Paths of the gel images relative to the catalogue, in finger order.
-        metadata: The user's own keys and values.
-    """
+    """One touch of an object: its gel images' paths relative to the catalogue, in finger order, and metadata."""
 
     object_id: str
     paths: tuple[str, ...]

@@ -37,26 +37,17 @@ _EIGHT_BIT_MODES = frozenset({"1", "L", "P", "RGB", "RGBX", "CMYK", "YCbCr", "LA
 _STRIP = 1 << 20  # pixels
 _ORIENTATION, _BITS, _PHOTOMETRIC = 274, 258, 262
 
-
 # Pillow warns of sizes and damaged metadata. Filters belong to the process: a thread must not change them for a while.
 warnings.filterwarnings("ignore", module="PIL|pillow_heif")
 
 
 def read_rgb(path: str | Path) -> RgbImage:
-    """Read the picture at `path` as (H, W, 3) float32 RGB in 0..1, upright.
-
-    Raises:
-        ImageError: The file cannot be read or decoded.
-    """
+    """Read the picture at `path` as (H, W, 3) float32 RGB in 0..1, upright. Raises ImageError."""
     return decode_rgb(read_bytes(path), path)
 
 
 def read_bytes(path: str | Path) -> bytes:
-    """Return the bytes of a regular file of at most MAX_BYTES.
-
-    Raises:
-        ImageError: The file cannot be read.
-    """
+    """Return the bytes of a regular file of at most MAX_BYTES. Raises ImageError."""
     try:
         return read_regular(path, MAX_BYTES)
     except FileNotFoundError:
@@ -182,11 +173,7 @@ def _apply_draft_mode(image: Image.Image, min_side: int | None) -> None:
 
 
 def check_pixels(size: tuple[int, int], name: str | Path) -> None:
-    """Check a size (width, height) from a header before anything of that size is allocated.
-
-    Raises:
-        ImageError: The size is empty, too large or too elongated.
-    """
+    """Raise ImageError if a size (width, height), from a header, is empty, too large or too elongated to allocate."""
     width, height = size
     if width < 1 or height < 1:
         raise ImageError(name, f"has no pixels ({width} x {height})")

@@ -33,15 +33,7 @@ _TIFF_TEXT, _TIFF_BYTES, _TIFF_EXTENSIONS = 2, frozenset({1, 6, 7}), 340
 
 
 def check_structure(data: bytes, name: str | Path) -> None:
-    """Check that the structure of a picture file costs no more than its pixels.
-
-    Args:
-        data: Bytes of the file.
-        name: Name of the picture in messages.
-
-    Raises:
-        ImageError: The file has too many scans, segments, chunks or tags.
-    """
+    """Raise ImageError if a picture file, called `name`, has too many scans, segments, chunks or tags."""
     if data.startswith(_JPEG):
         _check_jpeg(data, name)
     elif data.startswith(_PNG):

@@ -89,11 +89,7 @@ class Preprocessing:
         return tile_views(image, self.views, self.photo_px)
 
     def photo_from_bytes(self, data: bytes, name: str | Path) -> RgbImage:
-        """Return the tiled views of the photo in the bytes of a file, called `name` in messages.
-
-        Raises:
-            ImageError: The bytes cannot be decoded.
-        """
+        """Return the tiled views of the photo in the bytes of a file, called `name`. Raises ImageError."""
         if not self.reduced:
             return tile_views(decode(data, name), self.views, self.photo_px)
         image = decode(data, name, min_photo_side(self.views, self.photo_px))

@@ -81,14 +81,7 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
 
 
 def check_gel_layout(folder: Path) -> list[Finding]:
-    """Return the findings about exchanged channels and mirrored gel images; only the gel images are read.
-
-    Args:
-        folder: Folder of the recording.
-
-    Raises:
-        DatasetError: The recording cannot be read.
-    """
+    """Return the findings of `check_colour_layout`; only the gel images are read. Raises DatasetError."""
     grasps = [attempt.grasp for attempt in load_all_attempts(folder)]
     gels = {grasp.grasp_id: {*grasp.touches, *grasp.backgrounds} for grasp in grasps}
     records, broken = read_pictures(set().union(*gels.values()))
