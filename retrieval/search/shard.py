@@ -180,7 +180,8 @@ class FolderShard:
         if not self._has_embeddings or k >= self.generation.count:
             return np.arange(self.generation.count)
         rows = np.sort(self.generation.index.candidates(combined_embedding(embeddings), k)[0])
-        return np.union1d(rows, self.objects.other_rows(self.objects.nearest_by_reference(similarities, k), rows))
+        nearest = self.objects.nearest_by_reference(similarities, k)
+        return np.union1d(rows, self.objects.other_rows(nearest, rows)) if len(nearest) else rows
 
     def _logits(self, partials: Floats, rows: Rows) -> Floats:
         """Return the match logits of the rows, summed over grasps."""

@@ -13,7 +13,7 @@ from indexes.kinds import faiss_index
 from indexes.kinds.faiss_index import faiss_call
 from indexes.kinds.vector_index import VectorIndex, score_tolerance
 from tests import plugins
-from tests.oracle import disagreements, search
+from tests.oracle import disagreements
 
 N, D = 1000, 16
 APPROXIMATE = ["IVF16,Flat;nprobe=4", "IVF16,SQ8;nprobe=4", "HNSW16;efSearch=32", "PQ8x4", "IVF8,PQ4x4,RFlat"]
@@ -224,13 +224,3 @@ def test_faiss_is_imported_only_when_it_is_needed():
         "assert 'faiss' in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
-
-
-def test_the_oracle_equals_two_plain_loops():
-    vectors, queries = unit(40), unit(3, seed=2)
-    scores, rows = search(vectors, queries, 5)
-    for query, row, score in zip(queries, rows, scores, strict=True):
-        table = [sum(float(a) * float(b) for a, b in zip(query, vector, strict=True)) for vector in vectors]
-        best = sorted(range(40), key=lambda number: (-table[number], number))[:5]
-        assert row.tolist() == best
-        np.testing.assert_allclose(score, [table[number] for number in best], atol=1e-12)
