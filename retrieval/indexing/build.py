@@ -116,13 +116,7 @@ def build_options(
 ) -> tuple[BuildOptions, str]:
     """Return the options of a build, and a note if the rule that names objects changed.
 
-    Args:
-        checkpoint: The model.
-        before: Entries of the existing index's manifest; they determine what the user leaves open.
-        objects_from: As for `build_index`.
-        kind: As for `build_index`.
-        cells: As for `build_index`.
-        quiet: As for `build_index`.
+    Entries of the existing index's manifest, `before`, determine what the user leaves open.
 
     Raises:
         BadInput: As for `build_index`.
@@ -145,12 +139,6 @@ def build_options(
 
 def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, options: BuildOptions) -> BuildReport:
     """Write the next generation of an index of listed photos; as `build_index`, but old generations stay.
-
-    Args:
-        catalogue: The listed photos and touches.
-        checkpoint: The model.
-        out: The index folder.
-        options: The options of the build.
 
     Raises:
         NoReadablePhoto: No photo can be read.

@@ -212,13 +212,6 @@ class Codes:
 def find_codes(items: Sequence[Paths], encoder: Encoder, files: CatalogueFiles, cache: Cache, quiet: bool) -> Codes:
     """Store the codes of photos or touches in the cache of the index, each content once.
 
-    Args:
-        items: Files of each photo or touch.
-        encoder: Makes the codes.
-        files: The files of the catalogue; those that are read now become known.
-        cache: The cache of the index.
-        quiet: Show no progress.
-
     Raises:
         NumericalError: A partial activation exceeds float16.
     """

@@ -105,12 +105,6 @@ class IndexContents:
 def read_contents(catalogue: Catalogue, checkpoint: Checkpoint, cache: Cache, quiet: bool) -> IndexContents:
     """Find or make the codes of a catalogue's photos and touches.
 
-    Args:
-        catalogue: The catalogue.
-        checkpoint: The model.
-        cache: The cache of the index.
-        quiet: Show no progress.
-
     Raises:
         NoReadablePhoto: No photo can be read.
         BadInput: The catalogue has touches, and the model cannot compare them.
