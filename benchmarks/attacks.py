@@ -127,6 +127,23 @@ def many_pictures(target: Target) -> str:
     return _post_in_parallel(target, "/v1/query", _query([png_of_zeros(8, 8)] * 128), 8)
 
 
+def half_headers(target: Target) -> str:
+    """600 connections that each send half of a request's headers and then wait."""
+    connections = []
+    for _ in range(600):
+        try:
+            connection = target.connect()
+            connection.sendall(b"GET /healthz HTTP/1.1\r\nhost: localhost\r\nx-half: ")
+            connections.append(connection)
+        except OSError:
+            continue
+    time.sleep(15)
+    still_open = sum(_is_open(connection) for connection in connections)
+    for connection in connections:
+        connection.close()
+    return f"{still_open} of 600 open after 15 s"
+
+
 def slow_bodies(target: Target) -> str:
     """100 requests whose bodies arrive at one byte per second."""
     connections = []
@@ -150,6 +167,21 @@ def slow_bodies(target: Target) -> str:
     return f"{still_open} of 100 open after 18 s"
 
 
+def header_flood(target: Target) -> str:
+    """One connection that sends headers without end, up to 400 MB."""
+    lines = b"".join(b"x-%d: %s\r\n" % (number, b"a" * 1000) for number in range(1000))
+    with target.connect() as connection:
+        connection.sendall(b"GET /healthz HTTP/1.1\r\nhost: localhost\r\n")
+        sent = 0
+        try:
+            for _ in range(400):
+                connection.sendall(lines)
+                sent += len(lines)
+        except OSError:
+            pass
+        return f"{sent / 1e6:.0f} MB accepted"
+
+
 def many_grasps(target: Target) -> str:
     """60 simultaneous grasps of the simulated rig."""
     return _post_in_parallel(target, "/v1/grasp", b"", 60)
@@ -167,7 +199,9 @@ ATTACKS: tuple[Attack, ...] = (
     jpeg_markers,
     png_chunks,
     many_pictures,
+    half_headers,
     slow_bodies,
+    header_flood,
     many_grasps,
 )
 
