@@ -166,7 +166,7 @@ def test_reference_touches_are_reused_with_the_calibration_of_pooled_logits(
     assert generation.documents["touches"].shape[1] == CELLS.pooled_width
     with Searcher.open(tmp_path / "index") as searcher:
         posterior = searcher.query(next(iter(touches.values()))[0]).posterior
-        assert posterior["references"]["calibration"] == POOLED_REFERENCES.to_dict()
+        assert posterior["references"]["calibration"] == dataclasses.asdict(POOLED_REFERENCES)
 
 
 def test_only_a_checkpoint_with_cells_stores_the_calibration_of_pooled_logits(checkpoint, tmp_path):
