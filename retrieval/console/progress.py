@@ -61,6 +61,7 @@ class Bar:
         """Show `done` of `total` units; the bar begins at the first call."""
         if not self.total:
             self.total, self.done, self._first = total, done, done
+            self._start = self._last_line = time.monotonic()
             self.__enter__()
         self.advance(done - self.done, note)
 

@@ -83,7 +83,7 @@ def store_checkpoint(checkpoint: Checkpoint, path: Path) -> None:
     if checkpoint.queries is not None:
         state[_QUERIES] = torch.from_numpy(checkpoint.queries)
     write_tensors(path, state, header)
-    write_atomically(sibling_file(path, ".md"), _model_card(path.name, checkpoint).encode())
+    write_atomically(sibling_file(path, ".md"), _model_card(path.name, checkpoint).encode(errors="replace"))
 
 
 def require_writable(path: Path) -> None:

@@ -154,19 +154,19 @@ def adapt(
             of_start = accuracies(logits, [baseline.of_objects(fold) for fold in folds])
             measures |= {f"baseline_{name}": found for name, found in of_start.items()}
     metrics = {name: float(measure.by_object()[1].mean()) for name, measure in measures.items()}
-    is_baseline = metrics.get("baseline_pair_accuracy", 0.0) >= metrics["held_out_pair_accuracy"]
+    kept = baseline if metrics.get("baseline_pair_accuracy", 0.0) >= metrics["held_out_pair_accuracy"] else None
     licences = dict.fromkeys([*checkpoint_licences(start), recording_licence(recording)])
     about: dict[str, object] = {"source": recording_source(recording), "data_digest": data_digest(grasps)}
     provenance = {
         LICENCES: [dataclasses.asdict(licence) for licence in licences],
         "metrics": metrics | {"held_out_top1_chance": float(measures["held_out_top1"].chance[0])},
     }
-    if baseline is not None and is_baseline:
+    if kept is not None:
         made = dataclasses.replace(start, provenance=start.provenance | {"adapted_to": about} | provenance)
-        touches = partial(_baseline_touches, start, baseline, max_touches=MAX_CALIBRATION_TOUCHES)
+        touches = partial(_baseline_touches, start, kept, max_touches=MAX_CALIBRATION_TOUCHES)
         # Nothing was fitted to the objects, so a verification compares all of them with each other.
         pooled_touches = touches(folds, pooled=True) if start.config.matcher.cell_dim else []
-        made = with_calibrations(made, touches(folds), pooled_touches, touches([baseline.object_ids]))
+        made = with_calibrations(made, touches(folds), pooled_touches, touches([kept.object_ids]))
     else:
         with one_thread():
             choice = fit(features)
@@ -184,10 +184,10 @@ def adapt(
     names, device = sorted(set(features.object_ids)), default_device()
     groups = [[grasp for grasp in grasps if grasp.object_id in names[side::2]] for side in (0, 1)]
     made.matcher.to(device)
-    known = baseline if baseline is not None and is_baseline else features
+    known = features if kept is None else kept
     source = FrozenFeatures(made.config, features_by_image(grasps, known, device))
     store_checkpoint(with_gel_check(made, source, *groups, quiet=quiet), out)
-    return Adaptation(load_checkpoint(out), measures, is_baseline)
+    return Adaptation(load_checkpoint(out), measures, kept is not None)
 
 
 # The combined towers ---------------------------------------------------------------------------------------

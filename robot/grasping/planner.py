@@ -95,6 +95,10 @@ class SpreadPlanner(GraspPlanner):
         self.planner, self.heights_mm, self.draws = planner, heights_mm, draws
         self.needs_depth = planner.needs_depth
 
+    def check(self, rig: Rig) -> None:
+        """Raise RobotConfigError if the other planner cannot plan for `rig`."""
+        self.planner.check(rig)
+
     def plan(self, rig: Rig, image: RGBD, settings: GraspSettings, rng: np.random.Generator) -> GraspPlan:
         """Plan the grasp that is farthest from the earlier ones; raise the last error if all draws are impossible."""
         plans: list[GraspPlan] = []

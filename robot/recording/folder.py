@@ -25,6 +25,8 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from _touch_retrieval.files import sync, write_atomically
 from robot.errors import RecordingError
 from robot.gel_settings import UNKNOWN
@@ -242,7 +244,7 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
             data, suffix = file_content(column, source)
             paths[f"{column}_file_name"] = path = f"{IMAGES_FOLDER}/{name}{suffix}"
             contents[path] = data
-        plain = {key: value.tolist() if hasattr(value, "tolist") else value for key, value in fields.items()}
+        plain = {key: np.asarray(value).tolist() for key, value in fields.items()}  # numbers of numpy, in a pose too
         row = {"grasp_id": grasp_id, "object_id": object_id, **plain, **paths}
         grasp = RecordedGrasp.from_row(row)
         if unknown := sorted({key for key in row if row[key] is not None} - grasp.to_row().keys()):

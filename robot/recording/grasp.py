@@ -15,6 +15,8 @@ Outcome = Literal["held", "missed", "slipped", "no_plan"]
 
 _NUMBERS = ("force_n", "opening_mm", "touch_skew_s", "time_s")
 _PLAIN_KEYS = ("grasp_id", "object_id", *_NUMBERS, "pose", "grasped", "outcome", "sequence_id")
+_REPEATED_KEY = re.compile(r"object_id|sequence_id|outcome|photo_file_name|touch_[a-z]_before_file_name")
+"""Keys with equal values in many lines; their strings are interned."""
 _IMAGE_KEY = re.compile(r"(photo|depth|touch_([a-z])(_before|_after)?)_file_name")
 
 
@@ -95,8 +97,8 @@ class RecordedGrasp:
         for key, value in row.items():
             if value is None:
                 continue
-            if type(value) is str:
-                value = sys.intern(value)  # many lines have the same object, sequence and photo
+            if type(value) is str and _REPEATED_KEY.fullmatch(key):
+                value = sys.intern(value)
             if key in _PLAIN_KEYS:
                 values[key] = value
             elif match := _IMAGE_KEY.fullmatch(key):

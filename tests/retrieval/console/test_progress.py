@@ -46,6 +46,7 @@ def test_quiet_work_prints_nothing(clock, capsys):
 
 def test_the_first_call_of_show_states_the_total(clock, capsys):
     with Bar("collect", 0, "grasps") as bar:
+        clock[0] += 60.0  # what comes before the first call is not counted
         bar.show(2, 4)
         clock[0] += 4.0
         bar.show(4, 4, "held")

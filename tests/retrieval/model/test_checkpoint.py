@@ -93,6 +93,12 @@ def test_every_tensor_and_every_header_entry_comes_back_and_makes_an_equal_file(
     assert first.read_bytes() == second.read_bytes()
 
 
+def test_a_path_in_a_header_need_not_be_utf8(saved, tmp_path):
+    named = dataclasses.replace(load_checkpoint(saved), provenance={**PROVENANCE, "source": "caf\udce9.pth"})
+    store_checkpoint(named, tmp_path / "named.safetensors")
+    assert load_checkpoint(tmp_path / "named.safetensors").provenance == named.provenance
+
+
 # Model card ------------------------------------------------------------------------------------------------
 
 

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 import robot
-from robot.errors import PlanError, UngraspableError
+from robot.errors import PlanError, RobotConfigError, UngraspableError
 from robot.grasping.planner import SpreadPlanner
+from robot.sim.mesh_planner import MeshPlanner
 
 
 class Listed(robot.GraspPlanner):
@@ -50,3 +51,8 @@ def test_if_all_draws_are_impossible_the_last_reason_is_raised():
 def test_an_object_that_cannot_be_grasped_ends_the_draws():
     with pytest.raises(UngraspableError):
         planned([40.0], UngraspableError("larger than the jaws"), 42.0)
+
+
+def test_a_rig_that_the_other_planner_cannot_use_is_refused():
+    with robot.load_rig("sim", seed=0) as rig, pytest.raises(RobotConfigError, match="meshes"):
+        SpreadPlanner(MeshPlanner(), []).check(rig)

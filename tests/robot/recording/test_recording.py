@@ -61,7 +61,7 @@ def test_appended_grasps_are_read_back_and_a_line_has_the_documented_columns_wit
             images,
             force_n=np.float32(7.5),
             opening_mm=31,
-            pose=np.array([1.0, 2.0, 3.0, 0.5]),
+            pose=(*np.array([1.0, 2.0, 3.0]), 0.5),
             grasped=np.True_,
             outcome="slipped",
             sequence_id="tuesday",
