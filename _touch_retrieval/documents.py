@@ -95,6 +95,8 @@ def _hints(kind: type) -> dict[str, Any]:
 
 
 def _require_known(document: Any, kind: Any, name: str, complete: bool) -> None:
+    if not isinstance(document, Mapping | list | tuple):
+        return  # it has no keys
     kind = getattr(kind, "__origin__", kind) if hasattr(kind, "__metadata__") else kind  # of Annotated
     parts: Any = [document]
     kinds = get_args(kind)

@@ -102,9 +102,9 @@ class RecordedCamera(VirtualDevice, Camera):
 
 
 @contextlib.contextmanager
-def replay_rig(emulator=None):
+def replay_rig():
     """The rig, not connected; prompts to a person return at once."""
-    with replay_file(emulator) as path:
+    with replay_file() as path:
         yield load_rig(str(path), seed=0)
 
 

@@ -49,8 +49,9 @@ def describe(method: Method, scores: MethodScores, features: Features) -> SeedDe
         features: Features of all grasps, as the method takes them.
     """
     seed, objects, test = scores.seed, scores.queries.objects, scores.touches("test", "test")
-    sets = scores.sets("validation")
-    posteriors = {1: scores.posterior, 5: fit_posterior(sets[5], seed) if 5 in sets else None}
+    sizes = {grasps for _, grasps, _ in K_WAY_TESTS.values()} - {1}
+    validation = scores.sets("validation", sizes)
+    posteriors = {1: scores.posterior} | {size: fit_posterior(table, seed) for size, table in validation.items()}
     fitted = {grasps: posterior for grasps, posterior in posteriors.items() if posterior}
     accuracies = {
         "test_candidates": k_way(test, 5, seed=seed),
@@ -67,7 +68,7 @@ def describe(method: Method, scores: MethodScores, features: Features) -> SeedDe
             Confusion(objects[true], objects[other], fraction) for true, other, fraction in confusions(test, seed=seed)
         ],
         calibration={"posteriors": {str(grasps): posterior.to_dict() for grasps, posterior in fitted.items()}},
-        reliability=reliability(fitted, scores.sets("test") | {1: test}, seed=seed),
+        reliability=reliability(fitted, scores.sets("test", sizes) | {1: test}, seed=seed),
     )
     return SeedDetails(
         details,

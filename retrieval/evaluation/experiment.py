@@ -203,9 +203,10 @@ class Experiment:
                 f"{protocol.title}: a gallery has {len(tables.test.objects)} objects, too few for "
                 f"{protocol.measures[protocol.main].label}. Give more of the data set."
             )
-        units = sorted({facts.sequence_of[name] if protocol.is_by_sequence else name for name in facts.names})
-        unit_of = [units.index(facts.sequence_of[name] if protocol.is_by_sequence else name) for name in objects]
-        return {name: pooled(parts, dict(enumerate(unit_of))) for name, parts in found.items()}
+        unit_of = facts.sequence_of if protocol.is_by_sequence else {name: name for name in facts.names}
+        units = sorted(set(unit_of.values()))
+        numbers = {number: units.index(unit_of[name]) for number, name in enumerate(objects)}
+        return {name: pooled(parts, numbers) for name, parts in found.items()}
 
 
 def _of_gallery(tables: MethodScoreTables, mine: NDArray[np.bool_]) -> MethodScoreTables:

@@ -1,7 +1,7 @@
 """Queries of an evaluation, drawn once for all methods, and the scores of a fitted method for them."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -165,8 +165,8 @@ class MethodScores:
         singles = np.arange(len(self.queries.touches))[:, None]
         return self._shown(self._table(self.scores, singles, rows, columns, words, "touches"))
 
-    def sets(self, part: str) -> dict[int, ScoreTable]:
-        """Return the scores of sets of grasps with photos of the same part, by number of grasps.
+    def sets(self, part: str, sizes: Collection[int] = SET_SIZES) -> dict[int, ScoreTable]:
+        """Return the scores of sets of grasps of these sizes with photos of the same part, by number of grasps.
 
         Sizes without a set that has a target photo are left out.
         """
@@ -174,7 +174,7 @@ class MethodScores:
         tables = {
             size: self._table(self.set_scores[size], sets, part, part, f"{part} objects", "sets of grasps")
             for size, sets in queries.sets.items()
-            if len(queries.of_part(queries.touch_owner[sets[:, 0]], part))
+            if size in sizes and len(queries.of_part(queries.touch_owner[sets[:, 0]], part))
         }
         return {size: self._shown(table) for size, table in tables.items() if table.has_target.any()}
 

@@ -53,9 +53,9 @@ def verification_errors(scores: MethodScores, features: Features, checkpoint: Ch
     queries, posterior, test = scores.queries, checkpoint.posterior, scored_touches(scores.touches("test", "test"))
     if posterior is None:
         validation = scored_touches(scores.touches("validation", "validation"))
-        if len(np.unique(validation.photo_owner)) >= MIN_OBJECTS:
+        if validation.has_trials:
             posterior = fit_posterior(validation, seed=scores.seed)
-    if posterior is None or len(np.unique(test.photo_owner)) < MIN_OBJECTS:
+    if posterior is None or not test.has_trials:
         return None
     photos = torch.from_numpy(features.photo[queries.photos[queries.of_part(queries.photo_owner, "test")]])
     with torch.inference_mode():

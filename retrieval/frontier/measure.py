@@ -77,21 +77,25 @@ def measure_frontier(
     scale = Scale(min(photos, 2000), min(queries, 12), 2, quick) if quick else Scale(photos, queries, repeats)
     grasps = recording if callable(recording) else lambda: folder_of(recording)
     sample = Sample(Path(model or shipped_model()), grasps, out, scale, quiet)
-    rows, model_digest = {}, file_digest(sample.model)
+    rows, model_digest, here = {}, file_digest(sample.model), machine()
     for name, work in works.items():
-        rows[name] = _row(sample, name, work, [] if name in model_free else [model_digest, sample.digest])
+        rows[name] = _row(sample, name, work, here, [] if name in model_free else [model_digest, sample.digest])
         if not quiet:
             for line in rows[name].lines():
                 say(f"{name}: {line}")
-    content = {"software": __version__, "machine": machine(), "model": model_digest, "scale": scale, "rows": rows}
+    content = {"software": __version__, "machine": here, "model": model_digest, "scale": scale, "rows": rows}
     document: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(content))
     write_atomically(out / "frontier.json", json.dumps(document, allow_nan=False, indent=1).encode())
-    write_frontier(out, rows, machine(), scale.quick)
+    write_frontier(out, rows, here, scale.quick)
     return document
 
 
 def _row(
-    sample: Sample, name: str, work: Callable[[Sample], ApproximationResult], digests: Sequence[str]
+    sample: Sample,
+    name: str,
+    work: Callable[[Sample], ApproximationResult],
+    here: dict[str, Any],
+    digests: Sequence[str],
 ) -> ApproximationResult:
     """Return the stored result of an approximation, or measure and store it."""
 
@@ -100,5 +104,5 @@ def _row(
             say(f"frontier: measuring {name}")
         return msgspec.to_builtins(work(sample))
 
-    key = cache_key("frontier", name, FORMAT, __version__, machine(), msgspec.to_builtins(sample.scale), *digests)
+    key = cache_key("frontier", name, FORMAT, __version__, here, msgspec.to_builtins(sample.scale), *digests)
     return msgspec.convert(sample.stored(key, make), ApproximationResult)

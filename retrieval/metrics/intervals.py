@@ -30,13 +30,11 @@ from numpy.typing import NDArray
 from scipy.special import betaincinv, ndtr, stdtr, stdtrit
 
 from retrieval.errors import BadInput
-from retrieval.metrics.measure import Measure
+from retrieval.metrics.measure import FEW_OBJECTS, Measure
 
 LEVEL = 0.95
 DRAWS = 10_000
 """Resamples of an interval, and random sign flips of a p-value."""
-FEW_OBJECTS = 5
-"""With fewer objects, the coverage of an interval is far below LEVEL."""
 
 _EXACT_UP_TO = 18  # objects: 2 ** 17 sign flips; the other half mirrors them
 

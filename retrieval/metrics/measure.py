@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 from retrieval.errors import BadInput, NumericalError
 
+FEW_OBJECTS = 5
+"""With fewer objects, the coverage of an interval is far below its level."""
+
 
 @dataclass(frozen=True, eq=False)
 class Measure:

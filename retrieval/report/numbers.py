@@ -3,13 +3,15 @@
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from retrieval.metrics.measure import FEW_OBJECTS
+
 if TYPE_CHECKING:  # imports scipy, which the page of a query does not need
     from retrieval.metrics.intervals import Difference, Summary
 
 MISSING_VALUE = "–"
 FEW_OBJECTS_MARK = " †"
 FEW_OBJECTS_NOTE = (
-    "† Fewer than 5 objects: the interval is too narrow. In simulated samples it contained the true value "
+    f"† Fewer than {FEW_OBJECTS} objects: the interval is too narrow. In simulated samples it contained the true value "
     "in 50 % of cases for 2 objects, 74 % for 3 and 87 % for 4, instead of 95 %."
 )
 

@@ -126,7 +126,10 @@ class Objects:
             raise CorruptIndex(
                 f"{generation.folder}: the list of reference touches is invalid ({error}); {AGAIN}"
             ) from error
-        numbers = np.array([rows.find_object(one.object_id) for one in self._references.touches], dtype=np.int64)
+        listed = self._references
+        names = {one.object_id for one in listed.touches}.union(listed.touch_only)
+        number_of = {name: rows.find_object(name) for name in names}
+        numbers = np.array([number_of[one.object_id] for one in listed.touches], dtype=np.int64)
         order = np.argsort(numbers, kind="stable")
         order = order[numbers[order] >= 0]  # an object without a readable photo has no number
         self._touches = [self._references.touches[place].touch for place in order]
@@ -135,9 +138,7 @@ class Objects:
         self._owners = numbers[order]
         self._touched, self._starts = np.unique(self._owners, return_index=True)
         self._touch_only = np.zeros(self.count, np.bool_)
-        self._touch_only[
-            [number for name in self._references.touch_only if (number := rows.find_object(name)) >= 0]
-        ] = True
+        self._touch_only[[number_of[name] for name in listed.touch_only if number_of[name] >= 0]] = True
 
     @cached_property
     def gel_images(self) -> dict[str, ListedPhoto]:

@@ -24,6 +24,8 @@ ROOT = Path(__file__).parents[2]
 NAMES = ["round-0", "thin-1", "wide-2", "round-3"]
 SETTINGS = CollectSettings(grasps=2, most_attempts=8)
 
+pytestmark = pytest.mark.usefixtures("no_fsync")  # most of the time here; the killed processes do sync
+
 
 class BrokenRig(FakeRig):
     """A rig that fails in a given way at the first attempt at one object."""
@@ -50,12 +52,6 @@ def whole(tmp_path_factory):
     out = tmp_path_factory.mktemp("whole") / "r"
     run(out)
     return files(out)
-
-
-@pytest.fixture(autouse=True)
-def unsynced(monkeypatch):
-    """Skip fsync, which takes most of the time here; the killed processes do sync."""
-    monkeypatch.setattr("os.fsync", lambda descriptor: None)
 
 
 CHILD = """

@@ -25,13 +25,9 @@ from robot.sight.cylinder import CylinderFit
 from robot.storage import file_content
 from tests.fake_rig import FakeArm, FakeGripper, FakeRig, FakeSensor
 
+pytestmark = pytest.mark.usefixtures("no_fsync")  # most of the time here; other tests cover crashes
+
 NAMES = ("round-0", "thin-1", "round-2")
-
-
-@pytest.fixture(autouse=True)
-def unsynced(monkeypatch):
-    """Skip fsync, which takes most of the time here; other tests cover crashes."""
-    monkeypatch.setattr("os.fsync", lambda descriptor: None)
 
 
 def run(

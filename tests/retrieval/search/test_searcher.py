@@ -20,14 +20,6 @@ from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.export import touch_encoder_to_onnx
 from retrieval.model.fork_guard import fork_guard
 from retrieval.search.searcher import Searcher
-from tests import synthetic
-
-
-@pytest.fixture(scope="module")
-def grasps(tmp_path_factory):
-    """Files of three grasps of each of two objects."""
-    objects = synthetic.make_objects(2, seed=9)
-    return list(synthetic.write_queries(tmp_path_factory.mktemp("grasps"), objects, 3).values())
 
 
 def array(path):
