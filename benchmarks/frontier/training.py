@@ -53,7 +53,7 @@ class _Step:
         config = sample.checkpoint.config
         images = BatchImages(config.preprocessing)
         self.settings = dataclasses.replace(config.training, freeze_towers=False)
-        self.batch: PairBatch = PairSampler(sample.grasps, seed=sample.seed, share_photos=True).batch(number, touches)
+        self.batch: PairBatch = PairSampler(sample.grasps, seed=0, share_photos=True).batch(number, touches)
         self.touches = touch_batch([images.touch(grasp) for grasp in self.batch.grasps])
         self.photos = to_batch([config.preprocessing.load_photo(path) for path in self.batch.photos])
 

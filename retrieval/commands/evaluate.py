@@ -57,7 +57,7 @@ def evaluate(
     methods: Annotated[
         str | None, typer.Option(help=f"methods to compare, separated by commas: {', '.join(METHODS)} (default: all)")
     ] = None,
-    preset: Annotated[
+    config: Annotated[
         str | None,
         typer.Option(
             help=f"a preset, such as tiny, small, mobilenet or relief, or a TOML file (default: {DEFAULT_PRESET}; with "
@@ -92,9 +92,9 @@ def evaluate(
     from retrieval.evaluation.evaluate import evaluate as run
     from retrieval.report.evaluation import print_results, write_report
 
-    if model and (preset or init):
-        raise BadInput("--model already defines towers and settings; give either --model or --preset and --init")
-    preset = preset or (DATA_SET_PRESET if protocol else DEFAULT_PRESET)
+    if model and (config or init):
+        raise BadInput("--model already defines towers and settings; give either --model or --config and --init")
+    preset = config or (DATA_SET_PRESET if protocol else DEFAULT_PRESET)
     recordings: Mapping[str | None, Path] = {None: data}
     skipped: dict[str, str] = {}
     names: list[str] = []

@@ -15,7 +15,6 @@ import indexes
 from indexes.errors import ParameterError
 from indexes.kinds.faiss_index import FaissIndex
 from indexes.kinds.vector_index import VectorIndex
-from retrieval.console.progress import Bar
 from retrieval.frontier.clock import time_points
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, miss_rate_point
 from retrieval.frontier.sample import Array, Sample
@@ -69,13 +68,10 @@ def index_kinds(sample: Sample) -> ApproximationResult:
     embeddings, queries = sample.catalogue[name], sample.queries[name]
     k = min(default_k(sample), len(embeddings) // 4)
     points, works = list[Tradeoff](), list[Callable[[], object]]()
-    settings = sum(len(values) for _, values in STRUCTURES.values())
-    with Bar("kinds of index", 1 + settings, "settings", quiet=sample.quiet) as bar:
-        for series, setting, index in _indexes(embeddings, sample.scale.quick):
-            missed = ~(index.search(queries, k)[1] == sample.exhaustive_top1[:, None]).any(1)
-            points.append(miss_rate_point(series, setting, missed, series == DEFAULT_KIND))
-            works.append(_search_work(index, queries, k))
-            bar.advance()
+    for series, setting, index in _indexes(embeddings, sample.scale.quick):
+        missed = ~(index.search(queries, k)[1] == sample.exhaustive_top1[:, None]).any(1)
+        points.append(miss_rate_point(series, setting, missed, series == DEFAULT_KIND))
+        works.append(_search_work(index, queries, k))
     time = f"search of one query for k = {k:,}, one thread"
     return ApproximationResult(
         "Kind of index",
@@ -113,9 +109,8 @@ def default_k(sample: Sample) -> int:
     It is the first step of `build-index` whose candidates contain enough exhaustive top-1 photos.
     """
     name = sample.embeddings[0]
-    embeddings = sample.catalogue[name]
-    found = ranks(sample.queries[name], embeddings, sample.exhaustive_top1)
-    return next(k for k in candidate_steps(len(embeddings)) if np.mean(found < k) >= TARGET)
+    found = ranks(sample.queries[name], sample.catalogue[name], sample.exhaustive_top1)
+    return next(k for k in candidate_steps(len(sample.catalogue[name])) if np.mean(found < k) >= TARGET)
 
 
 def ranks(queries: Array, embeddings: Array, exhaustive_top1: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -3,11 +3,11 @@
 import dataclasses
 import os
 import platform
-import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from statistics import median
+from timeit import timeit
 
 from retrieval.frontier.points import Tradeoff
 from retrieval.model.encode import one_thread
@@ -26,19 +26,15 @@ def time_points(
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped, unused-ignore]
 
     with one_thread(), threadpool_limits(1):  # PyTorch and numpy
-        calls = [max(1, int(MIN_SECONDS / max(_seconds(work, 1), 1e-9))) for work in works]
-        rounds = [[_seconds(work, count) for work, count in zip(works, calls, strict=True)] for _ in range(repeats)]
+        calls = [max(1, int(MIN_SECONDS / max(timeit(work, number=1), 1e-9))) for work in works]
+        rounds = [
+            [timeit(work, number=count) / count for work, count in zip(works, calls, strict=True)]
+            for _ in range(repeats)
+        ]
     return tuple(
         dataclasses.replace(point, seconds=median(taken))
         for point, taken in zip(points, zip(*rounds, strict=True), strict=True)
     )
-
-
-def _seconds(work: Callable[[], object], calls: int) -> float:
-    start = time.perf_counter()
-    for _ in range(calls):
-        work()
-    return (time.perf_counter() - start) / calls
 
 
 def machine() -> dict[str, str | int | None]:

@@ -3,7 +3,6 @@
 Each finished row is stored, so a stopped run continues with the missing rows.
 """
 
-import json
 from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +12,7 @@ import msgspec
 from _touch_retrieval.cache import cache_key
 from _touch_retrieval.files import file_digest, write_atomically
 from retrieval.console.output import say
-from retrieval.data.dataset import AnyRecording, folder_of
+from retrieval.data.dataset import AnyRecording
 from retrieval.frontier import APPROXIMATIONS
 from retrieval.frontier.clock import machine
 from retrieval.frontier.points import ApproximationResult
@@ -31,7 +30,7 @@ FORMAT = 4
 def measure_frontier(
     out: Path,
     model: str | Path | None,
-    recording: AnyRecording | Callable[[], Path],
+    recording: AnyRecording | Callable[[], AnyRecording],
     *,
     only: Iterable[str] = (),
     photos: int = Scale.photos,
@@ -50,7 +49,7 @@ def measure_frontier(
     Args:
         out: Folder of the results.
         model: A checkpoint; None for the shipped one.
-        recording: Grasps of unseen objects; a function that returns the folder is called only if a row needs it.
+        recording: Grasps of unseen objects; a function that returns them is called only if a row needs it.
         only: Names of rows; empty for all.
         photos: Number of photos of a synthetic catalogue. The features of each are a weighted mean of those of two
             photos of the recording.
@@ -75,7 +74,7 @@ def measure_frontier(
     """
     works = {name: table.resolve(name) for name in only or table}
     scale = Scale(min(photos, 2000), min(queries, 12), 2, quick) if quick else Scale(photos, queries, repeats)
-    grasps = recording if callable(recording) else lambda: folder_of(recording)
+    grasps = recording if callable(recording) else lambda: recording
     sample = Sample(Path(model or shipped_model()), grasps, out, scale, quiet)
     rows, model_digest, here = {}, file_digest(sample.model), machine()
     for name, work in works.items():
@@ -84,10 +83,10 @@ def measure_frontier(
             for line in rows[name].lines():
                 say(f"{name}: {line}")
     content = {"software": __version__, "machine": here, "model": model_digest, "scale": scale, "rows": rows}
-    document: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(content))
-    write_atomically(out / "frontier.json", json.dumps(document, allow_nan=False, indent=1).encode())
+    document = msgspec.json.encode(content)
+    write_atomically(out / "frontier.json", msgspec.json.format(document, indent=1))
     write_frontier(out, rows, here, scale.quick)
-    return document
+    return msgspec.json.decode(document, type=dict[str, Any])
 
 
 def _row(

@@ -19,8 +19,7 @@ class Tradeoff:
         series: Points that differ in one number only; they have the same colour.
         setting: The number, in words.
         error: Error in the panel's unit.
-        low: Lower end of the 95 % interval if the error is a fraction of queries, else None.
-        high: Upper end of that interval.
+        interval: 95 % interval of the error if it is a fraction of queries, else None.
         is_default: Whether the code uses this setting by default.
         seconds: Run time; NaN until `retrieval.frontier.clock` has measured it.
     """
@@ -28,8 +27,7 @@ class Tradeoff:
     series: str
     setting: str
     error: float
-    low: float | None = None
-    high: float | None = None
+    interval: tuple[float, float] | None = None
     is_default: bool = False
     seconds: float = math.nan
 
@@ -45,7 +43,7 @@ def miss_rate_point(
     """Return a point whose error is the percentage of wrong queries, with its exact 95 % interval."""
     count, bad = len(wrong), int(np.count_nonzero(wrong))
     low, high = binomial_interval(bad, count)
-    return Tradeoff(series, setting, 100 * bad / count, 100 * low, 100 * high, is_default)
+    return Tradeoff(series, setting, 100 * bad / count, (100 * low, 100 * high), is_default)
 
 
 @dataclass(frozen=True)
@@ -93,14 +91,14 @@ class Panel:
         """Return the panel as one line of text."""
         best, within = self.recommended, f"within {self.tolerance:g}"
         found = f"cheapest {within}" if best.error <= self.tolerance else f"none {within}, smallest error"
-        default = self.describe_default("this")
+        default = self.describe_default()
         return f"{self.title} (against {self.reference}); {found}: {self.describe(best)}; default: {default}"
 
-    def describe_default(self, recommended: str) -> str:
-        """Return the default point as text; the word `recommended` if it is the recommended one."""
+    def describe_default(self) -> str:
+        """Return the default point as text; "the same" if it is the recommended one."""
         if self.default is None:
             return "none"
-        return recommended if self.default == self.recommended else self.describe(self.default)
+        return "the same" if self.default == self.recommended else self.describe(self.default)
 
     def describe(self, point: Tradeoff) -> str:
         """Return name, error and time of a point as text."""

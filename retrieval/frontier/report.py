@@ -4,6 +4,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, format_duration
 from retrieval.report.canvas import MUTED_COLOUR, Axes, Figure, canvas, logarithmic
 from retrieval.report.document import (
@@ -25,7 +27,7 @@ _LABEL: Any = {"textcoords": "offset points", "fontsize": 7.5, "color": "#3a434c
 _SIDES = (7, 5), (7, -10)
 """Offsets of labels in points: above and below in turn, because neighbours may be near each other."""
 _FLOOR = 0.5
-"""An error of 0 is drawn at this fraction of the smallest error above 0."""
+"""An error of 0 is drawn at this fraction of the smallest error above 0, or at the tolerance if that is lower."""
 
 LEGEND = (
     "Lower left is better. The line is the Pareto front: for its points, no other point is better in both time and "
@@ -64,7 +66,7 @@ def _lead(rows: Mapping[str, ApproximationResult], machine: Mapping[str, Any], q
 
 def _summary(title: str, panel: Panel) -> tuple[str, ...]:
     tolerance, best = f"{panel.tolerance:g} {panel.unit}", panel.describe(panel.recommended)
-    return (title, panel.title, panel.reference, tolerance, best, panel.describe_default("the same"))
+    return (title, panel.title, panel.reference, tolerance, best, panel.describe_default())
 
 
 def _section(name: str, row: ApproximationResult) -> Iterator[Block]:
@@ -83,8 +85,8 @@ def _points(panel: Panel) -> Table:
     best, front, rows = panel.recommended, panel.pareto(), []
     for point in panel.points:
         error = format_number(point.error)
-        if point.low is not None and point.high is not None:
-            error = interval(point.error, point.low, point.high, format_number)
+        if point.interval:
+            error = interval(point.error, *point.interval, format_number)
         marks = {"recommended": point == best, "default": point.is_default, "Pareto": point in front}
         rows.append(
             (point.name, format_duration(point.seconds), error, ", ".join(mark for mark in marks if marks[mark]))
@@ -107,7 +109,8 @@ def figure(panels: Sequence[Panel]) -> Figure:
 def _draw(axes: Axes, panel: Panel) -> None:
     axes.set(xscale="log", yscale="log", xlabel=f"{panel.time}, ms", ylabel=panel.unit)
     axes.margins(x=0.12, y=0.1)
-    floor = _FLOOR * min((point.error for point in panel.points if point.error), default=1.0)
+    limits = (panel.tolerance, *(_FLOOR * point.error for point in panel.points))
+    floor = min((limit for limit in limits if limit > 0), default=1.0)
     for number, name in enumerate(dict.fromkeys(point.series for point in panel.points)):
         _series(axes, [point for point in panel.points if point.series == name], number, floor)
     _front(axes, panel, floor)
@@ -125,8 +128,8 @@ def _series(axes: Axes, points: Sequence[Tradeoff], number: int, floor: float) -
         at, error = _place(point, floor)
         fill = colour if point.error else "white"
         axes.plot(at, error, marker, mfc=fill, mec=colour, ms=5, clip_on=point.error > 0)
-        if point.error and point.low is not None and point.high is not None:
-            axes.plot([at, at], [max(point.low, floor), point.high], color=colour, lw=1, alpha=0.35, zorder=1)
+        if point.error and point.interval:
+            axes.vlines(at, *np.maximum(point.interval, floor), color=colour, lw=1, alpha=0.35, zorder=1)
 
 
 def _front(axes: Axes, panel: Panel, floor: float) -> None:

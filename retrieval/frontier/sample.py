@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from _touch_retrieval.cache import Cache, cache_key
 from retrieval.console.progress import Bar
-from retrieval.data.dataset import Grasp, data_digest, load_grasps
+from retrieval.data.dataset import AnyRecording, Grasp, data_digest, folder_of, load_grasps
 from retrieval.errors import DatasetError
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.fusion import ImageEncoding
@@ -53,19 +53,17 @@ class Sample:
 
     Attributes:
         model: File of the checkpoint.
-        recording: Function that returns the folder of the recording, and may collect it first.
+        recording: Function that returns the recording, and may collect it first.
         folder: Folder of the cache.
         scale: Scale of the measurements.
         quiet: No output on stderr.
-        seed: Seed of the random draws.
     """
 
     model: Path
-    recording: Callable[[], Path]
+    recording: Callable[[], AnyRecording]
     folder: Path
     scale: Scale
     quiet: bool = False
-    seed: int = 0
 
     @cached_property
     def checkpoint(self) -> Checkpoint:
@@ -75,15 +73,15 @@ class Sample:
     @cached_property
     def grasps(self) -> list[Grasp]:
         """Grasps of unseen objects with at least two grasps each, sorted by object; at least two objects."""
-        folder, split = self.recording(), self.checkpoint.split
+        recording, split = self.recording(), self.checkpoint.split
         trained = {*split.train, *split.validation} if split else set()
-        unseen = [grasp for grasp in load_grasps(folder) if grasp.object_id not in trained]
+        unseen = [grasp for grasp in load_grasps(recording) if grasp.object_id not in trained]
         names = [grasp.object_id for grasp in unseen]
         usable = [grasp for grasp in unseen if names.count(grasp.object_id) > 1]
         if len({grasp.object_id for grasp in usable}) < 2:
             raise DatasetError(
-                f"{folder} needs at least 2 objects that the model was not trained on, with at least 2 grasps each. "
-                "Give another --recording, or omit it to collect one."
+                f"{folder_of(recording)} needs at least 2 objects that the model was not trained on, with at least 2 "
+                "grasps each. Give another --recording, or omit it to collect one."
             )
         return sorted(usable, key=lambda grasp: (grasp.object_id, grasp.grasp_id))
 
@@ -95,24 +93,20 @@ class Sample:
     @cached_property
     def features(self) -> Features:
         """Tower features of `grasps`."""
-        model, folder = self.checkpoint, self.folder / "features"
-        return encode_recording(self.grasps, model.matcher, model.config, folder, quiet=self.quiet)
+        model = self.checkpoint
+        return encode_recording(self.grasps, model.matcher, model.config, self.folder / "features", quiet=self.quiet)
 
     @cached_property
-    def _is_photo(self) -> NDArray[np.bool_]:
-        owner = np.unique([grasp.object_id for grasp in self.grasps], return_inverse=True)[1]
-        place = np.arange(len(owner)) - np.searchsorted(owner, owner)  # among the grasps of its object
-        return np.asarray(place < np.bincount(owner)[owner] // 2)
-
-    @property
     def photo_rows(self) -> NDArray[np.int64]:
         """Rows of `grasps` whose photos are in the catalogue."""
-        return np.flatnonzero(self._is_photo)
+        owner = np.unique([grasp.object_id for grasp in self.grasps], return_inverse=True)[1]
+        place = np.arange(len(owner)) - np.searchsorted(owner, owner)  # among the grasps of its object
+        return np.flatnonzero(place < np.bincount(owner)[owner] // 2)
 
     @property
     def touch_rows(self) -> NDArray[np.int64]:
         """Rows of `grasps` whose touches are queries, in random order, so that the first n have many objects."""
-        return np.random.default_rng([self.seed, 1]).permutation(np.flatnonzero(~self._is_photo))
+        return np.random.default_rng([0, 1]).permutation(np.setdiff1d(np.arange(len(self.grasps)), self.photo_rows))
 
     # Codes -------------------------------------------------------------------------------------------------
 
@@ -133,7 +127,7 @@ class Sample:
 
         Blends are clustered around real photos, unlike white noise.
         """
-        generator, features = torch.Generator().manual_seed(self.seed), torch.from_numpy(self.features.photo)
+        generator, features = torch.Generator().manual_seed(0), torch.from_numpy(self.features.photo)
         blocks: dict[str, list[NDArray[Any]]] = {}
         for start in range(0, self.scale.photos, _BLOCK):
             blended = blend(features, min(_BLOCK, self.scale.photos - start), generator)
@@ -163,7 +157,7 @@ class Sample:
     @cached_property
     def exhaustive_top1(self) -> NDArray[np.int64]:
         """The photo of `catalogue` that the fusion head ranks first, for each of `queries`; stored in the cache."""
-        inputs = self.checkpoint.digest, self.digest, self.seed, self.scale.photos, self.scale.queries
+        inputs = self.checkpoint.digest, self.digest, self.scale.photos, self.scale.queries
         return np.array(self.stored(cache_key("exhaustive-top1", *inputs), self._find_exhaustive_top1), dtype=np.int64)
 
     def _find_exhaustive_top1(self) -> list[int]:

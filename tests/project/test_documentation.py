@@ -45,7 +45,7 @@ SHORTER = {
     "identify": ["--grasps", "2"],
     "export": [],
     "export-recording": [],
-    "evaluate": ["--preset", "tiny", "--iterations", "2", "--seeds", "1", "--methods", "late_fusion,chance"],
+    "evaluate": ["--config", "tiny", "--iterations", "2", "--seeds", "1", "--methods", "late_fusion,chance"],
     "frontier": ["--only", "partials", "--recording", "recording"],
     "serve": ["--port", "0"],
 }

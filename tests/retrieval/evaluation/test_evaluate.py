@@ -326,7 +326,7 @@ def test_wrong_arguments_are_refused_before_anything_is_read(run, tmp_path):
 
 def test_the_command_writes_a_report_and_one_json_document(grasped, tmp_path, capsys):
     out = tmp_path / "report"
-    command = ["evaluate", str(grasped), "--out", str(out), "--preset", "tiny", "--iterations", "6"]
+    command = ["evaluate", str(grasped), "--out", str(out), "--config", "tiny", "--iterations", "6"]
     assert main([*command, "--methods", "late_fusion,cca,chance", "--json"]) == 0
     output = capsys.readouterr()
     for role in ("", " (permuted)", " (low_pass)"):
@@ -346,7 +346,7 @@ def test_the_command_writes_a_report_and_one_json_document(grasped, tmp_path, ca
 
 def test_the_command_refuses_conflicting_options(grasped, tmp_path, capsys):
     command = ["evaluate", str(grasped), "--out", str(tmp_path / "r"), "--model", "m.safetensors"]
-    assert main([*command, "--preset", "paper"]) == 2
-    assert "give either --model or --preset and --init" in capsys.readouterr().err
+    assert main([*command, "--config", "paper"]) == 2
+    assert "give either --model or --config and --init" in capsys.readouterr().err
     assert main([*command[:-2], "--methods", "oracle"]) == 2
     assert main(command) == 2

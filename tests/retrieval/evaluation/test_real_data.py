@@ -12,7 +12,7 @@ from retrieval.evaluation.results import Results, read_results
 from tests import real_data_sets
 from tests.data import touch_data
 
-TINY = ["--preset", "tiny", "--iterations", "2", "--seeds", "2", "--methods", "cca,chance"]
+TINY = ["--config", "tiny", "--iterations", "2", "--seeds", "2", "--methods", "cca,chance"]
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def test_the_report_has_verdicts_and_tables(out):
 def test_choices_report_each_fold(tmp_path, monkeypatch):
     monkeypatch.setattr(vt60, "DRAWN_CHOICES", 1)
     real_data_sets.write_vt60(tmp_path / "data" / "vt60", instances=3)
-    options = ["--preset", "tiny", "--seeds", "2", "--methods", "cca_towers,chance", "--protocol", "vt60-choices"]
+    options = ["--config", "tiny", "--seeds", "2", "--methods", "cca_towers,chance", "--protocol", "vt60-choices"]
     assert evaluate(tmp_path / "data", tmp_path / "out", methods=options) == 0
     entry = read(tmp_path / "out")["vt60-choices"]
     # One set of folds for all seeds

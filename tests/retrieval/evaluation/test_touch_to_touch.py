@@ -104,7 +104,7 @@ def test_images_on_the_common_frame_contain_only_the_contact_difference(recordin
 
 
 def evaluate(recording, out, *more):
-    options = ["--preset", "tiny", "--protocol", "physiclear", "--seeds", "2", "--methods", "chance", *more]
+    options = ["--config", "tiny", "--protocol", "physiclear", "--seeds", "2", "--methods", "chance", *more]
     return main(["evaluate", str(recording / "data"), "--out", str(out), *options])
 
 

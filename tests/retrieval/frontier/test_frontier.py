@@ -21,11 +21,10 @@ from retrieval.frontier.clock import time_points
 from retrieval.frontier.formats import FORMATS, encoders
 from retrieval.frontier.measure import measure_frontier
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, format_duration, miss_rate_point
-from retrieval.frontier.report import write_frontier
+from retrieval.frontier.report import figure, write_frontier
 from retrieval.frontier.sample import Sample, Scale
 from retrieval.indexing.build import build_index
 from retrieval.indexing.candidates import measure_candidates
-from retrieval.metrics.intervals import binomial_interval
 from retrieval.model.candidate_encoder import CandidateEncoder
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import encode_touches
@@ -76,7 +75,7 @@ def test_the_fastest_within_the_tolerance_is_recommended_else_that_of_the_smalle
     assert "none within 1, smallest error: s2" in made.line()
 
 
-@pytest.mark.parametrize(("used", "words"), [(0, "default: this"), (1, "default: s1: 0 %, 2 s")])
+@pytest.mark.parametrize(("used", "words"), [(0, "default: the same"), (1, "default: s1: 0 %, 2 s")])
 def test_a_line_compares_the_default_with_the_recommended_point(used, words):
     made = panel((1, 0.5), (2, 0))
     points = [dataclasses.replace(point, is_default=row == used) for row, point in enumerate(made.points)]
@@ -85,8 +84,7 @@ def test_a_line_compares_the_default_with_the_recommended_point(used, words):
 
 def test_a_miss_rate_is_in_percent_with_its_exact_interval():
     point = miss_rate_point("a", "b", [True, False, False, False])
-    low, high = binomial_interval(1, 4)
-    assert (point.error, point.low, point.high) == (25.0, 100 * low, 100 * high)
+    assert (point.error, point.interval) == (25.0, pytest.approx((0.6, 80.6), abs=0.05))  # Clopper and Pearson
 
 
 def test_durations_are_short():
@@ -278,7 +276,7 @@ def test_an_unknown_row_is_refused_before_anything_is_measured(model, tmp_path):
 @pytest.mark.parametrize("errors", [(3.0, 1.0, 0.0), (0.0, 0.0), (5.0,)], ids=["falling", "no errors", "one point"])
 def test_a_page_has_the_plot_the_reason_of_a_skipped_row_and_every_point(errors, tmp_path):
     points = tuple(
-        Tradeoff("a", f"k = {k}", error, 0.0, error + 1, seconds=1e-3 * (k + 1)) for k, error in enumerate(errors)
+        Tradeoff("a", f"k = {k}", error, (0.0, error + 1), seconds=1e-3 * (k + 1)) for k, error in enumerate(errors)
     )
     made = Panel("missed", "one query", "%", "every photo reranked", 1.5, points)
     rows = {
@@ -293,6 +291,17 @@ def test_a_page_has_the_plot_the_reason_of_a_skipped_row_and_every_point(errors,
     for words in ("every photo reranked", "a &lt;fast&gt; one", "A quick run", "Left out: nothing to measure."):
         assert words in text
     assert all(f"k = {k}" in text for k in range(len(errors)))
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "errors", "lowest"), [(0.5, (3, 0), 0.5), (2, (3, 0), 1.5), (0, (3, 0), 1.5), (0.5, (0, 0), 0.5)]
+)
+def test_the_tolerance_is_drawn_at_its_value_and_no_point_below_the_floor(tolerance, errors, lowest):
+    made = panel(*enumerate(errors, start=1), tolerance=tolerance)
+    axes = figure([made]).axes[0]
+    (dashed,) = [line for line in axes.lines if line.get_label() == "tolerance"]
+    assert dashed.get_ydata()[0] == (tolerance or lowest)
+    assert min(line.get_ydata()[0] for line in axes.lines if line is not dashed and len(line.get_ydata())) == lowest
 
 
 def test_the_performance_page_has_the_number_of_approximations():
