@@ -75,7 +75,7 @@ def anonymous():
     return int(next(line for line in open("/proc/self/status") if line.startswith("RssAnon")).split()[1])
 import faiss
 before, start = anonymous(), time.perf_counter()
-found = IndexStore(sys.argv[1]).open(verify=False, threads=1)
+found = IndexStore(sys.argv[1]).open(verify=False)
 opened = time.perf_counter() - start
 query = np.ascontiguousarray(found.embeddings[:1])
 found.index.search(query, 1000)
@@ -162,7 +162,7 @@ def measure(crowd: BlendedPhotos, photos: int, kinds: Sequence[str], folder: Pat
             size.kinds[kind] = {"refused": str(error)}
             continue
         start = time.perf_counter()
-        FaissIndex.build(generation.embeddings, name, threads=torch.get_num_threads())
+        FaissIndex.build(generation.embeddings, name)
         figures = {"structure_s": time.perf_counter() - start}
         indexed = write_blocks(store, photos, blocks_of(generation), name)
         figures |= opened(folder) | on_disk(indexed)
@@ -181,9 +181,8 @@ def blocks_of(generation: Generation) -> Iterator[Arrays]:
 
 def write_blocks(store: IndexStore, photos: int, blocks: Iterable[Arrays], kind: str = FLAT) -> Generation:
     """Write a generation of blocks of arrays, and return it opened."""
-    threads = torch.get_num_threads()
-    store.write(rows_of(photos), blocks, kind=kind, threads=threads)
-    return store.open(verify=False, threads=threads)
+    store.write(rows_of(photos), blocks, kind=kind)
+    return store.open(verify=False)
 
 
 def rows_of(photos: int) -> list[Row]:

@@ -62,13 +62,12 @@ def load_kind(name: str) -> "type[VectorIndex]":
     return KINDS.load(name if ":" in name or name in KINDS.names() else "flat")
 
 
-def build(vectors: "Floats", kind: "str | type[VectorIndex]" = "flat", *, threads: int | None = None) -> "VectorIndex":
+def build(vectors: "Floats", kind: "str | type[VectorIndex]" = "flat") -> "VectorIndex":
     """Build an index of vectors in memory.
 
     Args:
         vectors: Unit vectors (N, d) float32, N >= 1.
         kind: "flat", a factory string of FAISS with search settings after a semicolon, or your own class.
-        threads: Number of threads; None for the library's own setting.
 
     Raises:
         VectorError: A vector is invalid, or there is none.
@@ -80,7 +79,7 @@ def build(vectors: "Floats", kind: "str | type[VectorIndex]" = "flat", *, thread
     indexes.errors.ParameterError: the kind of index must be flat, a factory string of FAISS ... 'octree' ...
     """
     name = kind_name(kind)
-    return load_kind(name).build(vectors, name, threads=threads)
+    return load_kind(name).build(vectors, name)
 
 
 def open(folder: str | Path) -> "Generation":

@@ -13,7 +13,7 @@ class IndexesError(Exception):
     ...     indexes.IndexStore("nowhere").open()
     ... except indexes.IndexesError as error:
     ...     print(error.exit_code, error)
-    2 nowhere: there is no index here; run `retrieve build-index` first
+    2 nowhere: there is no index here; run `retrieve build-index` first (CURRENT: No such file or directory)
     """
 
     exit_code = 2
@@ -51,15 +51,13 @@ class LockedIndex(IndexesError):
     """Another writer is writing the index."""
 
 
-class JobFailed(IndexesError):
-    """The job ran and failed."""
+class WriteFailed(IndexesError):
+    """A file could not be written. The index is complete: either the old one or the new one."""
 
     exit_code = 1
 
 
-class WriteFailed(JobFailed):
-    """A file could not be written. The index is complete: either the old one or the new one."""
-
-
-class EngineError(JobFailed):
+class EngineError(IndexesError):
     """The vector library failed on input that passed every check."""
+
+    exit_code = 1

@@ -89,8 +89,7 @@ class FaissIndex(VectorIndex):
             return
         self._structure = _empty(self.kind, self.dim)
         # The graph of more threads would depend on their timing.
-        threads = 1 if hasattr(self._structure, "hnsw") else self.threads
-        with faiss_call(f"building {self.kind}", threads):
+        with faiss_call(f"building {self.kind}", 1 if hasattr(self._structure, "hnsw") else None):
             if not self._structure.is_trained:
                 self._structure.train(self.vectors)
             self._structure.add(self.vectors)
@@ -100,7 +99,7 @@ class FaissIndex(VectorIndex):
             scores: Floats = queries @ self.vectors.T
             rows: RowNumbers = np.argsort(-scores, axis=1, kind="stable")[:, :k]
             return np.take_along_axis(scores, rows, axis=1), rows
-        with faiss_call("searching", 1 if len(queries) == 1 else self.threads):
+        with faiss_call("searching", 1 if len(queries) == 1 else None):
             if self.exact:
                 faiss = load_faiss()
                 scores, rows = faiss.knn(queries, self.vectors, k, faiss.METRIC_INNER_PRODUCT)

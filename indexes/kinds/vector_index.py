@@ -15,7 +15,6 @@ RowNumbers: TypeAlias = NDArray[np.int64]
 
 NORM_TOLERANCE = 1e-3
 """Largest deviation of a norm from 1. Rounding to float32 changes a norm by 1e-7, to float16 by 5e-4."""
-BLOCK_ROWS = 8192
 
 
 class VectorIndex(ABC):
@@ -40,22 +39,21 @@ class VectorIndex(ABC):
     [[2]]
     """
 
-    def __init__(self, vectors: Floats, kind: str, threads: int | None) -> None:
+    def __init__(self, vectors: Floats, kind: str) -> None:
         """Store checked arguments; `build` and `load` call this."""
-        self.vectors, self.kind, self.threads = vectors, kind, threads
+        self.vectors, self.kind = vectors, kind
 
     @classmethod  # noqa: B027 - most kinds need nothing
     def require(cls, kind: str, count: int, dim: int) -> None:
         """Raise `ParameterError` unless this kind can be built of `count` vectors with `dim` components."""
 
     @classmethod
-    def build(cls, vectors: Floats, kind: str, *, threads: int | None = None) -> Self:
+    def build(cls, vectors: Floats, kind: str) -> Self:
         """Build an index of vectors.
 
         Args:
             vectors: Unit vectors (N, d) float32, N >= 1, perhaps memory-mapped.
             kind: Name of the kind.
-            threads: Number of threads; None for the library's own setting.
 
         Raises:
             VectorError: A vector is invalid, or there is none.
@@ -65,24 +63,23 @@ class VectorIndex(ABC):
         if not len(table):
             raise VectorError("an index needs at least one vector; got none")
         cls.require(kind, *table.shape)
-        index = cls(table, kind, threads)
+        index = cls(table, kind)
         index._build()
         return index
 
     @classmethod
-    def load(cls, path: Path, vectors: Floats, kind: str, *, threads: int | None = None) -> Self:
+    def load(cls, path: Path, vectors: Floats, kind: str) -> Self:
         """Load the index that `save` wrote.
 
         Args:
             path: File of the structure; it is read only if `save` returned True.
             vectors: The same vectors (N, d), perhaps memory-mapped; they are not checked.
             kind: Name of the kind.
-            threads: Number of threads; None for the library's own setting.
 
         Raises:
             CorruptIndex: The file is unreadable or does not fit the vectors.
         """
-        index = cls(vectors, kind, threads)
+        index = cls(vectors, kind)
         index._read(path)
         return index
 
@@ -112,9 +109,9 @@ class VectorIndex(ABC):
             Scores (Q, k') float32 and rows (Q, k') int64; k' = min(k, N). If an approximate kind finds fewer rows for a
             query, the others are -1, with a score of -inf.
         """
-        table, k = check_unit(queries, dim=self.dim, what="query"), min(check_k(k), self.count)
-        if not len(table):
-            return np.empty((0, k), np.float32), np.empty((0, k), np.int64)
+        if isinstance(k, bool) or not isinstance(k, int | np.integer) or k < 1:
+            raise ParameterError(f"k, the number of results, must be a whole number of at least 1; got {k!r}")
+        table, k = check_unit(queries, dim=self.dim, what="query"), min(int(k), self.count)
         if k == self.count:
             scores, rows = table @ self.vectors.T, np.tile(np.arange(k), (len(table), 1))
         else:
@@ -168,26 +165,11 @@ def check_unit(vectors: object, *, dim: int | None = None, names: Sequence[str] 
             "Was the index built with another model?"
         )
     table = np.ascontiguousarray(vectors)
-    norms = row_norms(table)
+    # in float64, which einsum converts to in small blocks; NaN and infinity give NaN and infinity
+    norms = np.sqrt(np.einsum("nd,nd->n", table, table, dtype=np.float64))
     bad = np.flatnonzero(~(np.abs(norms - 1.0) <= NORM_TOLERANCE))
     if len(bad):
         name = names[bad[0]] if names else str(bad[0])
         more = f" ({len(bad) - 1} more like it)" if len(bad) > 1 else ""
         raise VectorError(f"{what} {name!r}: the norm must be 1 within {NORM_TOLERANCE}; got {norms[bad[0]]:.6g}{more}")
     return table
-
-
-def check_k(k: int) -> int:
-    """Return `k` as int. Raises `ParameterError` unless it is a whole number of at least 1."""
-    if isinstance(k, bool) or not isinstance(k, int | np.integer) or k < 1:
-        raise ParameterError(f"k, the number of results, must be a whole number of at least 1; got {k!r}")
-    return int(k)
-
-
-def row_norms(table: Floats) -> NDArray[np.float64]:
-    """Return the Euclidean norms (N,) of the rows in float64; rows with NaN or infinity give NaN or infinity."""
-    norms = np.empty(len(table), dtype=np.float64)
-    for start in range(0, len(table), BLOCK_ROWS):
-        block = table[start : start + BLOCK_ROWS].astype(np.float64)
-        norms[start : start + BLOCK_ROWS] = np.sqrt(np.einsum("nd,nd->n", block, block))
-    return norms

@@ -19,19 +19,23 @@ current and complete; the next writer deletes the unfinished files.
 """
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from os import getpid
 from pathlib import Path
 from typing import Any
 
 from _touch_retrieval import files
 from _touch_retrieval.files import read_regular
+from indexes import load_kind
 from indexes.errors import AGAIN, CorruptIndex, NoIndex, WriteFailed
-from indexes.kinds.vector_index import Floats
-from indexes.store.generation import Arrays, Generation, Measure, read_generation, write_generation
+from indexes.kinds.measure import measured_recall
+from indexes.kinds.vector_index import Floats, VectorIndex
+from indexes.store.generation import EMBEDDINGS, STRUCTURE, Arrays, Generation, read_generation, write_contents
 from indexes.store.locking import writer_lock
-from indexes.store.manifest import Manifest
+from indexes.store.manifest import FORMAT, FileChecksum, Manifest, encode_document
+from indexes.store.manifest import NAME as MANIFEST
 from indexes.store.rows import Row
 
 GENERATION = re.compile(r"gen-(\d{6,})")
@@ -55,19 +59,12 @@ class IndexStore:
     def __init__(self, path: str | Path) -> None:
         self.path, self._is_locked = Path(path), False
 
-    def open(
-        self,
-        *,
-        name: str | None = None,
-        verify: bool = True,
-        threads: int | None = None,
-    ) -> Generation:
+    def open(self, *, name: str | None = None, verify: bool = True) -> Generation:
         """Open and check a generation.
 
         Args:
             name: Its name; None for the current generation.
             verify: Compare the SHA-256 of the files; sizes are always checked.
-            threads: Number of threads of a search; None for the library's own setting.
 
         Raises:
             NoIndex: There is no index.
@@ -76,22 +73,22 @@ class IndexStore:
         """
         requested = name or self.current()
         try:
-            return read_generation(self.path / requested, verify=verify, threads=threads)
+            return read_generation(self.path / requested, verify=verify)
         except CorruptIndex:
             if name is not None or self.current() == requested:
                 raise
             # A writer replaced it while it was being read.
-            return read_generation(self.path / self.current(), verify=verify, threads=threads)
+            return read_generation(self.path / self.current(), verify=verify)
 
     def current(self) -> str:
         """Return the name of the current generation, from CURRENT."""
         path = self.path / "CURRENT"
         try:
             text = read_regular(path).decode("ascii", "replace").strip()
-        except FileNotFoundError as error:
-            raise NoIndex(f"{self.path}: there is no index here; run `retrieve build-index` first") from error
         except OSError as error:
-            raise NoIndex(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
+            raise NoIndex(
+                f"{self.path}: there is no index here; run `retrieve build-index` first ({path.name}: {error.strerror})"
+            ) from error
         if not GENERATION.fullmatch(text):
             raise CorruptIndex(f"{path}: must name a generation such as gen-000001, got {text!r}; {AGAIN}")
         return text
@@ -117,11 +114,10 @@ class IndexStore:
         kind: str = "flat",
         documents: Mapping[str, Any] | None = None,
         queries: Floats | None = None,
-        measure: Measure | None = None,
+        measure: Callable[[VectorIndex, Arrays], Mapping[str, Any]] | None = None,
         fingerprint: Mapping[str, str] | None = None,
         about: Mapping[str, Any] | None = None,
         software: str = "",
-        threads: int | None = None,
     ) -> Manifest:
         """Write a new generation, make it current, and return its manifest.
 
@@ -139,7 +135,6 @@ class IndexStore:
             fingerprint: Digests of what made the vectors (`check_fingerprint`).
             about: Further entries of the manifest.
             software: Version of the writing software.
-            threads: Number of threads; None for the library's own setting.
 
         Raises:
             RowError: A row, array or document is invalid.
@@ -148,21 +143,34 @@ class IndexStore:
             LockedIndex: Another writer is writing the index.
             WriteFailed: A file could not be written.
         """
+        documents = documents or {}
         with self.lock(), self._draft() as (folder, name):
-            return write_generation(
-                folder,
-                name,
-                rows,
-                blocks,
-                kind=kind,
-                documents=documents or {},
-                queries=queries,
-                measure=measure,
-                fingerprint=fingerprint or {},
-                about=about or {},
+            arrays = write_contents(folder, rows, blocks, documents)
+            index = load_kind(kind).build(arrays[EMBEDDINGS], kind)
+            if index.save(folder / STRUCTURE):
+                files.sync(folder / STRUCTURE)
+            manifest = Manifest(
+                generation=name,
+                created=datetime.now(UTC).isoformat(timespec="seconds"),
                 software=software,
-                threads=threads,
+                fingerprint=dict(fingerprint or {}),
+                about={**(about or {}), **(measure(index, arrays) if measure else {})},
+                dim=index.dim,
+                kind=index.kind,
+                recall=measured_recall(index, queries),
+                photos=len(rows),
+                objects=len({row.object_id for row in rows}),
+                arrays=sorted(arrays.keys() - {EMBEDDINGS}),
+                documents=sorted(documents),
+                files={
+                    path.name: FileChecksum(path.stat().st_size, files.file_digest(path))
+                    for path in sorted(folder.iterdir())
+                },
             )
+            with files.durable_file(folder / MANIFEST) as file:
+                file.write(encode_document(manifest, FORMAT))
+            files.sync(folder)
+        return manifest
 
     @contextmanager
     def _draft(self) -> Iterator[tuple[Path, str]]:

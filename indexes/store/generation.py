@@ -1,9 +1,8 @@
 """A generation of an index: its folder is written part by part, and opened for searching as a whole."""
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -22,18 +21,14 @@ from indexes.errors import (
     RowError,
     UnsupportedFormat,
 )
-from indexes.kinds.measure import measured_recall
-from indexes.kinds.vector_index import Floats, VectorIndex, check_unit
-from indexes.store.manifest import FORMAT, FileChecksum, Manifest, check_files, encode_document, read_manifest
-from indexes.store.manifest import NAME as MANIFEST
+from indexes.kinds.vector_index import VectorIndex, check_unit
+from indexes.store.manifest import Manifest, check_files, read_manifest
 from indexes.store.rows import Row, Rows, read_rows, write_rows
 
 EMBEDDINGS, STRUCTURE = "embeddings", "vectors.faiss"
 
 Arrays = Mapping[str, NDArray[Any]]
 """Name to per-row array (N, ...)."""
-Measure = Callable[[VectorIndex, Arrays], Mapping[str, Any]]
-"""Returns further entries of a manifest, measured on the written index and arrays."""
 
 
 class Generation:
@@ -96,22 +91,14 @@ def check_fingerprint(where: str | Path, fingerprint: Mapping[str, str], expect:
             )
 
 
-def write_generation(
-    folder: Path,
-    name: str,
-    rows: Sequence[Row],
-    blocks: Iterable[Arrays],
-    *,
-    kind: str,
-    documents: Mapping[str, Any],
-    queries: Floats | None,
-    measure: Measure | None,
-    fingerprint: Mapping[str, str],
-    about: Mapping[str, Any],
-    software: str,
-    threads: int | None,
-) -> Manifest:
-    """Write all files of a generation into an empty folder, the manifest last; arguments as of `IndexStore.write`."""
+def write_contents(
+    folder: Path, rows: Sequence[Row], blocks: Iterable[Arrays], documents: Mapping[str, Any]
+) -> dict[str, NDArray[Any]]:
+    """Write rows, arrays and documents into the empty folder of a generation, as `IndexStore.write`.
+
+    Returns:
+        The arrays by name, memory-mapped.
+    """
     write_rows(folder, rows)
     arrays = _write_arrays(folder, rows, blocks)
     for document, value in documents.items():
@@ -120,30 +107,7 @@ def write_generation(
                 np.save(file, value)
             else:
                 file.write(json.dumps(value, allow_nan=False, indent=2).encode() + b"\n")
-    index = load_kind(kind).build(arrays[EMBEDDINGS], kind, threads=threads)
-    if index.save(folder / STRUCTURE):
-        files.sync(folder / STRUCTURE)
-    manifest = Manifest(
-        generation=name,
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
-        software=software,
-        fingerprint=dict(fingerprint),
-        about={**about, **(measure(index, arrays) if measure else {})},
-        dim=index.dim,
-        kind=index.kind,
-        recall=measured_recall(index, queries),
-        photos=len(rows),
-        objects=len({row.object_id for row in rows}),
-        arrays=sorted(arrays.keys() - {EMBEDDINGS}),
-        documents=sorted(documents),
-        files={
-            path.name: FileChecksum(path.stat().st_size, files.file_digest(path)) for path in sorted(folder.iterdir())
-        },
-    )
-    with files.durable_file(folder / MANIFEST) as file:
-        file.write(encode_document(manifest, FORMAT))
-    files.sync(folder)
-    return manifest
+    return arrays
 
 
 def _write_arrays(folder: Path, rows: Sequence[Row], blocks: Iterable[Arrays]) -> dict[str, NDArray[Any]]:
@@ -173,7 +137,7 @@ def _write_arrays(folder: Path, rows: Sequence[Row], blocks: Iterable[Arrays]) -
     return {name: _open_array(folder / f"{name}.npy") for name in opened}
 
 
-def read_generation(folder: Path, *, verify: bool, threads: int | None) -> Generation:
+def read_generation(folder: Path, *, verify: bool) -> Generation:
     """Open and check a generation's folder, as `IndexStore.open`."""
     manifest = read_manifest(folder)
     check_files(folder, manifest, verify=verify)
@@ -190,7 +154,7 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None) -> Gener
             else read_json(folder / f"{name}.json")
             for name in manifest.documents
         }
-        index = load_kind(manifest.kind).load(folder / STRUCTURE, embeddings, manifest.kind, threads=threads)
+        index = load_kind(manifest.kind).load(folder / STRUCTURE, embeddings, manifest.kind)
         return Generation(folder, manifest, rows, arrays, documents, index)
     except ParameterError as error:
         raise UnsupportedFormat(f"{folder}: {error}. Update the software, or {AGAIN}") from error

@@ -97,11 +97,9 @@ def read_document(path: Path, version: int, kind: type[T]) -> T:
         raise CorruptIndex(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
     except ValueError as error:
         raise CorruptIndex(f"{path}: must be JSON, but is truncated or damaged ({error}); {AGAIN}") from error
-    if not isinstance(content, dict):
-        raise CorruptIndex(f"{path}: must be a JSON object; {AGAIN}")
-    found = content.get("format")
-    if not isinstance(found, int) or isinstance(found, bool):
-        raise CorruptIndex(f"{path}: must have a format version, got {found!r}; {AGAIN}")
+    found = content.get("format") if isinstance(content, dict) else None
+    if type(found) is not int:
+        raise CorruptIndex(f"{path}: must be a JSON object with a format version, got {found!r}; {AGAIN}")
     if found != version:
         age, remedy = ("newer", f"update the software, or {AGAIN}") if found > version else ("older", AGAIN)
         raise UnsupportedFormat(f"{path}: has the {age} format {found}, but this software reads {version}; {remedy}")

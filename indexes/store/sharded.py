@@ -81,12 +81,7 @@ def is_sharded(folder: Path) -> bool:
 
 
 def shard_number(object_id: str, shards: int) -> int:
-    """Return the shard of an object, from a hash of its name that is equal on every machine.
-
-    Args:
-        object_id: The object.
-        shards: Number of shards.
-    """
+    """Return the shard of an object, one of `shards`, from a hash of its name that is equal on every machine."""
     digest = blake2b(object_id.encode("utf-8", "surrogatepass"), digest_size=16).digest()
     return int.from_bytes(digest[8:], "little") % shards
 
@@ -106,18 +101,13 @@ def read_sharded_manifest(folder: Path) -> ShardedManifest:
     return read_document(path, FORMAT, ShardedManifest)
 
 
-def open_shard(index: Path, entry: ShardEntry, *, threads: int | None = None) -> Generation:
-    """Open and check a shard, as `IndexStore.open`.
-
-    Args:
-        index: Folder of the sharded index.
-        entry: Manifest entry of the shard.
-        threads: Number of threads of a search; None for the library's own setting.
+def open_shard(index: Path, entry: ShardEntry) -> Generation:
+    """Open and check the shard of a manifest entry.
 
     Raises:
         IndexesError: The shard is missing, damaged, or not the generation in the manifest.
     """
-    generation = IndexStore(index / entry.folder).open(name=entry.generation, threads=threads)
+    generation = IndexStore(index / entry.folder).open(name=entry.generation)
     if file_digest(generation.folder / GENERATION_MANIFEST) != entry.sha256:
         raise CorruptIndex(f"{generation.folder} is not the generation that {index / NAME} lists; {AGAIN}")
     return generation

@@ -59,7 +59,7 @@ class ShardReplica:
     """One shard in a process of Ray Serve."""
 
     def __init__(self, index: str, entry: ShardEntry, model: str) -> None:
-        generation = open_shard(Path(index), entry, threads=1)
+        generation = open_shard(Path(index), entry)
         self._shard = FolderShard(generation, checkpoint_of(generation.manifest, model))
         threadpool_limits(1, "blas")  # for the whole process: idle BLAS threads spin on CPUs that others need
 

@@ -44,7 +44,7 @@ def candidates(sample: Sample) -> ApproximationResult:
     points, works = list[Tradeoff](), list[Callable[[], object]]()
     for name in sample.embeddings:
         found = ranks(sample.queries[name], sample.catalogue[name], best)
-        index = indexes.build(sample.catalogue[name], threads=1)
+        index = indexes.build(sample.catalogue[name])
         for k in (*FEW, *candidate_steps(len(photos))[:-1]):
             is_default = k == default and name == sample.embeddings[0]
             points.append(miss_rate_point(name, f"k = {k:,}", found >= k, is_default))
@@ -122,7 +122,7 @@ def ranks(queries: Array, embeddings: Array, exhaustive_top1: NDArray[np.int64])
 def _indexes(embeddings: Array, quick: bool) -> Iterator[tuple[str, str, VectorIndex]]:
     """Yield (series, setting, index) of every kind that these embeddings can train."""
     lists = 1 << max(0, round(np.log2(np.sqrt(len(embeddings)))))  # near the square root, a power of two
-    yield DEFAULT_KIND, "", indexes.build(embeddings, DEFAULT_KIND, threads=1)
+    yield DEFAULT_KIND, "", indexes.build(embeddings, DEFAULT_KIND)
     for pattern, (setting, values) in STRUCTURES.items():
         kind = pattern.format(lists=lists)
         try:

@@ -111,7 +111,7 @@ def open_index(
         CheckpointError: The checkpoint is missing or damaged.
     """
     if not is_sharded(index):
-        generation = IndexStore(index).open(threads=1)  # one query at a time
+        generation = IndexStore(index).open()
         stored = checkpoint_of(generation.manifest, model)
         return FolderShard(generation, stored), stored
     manifest = read_sharded_manifest(index)
@@ -119,7 +119,7 @@ def open_index(
     if shards is not None:
         return shards(index, manifest, stored), stored
     check_fingerprint(index, manifest.fingerprint, fingerprint(stored))
-    opened = [FolderShard(open_shard(index, entry, threads=1), stored) for entry in manifest.shards]
+    opened = [FolderShard(open_shard(index, entry), stored) for entry in manifest.shards]
     return Shards(manifest, opened), stored
 
 

@@ -12,7 +12,7 @@ from robot.readings import RGBD, Region
 Array = npt.NDArray[np.float64]
 Depth = npt.NDArray[np.float32]
 
-MAX_HEIGHT_MM = 400.0
+_MAX_HEIGHT_MM = 400.0
 _NEAR_TABLE_MM = 40.0
 _TABLE_TOLERANCE_MM = 6.0
 _MAX_SLOPE = 0.1
@@ -29,7 +29,6 @@ class TablePlane:
     b: float
     c: float
     noise_mm: float
-    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -53,6 +52,11 @@ class Rays:
         y = (np.arange(rows, dtype=np.float32) - lens.cy) / lens.fy
         return cls(x.astype(np.float32), y.astype(np.float32), extrinsics)
 
+    @property
+    def steepness(self) -> float:
+        """Slope of the middle ray at depth 1: the factor from depth noise to height noise."""
+        return abs(float(self.pose[2, 2]))
+
     def along(self, normal: Array) -> Depth:
         """Return the (H, W) component of each ray along a vector (3,) of the rig's frame, at depth 1."""
         local = (self.pose[:3, :3].T @ normal).astype(np.float32)
@@ -68,14 +72,14 @@ class Rays:
 def find_table(depth_mm: Depth, rays: Rays) -> TablePlane:
     """Fit the table near z = 0, its height by the calibration: RANSAC over three points, then least squares.
 
-    If too little of the table is visible, the result is z = 0 with a note. `depth_mm` (H, W) is NaN where unknown.
+    If too little of the table is visible, the result is z = 0. `depth_mm` (H, W) is NaN where unknown.
     """
     step = max(1, int(np.sqrt(depth_mm.size / _SAMPLES)))
     rows, columns = np.nonzero(np.isfinite(depth_mm[::step, ::step]))
     points = rays.points(depth_mm, rows * step, columns * step)
     near = points[np.abs(points[:, 2]) < _NEAR_TABLE_MM]
     if len(near) < 100:
-        return TablePlane(0.0, 0.0, 0.0, 2.0, ("too little of the table is visible: z = 0 of the calibration is used",))
+        return TablePlane(0.0, 0.0, 0.0, 2.0)
     plane = _best_plane(near)
     for _ in range(3):
         off = near[:, 2] - _heights(plane, near)
@@ -83,16 +87,8 @@ def find_table(depth_mm: Depth, rays: Rays) -> TablePlane:
         design = np.column_stack([inside[:, :2], np.ones(len(inside))])
         plane = np.asarray(np.linalg.lstsq(design, inside[:, 2], rcond=None)[0], np.float64)
     off = near[:, 2] - _heights(plane, near)
-    noise = 1.4826 * float(np.median(np.abs(off))) / max(abs(_steepness(rays)), 0.1)
-    a, b, c = map(float, plane)
-    slope = float(np.degrees(np.arctan(np.hypot(a, b))))
-    note = f"the camera measures a table {c:.0f} mm high and {slope:.1f} degrees steep: calibrate the camera again"
-    return TablePlane(a, b, c, max(noise, 0.3), (note,) if abs(c) >= 15.0 or slope >= 2.0 else ())
-
-
-def _steepness(rays: Rays) -> float:
-    """Return the rise of the middle ray at depth 1: the factor from depth noise to height noise."""
-    return float(rays.pose[2, 2])
+    noise = 1.4826 * float(np.median(np.abs(off))) / max(rays.steepness, 0.1)
+    return TablePlane(*map(float, plane), max(noise, 0.3))
 
 
 def _best_plane(points: Array) -> Array:
@@ -127,8 +123,8 @@ def find_object_points(
     normal = np.array([-table.a, -table.b, 1.0])
     start = float(normal @ rays.pose[:3, 3]) - table.c
     above = np.asarray(depth_mm * rays.along(normal) + np.float32(start))  # the height of each pixel
-    min_height_mm = max(_MIN_HEIGHT_MM, 3.0 * table.noise_mm * abs(_steepness(rays)))
-    raised = (above > min_height_mm) & (above < MAX_HEIGHT_MM)
+    min_height_mm = max(_MIN_HEIGHT_MM, 3.0 * table.noise_mm * rays.steepness)
+    raised = (above > min_height_mm) & (above < _MAX_HEIGHT_MM)
     if region is not None:
         for axis in (0, 1):
             position = depth_mm * rays.along(np.eye(3)[axis]) + np.float32(rays.pose[axis, 3])
@@ -146,7 +142,7 @@ def find_object_points(
     rows, columns = ((labels == best) & raised).nonzero()
     points = rays.points(depth_mm, rows, columns)
     points[:, 2] = above[rows, columns]
-    level = abs(_steepness(rays)) / (float(np.median(depth_mm[rows, columns])) * float(rays.x[1] - rays.x[0])) ** 2
+    level = rays.steepness / (float(np.median(depth_mm[rows, columns])) * float(rays.x[1] - rays.x[0])) ** 2
     points = _remove_outliers(points, level)
     if len(points) > _MAX_POINTS:
         points = points[np.sort(np.random.default_rng(0).choice(len(points), _MAX_POINTS, replace=False))]

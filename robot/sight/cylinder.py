@@ -2,7 +2,7 @@
 
 A depth picture shows only one side of the object. An upright cylinder, a box and a lying cylinder (robot.sight.solids)
 are fitted to the points above the table (robot.sight.cloud); the one with the smallest BIC is returned. If none is
-reliable, a cruder method is used. `method` and `notes` of the result name it:
+reliable, a cruder method is used. `method` of the result names it:
 
     circle              robust circle through the visible side of an upright cylinder
     box                 the cylinder inscribed in a box, as for a packet
@@ -39,7 +39,6 @@ MIN_SIDE_POINTS = 10
 MIN_ARC_DEG = 60.0
 _SECTOR_DEG = 10.0
 _MIN_CUT_OFF_ARC_DEG = 90.0
-_MAX_OUTLIER_FRACTION = 0.3
 _MIN_TOP_FRACTION = 0.05
 _MAX_LOSS, _OUTLIER_MM = 0.35, 2.0
 _CRUDE_MM, _ROUGH_MM, _GUESS_MM = 3.0, 6.0, 10.0
@@ -58,8 +57,6 @@ class CylinderFit:
         error_mm: Standard error of the centre, without the error of the camera calibration.
         method: Method of the fit; see the top of the file.
         half_mm: Half sizes of the footprint along `yaw_rad` and across; both are the radius for a round object.
-        arc_deg: Visible arc of the circle, for the method "circle".
-        notes: Remarks for the user.
     """
 
     x_mm: float
@@ -70,9 +67,6 @@ class CylinderFit:
     method: str
     half_mm: tuple[float, float]
     yaw_rad: float = 0.0
-    points: int = 0
-    arc_deg: float = 0.0
-    notes: tuple[str, ...] = ()
 
     def width_mm(self, yaw_rad: float, finger_mm: float) -> float:
         """Return the smallest opening with which two fingers, `finger_mm` wide and centred, pass the object.
@@ -121,51 +115,35 @@ def fit_cylinder(image: RGBD, extrinsics: npt.ArrayLike, region: Region | None =
         raise PlanError("the object touches the border of the picture, and its visible part is too small to locate it")
     solid = best.solid
     residual_mm = OUTLIER_CUT * noise * math.sqrt(_loss(solid, points, noise))
-    notes = [*table.notes, *filter(None, [best.note])]
-    if is_cut_off:
-        notes.append("it touches the border of the picture: a part of it is not visible")
-    if (solid.distance(points) > OUTLIER_CUT * noise).mean() > _MAX_OUTLIER_FRACTION:
-        notes.append("it is not a simple solid: many points lie off the fitted surface")
+    error_mm = max(best.error_mm, 0.5 * residual_mm)
     return CylinderFit(
-        solid.x,
-        solid.y,
-        solid.height,
-        min(solid.half),
-        max(best.error_mm, 0.5 * residual_mm),
-        best.method,
-        solid.half,
-        solid.yaw_rad,
-        len(points),
-        best.arc_deg,
-        tuple(notes),
+        solid.x, solid.y, solid.height, min(solid.half), error_mm, best.method, solid.half, solid.yaw_rad
     )
 
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A fitted solid, its method, and the standard error of its centre in mm."""
+    """A fitted solid, its method, the standard error of its centre in mm, and the visible arc of a circle."""
 
     solid: Solid
     method: str
     error_mm: float
     arc_deg: float = 0.0
-    note: str = ""
 
 
 def _best_candidate(points: Array, top: float, noise: float, rays: Rays) -> _Candidate:
     eye = rays.pose[:2, 3]
     box = fit_cuboid(points, top, eye)
     lying = (fit_lying_cylinder(points, box, along, eye) for along in (True, False))
+    has_top = (np.abs(points[:, 2] - top) < 2 * noise).mean() > _MIN_TOP_FRACTION
     candidates = [
         _upright_candidate(points, top, noise, rays, box),
-        _Candidate(box, "box", _CRUDE_MM)
-        if (np.abs(points[:, 2] - top) < 2 * noise).mean() > _MIN_TOP_FRACTION
-        else _Candidate(box, "box", _GUESS_MM, note="its top is not visible, so the place of its far side is a guess"),
+        _Candidate(box, "box", _CRUDE_MM if has_top else _GUESS_MM),
         *(_Candidate(solid, "lying", _CRUDE_MM) for solid in lying if solid is not None),
     ]
     best = min(candidates, key=lambda candidate: candidate.solid.misfit(points, noise, rays.pose[:3, 3]))
     if best.method != "circle" and _loss(best.solid, points, noise) > _MAX_LOSS:
-        return _enclosing_candidate(points, top, "no simple solid fits the visible points", _ROUGH_MM)
+        return _enclosing_candidate(points, top, _ROUGH_MM)
     return best
 
 
@@ -176,17 +154,15 @@ def _loss(solid: Solid, points: Array, noise: float) -> float:
 
 def _top(points: Array, noise: float) -> float:
     """Return the height of the uppermost dense layer; layers of outliers above it are sparse."""
-    width = max(4.0, noise)
     z = points[:, 2]
-    layer = (z / width).astype(int)
+    layer = (z / max(4.0, noise)).astype(int)
     count = np.bincount(layer)
     usual = float(np.median(count[layer]))
     last = int(np.nonzero(count >= 0.2 * usual)[0][-1])
     fullest = int(count.argmax())
     lower = count[1 : max(fullest - 1, 1)]
-    if fullest >= last - 3 and (
-        len(lower) == 0 or count[fullest] > 2 * np.median(lower)
-    ):  # a level top, seen from above
+    is_level = len(lower) == 0 or count[fullest] > 2 * np.median(lower)
+    if fullest >= last - 3 and is_level:  # a level top, seen from above
         return float(np.median(z[np.abs(layer - fullest) <= 1]))
     return float(np.quantile(z[layer <= last], 0.99))
 
@@ -195,20 +171,20 @@ def _upright_candidate(points: Array, top: float, noise: float, rays: Rays, box:
     """Fit an upright cylinder to its visible side, or an enclosing circle if that is not sufficient."""
     side = points[points[:, 2] < top - max(4.0, noise), :2]
     if len(side) < MIN_SIDE_POINTS:
-        return _enclosing_candidate(points, top, f"only {len(side)} points on its side")
+        return _enclosing_candidate(points, top)
     viewing = side.mean(0) - rays.pose[:2, 3]
     largest = 2 * math.hypot(*box.half)
     away = viewing / max(float(np.hypot(*viewing)), 1e-9)
     circle = fit_circle(side, noise, away, largest)
     if circle is None:
-        return _enclosing_candidate(points, top, "no circle fits its visible side")
+        return _enclosing_candidate(points, top)
     arc = _arc_deg(circle, side)
     centre = np.array([circle.x, circle.y])
     whole = refine_circle(points[:, :2], centre, circle.radius, noise, largest, away, top - points[:, 2])
     if whole is not None:
         circle, side = whole, points[:, :2]
     if arc < MIN_ARC_DEG or circle.inliers.sum() < MIN_SIDE_POINTS:
-        return _enclosing_candidate(points, top, f"its side shows an arc of only {arc:.0f} degrees")
+        return _enclosing_candidate(points, top)
     solid = UprightCylinder(circle.x, circle.y, (circle.radius, circle.radius), top)
     return _Candidate(solid, "circle", _circle_error(circle, side, arc), arc)
 
@@ -231,12 +207,11 @@ def _arc_deg(circle: Circle, side: Array) -> float:
     return float((count >= 2).sum() * _SECTOR_DEG)
 
 
-def _enclosing_candidate(points: Array, top: float, reason: str, error_mm: float = _CRUDE_MM) -> _Candidate:
+def _enclosing_candidate(points: Array, top: float, error_mm: float = _CRUDE_MM) -> _Candidate:
     """Return the smallest circle around the points in plan, without the outermost points, which may be outliers."""
     plan = points[:, :2]
     low, high = np.quantile(plan, [0.02, 0.98], axis=0)
     inner = plan[((plan > low - _OUTLIER_MM) & (plan < high + _OUTLIER_MM)).all(1)]
     (x, y), radius = cv2.minEnclosingCircle(inner.astype(np.float32))
     solid = UprightCylinder(float(x), float(y), (float(radius), float(radius)), top)
-    note = f"{reason}: the smallest circle around its points, without outliers, is used"
-    return _Candidate(solid, "enclosing circle", error_mm, 0.0, note)
+    return _Candidate(solid, "enclosing circle", error_mm)

@@ -14,7 +14,7 @@ import pytest
 
 from _touch_retrieval import files
 from indexes.errors import LockedIndex, NoIndex, WriteFailed
-from indexes.store import folder, generation, locking
+from indexes.store import folder, locking
 from indexes.store.folder import IndexStore
 from tests.indexes.test_store import filled, names, rows_of
 from tests.waiting import first_line, run_process
@@ -109,7 +109,7 @@ while True:
     rows = [Row(f"{number:03}", str(turn), str(number)) for number in range(200)]
     vectors = np.random.default_rng(turn).normal(size=(200, 16))
     vectors = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
-    IndexStore(sys.argv[1]).write(rows, [{"embeddings": vectors, "partials": vectors}], kind=sys.argv[2], threads=1)
+    IndexStore(sys.argv[1]).write(rows, [{"embeddings": vectors, "partials": vectors}], kind=sys.argv[2])
     print(turn, flush=True)
 """
 
@@ -194,7 +194,7 @@ def test_an_interrupted_writer_cleans_up_and_releases_the_lock(tmp_path, monkeyp
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(generation, "encode_document", interrupted)
+        patch.setattr(folder, "encode_document", interrupted)
         with pytest.raises(KeyboardInterrupt):
             filled(tmp_path, 5)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["CURRENT", "LOCK", "gen-000001"]

@@ -31,7 +31,7 @@ QUERIES = unit(12, seed=1)
 
 @pytest.fixture(scope="module", params=KINDS)
 def built(request):
-    return indexes.build(unit(N), request.param, threads=1)
+    return indexes.build(unit(N), request.param)
 
 
 @pytest.fixture(params=["numpy", "FAISS"])
@@ -54,9 +54,10 @@ def test_scores_do_not_depend_on_the_batch_or_the_threads(built):
     for number, query in enumerate(QUERIES):
         single = built.search(query[None], 10)[0][0]
         np.testing.assert_allclose(single, scores[number], atol=TOLERANCE)
-    built.threads = 3
+    before = faiss.omp_get_max_threads()
+    faiss.omp_set_num_threads(3 if before == 1 else 1)
     np.testing.assert_allclose(built.search(QUERIES, 10)[0], scores, atol=TOLERANCE)
-    built.threads = 1
+    faiss.omp_set_num_threads(before)
     assert (np.diff(scores, axis=1) <= 0).all()
     assert rows.min() >= 0
 
@@ -92,7 +93,7 @@ def test_a_search_setting_trades_time_for_recall():
 
 
 def test_the_same_input_gives_the_same_index(built, tmp_path):
-    other = indexes.build(unit(N), built.kind, threads=1)
+    other = indexes.build(unit(N), built.kind)
     assert built.save(tmp_path / "one") == other.save(tmp_path / "other") == (not built.exact)
     if not built.exact:
         assert (tmp_path / "one").read_bytes() == (tmp_path / "other").read_bytes()
@@ -100,7 +101,7 @@ def test_the_same_input_gives_the_same_index(built, tmp_path):
 
 def test_a_saved_index_loads_and_gives_the_same_results(built, tmp_path):
     built.save(tmp_path / "x")
-    loaded = indexes.load_kind(built.kind).load(tmp_path / "x", built.vectors, built.kind, threads=1)
+    loaded = indexes.load_kind(built.kind).load(tmp_path / "x", built.vectors, built.kind)
     for mine, other in zip(loaded.search(QUERIES, 7), built.search(QUERIES, 7), strict=True):
         np.testing.assert_array_equal(mine, other)
     if not built.exact:
@@ -151,7 +152,6 @@ def test_an_index_needs_a_vector_and_queries_of_its_size():
         indexes.build(unit(0))
     with pytest.raises(VectorError, match=r"must have 16 components.*another model"):
         indexes.build(unit(3)).search(unit(1, dim=8), 1)
-    assert indexes.build(unit(3)).search(unit(0), 2)[1].shape == (0, 2)
 
 
 # Kinds -------------------------------------------------------------------------------------------------------------

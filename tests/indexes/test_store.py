@@ -26,7 +26,7 @@ def names(count: int) -> list[str]:
 
 def filled(path, count: int = 20, kind: str = "flat", arrays=None, **more) -> Generation:
     """A small index of `count` random vectors."""
-    store, more = IndexStore(path), {"fingerprint": FINGERPRINT, "threads": 1} | more
+    store, more = IndexStore(path), {"fingerprint": FINGERPRINT} | more
     store.discard_before(
         store.write(rows_of(names(count)), blocks(unit(count, DIM), arrays), kind=kind, **more).generation
     )
@@ -57,9 +57,8 @@ def test_a_written_index_is_read_back(tmp_path, kind):
         about={"checkpoint": "model.safetensors"},
         kind=kind,
         software="0.1.0",
-        threads=1,
     )
-    generation = store.open(threads=1)
+    generation = store.open()
     assert generation.folder == tmp_path / "a" / "index" / "gen-000001"
     assert generation.manifest == manifest
     assert list(generation.rows) == rows
