@@ -13,9 +13,8 @@ import os
 import secrets
 import shutil
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from functools import partial
 from io import BufferedReader
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -96,11 +95,8 @@ def open_regular(path: str | Path) -> BufferedReader:
     """Open a regular file for reading. Raises OSError; its `strerror` says that any other file is not one."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # a pipe does not block
     try:
-        mode = os.fstat(descriptor).st_mode
-        if stat.S_ISDIR(mode):
-            raise IsADirectoryError(errno.EISDIR, "is a folder, not a file", str(path))
-        if not stat.S_ISREG(mode):
-            raise OSError(errno.EINVAL, "is a pipe, a device or a socket, not a regular file", str(path))
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, "is a folder, a pipe, a device or a socket, not a regular file", str(path))
         return os.fdopen(descriptor, "rb")
     except BaseException:
         os.close(descriptor)
@@ -124,23 +120,18 @@ def read_json(path: str | Path, max_bytes: int = MAX_JSON_BYTES) -> Any:
     return parse_json(read_regular(path, max_bytes))
 
 
-def parse_json(text: str | bytes) -> Any:
+def parse_json(text: str | bytes, *, own: bool = False) -> Any:
     """Return the document in a JSON text in UTF-8.
+
+    Args:
+        text: The text.
+        own: Whether `json.dumps` wrote it: it may contain paths that are not UTF-8, which msgspec refuses.
 
     Raises:
         ValueError: The text is not JSON, has a number that is not finite, or is nested deeper than `MAX_DEPTH`.
     """
-    return _parsed(text, msgspec.json.decode)
-
-
-def parse_own_json(text: str | bytes) -> Any:
-    """As `parse_json`, for what `json.dumps` wrote: it may contain paths that are not UTF-8, which msgspec refuses."""
-    return _parsed(text, partial(json.loads, parse_constant=_finite, parse_float=_finite))
-
-
-def _parsed(text: str | bytes, parse: Callable[[str | bytes], Any]) -> Any:
     try:
-        document = parse(text)
+        document = json.loads(text, parse_constant=_finite, parse_float=_finite) if own else msgspec.json.decode(text)
         _require_depth(document, MAX_DEPTH)
     except RecursionError as error:
         raise ValueError(f"it is nested deeper than {MAX_DEPTH} levels") from error

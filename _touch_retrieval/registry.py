@@ -49,8 +49,11 @@ class Registry(dict[str, str], Generic[T]):
         """Return the built-in names, then the names that installed packages add."""
         return list(dict.fromkeys([*self, *sorted(self._installed())]))
 
-    def load(self, name: str) -> T:
-        """Return the entry with this name. Raises the registry's error if it is unknown or unusable."""
+    def load(self, name: str, *, imports: bool = False) -> T:
+        """Return the entry with this name; `imports`: a user gave it, so the module of `module:Class` is imported.
+
+        Raises the registry's error if it is unknown or unusable.
+        """
         if name in self:
             return cast(T, _imported(self[name]))
         place = self._installed().get(name)
@@ -61,7 +64,7 @@ class Registry(dict[str, str], Generic[T]):
                     f"{self.noun} must be one of {', '.join(self.names())}; got {name!r}. Give module:Class for your "
                     f"own, or install a package that adds one by an entry point of the group {self.group}"
                 )
-            if module not in sys.modules:
+            if not imports and module not in sys.modules:
                 raise self._error(
                     f"{self.noun} {name!r}: its module is not imported, and a name in a file cannot import it. Import "
                     f"{module} first, or install a package that adds it by an entry point of the group {self.group}"
@@ -69,7 +72,8 @@ class Registry(dict[str, str], Generic[T]):
         try:
             return self._checked(name, _imported(place))
         except (ImportError, AttributeError) as error:
-            raise self._error(f"{self.noun} {name!r} cannot be imported: {error}") from error
+            hint = "install its package, or add its folder to PYTHONPATH"
+            raise self._error(f"{self.noun} {name!r} cannot be imported: {error}; {hint}") from error
 
     def name_of(self, choice: "str | T") -> str:
         """Return the name of a user's choice: a name, a `module:Class`, which is imported, or the object itself.
@@ -83,16 +87,8 @@ class Registry(dict[str, str], Generic[T]):
                 if known == place:
                     return name
             choice = place
-        elif ":" in choice and choice not in self.names():
-            try:
-                import_module(choice.partition(":")[0])
-            except ImportError as error:
-                raise self._error(
-                    f"{self.noun} {choice!r} cannot be imported ({error}); install its package, or add its folder to "
-                    "PYTHONPATH"
-                ) from error
         if choice not in self:
-            self.load(choice)
+            self.load(choice, imports=True)
         return choice
 
     def resolve(self, choice: "str | T") -> T:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, TypeVar
 from msgspec import Meta
 
 from _touch_retrieval.documents import typed
-from _touch_retrieval.files import file_digest, open_regular, parse_own_json, read_regular
+from _touch_retrieval.files import file_digest, open_regular, parse_json, read_regular
 from indexes.errors import AGAIN, CorruptIndex, UnsupportedFormat
 
 FORMAT = 7
@@ -92,7 +92,7 @@ def read_document(path: Path, version: int, kind: type[T]) -> T:
         UnsupportedFormat: The file has another format version.
     """
     try:
-        content = parse_own_json(read_regular(path, MAX_BYTES))
+        content = parse_json(read_regular(path, MAX_BYTES), own=True)
     except OSError as error:
         raise CorruptIndex(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
     except ValueError as error:

@@ -21,7 +21,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from _touch_retrieval.files import parse_json, read_regular
-from retrieval.data.images import EXTENSIONS, read_bytes
+from retrieval.data.images import EXTENSIONS
 from retrieval.data.naming import STEM, Naming
 from retrieval.data.text import is_utf8
 from retrieval.errors import BadInput, DatasetError
@@ -86,10 +86,6 @@ class Catalogue:
         """The absolute path of the folder, which indexes store."""
         return str(self.folder.resolve())
 
-    def read(self, path: str) -> bytes:
-        """Return the bytes of a photo's file. Raises ImageError."""
-        return read_bytes(self.folder / path)
-
     @property
     def paths(self) -> list[str]:
         """The paths of all photos and gel images."""
@@ -132,8 +128,7 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
     ignored: list[str] = []
     unfit: list[SkippedPhoto] = []
     for path in sorted(names):
-        dot = path.rfind(".")
-        extension = path[dot:].lower() if dot > path.rfind("/") + 1 else ""
+        extension = os.path.splitext(path)[1].lower()
         if extension in UNSUPPORTED_EXTENSIONS:
             skipped.append(SkippedPhoto(path, f"{extension} pictures are not read: save it as PNG or JPEG"))
         elif extension not in EXTENSIONS:
@@ -218,8 +213,6 @@ def _no_photo_error(
             f"{unfit[0].path}. Use folder, stem, or a pattern for paths like this one"
         )
     others = f", only {len(ignored)} other file(s) such as {ignored[0]}" if ignored else ""
-    if not ignored and not skipped:
-        others = ", and no other file"
     left_out = "".join(f"; {item.path}: {item.reason}" for item in skipped[:1])
     kinds = ", ".join(sorted(EXTENSIONS))
     return DatasetError(f"no photo ({kinds}) in the catalogue {where}{others}{left_out}: {_LAYOUT}")

@@ -56,8 +56,13 @@ def read_bytes(path: str | Path) -> bytes:
         raise ImageError(path, f"cannot be read: {_reason(error)}") from error
 
 
-def decode_rgb(data: bytes, name: str | Path, min_side: int | None = None) -> RgbImage:
-    """Decode one picture to (H, W, 3) float32 RGB in 0..1.
+def decode_rgb(data: bytes, name: str | Path) -> RgbImage:
+    """Decode like `decode`, to (H, W, 3) float32 RGB in 0..1. Raises ImageError."""
+    return to_float(decode(data, name))
+
+
+def decode(data: bytes, name: str | Path, min_side: int | None = None) -> Samples:
+    """Decode one picture to RGB (H, W, 3): uint8 for an opaque picture of 8 bits, else float32 in 0..1.
 
     Grey becomes three equal channels, transparency is composited on white, and the EXIF orientation is applied. Of
     several pages or frames, the first is decoded.
@@ -72,11 +77,6 @@ def decode_rgb(data: bytes, name: str | Path, min_side: int | None = None) -> Rg
     Raises:
         ImageError: The bytes are not a picture that can be decoded.
     """
-    return to_float(decode(data, name, min_side))
-
-
-def decode(data: bytes, name: str | Path, min_side: int | None = None) -> Samples:
-    """Decode like `decode_rgb`, but return (H, W, 3) uint8 for an opaque picture of 8 bits."""
     with _image_errors(name), _open_image(data, name) as image:
         _apply_draft_mode(image, min_side)
         check_pixels(image.size, name)

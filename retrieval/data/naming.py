@@ -7,8 +7,8 @@
                {split}/{object}/{photo}, or {object}_{view}.jpg
 
 A pattern must match the photo's whole path, first without its extension, then with it. A word in braces matches one
-character or more, but no "/"; {object} matches as many as possible, the others as few as possible. The same word twice
-matches the same text.
+character or more, but no "/"; {object} matches as many as possible, the others as few as possible. A second {object}
+matches the same text as the first.
 """
 
 import re
@@ -31,6 +31,7 @@ NOT_OBJECTS = frozenset(
 """Names that data sets give to folders of many objects."""
 
 _FIELD = re.compile(r"\{(\w+)\}")
+_ESCAPED_FIELD = re.compile(r"\\\{(\w+)\\\}")  # as re.escape writes it
 _NUMBER = re.compile(r"[\s._#-]*\(?\d+\)?$")
 _MAX_EXAMPLES = 3
 
@@ -61,13 +62,11 @@ class Naming:
 
     def object_of(self, path: str) -> str | None:
         """Return the object of the photo at `path` (forward slashes), or None if the path does not fit the rule."""
-        if self.text == FOLDER:
-            first, _, rest = path.partition("/")
-            if first not in ("", ".") and rest.strip("./"):  # fast way for most paths
-                return first
+        if self.text == FOLDER and "/" in path:
+            return path.partition("/")[0]
         name = PurePosixPath(path)
         if self.text == FOLDER:
-            return name.parts[0] if len(name.parts) > 1 else name.stem
+            return name.stem
         if self.text == STEM:
             return _NUMBER.sub("", name.stem) or None
         found = self._pattern.fullmatch(path.removesuffix(name.suffix)) or self._pattern.fullmatch(path)
@@ -75,16 +74,10 @@ class Naming:
 
     @cached_property
     def _pattern(self) -> re.Pattern[str]:
-        parts, words = [], set()
-        for number, part in enumerate(_FIELD.split(self.text)):  # text, word, text, word, ..., text
-            if number % 2 == 0:
-                parts.append(re.escape(part))
-            elif part in words:
-                parts.append(f"(?P={part})")
-            else:
-                parts.append(f"(?P<{part}>[^/]+{'' if part == OBJECT else '?'})")
-                words.add(part)
-        return re.compile("".join(parts))
+        again = f"(?P={OBJECT})"
+        escaped = re.escape(self.text)
+        pattern = _ESCAPED_FIELD.sub(lambda field: again if field[1] == OBJECT else "[^/]+?", escaped)
+        return re.compile(pattern.replace(again, f"(?P<{OBJECT}>[^/]+)", 1))
 
 
 def naming_warnings(photos: Mapping[str, int], naming: Naming) -> list[str]:

@@ -65,7 +65,8 @@ class PairSampler:
         self.objects = sorted(by_object)
         self.grasps = [by_object[name] for name in self.objects]
         self.photos = [sorted({grasp.photo for grasp in part}) for part in self.grasps]
-        if len({photo for part in self.photos for photo in part}) != sum(map(len, self.photos)):
+        self._owners = {photo: index for index, part in enumerate(self.photos) for photo in part}
+        if len(self._owners) != sum(map(len, self.photos)):
             raise DatasetError("two objects share a photo file; run `retrieve check`")
         # Permuting 10,000 objects for each touch would take as long as a training step.
         self._order_of_round = lru_cache(maxsize=2)(lambda number: self._rng(3, number).permutation(len(self.objects)))
@@ -91,11 +92,9 @@ class PairSampler:
     def _pairs(self, touches: list[tuple[int, Grasp]], stream: tuple[int, ...], share: bool = False) -> PairBatch:
         rng = self._rng(*stream)
         photos: dict[Path, int] = {}
-        owners: dict[Path, int] = {}
         pairs: list[tuple[int, int, float]] = []
         for row, drawn in enumerate(self._draw_photos([index for index, _ in touches], rng, share)):
-            for owner, photo, label in drawn:
-                owners[photo] = owner
+            for photo, label in drawn:
                 pairs.append((row, photos.setdefault(photo, len(photos)), label))
         touch_index, photo_index, labels = zip(*pairs, strict=True)
         return PairBatch(
@@ -105,20 +104,20 @@ class PairSampler:
             photo_index=np.array(photo_index, dtype=np.int64),
             labels=np.array(labels, dtype=np.float32),
             touch_objects=np.array([index for index, _ in touches], dtype=np.int64),
-            photo_objects=np.array([owners[photo] for photo in photos], dtype=np.int64),
+            photo_objects=np.array([self._owners[photo] for photo in photos], dtype=np.int64),
         )
 
     def _draw_photos(
         self, objects: list[int], rng: np.random.Generator, share: bool
-    ) -> Iterator[list[tuple[int, Path, float]]]:
-        """Yield the photos to pair with the touch of each object: (object, photo, label).
+    ) -> Iterator[list[tuple[Path, float]]]:
+        """Yield the photos to pair with the touch of each object: (photo, label).
 
         With `share`, negatives are the batch's photos of its other objects; without other objects, of all objects.
         """
         if not share:
             for index in objects:
-                matches = [(index, photo, 1.0) for photo in self._positives(index, rng)]
-                yield matches + [(*self._negative(index, rng), 0.0) for _ in range(self.negatives)]
+                matches = [(photo, 1.0) for photo in self._positives(index, rng)]
+                yield matches + [(self._negative(index, rng), 0.0) for _ in range(self.negatives)]
             return
         positives = [self._positives(index, rng) for index in objects]
         photos_of: dict[int, list[Path]] = defaultdict(list)
@@ -129,10 +128,10 @@ class PairSampler:
             if others:
                 rounds = [rng.permutation(len(others)) for _ in range(-(-self.negatives // len(others)))]
                 chosen = [others[turn] for turn in np.concatenate(rounds)[: self.negatives]]
-                negatives = [(other, photos_of[other][int(rng.integers(len(photos_of[other])))]) for other in chosen]
+                negatives = [photos_of[other][int(rng.integers(len(photos_of[other])))] for other in chosen]
             else:
                 negatives = [self._negative(index, rng) for _ in range(self.negatives)]
-            yield [(index, photo, 1.0) for photo in drawn] + [(*negative, 0.0) for negative in negatives]
+            yield [(photo, 1.0) for photo in drawn] + [(photo, 0.0) for photo in negatives]
 
     def _positives(self, index: int, rng: np.random.Generator) -> list[Path]:
         """Draw matching photos, without replacement if the object has enough of them."""
@@ -140,10 +139,10 @@ class PairSampler:
         chosen = rng.choice(len(photos), self.positives, replace=len(photos) < self.positives)
         return [photos[int(row)] for row in chosen]
 
-    def _negative(self, index: int, rng: np.random.Generator) -> tuple[int, Path]:
+    def _negative(self, index: int, rng: np.random.Generator) -> Path:
         other = int(rng.integers(len(self.objects) - 1))
         other += other >= index
-        return other, self.photos[other][int(rng.integers(len(self.photos[other])))]
+        return self.photos[other][int(rng.integers(len(self.photos[other])))]
 
     def _rng(self, *stream: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, *stream])

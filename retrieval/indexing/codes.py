@@ -25,7 +25,7 @@ from _touch_retrieval.cache import Cache, cache_key
 from indexes.errors import WriteFailed
 from retrieval.console.progress import Bar
 from retrieval.data.catalogue import Catalogue, SkippedPhoto
-from retrieval.data.images import decode_rgb
+from retrieval.data.images import decode_rgb, read_bytes
 from retrieval.data.loading import map_in_order
 from retrieval.errors import ImageError, NumericalError
 from retrieval.model.checkpoint import Checkpoint
@@ -89,7 +89,7 @@ class CatalogueFiles:
     def read(self, path: str) -> tuple[FileRecord, bytes]:
         """Read a file, which becomes known. Raises ImageError."""
         status = self._status(path)  # before reading: if the file changes now, the next build reads it again
-        content = self._catalogue.read(path)
+        content = read_bytes(self._catalogue.folder / path)
         self.known[path] = record = FileRecord(*status, hashlib.sha256(content).hexdigest())
         return record, content
 

@@ -8,7 +8,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from _touch_retrieval.documents import typed
-from _touch_retrieval.files import file_digest, open_regular, parse_own_json
+from _touch_retrieval.files import file_digest, open_regular, parse_json
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.config import Config
 from retrieval.model.fusion_scorer import FusionScorer
@@ -154,7 +154,7 @@ def read_header(path: Path) -> dict[str, Any]:
             "(use other weights with `retrieve train --init`)"
         )
     try:
-        header = parse_own_json(text)
+        header = parse_json(text, own=True)
         version = header["format"]
     except (ValueError, KeyError, TypeError) as error:
         raise CheckpointError(f"the header of {path} is damaged ({error}); train again or restore the file") from error

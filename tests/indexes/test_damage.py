@@ -174,7 +174,7 @@ def test_a_path_that_is_not_a_regular_file_raises_without_reading(folder, name):
     server = socket.socket(socket.AF_UNIX)
     for make_it in (os.mkfifo, server.bind, lambda there: os.symlink("/dev/zero", there), os.mkdir):
         make_it(str(path))
-        with pytest.raises(IndexesError, match=r"is a folder, not a file|not a regular file|No such device"):
+        with pytest.raises(IndexesError, match=r"not a regular file|No such device"):
             IndexStore(folder.parent).open()
         path.rmdir() if path.is_dir() else path.unlink()
     server.close()

@@ -5,14 +5,13 @@ the grasp, and the time identifies the object. The measures are leave-one-out ac
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.data.check.pictures import Finding, ImageRecords
 from retrieval.data.dataset import Grasp
-from retrieval.metrics.intervals import summarise
+from retrieval.metrics.intervals import Summary, summarise
 from retrieval.metrics.measure import Measure, object_means
 
 _MAX_BY_DRIFT = 0.2
@@ -44,21 +43,21 @@ def check_drift(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Find
     by_frame_order = _by_order(different)
     if by_frame_order is None:
         text = (
-            f"the order of capture alone identifies the object in {by_order}; without a separate no-contact frame for "
-            "every grasp, light that identifies the object cannot be found"
+            f"the order of capture alone identifies the object in {_percent(by_order)}; without a separate no-contact "
+            "frame for every grasp, light that identifies the object cannot be found"
         )
-        yield Finding("note", "unchecked-light", f"{text}, and {_ADVICE}" if by_order.is_above_chance else text)
+        yield Finding("note", "unchecked-light", f"{text}, and {_ADVICE}" if is_above_chance(by_order) else text)
         return
     small = np.array([[records[path].small for path in grasp.backgrounds] for grasp in different])
     found = nearest_grasp_accuracy(small, _owners(different))
     assert found is not None  # as for the order
     text = (
-        f"the no-contact frames alone identify the object in {found}, the order of their capture alone in "
-        f"{by_frame_order} ({found.queries} different frames of {found.objects} objects)"
+        f"the no-contact frames alone identify the object in {_percent(found)}, the order of their capture alone in "
+        f"{_percent(by_frame_order)} ({found.queries} different frames of {found.objects} objects)"
     )
     if left_out := len({grasp.object_id for grasp in different}) - found.objects:
         text += f"; {left_out} object(s) with one no-contact frame for all grasps are left out"
-    if found.is_above_chance:
+    if is_above_chance(found):
         yield Finding("warning", "drift", f"{text}: light or gel drifted, and {_ADVICE}")
     else:
         yield Finding("note", "drift", text)
@@ -68,45 +67,29 @@ def _owners(grasps: Sequence[Grasp]) -> NDArray[np.int64]:
     return np.unique([grasp.object_id for grasp in grasps], return_inverse=True)[1]
 
 
-def _by_order(grasps: Sequence[Grasp]) -> "NearestGraspAccuracy | None":
+def _by_order(grasps: Sequence[Grasp]) -> Summary | None:
     return nearest_grasp_accuracy(np.arange(len(grasps))[:, None], _owners(grasps)) if grasps else None
 
 
-@dataclass(frozen=True)
-class NearestGraspAccuracy:
-    """Leave-one-out accuracy of identifying a grasp's object by the nearest other grasp; objects have equal weight.
+def is_above_chance(found: Summary) -> bool:
+    """Return whether an accuracy is far above chance (`_MAX_BY_DRIFT`), and significantly so."""
+    chance = found.chance[0]
+    deviation = np.sqrt(chance * (1 - chance) / found.queries)
+    return bool(found.value[0] > chance + max(_MAX_BY_DRIFT * (1 - chance), 5 * deviation))
 
-    Attributes:
-        accuracy: Mean over objects of the fraction of grasps whose nearest other grasp has the same object.
-        low, high: Its 95 % interval, which resamples objects.
-        chance: Expected accuracy by chance.
-        queries, objects: Numbers of grasps of objects with at least two, and of these objects.
-    """
 
-    accuracy: float
-    low: float
-    high: float
-    chance: float
-    queries: int
-    objects: int
-
-    @property
-    def is_above_chance(self) -> bool:
-        """Whether the accuracy is far above chance (`_MAX_BY_DRIFT`), and significantly so."""
-        deviation = np.sqrt(self.chance * (1 - self.chance) / self.queries)
-        return bool(self.accuracy > self.chance + max(_MAX_BY_DRIFT * (1 - self.chance), 5 * deviation))
-
-    def __str__(self) -> str:
-        interval = f"[{100 * self.low:.0f}, {100 * self.high:.0f}]"
-        return f"{self.accuracy:.0%} {interval} (chance {self.chance:.0%})"
+def _percent(found: Summary) -> str:
+    interval = f"[{100 * found.low[0]:.0f}, {100 * found.high[0]:.0f}]"
+    return f"{found.value[0]:.0%} {interval} (chance {found.chance[0]:.0%})"
 
 
 def nearest_grasp_accuracy(
     values: NDArray[np.floating] | NDArray[np.integer], objects: NDArray[np.int64]
-) -> NearestGraspAccuracy | None:
+) -> Summary | None:
     """Return how well values (n, ...) of grasps identify their objects (n,) by the nearest other grasp.
 
-    Equally near grasps count by expectation. None if there is only one object, or no object has two grasps.
+    A query is a grasp of an object with at least two. Objects have equal weight, and equally near grasps count by
+    expectation. None if there is only one object, or no object has two grasps.
     """
     others = np.bincount(objects)[objects] - 1  # grasps of the same object
     if not others.any() or others.max() == len(objects) - 1:
@@ -123,7 +106,4 @@ def nearest_grasp_accuracy(
         correct[row] = (objects[nearest] == objects[row]).mean()
     rows = others > 0
     chance = object_means(others[rows, None] / (len(objects) - 1), objects[rows])[1].mean(axis=0)
-    found = summarise([Measure(correct[rows, None], objects[rows], chance, "other grasps")])
-    return NearestGraspAccuracy(
-        found.value[0], found.low[0], found.high[0], float(chance[0]), found.queries, found.objects
-    )
+    return summarise([Measure(correct[rows, None], objects[rows], chance, "other grasps")])

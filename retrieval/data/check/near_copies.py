@@ -99,13 +99,11 @@ class NearestPictures:
 
     Attributes:
         row: Row of the nearest picture.
-        distance: Its distance; infinite without another object.
         checked: Whether a copy of the picture can be distinguished from other pictures.
         copy: Whether the nearest picture is a copy.
     """
 
     row: NDArray[np.int64]
-    distance: NDArray[np.float64]
     checked: NDArray[np.bool_]
     copy: NDArray[np.bool_]
 
@@ -142,4 +140,4 @@ def nearest_pictures(thumbnails: Sequence[Thumbnail], objects: Sequence[str]) ->
     limits = np.maximum(limits, limits[row])  # either may be the copy: a second compression as JPEG changes little
     farthest, nearest = limits.max(axis=1), limits.min(axis=1)
     limit = np.where(farthest < maximum, farthest, np.minimum(nearest, maximum))
-    return NearestPictures(row, distance, checked, distance <= limit)
+    return NearestPictures(row, checked, distance <= limit)

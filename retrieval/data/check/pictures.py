@@ -76,11 +76,6 @@ def small_images(records: ImageRecords, paths: Sequence[Path]) -> SmallImages:
     return np.array([records[path].small for path in paths], dtype=np.float32)
 
 
-def thumbnails(records: ImageRecords, paths: Sequence[Path]) -> list[Thumbnail]:
-    """Return the thumbnails of accepted photos or touches."""
-    return [one for path in paths if (one := records[path].thumbnail)]
-
-
 def fingers_of(grasps: Sequence[Grasp]) -> range:
     """Return the numbers of the fingers that every grasp has."""
     return range(min((len(grasp.touches) for grasp in grasps), default=0))

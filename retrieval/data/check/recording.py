@@ -15,7 +15,7 @@ from retrieval.console.output import abbreviate_list
 from retrieval.data.check import appearance
 from retrieval.data.check.drift import check_drift
 from retrieval.data.check.near_copies import nearest_pictures
-from retrieval.data.check.pictures import Finding, ImageRecords, findings_for, fingers_of, read_pictures, thumbnails
+from retrieval.data.check.pictures import Finding, ImageRecords, findings_for, fingers_of, read_pictures
 from retrieval.data.check.split import check_split
 from retrieval.data.dataset import Attempt, Grasp, Split, load_all_attempts, require_accepted
 
@@ -178,7 +178,8 @@ def _near_copies(grasps: Sequence[Grasp], records: ImageRecords, accepted: Seque
     counts, low_contact, left_out = [], 0, 0
     for kind, every in _by_kind(accepted).items():
         items = list(_by_kind(grasps).get(kind, {}).items())
-        found = nearest_pictures(thumbnails(records, [path for path, _ in items]), [one.object_id for _, one in items])
+        thumbnails = [one for path, _ in items if (one := records[path].thumbnail)]
+        found = nearest_pictures(thumbnails, [grasp.object_id for _, grasp in items])
         pairs: dict[tuple[int, ...], str] = {}
         for row in np.flatnonzero(found.copy).tolist():
             (path, grasp), (near, other) = items[row], items[found.row[row]]

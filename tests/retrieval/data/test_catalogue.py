@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from retrieval.data.catalogue import CatalogueTouch, SkippedPhoto, list_catalogue
-from retrieval.data.images import decode_rgb
+from retrieval.data.images import read_rgb
 from retrieval.data.naming import Naming
 from retrieval.errors import DatasetError, ImageError
 
@@ -78,7 +78,7 @@ def test_a_missing_folder_a_file_and_an_empty_folder_give_different_errors(tmp_p
     with pytest.raises(DatasetError, match="is a file"):
         list_catalogue(tmp_path / "file.png")
     (tmp_path / "empty" / "mug").mkdir(parents=True)
-    with pytest.raises(DatasetError, match=r"no photo \(\.avif, \.bmp, .*/empty, and no other file: put"):
+    with pytest.raises(DatasetError, match=r"no photo \(\.avif, \.bmp, .*/empty: put"):
         list_catalogue(tmp_path / "empty")
     with pytest.raises(
         DatasetError, match=r"only 1 other file\(s\) such as b\.txt; a\.gif: \.gif pictures are not read"
@@ -221,13 +221,13 @@ def test_broken_files_are_listed_and_reading_them_gives_the_reason(tmp_path):
     skipped = {}
     for photo_ in listed.photos:
         try:
-            decode_rgb(listed.read(photo_.path), photo_.path)
+            read_rgb(tmp_path / photo_.path)
         except ImageError as error:
             skipped[photo_.path] = error.reason
     assert list(skipped) == ["b.png", "c.png", "d.png", "e.png"]
     assert skipped["c.png"] == "the file is empty"
     assert skipped["d.png"] == "no such file"
-    assert skipped["e.png"].startswith("cannot be read: is a pipe, a device or a socket, not a regular file")
+    assert skipped["e.png"].startswith("cannot be read: is a folder, a pipe, a device or a socket, not a regular file")
 
 
 # Touches ---------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from PIL import Image
 from retrieval.data import preprocessing
 from retrieval.data.images import decode, decode_rgb
 from retrieval.data.preprocessing import Preprocessing
+from retrieval.data.resize import to_float
 from retrieval.errors import ImageError
 from retrieval.model.config import Config
 from retrieval.search.embeddings import _preprocess
@@ -51,21 +52,21 @@ def decoded(monkeypatch):
 @pytest.mark.parametrize("progressive", [False, True])
 def test_a_jpeg_is_decoded_as_small_as_its_shorter_side_may_be(min_side, shape, progressive):
     data = jpeg(600, 800, progressive=progressive)
-    assert decode_rgb(data, "x", min_side).shape[:2] == shape
+    assert decode(data, "x", min_side).shape[:2] == shape
 
 
 def test_other_formats_are_not_reduced_and_a_rotated_photo_is_turned_upright():
     buffer = io.BytesIO()
     Image.new("RGB", (400, 300)).save(buffer, "PNG")
-    assert decode_rgb(buffer.getvalue(), "x", 10).shape == (300, 400, 3)
+    assert decode(buffer.getvalue(), "x", 10).shape == (300, 400, 3)
     content = Image.Exif()
     content[274] = 6  # a quarter turn
-    assert decode_rgb(jpeg(1200, 1600, exif=content.tobytes()), "x", 300).shape == (400, 300, 3)
+    assert decode(jpeg(1200, 1600, exif=content.tobytes()), "x", 300).shape == (400, 300, 3)
 
 
 def test_a_reduced_pixel_is_nearly_the_mean_of_its_area():
     data = jpeg(800, 800)
-    whole, half = decode_rgb(data, "x"), decode_rgb(data, "x", 400)
+    whole, half = decode_rgb(data, "x"), to_float(decode(data, "x", 400))
     means = whole.reshape(400, 2, 400, 2, 3).mean(axis=(1, 3))
     assert np.abs(half - means).max() < 3 / 255
 

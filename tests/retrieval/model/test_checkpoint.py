@@ -123,7 +123,7 @@ def test_what_is_not_a_regular_file_is_refused_without_being_read(tmp_path):
     (tmp_path / "zero").symlink_to("/dev/zero")
     for read in (load_checkpoint, read_checkpoint_info, load_gate):
         for name in ("pipe", "zero", "."):
-            with pytest.raises(CheckpointError, match=r"not a regular file|is a folder, not a file"):
+            with pytest.raises(CheckpointError, match="not a regular file"):
                 read(tmp_path / name)
         with pytest.raises(CheckpointError, match=r"no .* at .*none\.safetensors"):
             read(tmp_path / "none.safetensors")

@@ -373,7 +373,7 @@ def test_a_path_that_is_not_a_file_is_refused_without_being_read_or_written(tmp_
     path.unlink()
     for make in (os.mkfifo, lambda there: os.symlink("/dev/zero", there), os.mkdir):
         make(path)
-        with pytest.raises(RecordingError, match=r"not a regular file|is a folder, not a file"):
+        with pytest.raises(RecordingError, match="not a regular file"):
             read_recording(tmp_path)
         with pytest.raises((RecordingError, StorageError)):
             RecordingWriter(tmp_path, INFO)
