@@ -43,12 +43,11 @@ def details(rng, name):
             "all_candidates": {name: rng.uniform() for name in OBJECTS},
         },
         "confusions": [{"object_id": OBJECTS[8], "mistaken_for": OBJECTS[9], "share": 0.4}],
-        "reliability": {kind: {"ece": 0.04, "bins": bins} for kind in ("pairs", "k5", "k10", "k5_g5")},
-        "calibration": {"pairs": {"1": {"slope": 0.9, "intercept": -0.1}}, "posteriors": {}},
+        "reliability": {kind: {"ece": 0.04, "bins": bins} for kind in ("pairs", "k5", "k10")},
+        "posterior": {"slope": 0.9, "offset": -0.1},
         "reject": {
             **{key: summary(rng) for key in ("auroc", "false_accepts_at_95", "balanced_accuracy")},
             "roc": curve,
-            "risk_coverage": curve,
         },
         "verification": verification() if name == "late_fusion" else None,
     }
@@ -83,7 +82,6 @@ def synthetic_protocol(methods):
         "labels": [[key, metric.label] for key, metric in METRICS.items()],
         "unit": "object",
         "recording": {"name": "lab", "source": "simulated rig", "digest": "ab" * 32, "objects": 12, "grasps": 36},
-        "features": {"touch": 1280, "photo": 1280, "fingers": 2, "digest": "cd" * 32},
         "folds": [[SPLIT]],
         "rows": {
             name: row | {"method": name, "measures": measures(rng), "details": details(rng, name)} for name in methods
@@ -108,7 +106,6 @@ def write_synthetic_results(out, methods):
     rows = {name: dict.fromkeys(names, number + 0.5) for number, name in enumerate(methods)}
     times = {
         "cpus": 2,
-        "threads": 1,
         "protocols": {PROTOCOL: {"tower_touch_ms": 14, "tower_photo_ms": 21, "rows": rows}},
     }
     out.mkdir(parents=True, exist_ok=True)

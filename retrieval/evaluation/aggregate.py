@@ -10,7 +10,6 @@ from retrieval.evaluation.protocol import Protocol, RecordingFacts
 from retrieval.evaluation.results import (
     Comparison,
     ControlResult,
-    FeatureCounts,
     ProtocolResult,
     RecordingResult,
     RowResult,
@@ -81,7 +80,6 @@ def protocol_result(
     compared: Iterable[tuple[str, str]],
     aggregation: Aggregation,
     reasons: Mapping[str, str] = MappingProxyType({}),
-    features: FeatureCounts | None = None,
 ) -> ProtocolResult:
     """Return the results of a protocol.
 
@@ -94,7 +92,6 @@ def protocol_result(
         compared: Pairs of rows whose paired differences are stated.
         aggregation: How measures are aggregated.
         reasons: Why a control or a ceiling was not measured.
-        features: Counts of the features.
     """
     controls = {
         kind: ControlResult(
@@ -120,7 +117,6 @@ def protocol_result(
             len(facts.names),
             len(facts.grasps),
         ),
-        features=features,
         folds=[[asdict(split) for split in splits] for splits in folds],
         rows={name: _measured(protocol, name, row, measures, aggregation) for name, row in rows.items()},
         controls={kind: one for kind, one in controls.items() if kind not in protocol.ceilings},

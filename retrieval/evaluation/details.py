@@ -1,7 +1,7 @@
 """Single objects and decisions of a method on one split: accuracy by object, confusions, calibration, rejection."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, softmax
 
-from retrieval.evaluation.queries import MethodScores, fit_posterior
+from retrieval.evaluation.queries import MethodScores
 from retrieval.evaluation.reject import reject
 from retrieval.evaluation.results import Confusion, Details, Rejection
 from retrieval.evaluation.verification import ErrorsByImpostors, verification_errors, verification_rates
@@ -18,14 +18,14 @@ from retrieval.methods.method import Method
 from retrieval.metrics.intervals import Summary, summarise
 from retrieval.metrics.measure import Measure
 from retrieval.metrics.pairs import reliability_bins
-from retrieval.metrics.registry import PHOTOS_PER_CANDIDATE, confusions, k_way
+from retrieval.metrics.registry import confusions, k_way
 from retrieval.metrics.table import ScoreTable, object_scores
 from retrieval.model.posterior import Posterior
 from retrieval.training.calibration import MIN_OBJECTS
 from retrieval.training.features import Features
 
-K_WAY_TESTS = {"k5": (5, 1, 1), "k10": (10, 1, 1), "k5_g5": (5, 5, PHOTOS_PER_CANDIDATE)}
-"""Tests of calibrated probabilities: candidates, grasps of a query, and photos of a candidate."""
+K_WAY_TESTS = {"k5": 5, "k10": 10}
+"""Tests of calibrated probabilities: number of candidates, of one photo each."""
 _CONFUSIONS = 12
 _PAIRS_OF_A_ROW = 8  # of each kind
 _TESTS_OF_A_ROW = 4
@@ -48,15 +48,8 @@ def describe(method: Method, scores: MethodScores, features: Features) -> SeedDe
         scores: Its scores.
         features: Features of all grasps, as the method takes them.
     """
-    seed, objects, test = scores.seed, scores.queries.objects, scores.touches("test", "test")
-    sizes = {grasps for _, grasps, _ in K_WAY_TESTS.values()} - {1}
-    validation = scores.sets("validation", sizes)
-    posteriors = {1: scores.posterior} | {size: fit_posterior(table, seed) for size, table in validation.items()}
-    fitted = {grasps: posterior for grasps, posterior in posteriors.items() if posterior}
-    accuracies = {
-        "test_candidates": k_way(test, 5, seed=seed),
-        "all_candidates": k_way(scores.touches(None, None), 5, seed=seed),
-    }
+    seed, objects, test, posterior = scores.seed, scores.queries.objects, scores.touches("test"), scores.posterior
+    accuracies = {"test_candidates": k_way(test, 5, seed=seed), "all_candidates": k_way(scores.touches(), 5, seed=seed)}
     details = Details(
         pair_threshold=scores.pair_threshold,
         per_object={
@@ -67,12 +60,12 @@ def describe(method: Method, scores: MethodScores, features: Features) -> SeedDe
         confusions=[
             Confusion(objects[true], objects[other], fraction) for true, other, fraction in confusions(test, seed=seed)
         ],
-        calibration={"posteriors": {str(grasps): posterior.to_dict() for grasps, posterior in fitted.items()}},
-        reliability=reliability(fitted, scores.sets("test", sizes) | {1: test}, seed=seed),
+        posterior=posterior.to_dict() if posterior else None,
+        reliability=reliability(posterior, test, seed=seed) if posterior else {},
     )
     return SeedDetails(
         details,
-        reject(fitted[1], test, seed=seed) if fitted and len(test.objects) >= MIN_OBJECTS else None,
+        reject(posterior, test, seed=seed) if posterior and len(test.objects) >= MIN_OBJECTS else None,
         verification_errors(scores, features, method.checkpoint) if type(method) is LateFusion else None,
     )
 
@@ -97,43 +90,39 @@ def draw_pairs(table: ScoreTable, seed: int) -> tuple[NDArray[np.float64], NDArr
     return np.concatenate(scores).astype(np.float64), np.repeat([1, 0], is_drawn.sum())
 
 
-def draw_k_way_tests(table: ScoreTable, k: int, photos: int, seed: int, posterior: Posterior) -> NDArray[np.float64]:
-    """Return logits (Q, k) of K-way tests, the true candidate first: 4 tests for each row with uniformly drawn rivals.
+def draw_k_way_tests(table: ScoreTable, k: int, seed: int) -> NDArray[np.float64]:
+    """Return scores (Q, k) of K-way tests, the true candidate first: 4 tests for each row with uniformly drawn rivals.
 
-    The posterior combines the scores of a candidate's photos. There must be at least k objects.
+    A candidate has one photo. There must be at least k objects.
     """
     targets = table.with_targets
-    scores = object_scores(targets, photos, _TESTS_OF_A_ROW, seed, posterior.object_logits)
+    scores = object_scores(targets, 1, _TESTS_OF_A_ROW, seed)
     # The true object gets the smallest key, so it always comes first.
     true = targets.touch_owner[:, None] == targets.objects
     keys = np.random.default_rng([seed, 2]).random(scores.shape) - true
     return np.take_along_axis(scores, np.argsort(keys, axis=2)[..., :k], 2).reshape(-1, k)
 
 
-def reliability(
-    posteriors: Mapping[int, Posterior], test: Mapping[int, ScoreTable], *, seed: int = 0
-) -> dict[str, Any]:
+def reliability(posterior: Posterior, test: ScoreTable, *, seed: int = 0) -> dict[str, Any]:
     """Return the reliability bins of calibrated probabilities on test objects.
 
     Args:
-        posteriors: The fitted posteriors, by number of grasps.
-        test: Scores of test objects, by number of grasps.
+        posterior: The fitted posterior.
+        test: Scores of touches of test objects.
         seed: Seed of the drawn pairs and tests.
 
     Returns:
-        "pairs": bins of match probabilities of single touches at even prior odds; and by name of `K_WAY_TESTS`:
-        probability of the top-1 candidate when one candidate is true (prior of none: 0) against its accuracy, where
-        tied candidates split the credit. Tests without a posterior or enough test objects are left out.
+        "pairs": bins of match probabilities at even prior odds; and by name of `K_WAY_TESTS`: probability of the top-1
+        candidate when one candidate is true (prior of none: 0) against its accuracy, where tied candidates split the
+        credit. Tests without enough test objects are left out.
     """
-    found = {}
-    if 1 in posteriors:
-        scores, labels = draw_pairs(test[1], seed)
-        found["pairs"] = reliability_bins(expit(posteriors[1].log_ratio(scores, 1)), labels)
-    for name, (k, grasps, photos) in K_WAY_TESTS.items():
-        if grasps in posteriors and grasps in test and len(test[grasps].objects) >= k:
-            logits = draw_k_way_tests(test[grasps], k, photos, seed, posteriors[grasps])
+    scores, labels = draw_pairs(test, seed)
+    found = {"pairs": reliability_bins(expit(posterior.log_ratio(scores, 1)), labels)}
+    for name, k in K_WAY_TESTS.items():
+        if len(test.objects) >= k:
+            logits = draw_k_way_tests(test, k, seed)
             tied = logits == logits.max(1, keepdims=True)
-            confidences = softmax(posteriors[grasps].slope * logits, axis=1).max(1)
+            confidences = softmax(posterior.slope * logits, axis=1).max(1)
             found[name] = reliability_bins(confidences, tied[:, 0] / tied.sum(1))
     return found
 
@@ -167,4 +156,4 @@ def combine(by_seed: Sequence[SeedDetails], seed: int) -> Details:
 def _rejection(by_seed: Sequence[Rejection[Measure]], seed: int) -> Rejection[Summary]:
     names = "auroc", "false_accepts_at_95", "balanced_accuracy"
     summaries = {name: summarise([getattr(one, name) for one in by_seed], seed=seed) for name in names}
-    return Rejection(**summaries, roc=by_seed[0].roc, risk_coverage=by_seed[0].risk_coverage)
+    return Rejection(**summaries, roc=by_seed[0].roc)

@@ -19,7 +19,7 @@ from retrieval.evaluation.results import ProtocolResult, ProtocolTimes, Results,
 from retrieval.evaluation.touch_to_touch import FROZEN, TouchToTouch, run_touch_to_touch
 from retrieval.methods import METHODS
 from retrieval.methods.method import Method
-from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.config import Config, named_config
 from retrieval.training.initial_weights import training_licences
 from retrieval.training.train import Trainer
@@ -146,7 +146,7 @@ def evaluate(
     )
     results = Results(setting, found, dict(skipped), __version__)
     write_results(out / "results.json", results)
-    write_results(out / "timings.json", Timings(os.cpu_count() or 1, 1, times))
+    write_results(out / "timings.json", Timings(os.cpu_count() or 1, times))
     return results
 
 
@@ -179,8 +179,7 @@ def _require_use(
 
 def _trained(facts: RecordingFacts, protocol: Protocol, towers: TowerEncoder, out: Path, quiet: bool) -> Checkpoint:
     """Train the towers on the split of the protocol, unless `out` has this model; return the checkpoint."""
-    path = out / "model.safetensors"
-    require_writable(path)
     (split,) = protocol.folds(facts, towers.config.training.seed)
     licences = training_licences(facts.folder, towers.config.training)
+    path = out / "model.safetensors"
     return Trainer(towers.config, split, facts.grasps, path, facts.source, licences=licences).run_or_reuse(quiet)

@@ -23,7 +23,7 @@ from retrieval.evaluation.details import SeedDetails, combine, describe
 from retrieval.evaluation.inputs import Row, TowerEncoder, thin_grasps
 from retrieval.evaluation.protocol import Protocol, RecordingFacts
 from retrieval.evaluation.queries import MethodScores, Queries, draw_queries, score_queries, timed
-from retrieval.evaluation.results import FeatureCounts, MethodTimes, ProtocolResult, ProtocolTimes, RowResult
+from retrieval.evaluation.results import MethodTimes, ProtocolResult, ProtocolTimes, RowResult
 from retrieval.methods import CHANCE, METHODS
 from retrieval.methods.late_fusion import LateFusion
 from retrieval.methods.method import Method, MethodSettings
@@ -37,7 +37,7 @@ from retrieval.version import __version__
 
 MAX_CONTROL_GRASPS = 12
 """Maximum number of grasps of one object whose images are encoded again for a control of a protocol in depth."""
-_FORMAT = 2  # raised if the same inputs give other outcomes
+_FORMAT = 3  # raised if the same inputs give other outcomes
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,7 +291,6 @@ class ProtocolRun:
             times["retrieve_rerank"] = replace(times["retrieve_rerank"], fit_s=times["late_fusion"].fit_s)
         splits = [split for of_seed in self.folds.values() for split in of_seed]
         ratio = sum(len(one.test) for one in splits) / sum(len(one.train + one.validation) for one in splits)
-        features = towers.inputs("touch")
         result = protocol_result(
             protocol,
             self.facts,
@@ -301,7 +300,6 @@ class ProtocolRun:
             [(self.rows[0].name, other.name) for other in self.rows[1:]],
             Aggregation(self.seeds[0], ratio if protocol.choices else None),
             reasons,
-            FeatureCounts(features.touch.shape[2], features.photo.shape[1], features.touch.shape[1], features.digest),
         )
         return result, ProtocolTimes(*_tower_times(towers), times)
 

@@ -1,7 +1,7 @@
 """Queries of an evaluation, drawn once for all methods, and the scores of a fitted method for them."""
 
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -128,10 +128,7 @@ def identification_trials(table: ScoreTable, seed: int = 0) -> IdentificationTri
 
 
 def fit_posterior(validation: ScoreTable, seed: int = 0) -> Posterior | None:
-    """Return the posterior (`retrieval.model.posterior`) of a table's rows; None for fewer than three objects.
-
-    A row may be a set of grasps: each method combines the scores of grasps in its own way.
-    """
+    """Return the posterior (`retrieval.model.posterior`) of a table's rows; None for fewer than three objects."""
     if len(validation.objects) < MIN_OBJECTS:
         return None
     return fit_posterior_to_trials([identification_trials(validation, seed)])
@@ -159,50 +156,30 @@ class MethodScores:
     seed: int
     allows_own_photos: bool = False
 
-    def touches(self, rows: str | None, columns: str | None) -> ScoreTable:
-        """Return the scores of the touches of one part of the objects with the photos of one part; None for all."""
-        words = f"{columns} objects" if columns else "objects of all parts"
+    def touches(self, part: str | None = None, *, all_photos: bool = False) -> ScoreTable:
+        """Return the scores of touches of one part of the objects with its photos or all; `part` None: of all parts."""
         singles = np.arange(len(self.queries.touches))[:, None]
-        return self._shown(self._table(self.scores, singles, rows, columns, words, "touches"))
+        return self._table(self.scores, singles, part, None if all_photos else part)
 
-    def sets(self, part: str, sizes: Collection[int] = SET_SIZES) -> dict[int, ScoreTable]:
-        """Return the scores of sets of grasps of these sizes with photos of the same part, by number of grasps.
-
-        Sizes without a set that has a target photo are left out.
-        """
-        queries = self.queries
-        tables = {
-            size: self._table(self.set_scores[size], sets, part, part, f"{part} objects", "sets of grasps")
-            for size, sets in queries.sets.items()
-            if size in sizes and len(queries.of_part(queries.touch_owner[sets[:, 0]], part))
-        }
-        return {size: self._shown(table) for size, table in tables.items() if table.has_target.any()}
-
-    def _table(
-        self,
-        scores: NDArray[np.float32],
-        sets: Rows,
-        part: str | None,
-        columns: str | None,
-        object_words: str,
-        row_words: str,
-    ) -> ScoreTable:
+    def _table(self, scores: NDArray[np.float32], sets: Rows, part: str | None, photo_part: str | None) -> ScoreTable:
         queries = self.queries
         owner = queries.touch_owner[sets[:, 0]]
-        rows, photos = queries.of_part(owner, part), queries.of_part(queries.photo_owner, columns)
-        own = (queries.own_photo[sets[rows]][:, :, None] == photos).any(1)
-        owners = owner[rows], queries.photo_owner[photos]
-        return ScoreTable(scores[np.ix_(rows, photos)], *owners, own, object_words, row_words)
-
-    def _shown(self, table: ScoreTable) -> ScoreTable:
-        return table.with_own() if self.allows_own_photos else table
+        rows, photos = queries.of_part(owner, part), queries.of_part(queries.photo_owner, photo_part)
+        own = (queries.own_photo[sets[rows]][:, :, None] == photos).any(1) & (not self.allows_own_photos)
+        return ScoreTable(scores[np.ix_(rows, photos)], owner[rows], queries.photo_owner[photos], own)
 
     def tables(self, with_threshold: bool) -> MethodScoreTables:
-        """Return the tables that metrics need; the pair threshold only if a metric uses it."""
+        """Return the tables that metrics need; the pair threshold only if a metric uses it.
+
+        Numbers of grasps without a set that has a target photo are left out.
+        """
+        sets = {
+            size: self._table(self.set_scores[size], sets, "test", "test") for size, sets in self.queries.sets.items()
+        }
         return MethodScoreTables(
-            test=self.touches("test", "test"),
-            all_objects=self.touches("test", None),
-            sets=self.sets("test"),
+            test=self.touches("test"),
+            all_objects=self.touches("test", all_photos=True),
+            sets={size: table for size, table in sets.items() if table.has_target.any()},
             threshold=self.pair_threshold.at if with_threshold else None,
             seed=self.seed,
         )
@@ -210,7 +187,7 @@ class MethodScores:
     @cached_property
     def posterior(self) -> Posterior | None:
         """The posterior of single touches, fitted on validation objects; None for too few of them."""
-        return fit_posterior(self.touches("validation", "validation"), self.seed)
+        return fit_posterior(self.touches("validation"), self.seed)
 
     @cached_property
     def pair_threshold(self) -> PairThreshold:
@@ -220,7 +197,7 @@ class MethodScores:
         """
         if (own := self.best_params.get("pair_threshold")) is not None:
             return PairThreshold(own, "the checkpoint")
-        count = len(self.touches("validation", "validation").with_targets.objects)
+        count = len(self.touches("validation").with_targets.objects)
         if count >= MIN_THRESHOLD_OBJECTS and self.posterior:
             return PairThreshold(self.posterior.threshold, "validation objects")
         needs = f"a threshold of the checkpoint, or one fitted on at least {MIN_THRESHOLD_OBJECTS} validation objects"

@@ -1,4 +1,4 @@
-"""Open-set rejection: detect objects that are not in the catalogue, and the risk of top-1 answers.
+"""Open-set rejection: detect objects that are not in the catalogue.
 
 Every row is scored twice: with its object in the gallery and without it. Both galleries have the same number of
 objects: a random rival is dropped from the gallery with the row's own object. In a larger gallery the best score is
@@ -50,8 +50,7 @@ def reject(posterior: Posterior, table: ScoreTable, *, seed: int = 0) -> Rejecti
     """
     targets = table.with_targets
     true = np.asarray(targets.touch_owner[:, None] == targets.objects)
-    pair = galleries(identification_trials(targets, seed).log_ratios(posterior), true, seed)
-    present, absent = map(statistic, pair)
+    present, absent = map(statistic, galleries(identification_trials(targets, seed).log_ratios(posterior), true, seed))
     weights = object_weights(targets.touch_owner)
     words = f"{table.gallery}; each query with its object in the gallery, and with a rival in its place"
 
@@ -63,7 +62,6 @@ def reject(posterior: Posterior, table: ScoreTable, *, seed: int = 0) -> Rejecti
         balanced_accuracy=measure(((present >= 0) + 1.0 - (absent >= 0)) / 2, 0.5),
         false_accepts_at_95=measure(false_accepts(present, absent, targets.touch_owner), TRUE_ACCEPTS),
         roc=_roc(present, absent, weights),
-        risk_coverage=_risk_coverage(np.concatenate(pair), np.tile(true, (2, 1)), np.tile(weights, 2) / 2),
     )
 
 
@@ -106,26 +104,8 @@ def _false_accept_rate(present: Floats, absent: Floats, owner: NDArray[np.int64]
 
 
 def _roc(present: Floats, absent: Floats, weights: Floats) -> list[list[float]]:
+    """Return at most 200 points of the curve, evenly spaced."""
     thresholds = np.unique(np.append(present, absent))[::-1]
     points = [[float(weights[part >= threshold].sum()) for part in (absent, present)] for threshold in thresholds]
-    return _thin_points([[0.0, 0.0], *points])
-
-
-def _risk_coverage(ratios: Floats, true: Bools, weights: Floats) -> list[list[float]]:
-    """Return the risk-coverage curve, in descending order of the top-1 probability; ties are answered together.
-
-    If several objects tie for top-1, each is equally likely to be the answer.
-    """
-    first = ratios == ratios.max(1, keepdims=True)
-    wrong = 1 - (first & true).sum(1) / first.sum(1)
-    # Log of the probability at even prior, which is 1 for all sure answers: odds of each object over 1 plus their sum.
-    confidences = ratios.max(1) - np.log(np.isfinite(ratios).sum(1)) - np.logaddexp(0, statistic(ratios))
-    levels, place = np.unique(-confidences, return_inverse=True)
-    answered, failed = (np.cumsum(np.bincount(place, part, len(levels))) for part in (weights, weights * wrong))
-    return _thin_points(np.stack([answered / answered[-1], failed / answered], axis=1).tolist())
-
-
-def _thin_points(points: list[list[float]]) -> list[list[float]]:
-    """Return at most 200 of the points, evenly spaced."""
-    chosen = np.unique(np.linspace(0, len(points) - 1, _CURVE_POINTS).round().astype(int))
-    return [points[place] for place in chosen]
+    chosen = np.unique(np.linspace(0, len(points), _CURVE_POINTS).round().astype(int))
+    return [[[0.0, 0.0], *points][place] for place in chosen]

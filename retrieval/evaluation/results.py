@@ -11,7 +11,7 @@ from retrieval.errors import BadInput
 from retrieval.metrics.intervals import Difference, Summary
 from retrieval.metrics.measure import Measure
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 """Schema version of results.json."""
 T = TypeVar("T")
 M = TypeVar("M", Measure, Summary)
@@ -58,15 +58,12 @@ class Rejection(Generic[M]):
         balanced_accuracy: Mean of true accept rate and true reject rate; a row is accepted if "one of these" is at
             least as likely as none, at even prior.
         roc: [false accept rate, true accept rate] of the first seed, from accepting none to accepting all.
-        risk_coverage: [fraction answered, top-1 error rate among these] of the first seed, from the most confident
-            answers to all. Half of the queries are without their object.
     """
 
     auroc: M
     false_accepts_at_95: M
     balanced_accuracy: M
     roc: list[list[float]]
-    risk_coverage: list[list[float]]
 
 
 @dataclass(frozen=True)
@@ -97,8 +94,8 @@ class Details:
         pair_threshold: The threshold of pair accuracy.
         per_object: Mean top-1 accuracy of 5 of each object: "test_candidates" among test objects, "all_candidates".
         confusions: The most frequent ones.
-        calibration: "posteriors" of the first seed, by number of grasps.
-        reliability: "pairs", "k5", "k10", "k5_g5" -> {"ece", "bins"}.
+        posterior: That of single touches, of the first seed; None with too few validation objects.
+        reliability: "pairs", "k5", "k10" -> {"ece", "bins"}; empty without a posterior.
         reject: None with too few objects.
         verification: Impostors ("random", "similar") -> number of grasps -> rates; None with too few objects, and for
             methods other than late fusion.
@@ -107,7 +104,7 @@ class Details:
     pair_threshold: PairThreshold
     per_object: dict[str, dict[str, float]]
     confusions: list[Confusion]
-    calibration: dict[str, Any]
+    posterior: dict[str, Any] | None
     reliability: dict[str, Any]
     reject: Rejection[Summary] | None = None
     verification: dict[str, dict[str, VerificationRates]] | None = None
@@ -170,16 +167,6 @@ class RecordingResult:
 
 
 @dataclass(frozen=True)
-class FeatureCounts:
-    """Features of the towers of the first row: of one finger, of a photo; number of fingers; their digest."""
-
-    touch: int
-    photo: int
-    fingers: int
-    digest: str
-
-
-@dataclass(frozen=True)
 class ProtocolResult:
     """Results of one protocol, described in `rule`.
 
@@ -187,7 +174,6 @@ class ProtocolResult:
         main: The measure that decides.
         labels: Measure and label, in the order of tables.
         unit: What intervals resample: "object" or "sequence"; or "choice", if they cover choices of test objects.
-        features: None for touch to touch.
         folds: The splits of each seed; one list if all seeds have the same splits.
         rows: Rows by name, in the order of tables.
         controls: Controls by name.
@@ -202,7 +188,6 @@ class ProtocolResult:
     labels: list[tuple[str, str]]
     unit: str
     recording: RecordingResult
-    features: FeatureCounts | None
     folds: list[list[dict[str, Any]]]
     rows: dict[str, RowResult]
     controls: dict[str, ControlResult]
@@ -262,10 +247,9 @@ class ProtocolTimes:
 
 @dataclass(frozen=True)
 class Timings:
-    """Content of timings.json: CPUs of the machine, threads of a measurement, and times by protocol."""
+    """Content of timings.json: CPUs of the machine, and times by protocol, on one thread."""
 
     cpus: int
-    threads: int
     protocols: dict[str, ProtocolTimes]
 
 

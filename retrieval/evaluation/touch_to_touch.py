@@ -13,7 +13,6 @@ sequences is the cosine of their first principal components; scaling and compone
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -98,11 +97,18 @@ def leave_one_out_scores(vectors: Vectors, components: int = COMPONENTS) -> NDAr
 
 @dataclass(frozen=True, eq=False)
 class Sequences:
-    """The sequences of a recording in the order of capture: name, object, and places of the grasps of each."""
+    """The sequences of a recording in the order of capture.
+
+    Attributes:
+        grasps: The grasps.
+        names: Name of each sequence.
+        owner: (S,) object number of each sequence, in the order of the sorted names.
+        rows: Places of the grasps of each.
+    """
 
     grasps: Sequence[Grasp]
     names: tuple[str, ...]
-    objects: tuple[str, ...]
+    owner: NDArray[np.int64]
     rows: tuple[NDArray[np.int64], ...]
 
     @classmethod
@@ -115,20 +121,14 @@ class Sequences:
         places: dict[tuple[str, str], list[int]] = {}
         for place, grasp in enumerate(grasps):
             places.setdefault((grasp.object_id, grasp.sequence_id or grasp.grasp_id), []).append(place)
-        objects = [name for name, _ in places]
-        single = sorted({name for name in objects if objects.count(name) < 2})
-        if single or len(set(objects)) < 2:
+        objects, owner, counts = np.unique([name for name, _ in places], return_inverse=True, return_counts=True)
+        if len(objects) < 2 or counts.min() < 2:
             raise DatasetError(
-                "Touch to touch needs at least 2 objects with 2 sequences each, but "
-                + (f"{single[0]} has 1 sequence." if single else f"the recording has {len(set(objects))} object(s).")
+                f"Touch to touch needs at least 2 objects with 2 sequences each, but the recording has {len(objects)} "
+                f"object(s), and {objects[counts.argmin()]} has {counts.min()} sequence(s)."
             )
         rows = tuple(np.array(each, np.int64) for each in places.values())
-        return cls(grasps, tuple(name for _, name in places), tuple(objects), rows)
-
-    @cached_property
-    def owner(self) -> NDArray[np.int64]:
-        """(S,) object number of each sequence, in the order of the sorted names."""
-        return np.unique(np.array(self.objects), return_inverse=True)[1].astype(np.int64)
+        return cls(grasps, tuple(name for _, name in places), owner, rows)
 
     def mean(self, features: NDArray[np.float32]) -> Vectors:
         """Return the mean (S, F) of features (G, F) over the grasps of each sequence."""
@@ -143,7 +143,7 @@ class Sequences:
         """
         owner = self.owner if owner is None else owner
         own = np.eye(len(owner), dtype=np.bool_)
-        table = ScoreTable(scores, owner, owner, own, row_words="sequences", column_words="sequences")
+        table = ScoreTable(scores, owner, owner, own, "sequences")
         tables = MethodScoreTables(table, table, {}, None, 0)
         found = {name: metric.compute(tables) for name, metric in protocol.measures.items()}
         return {name: pooled([one]) for name, one in found.items() if one}
@@ -153,9 +153,6 @@ def with_common_frame(grasps: Sequence[Grasp], folder: Path, *, quiet: bool = Tr
     """Return the grasps with images of their contact differences on one common no-contact frame, that of the first.
 
     An image is common + touch - no-contact frame, clipped to 8 bits. It is written to `folder`, unless it exists.
-
-    Raises:
-        DatasetError: The frames differ in size.
     """
     common = [read_rgb(path) for path in grasps[0].backgrounds]
     folder.mkdir(parents=True, exist_ok=True)
@@ -166,14 +163,8 @@ def with_common_frame(grasps: Sequence[Grasp], folder: Path, *, quiet: bool = Tr
             for finger, (touch, before) in enumerate(zip(grasp.touches, grasp.backgrounds, strict=True)):
                 path = folder / f"{grasp.grasp_id}-{finger}.png"
                 if not path.is_file():
-                    pressed, no_contact, shared = read_rgb(touch), read_rgb(before), common[finger]
-                    if not pressed.shape == no_contact.shape == shared.shape:
-                        raise DatasetError(
-                            f"{touch}, its no-contact frame and the first no-contact frame of the recording must have "
-                            f"the same size, got {pressed.shape}, {no_contact.shape} and {shared.shape}."
-                        )
-                    image = np.clip(np.rint(255 * (shared + pressed - no_contact)), 0, 255).astype(np.uint8)
-                    write_atomically(path, encode_image(image))
+                    image = np.rint(255 * (common[finger] + read_rgb(touch) - read_rgb(before)))
+                    write_atomically(path, encode_image(np.clip(image, 0, 255).astype(np.uint8)))
                 files.append(path)
             found.append(dataclasses.replace(grasp, touches=tuple(files), backgrounds=grasps[0].backgrounds))
             bar.advance()

@@ -50,9 +50,9 @@ def verification_errors(scores: MethodScores, features: Features, checkpoint: Ch
         The errors; None for fewer than three test objects, or for a model without posterior and fewer than three
         validation objects.
     """
-    queries, posterior, test = scores.queries, checkpoint.posterior, scored_touches(scores.touches("test", "test"))
+    queries, posterior, test = scores.queries, checkpoint.posterior, scored_touches(scores.touches("test"))
     if posterior is None:
-        validation = scored_touches(scores.touches("validation", "validation"))
+        validation = scored_touches(scores.touches("validation"))
         if validation.has_trials:
             posterior = fit_posterior(validation, seed=scores.seed)
     if posterior is None or not test.has_trials:

@@ -72,6 +72,3 @@ class Cca(Method):
 
     def _encode_photo(self, photo: Array) -> Array:
         return unit_rows(self._standardise[1](photo) @ self._maps[1])
-
-    def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
-        return touch_encodings @ photo_encodings.T

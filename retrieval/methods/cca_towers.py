@@ -42,6 +42,3 @@ class CcaTowers(Method):
 
     def _encode_photo(self, photo: Array) -> Array:
         return unit_rows(self._projections.photo(photo))
-
-    def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
-        return touch_encodings @ photo_encodings.T

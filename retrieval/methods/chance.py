@@ -28,9 +28,6 @@ class Chance(Method):
     def _encode_photo(self, photo: Array) -> Array:
         return self._directions(1, photo)
 
-    def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
-        return touch_encodings @ photo_encodings.T
-
     def _directions(self, modality: int, items: Array) -> Array:
         drawn = np.empty((len(items), DIM), dtype=np.float32)
         for row, item in enumerate(items):

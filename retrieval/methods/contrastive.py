@@ -134,11 +134,10 @@ class ObjectSampler:
         self._counts = torch.bincount(owner)
         self._starts = self._counts.cumsum(0) - self._counts
         self._generator = generator
-        self.objects = len(self._counts)
 
     def distinct_objects(self, count: int) -> Tensor:
         """Return (count,) objects, each at most once."""
-        return torch.randperm(self.objects, generator=self._generator)[:count]
+        return torch.randperm(len(self._counts), generator=self._generator)[:count]
 
     def rows(self, objects: Tensor) -> Tensor:
         """Return one row of each of `objects` (any shape), uniformly."""

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 
 from retrieval.data.dataset import Grasp, Split
-from retrieval.errors import BadInput
 from retrieval.methods.method import Array, Method, MethodSettings
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
@@ -35,8 +34,8 @@ class LateFusion(Method):
         method._use_checkpoint(checkpoint)
         if checkpoint.posterior is not None:  # the logit at which the likelihood ratio is 1
             method.best_params["pair_threshold"] = checkpoint.posterior.threshold
-        fingers, touch, photo = _feature_counts(checkpoint.matcher)
-        method._shapes = (fingers, touch), (photo,)
+        matcher = checkpoint.matcher
+        method._shapes = (matcher.config.fingers, matcher.touch_tower.output_count), (matcher.photo_feature_count,)
         return method
 
     def _fit(self, train: Features, validation: Features) -> None:
@@ -66,7 +65,6 @@ def trained_checkpoint(settings: MethodSettings, train: Features, validation: Fe
     encoder, because every photo is scored.
 
     Raises:
-        BadInput: The features are not from such towers.
         JobInterrupted: The user pressed Ctrl-C.
     """
     known = train.concatenate(validation)
@@ -86,12 +84,6 @@ def trained_checkpoint(settings: MethodSettings, train: Features, validation: Fe
     with nullcontext(settings.folder) if settings.folder else tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"late_fusion-{settings.seed}.safetensors"
         trainer = Trainer(config, split, grasps, path, SOURCE, known)
-        expected, got = _feature_counts(trainer.matcher), (*known.touch.shape[1:], *known.photo.shape[1:])
-        if expected != got:
-            raise BadInput(
-                f"late fusion takes features of its own towers, {expected[1]} of a finger and {expected[2]} of a photo "
-                f"({config.matcher.tower}, {config.matcher.tower_output}); got {got[1]} and {got[2]}; use these towers"
-            )
         towers = frozen_matcher(settings.config)
         trainer.matcher.touch_tower.load_state_dict(towers.touch_tower.state_dict())
         trainer.matcher.photo_tower.load_state_dict(towers.photo_tower.state_dict())
@@ -106,8 +98,3 @@ def frozen_matcher(config: Config) -> Matcher:
     """
     torch.manual_seed(config.training.seed)
     return build_matcher(config).eval()
-
-
-def _feature_counts(matcher: Matcher) -> tuple[int, int, int]:
-    """Return the fingers, the features of one finger, and the features of a photo."""
-    return matcher.config.fingers, matcher.touch_tower.output_count, matcher.photo_feature_count

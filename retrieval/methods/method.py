@@ -1,4 +1,4 @@
-"""Base class of every method; a method only implements `_fit`, `_encode_touch`, `_encode_photo` and `_score`."""
+"""Base class of every method; a method implements `_fit`, `_encode_touch`, `_encode_photo`, and possibly `_score`."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -79,11 +79,8 @@ class Method(ABC):
         """Fit on the grasps of training objects; choose settings on those of validation objects.
 
         Raises:
-            BadInput: One of the two has fewer than two objects, or they have a common object.
+            BadInput: The two have a common object.
         """
-        for name, part in (("training", train), ("validation", validation)):
-            if (count := len(set(part.object_ids))) < 2:
-                raise BadInput(f"a method is fitted on at least 2 {name} objects; got {count}; record more objects")
         if shared := set(train.object_ids) & set(validation.object_ids):
             raise BadInput(
                 f"training and validation objects must differ; {min(shared)!r} is in both; split the grasps by object"
@@ -100,7 +97,10 @@ class Method(ABC):
         return self._encode_photo(_checked("photo features", photo, None, *self._fitted_shapes()[1]))
 
     def score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
-        """Return scores (T, N) of every touch with every photo. Raises NumericalError for one that is not finite."""
+        """Return scores (T, N) of every touch with every photo: by default, inner products of the encodings.
+
+        Raises NumericalError for a score that is not finite.
+        """
         scores = self._score(touch_encodings, photo_encodings)
         return _checked("scores", scores, len(touch_encodings), len(photo_encodings))
 
@@ -122,8 +122,8 @@ class Method(ABC):
     @abstractmethod
     def _encode_photo(self, photo: Array) -> Array: ...
 
-    @abstractmethod
-    def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array: ...
+    def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
+        return touch_encodings @ photo_encodings.T
 
     def _score_sets(self, touch_encodings: Array, photo_encodings: Array, sets: NDArray[np.int64]) -> Array:
         used, place = np.unique(sets, return_inverse=True)

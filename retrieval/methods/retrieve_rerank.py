@@ -48,7 +48,7 @@ class RetrieveRerank(LateFusion):
         touch_partials, partials, nearness = self._parts(touch_encodings, photo_encodings)
         scores, scorer = [], self._matcher.head.scorer
         for touch_partial, near in zip(touch_partials, nearness, strict=True):
-            rows = nearest_photos(near[None], self._count(len(partials)))
+            rows = self._nearest(near[None])
             scores.append(merge_scores(near[None], rows, scorer.logits(touch_partial[None], partials, rows)))
         return np.array(scores)
 
@@ -59,7 +59,7 @@ class RetrieveRerank(LateFusion):
         logits = super()._score(touch_partials, partials)
         scores = []
         for members in place.reshape(sets.shape):
-            rows = nearest_photos(nearness[members], self._count(len(partials)))
+            rows = self._nearest(nearness[members])
             summed = logits[np.ix_(members, rows)].sum(0, dtype=np.float64).astype(np.float32)
             scores.append(merge_scores(nearness[members], rows, summed))
         return np.array(scores)
@@ -70,8 +70,10 @@ class RetrieveRerank(LateFusion):
         nearness = touch_encodings[:, touch:] @ photo_encodings[:, photo:].T
         return touch_encodings[:, :touch], np.ascontiguousarray(photo_encodings[:, :photo]), nearness
 
-    def _count(self, photos: int) -> int:
-        return max(1, round(self.reranked_fraction * photos))
+    def _nearest(self, nearness: Array) -> NDArray[np.int64]:
+        """Return the photos to rerank, nearest to all grasps together, from nearness (G, N); among ties the first."""
+        count = max(1, round(self.reranked_fraction * nearness.shape[1]))
+        return np.sort(np.argsort(-nearness.sum(0), kind="stable")[:count])
 
 
 def merge_scores(nearness: Array, rows: NDArray[np.int64], logits: Array) -> Array:
@@ -79,8 +81,3 @@ def merge_scores(nearness: Array, rows: NDArray[np.int64], logits: Array) -> Arr
     scores = logits.min() - 1 - (1 - nearness.mean(0))
     scores[rows] = logits
     return np.asarray(scores)
-
-
-def nearest_photos(nearness: Array, count: int) -> NDArray[np.int64]:
-    """Return the `count` photos nearest to all grasps together, from nearness (G, N); among ties the first rows."""
-    return np.sort(np.argsort(-nearness.sum(0), kind="stable")[:count])

@@ -133,9 +133,8 @@ def compare(a: Sequence[Measure], b: Sequence[Measure], *, seed: int = 0) -> Dif
     all flips, else random ones (Phipson and Smyth 2010: p is never 0). The p-value is 1 for one object or no
     difference. Each method has one measure per training seed. Raises BadInput unless all have the same queries.
     """
-    if not np.array_equal(a[0].owner, b[0].owner):
-        raise BadInput("compared methods must have the same queries; score both on the same queries")
-    differences = _object_means(a).mean(0)[:, 0] - _object_means(b).mean(0)[:, 0]
+    means = _object_means([*a, *b])[..., 0]
+    differences = means[: len(a)].mean(0) - means[len(a) :].mean(0)
     low, high = bootstrap_interval(differences[:, None], seed=seed)
     return Difference(
         value=float(differences.mean()),
@@ -146,7 +145,7 @@ def compare(a: Sequence[Measure], b: Sequence[Measure], *, seed: int = 0) -> Dif
     )
 
 
-def sign_flip_p(differences: NDArray[np.float64], *, draws: int = DRAWS, seed: int = 0) -> float:
+def sign_flip_p(differences: NDArray[np.float64], *, seed: int = 0) -> float:
     """Return the fraction of sign flips of the differences (R,) whose mean is at least as far from 0 as observed."""
     observed = abs(differences.sum())
     # Sums of the same numbers in another order differ by rounding; they are treated as equal.
@@ -156,8 +155,8 @@ def sign_flip_p(differences: NDArray[np.float64], *, draws: int = DRAWS, seed: i
         for difference in differences[1:]:
             sums = np.concatenate([sums + difference, sums - difference])
         return float((np.abs(sums) >= threshold).mean())
-    signs = np.random.default_rng(seed).choice((-1.0, 1.0), (draws, len(differences)))
-    return float((1 + (np.abs(signs @ differences) >= threshold).sum()) / (1 + draws))
+    signs = np.random.default_rng(seed).choice((-1.0, 1.0), (DRAWS, len(differences)))
+    return float((1 + (np.abs(signs @ differences) >= threshold).sum()) / (1 + DRAWS))
 
 
 # Splits ----------------------------------------------------------------------------------------------------
@@ -224,12 +223,12 @@ def grouped_interval(correct: Sequence[Sequence[bool]]) -> tuple[float, float]:
     return binomial_interval(fraction * effective, effective)
 
 
-def binomial_interval(successes: float, trials: float, level: float = 0.95) -> tuple[float, float]:
+def binomial_interval(successes: float, trials: float) -> tuple[float, float]:
     """Return the exact interval of a proportion (Clopper and Pearson 1934): conservative for independent trials.
 
     The numbers need not be whole.
     """
-    tail = (1 - level) / 2
+    tail = (1 - LEVEL) / 2
     low = betaincinv(successes, trials - successes + 1, tail) if successes else 0.0
     high = betaincinv(successes + 1, trials - successes, 1 - tail) if successes < trials else 1.0
     return float(low), float(high)

@@ -62,7 +62,7 @@ def _rival_weights(table: ScoreTable) -> NDArray[np.float64]:
     weights = np.where(table.relevant, 0, columns)
     total = weights.sum(1, keepdims=True)
     if not total.all():
-        raise BadInput(f"a test needs {table.column_words} of at least two objects; a row has only those of one object")
+        raise BadInput(f"a test needs {table.items} of at least two objects; a row has only those of one object")
     return np.asarray(weights / total)
 
 
@@ -171,11 +171,6 @@ class Metric:
     section: str
     compute: Callable[[MethodScoreTables], Measure | None]
     short_label: str = ""
-
-    @property
-    def column(self) -> str:
-        """Heading in its table."""
-        return self.short_label or self.label
 
 
 def grasps_metric_name(count: int) -> str:

@@ -1,6 +1,5 @@
 """Score tables with the objects of rows and columns, and object scores drawn from them."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -20,9 +19,7 @@ class ScoreTable:
         photo_owner: (N,) object of each column.
         own: (T, N) whether the photo was taken in a grasp of that row. The row's gallery excludes these photos, unless
             a protocol includes them.
-        object_words: Noun for the objects in descriptions of the gallery.
-        row_words: The same for the rows.
-        column_words: The same for the columns.
+        items: Noun for the columns in descriptions of the gallery.
 
     Raises:
         NumericalError: A score is not finite: in descending order a NaN would come first.
@@ -32,9 +29,7 @@ class ScoreTable:
     touch_owner: NDArray[np.int64]
     photo_owner: NDArray[np.int64]
     own: NDArray[np.bool_]
-    object_words: str = "objects"
-    row_words: str = "touches"
-    column_words: str = "photos"
+    items: str = "photos"
 
     def __post_init__(self) -> None:
         bad = np.argwhere(~np.isfinite(self.scores))
@@ -59,8 +54,8 @@ class ScoreTable:
         """The table of the rows with `has_target`. Raises BadInput if there is none."""
         if not self.has_target.any():
             raise BadInput(
-                f"as queries, {self.row_words} need {self.column_words} of their object from another grasp; none has "
-                "any; record more grasps of each object"
+                f"queries need {self.items} of their object from another grasp; none has any; record more grasps of "
+                "each object"
             )
         return self if self.has_target.all() else self.select(self.has_target, np.arange(len(self.photo_owner)))
 
@@ -68,9 +63,9 @@ class ScoreTable:
     def gallery(self) -> str:
         """Description of the searched items."""
         own = "those of the same grasp left out" if self.own.any() else "those of the same grasp included"
-        words = f"{len(self.objects)} {self.object_words}, {len(self.photo_owner)} {self.column_words}; {own}"
+        words = f"{len(self.objects)} objects, {len(self.photo_owner)} {self.items}; {own}"
         missing = np.count_nonzero(~self.has_target)
-        return words + (f"; {missing} {self.row_words} left out, which have no other" if missing else "")
+        return words + (f"; {missing} queries left out, which have no other" if missing else "")
 
     @cached_property
     def objects(self) -> NDArray[np.int64]:
@@ -87,23 +82,15 @@ class ScoreTable:
 
     def transposed(self) -> "ScoreTable":
         """Return the table with photos as queries and touches as gallery."""
-        owners = self.photo_owner, self.touch_owner
-        return ScoreTable(self.scores.T, *owners, self.own.T, self.object_words, self.column_words, self.row_words)
+        return ScoreTable(self.scores.T, self.photo_owner, self.touch_owner, self.own.T, "touches")
 
     def with_own(self) -> "ScoreTable":
         """Return the table for a protocol whose galleries include a row's own photos."""
         return replace(self, own=np.zeros_like(self.own))
 
 
-Pooling = Callable[[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]]
-"""Function of the scores of photos (P,), the row of each (P,) and their number by row (T,); returns the rows' scores
-(T,)."""
-
-
-def object_scores(
-    table: ScoreTable, photos: int, draws: int, seed: int, pool: Pooling | None = None
-) -> NDArray[np.float64]:
-    """Return scores (draws, T, O) of rows of `with_targets` with `table.objects`.
+def object_scores(table: ScoreTable, photos: int, draws: int, seed: int) -> NDArray[np.float64]:
+    """Return mean scores (draws, T, O) of rows of `with_targets` with photos of `table.objects`.
 
     Each object is represented by photos that are drawn without replacement, never a row's own; an object with fewer
     photos uses all of them. The draws depend on the seed and on the owners, never on scores, so all methods get the
@@ -114,8 +101,6 @@ def object_scores(
         photos: Photos of each object.
         draws: Repetitions.
         seed: Seed of the draws.
-        pool: Combines the scores of the photos, such as a posterior's logit of the object
-            (`Posterior.object_logits`); None for their mean.
     """
     rng = np.random.default_rng([seed, photos])
     found = np.empty((draws, len(table.touch_owner), len(table.objects)))
@@ -123,38 +108,25 @@ def object_scores(
         for place, name in enumerate(table.objects):
             columns = rng.permutation(np.flatnonzero(table.photo_owner == name))
             mine = np.flatnonzero(table.touch_owner == name)
-            found[draw, :, place] = _pooled_scores(*_window(table.scores, columns, photos, rng), pool)
-            found[draw, mine, place] = _pooled_scores(*_without_own(table, mine, columns, photos, rng), pool)
+            found[draw, :, place] = _window_means(table.scores, columns, photos, rng)
+            found[draw, mine, place] = _means_without_own(table, mine, columns, photos, rng)
     return found
 
 
-GalleryScores = tuple[NDArray[np.float64], NDArray[np.bool_]]
-"""Scores (T, p) of rows with photos of one object, and whether each is in the row's gallery."""
-
-
-def _window(
+def _window_means(
     scores: NDArray[np.float32], columns: NDArray[np.int64], photos: int, rng: np.random.Generator
-) -> GalleryScores:
+) -> NDArray[np.float64]:
     """Give every row its own window over the shuffled columns: sampling without replacement at low cost."""
     start = rng.integers(len(columns), size=len(scores))
     window = (start[:, None] + np.arange(min(photos, len(columns)))) % len(columns)
-    found = scores[np.arange(len(scores))[:, None], columns[window]].astype(np.float64)
-    return found, np.ones(found.shape, dtype=bool)
+    return np.asarray(scores[np.arange(len(scores))[:, None], columns[window]].mean(1, dtype=np.float64))
 
 
-def _without_own(
+def _means_without_own(
     table: ScoreTable, mine: NDArray[np.int64], columns: NDArray[np.int64], photos: int, rng: np.random.Generator
-) -> GalleryScores:
-    """Return photos for the object's own rows: in a random order per row, its own ones last and not in the gallery."""
+) -> NDArray[np.float64]:
+    """Draw photos for the object's own rows: in a random order per row, its own ones last and not in the mean."""
     own, scores = table.own[mine][:, columns], table.scores[mine][:, columns].astype(np.float64)
     order = np.argsort(rng.random(own.shape) + own, axis=1)[:, :photos]
-    return np.take_along_axis(scores, order, 1), ~np.take_along_axis(own, order, 1)
-
-
-def _pooled_scores(
-    scores: NDArray[np.float64], in_gallery: NDArray[np.bool_], pool: Pooling | None
-) -> NDArray[np.float64]:
-    """Return the scores (T,) of each row with the photos in its gallery."""
-    if pool is None:
-        return np.asarray((scores * in_gallery).sum(1) / in_gallery.sum(1))
-    return pool(scores[in_gallery], np.nonzero(in_gallery)[0], in_gallery.sum(1))
+    in_gallery = ~np.take_along_axis(own, order, 1)
+    return np.asarray((np.take_along_axis(scores, order, 1) * in_gallery).sum(1) / in_gallery.sum(1))

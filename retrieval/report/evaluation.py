@@ -238,18 +238,12 @@ def _reliability(view: ProtocolView, name: str, details: Details) -> Iterator[Bl
 def _reject(view: ProtocolView) -> Blocks:
     found = {name: details.reject for name, details in view.details.items() if details.reject}
     if found:
-        descriptions = [
-            f"{view.label(name)} {percent(one.auroc.value[0])} % "
-            f"({percent(one.risk_coverage[-1][1])} % wrong if all queries are answered)"
-            for name, one in found.items()
-        ]
+        areas = ", ".join(f"{view.label(name)} {percent(one.auroc.value[0])} %" for name, one in found.items())
         yield Picture(
             view.figure_name("reject"),
-            f"ROC curves, and risk against coverage; areas under the ROC curves: {', '.join(descriptions)}.",
-            "Each query is used twice: with its object in the gallery, and without it. Left: ROC curve of the decision "
-            "that the gallery contains the object; the grey line marks 95 % true accepts. Right: fraction of wrong "
-            "top-1 answers; half of the queries have no right answer, so a method that answers all of them ends on or "
-            "above the grey line.",
+            f"ROC curves; areas under them: {areas}.",
+            "Each query is used twice: with its object in the gallery, and without it. ROC curve of the decision that "
+            "the gallery contains the object; the grey line marks 95 % true accepts.",
             lambda: plots.reject(view),
         )
         yield tables.rejects(view, found)
@@ -273,11 +267,8 @@ def _verification(view: ProtocolView) -> Blocks:
 
 
 def _recording(view: ProtocolView) -> Blocks:
-    recording, features = view.result.recording, view.result.features
+    recording = view.result.recording
     rows = [("recording", f"{recording.name} ({recording.source})"), ("digest of the recording", recording.digest)]
-    if features:
-        words = f"touch {features.touch} x {features.fingers} finger(s), photo {features.photo}"
-        rows += [("features", words), ("digest of the features", features.digest)]
     yield Table(("property", "value"), tuple(rows), words=frozenset({1}))
     if len(view.result.folds[0]) == 1:
         yield Section("Objects of each part", (tables.split(view.result.folds[0][0]),))

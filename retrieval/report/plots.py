@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from retrieval.methods import CHANCE
 from retrieval.metrics.intervals import Summary
@@ -11,7 +10,6 @@ from retrieval.metrics.registry import SET_SIZES, grasps_metric_name
 from retrieval.report.canvas import (
     MUTED_COLOUR,
     PART_COLOURS,
-    Axes,
     Figure,
     canvas,
     logarithmic,
@@ -130,7 +128,6 @@ RELIABILITIES = {
     "pairs": "one touch, one photo, even odds",
     "k5": "5 candidates, one grasp",
     "k10": "10 candidates, one grasp",
-    "k5_g5": "5 candidates, 3 photos, 5 grasps",
 }
 
 
@@ -152,29 +149,22 @@ def reliability(view: ProtocolView, row: str) -> Figure:
 
 
 def reject(view: ProtocolView) -> Figure:
-    """Plot the ROC curve of "the catalogue contains the object", and the top-1 risk against coverage."""
-    figure = canvas(10.5, 4.4)
-    accepts, risk = figure.subplots(1, 2)
+    """Plot the ROC curve of "the catalogue contains the object"."""
+    figure = canvas(6.5, 4.4)
+    panel = figure.subplots()
     rejections = {name: details.reject for name, details in view.details.items() if details.reject}
     for name, rejection in reversed(rejections.items()):
-        _curve(accepts, name, 100 * np.array(rejection.roc))
-        _curve(risk, name, 100 * np.array(rejection.risk_coverage))
-    accepts.plot([0, 100], [0, 100], color=MUTED_COLOUR, ls="--", lw=1.2)
-    accepts.axhline(95, color=MUTED_COLOUR, lw=0.8)
-    accepts.set(xlabel="accepted, object absent (false accepts), %", ylabel="accepted, object present, %")
-    risk.axhline(50, color=MUTED_COLOUR, lw=0.8)
-    risk.set(xlabel="answered queries, most confident first, %", ylabel="wrong top-1 answers among these, %")
-    for panel in (accepts, risk):
-        panel.set(xlim=(-1, 101), ylim=(-1, 101))
-        panel.set_aspect("equal", adjustable="box")
+        points, style = 100 * np.array(rejection.roc), style_of(name)
+        panel.plot(*points.T, color=style.colour, ls=style.line)
+        step = max(1, len(points) // 6)  # a curve of many corners, with a few markers
+        panel.plot(*points[step:-1:step].T, style.marker, color=style.colour, ms=5)
+    panel.plot([0, 100], [0, 100], color=MUTED_COLOUR, ls="--", lw=1.2)
+    panel.axhline(95, color=MUTED_COLOUR, lw=0.8)
+    panel.set(xlabel="accepted, object absent (false accepts), %", ylabel="accepted, object present, %")
+    panel.set(xlim=(-1, 101), ylim=(-1, 101))
+    panel.set_aspect("equal", adjustable="box")
     _legend(figure, view, list(rejections))
     return figure
-
-
-def _curve(panel: Axes, row: str, points: NDArray[np.float64]) -> None:  # of many corners, with a few markers
-    style, step = style_of(row), max(1, len(points) // 6)
-    panel.plot(*points.T, color=style.colour, ls=style.line)
-    panel.plot(*points[step:-1:step].T, style.marker, color=style.colour, ms=5)
 
 
 # Time ------------------------------------------------------------------------------------------------

@@ -51,7 +51,8 @@ def _marked(header: Row, rows: Iterable[Row], notes: Sequence[str] = (), words: 
 def section(view: ProtocolView, name: str) -> Table | None:
     """Return the measures of a section; a protocol with few measures has all of them in the section "main"."""
     if view.details:
-        return measures(view, {key: metric.column for key, metric in METRICS.items() if metric.section == name})
+        shown = {key: metric for key, metric in METRICS.items() if metric.section == name}
+        return measures(view, {key: metric.short_label or metric.label for key, metric in shown.items()})
     return measures(view, dict(view.result.labels)) if name == "main" else None
 
 
@@ -243,7 +244,7 @@ def times(view: ProtocolView, timings: Timings, found: ProtocolTimes) -> Table:
         (view.label(name), *(format_number(getattr(row, key)) for key in columns)) for name, row in found.rows.items()
     )
     note = (
-        f"On {timings.cpus} CPU(s) with {timings.threads} thread(s). Times of the methods without the towers: one "
+        f"On {timings.cpus} CPU(s) with one thread. Times of the methods without the towers: one "
         "query is one touch against the whole gallery, with precomputed features. The towers, shared by all methods, "
         f"take {format_number(found.tower_touch_ms)} ms for a touch and {format_number(found.tower_photo_ms)} ms for a "
         "photo."

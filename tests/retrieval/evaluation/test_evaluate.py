@@ -92,7 +92,6 @@ def test_results_describe_data_settings_and_measures_with_intervals(made):
     found = of(made[0])
     assert (found.recording.objects, found.recording.grasps) == (18, 72)
     assert made[0].setting.seeds == [0, 1]
-    assert (found.features.touch, found.features.photo, found.features.fingers) == (256, 256, 2)
     ((split,),) = found.folds
     assert [len(split[part]) for part in ("train", "validation", "test")] == [8, 4, 6]
     assert list(found.rows) == list(FEW)

@@ -114,14 +114,18 @@ def test_scores_are_those_of_the_method_for_touches_and_sets(features):
 
 def test_tables_have_the_rows_and_photos_of_their_parts_and_mark_photos_of_own_grasps(features):
     found = score_queries(fitted(Chance, features), features, QUERIES)
-    table = found.touches("test", None)
-    assert {QUERIES.objects[number] for number in table.touch_owner} == set(SPLIT.test)
-    assert set(table.photo_owner) == set(range(6))
-    assert table.own.sum(1).tolist() == [1] * len(table.own)
-    for size, sets in found.sets("validation").items():
-        assert {QUERIES.objects[number] for number in sets.touch_owner} <= set(SPLIT.validation)
+    tables = found.tables(with_threshold=False)
+    assert [set(table.photo_owner) for table in (tables.test, tables.all_objects)] == [{4, 5}, set(range(6))]
+    for table in (tables.test, tables.all_objects):
+        assert {QUERIES.objects[number] for number in table.touch_owner} == set(SPLIT.test)
+        assert table.own.sum(1).tolist() == [1] * len(table.own)
+    assert set(tables.sets) == set(SET_SIZES)
+    for size, sets in tables.sets.items():
+        assert {QUERIES.objects[number] for number in sets.touch_owner} <= set(SPLIT.test)
         assert (sets.own.sum(1) <= size).all()
-    assert not replace(found, allows_own_photos=True).touches("test", "test").own.any()
+        assert sets.own.any()
+    assert {QUERIES.objects[number] for number in found.touches("validation").photo_owner} == set(SPLIT.validation)
+    assert not replace(found, allows_own_photos=True).touches("test").own.any()
 
 
 def test_pair_accuracy_uses_the_threshold_of_the_checkpoint_or_of_a_posterior_of_ten_validation_objects():

@@ -53,7 +53,7 @@ def test_trained_rows_have_a_low_pass_control_and_a_verdict_over_galleries_of_on
     assert (entry.unit, len(entry.folds), [len(folds) for folds in entry.folds]) == ("sequence", 2, [4, 4])
     summary = row.measures["topn_k4"]
     assert (summary.objects, summary.queries, summary.few_objects) == (3, 48, True)
-    assert "4 test objects, 4 photos" in summary.gallery
+    assert "4 objects, 4 photos" in summary.gallery
     assert len(row.best_params) == 2
     assert sorted(entry.controls) == ["background", "no_contact", "order", "permuted"]
     assert "lacks no-contact frames" in entry.controls["no_contact"].reason

@@ -52,8 +52,6 @@ def test_a_constant_scorer_is_exactly_at_chance():
     assert value(found.balanced_accuracy) == 0.5
     assert value(found.false_accepts_at_95) == pytest.approx(0.95, abs=1e-12)
     assert found.roc == [[0, 0], [pytest.approx(1), pytest.approx(1)]]
-    # One of four tied objects is right: 1/8 of all answers, as half of the queries are without their object.
-    assert found.risk_coverage == [[pytest.approx(1), pytest.approx(7 / 8)]]
 
 
 def test_a_larger_gallery_with_the_object_makes_an_uninformative_scorer_seem_better():
@@ -99,23 +97,6 @@ def test_false_accepts_use_the_threshold_with_95_percent_true_accepts():
     present, absent = statistics(ratios, true)
     threshold = sorted(present, reverse=True)[190 - 1]
     assert value(found.false_accepts_at_95) == pytest.approx(np.mean(absent >= threshold))
-
-
-def test_the_risk_equals_a_loop_over_the_most_confident_answers():
-    posterior, table = fit(planted(gap=1.5, seed=1)), planted(gap=1.5, seed=2, objects=5, grasps=3)
-    found = np.array(reject(posterior, table).risk_coverage)
-    ratios, true = identification_trials(table).log_ratios(posterior), table.touch_owner[:, None] == table.objects
-    answers = []
-    for gallery in galleries(ratios, true):
-        for row, own in zip(gallery, true, strict=True):
-            odds = [0.25 * np.exp(ratio) for ratio in row]  # of four objects each
-            answers.append((max(odds) / (1 + sum(odds)), bool(own[np.argmax(row)])))
-    answers.sort(reverse=True)
-    assert len(found) == len(answers) == 30
-    for count, (coverage, risk) in enumerate(found, start=1):
-        assert coverage == pytest.approx(count / 30)
-        assert risk == pytest.approx(np.mean([not right for _, right in answers[:count]]))
-    assert found[-1, 1] >= 0.5  # without the object no answer is right
 
 
 def test_the_roc_runs_from_corner_to_corner_and_has_the_reported_area():

@@ -70,7 +70,7 @@ def test_a_sequence_is_the_mean_of_its_own_grasps():
 
 
 @pytest.mark.parametrize(
-    ("counts", "message"), [({"a": 2, "b": 1}, "b has 1 sequence"), ({"a": 3}, r"the recording has 1 object\(s\)")]
+    ("counts", "message"), [({"a": 2, "b": 1}, "and b has 1 sequence"), ({"a": 3}, r"has 1 object\(s\)")]
 )
 def test_one_sequence_of_an_object_or_one_object_is_refused(counts, message):
     with pytest.raises(DatasetError, match=message):

@@ -107,12 +107,6 @@ def test_a_finished_fit_or_a_checkpoint_is_not_trained_again_and_scores_the_same
         loaded.encode_touch(parts[2].touch[:, :1])
 
 
-def test_features_of_other_towers_are_refused(parts):
-    cut = [dataclasses.replace(part, photo=part.photo[:, :100]) for part in parts]
-    with pytest.raises(BadInput, match=r"256 of a photo .*; got 256 and 100"):
-        fit(LateFusion, cut, None)
-
-
 def expected_order(logits, nearness, count):
     """Return the photos nearest to all grasps of the set by their summed logit, then the others by nearness."""
     mean = nearness.mean(0)

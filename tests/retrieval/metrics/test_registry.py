@@ -204,7 +204,7 @@ def test_rows_without_another_photo_of_their_object_are_counted_and_neither_hidd
     table = table_of(np.arange(16).reshape(4, 4), [0, 0, 1, 2])
     for measure in (pair_accuracy(table, 0.0), pair_auc(table), k_way(table, 2), *full_gallery(table).values()):
         assert measure.owner.tolist() == [0, 0]
-        assert measure.gallery.endswith("; 2 touches left out, which have no other")
+        assert measure.gallery.endswith("; 2 queries left out, which have no other")
     with pytest.raises(BadInput, match="from another grasp; none has"):
         pair_auc(table_of(np.zeros((2, 2)), [0, 1]))
 
