@@ -17,7 +17,6 @@ them, since hashes depend on the common content of the pictures. So this module 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -31,21 +30,13 @@ _FLIPS = ((1, 1), (-1, 1), (1, -1), (-1, -1))
 _BLOCK = 512
 _NEIGHBOUR_RANK, _RELATIVE_LIMIT = 3, 0.25
 Greys = NDArray[np.float32]
-"""(n, 256): thumbnails in grey levels 0..255."""
+"""(n, 256): small pictures in grey levels 0..255."""
 
 
-@dataclass(frozen=True, eq=False)
-class Thumbnail:
-    """Grey levels of one picture (256,), and of its distorted copies (4, 256), in the order of `DISTORTIONS`."""
-
-    grey: Greys
-    distorted: Greys
-
-
-def thumbnail(image: RgbImage) -> Thumbnail:
-    """Return the thumbnail of a picture (H, W, 3)."""
+def thumbnail(image: RgbImage) -> Greys:
+    """Return small grey levels (5, 256) of a picture (H, W, 3), then of its distorted copies, as in `DISTORTIONS`."""
     picture = np.rint(255 * image).astype(np.uint8)
-    return Thumbnail(_small(picture), np.stack([_small(distort(picture)) for distort in DISTORTIONS]))
+    return np.stack([_small(picture), *(_small(distort(picture)) for distort in DISTORTIONS)])
 
 
 def _small(picture: NDArray[np.uint8]) -> Greys:
@@ -76,9 +67,9 @@ DISTORTIONS = (_as_jpeg, _brighter, _shifted, _shifted_across)
 
 
 def shapes(greys: Greys, common: Greys) -> Greys:
-    """Return the shapes of thumbnails (..., 256) as unit vectors: the residuals after a constant and `common` (256,).
+    """Return the shapes of small pictures (..., 256): the residuals after a constant and `common` (256,).
 
-    A residual of zero gives zeros.
+    They are unit vectors, or zero.
     """
     shared = np.stack([np.ones(PX**2, np.float32), common], axis=1)
     basis = np.linalg.qr(shared.astype(np.float64))[0].astype(np.float32)
@@ -87,36 +78,27 @@ def shapes(greys: Greys, common: Greys) -> Greys:
     return np.asarray(rest / np.where(length > 1e-3, length, np.inf))
 
 
-def flip_thumbnails(greys: Greys, flip: tuple[int, int]) -> Greys:
-    """Return the thumbnails (n, 256) of the flipped pictures."""
+def flip_greys(greys: Greys, flip: tuple[int, int]) -> Greys:
+    """Return the flipped small pictures (n, 256)."""
     turned = greys.reshape(-1, PX, PX)[:, :: flip[0], :: flip[1]]
     return np.ascontiguousarray(turned).reshape(-1, PX**2)
 
 
-@dataclass(frozen=True, eq=False)
-class NearestPictures:
-    """The nearest picture of another object for each picture, in arrays (n,).
-
-    Attributes:
-        row: Row of the nearest picture.
-        checked: Whether a copy of the picture can be distinguished from other pictures.
-        copy: Whether the nearest picture is a copy.
-    """
-
-    row: NDArray[np.int64]
-    checked: NDArray[np.bool_]
-    copy: NDArray[np.bool_]
-
-
-def nearest_pictures(thumbnails: Sequence[Thumbnail], objects: Sequence[str]) -> NearestPictures:
-    """Return the nearest picture of another object for each picture of one kind, such as the photos.
+def nearest_pictures(
+    thumbnails: Sequence[Greys], objects: Sequence[str]
+) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Find the nearest picture of another object for each of n pictures of one kind, such as the photos.
 
     Args:
-        thumbnails: The pictures.
+        thumbnails: Thumbnails of the pictures.
         objects: The object of each picture.
+
+    Returns:
+        (n,) the row of the nearest picture; whether a copy of the picture can be distinguished from other pictures;
+        and whether the nearest picture is a copy.
     """
-    greys = np.array([one.grey for one in thumbnails], dtype=np.float32).reshape(-1, PX**2)
-    distorted = np.array([one.distorted for one in thumbnails], dtype=np.float32).reshape(-1, len(DISTORTIONS), PX**2)
+    stacked = np.array(thumbnails, dtype=np.float32).reshape(-1, 1 + len(DISTORTIONS), PX**2)
+    greys, distorted = stacked[:, 0], stacked[:, 1:]
     owner = np.unique(np.array(objects, dtype=str), return_inverse=True)[1]
     common = np.median(greys, axis=0) if len(greys) else np.zeros(PX**2, np.float32)
     originals = shapes(greys, common)
@@ -126,7 +108,7 @@ def nearest_pictures(thumbnails: Sequence[Thumbnail], objects: Sequence[str]) ->
     first = np.flatnonzero(np.diff(owner[by_owner], prepend=-1))
     for start in range(0, len(greys), _BLOCK):
         block = slice(start, start + _BLOCK)
-        flipped = [shapes(flip_thumbnails(greys[block], flip), common) for flip in _FLIPS]
+        flipped = [shapes(flip_greys(greys[block], flip), common) for flip in _FLIPS]
         distances = 1.0 - np.max([each @ originals[by_owner].T for each in flipped], axis=0).astype(np.float64)
         distances[owner[block, None] == owner[by_owner]] = np.inf
         row[block], distance[block] = by_owner[distances.argmin(axis=1)], distances.min(axis=1)
@@ -140,4 +122,4 @@ def nearest_pictures(thumbnails: Sequence[Thumbnail], objects: Sequence[str]) ->
     limits = np.maximum(limits, limits[row])  # either may be the copy: a second compression as JPEG changes little
     farthest, nearest = limits.max(axis=1), limits.min(axis=1)
     limit = np.where(farthest < maximum, farthest, np.minimum(nearest, maximum))
-    return NearestPictures(row, checked, distance <= limit)
+    return row, checked, distance <= limit

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from retrieval.console.output import abbreviate_list
 from retrieval.console.progress import Bar
-from retrieval.data.check.near_copies import Thumbnail, thumbnail
+from retrieval.data.check.near_copies import Greys, thumbnail
 from retrieval.data.dataset import Grasp
 from retrieval.data.images import decode_rgb, read_bytes
 from retrieval.data.resize import resize
@@ -65,7 +65,7 @@ class ImageRecord:
     digest: str
     is_flat: bool
     small: NDArray[np.float32]
-    thumbnail: Thumbnail | None
+    thumbnail: Greys | None
 
 
 ImageRecords = dict[Path, ImageRecord]

@@ -178,21 +178,21 @@ def _near_copies(grasps: Sequence[Grasp], records: ImageRecords, accepted: Seque
     counts, low_contact, left_out = [], 0, 0
     for kind, every in _by_kind(accepted).items():
         items = list(_by_kind(grasps).get(kind, {}).items())
-        thumbnails = [one for path, _ in items if (one := records[path].thumbnail)]
-        found = nearest_pictures(thumbnails, [grasp.object_id for _, grasp in items])
+        thumbnails = [one for path, _ in items if (one := records[path].thumbnail) is not None]
+        nearest, is_checked, is_copy = nearest_pictures(thumbnails, [grasp.object_id for _, grasp in items])
         pairs: dict[tuple[int, ...], str] = {}
-        for row in np.flatnonzero(found.copy).tolist():
-            (path, grasp), (near, other) = items[row], items[found.row[row]]
+        for row in np.flatnonzero(is_copy).tolist():
+            (path, grasp), (near, other) = items[row], items[nearest[row]]
             if records[path].digest != records[near].digest:
-                pairs[tuple(sorted((row, int(found.row[row]))))] = f"{grasp.grasp_id} and {other.grasp_id}"
+                pairs[tuple(sorted((row, int(nearest[row]))))] = f"{grasp.grasp_id} and {other.grasp_id}"
         if pairs:
             text = f"{len(pairs)} pair(s) of images ({kind}) of two objects are near copies of each other"
             severity, or_else = (
                 ("error", "") if kind == "photo" else ("warning", ", or the touches of these objects are similar")
             )
             yield Finding(severity, "near-copy", f"{text}{or_else}: {abbreviate_list(list(pairs.values()))}")
-        counts.append(f"{found.checked.sum()} of {len(every)} images ({kind})")
-        low_contact += int((~found.checked).sum())
+        counts.append(f"{is_checked.sum()} of {len(every)} images ({kind})")
+        low_contact += int((~is_checked).sum())
         left_out += len(every) - len(items)
     text = f"near copies were searched for in {', '.join(counts)}"
     if low_contact:

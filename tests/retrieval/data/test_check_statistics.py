@@ -1,12 +1,14 @@
 """Statistics of the checks of a recording, compared with plain loops and with hand-made images."""
 
+from itertools import product
+
 import cv2
 import numpy as np
 import pytest
 
 from retrieval.data.check.appearance import CHANGES, changed_layout, swapped_fingers
 from retrieval.data.check.drift import is_above_chance, nearest_grasp_accuracy
-from retrieval.data.check.near_copies import flip_thumbnails, nearest_pictures, shapes, thumbnail
+from retrieval.data.check.near_copies import flip_greys, nearest_pictures, shapes, thumbnail
 from tests.data import touch_data
 
 # Near copies -----------------------------------------------------------------------------------------------
@@ -26,29 +28,27 @@ def nearest(images):
 
 def test_the_nearest_picture_of_another_object_equals_that_of_plain_loops():
     images = [scene(seed) for seed in range(7)]
-    greys = np.stack([thumbnail(image).grey for image in images])
+    greys = np.stack([thumbnail(image)[0] for image in images])
     common = np.median(greys, axis=0)
     unit = [shapes(one[None], common)[0] for one in greys]
-    found = nearest(images)
+    rows, _, _ = nearest(images)
     for query in range(7):
-        turned = [
-            shapes(flip_thumbnails(greys[[query]], flip), common)[0] for flip in ((1, 1), (1, -1), (-1, 1), (-1, -1))
-        ]
+        turned = [shapes(flip_greys(greys[[query]], flip), common)[0] for flip in product((1, -1), repeat=2)]
         distances = {row: min(1 - float(turn @ unit[row]) for turn in turned) for row in range(7) if row != query}
-        assert found.row[query] == min(distances, key=distances.get)
+        assert rows[query] == min(distances, key=distances.get)
 
 
 def test_both_a_picture_and_its_flipped_brighter_copy_are_copies_and_no_other_picture_is():
     images = [1.1 * scene(seed) + 0.02 for seed in range(9)]
     images.append(1.05 * np.ascontiguousarray(images[2][::-1]))
-    found = nearest([np.clip(image, 0, 1).astype(np.float32) for image in images])
-    assert np.flatnonzero(found.copy).tolist() == [2, 9]
-    assert found.row[[2, 9]].tolist() == [9, 2]
-    assert found.checked.all()
+    rows, is_checked, is_copy = nearest([np.clip(image, 0, 1).astype(np.float32) for image in images])
+    assert np.flatnonzero(is_copy).tolist() == [2, 9]
+    assert rows[[2, 9]].tolist() == [9, 2]
+    assert is_checked.all()
 
 
 def test_without_pictures_nothing_is_found():
-    assert [nearest(images).copy.tolist() for images in ([], [scene(0)])] == [[], [False]]
+    assert [nearest(images)[2].tolist() for images in ([], [scene(0)])] == [[], [False]]
 
 
 # Fingers and layouts ---------------------------------------------------------------------------------------
