@@ -65,7 +65,7 @@ def verification_errors(scores: MethodScores, features: Features, checkpoint: Ch
     for grasps in GRASPS:
         sequences = verification_sequences(test, posterior, scores.seed, grasps)
         if sequences is not None and (objects := len(np.unique(sequences.owner))) >= MIN_OBJECTS:
-            genuine = sequences.genuine[-1]
+            genuine = sequences.ratios.max(1)
             for kind, impostors in (("random", sequences.impostor.ravel()), ("similar", sequences.similar)):
                 frr = [false_rejects(far, genuine, impostors) for far in FARS]
                 found[kind][str(grasps)] = objects, len(genuine), (equal_error_rate(genuine, impostors), *frr)

@@ -195,11 +195,17 @@ def adapt(
 
 def combined_matcher(start: Checkpoint, fingers: int, init: str) -> tuple[Config, Matcher]:
     """Return the configuration and a matcher with the towers of the fit; `init` as for `adapt`."""
-    preset, source, sources = load_config("adapt"), start.config.matcher, _tower_sources(start, init)
+    preset, source = load_config("adapt"), start.config.matcher
+    touch_parts: list[Tower | str] = [start.matcher.touch_tower]
+    photo_parts: list[Tower | str] = [start.matcher.photo_tower]
+    if init != "none":
+        gel = [GEL] if source.tower_output == "stages" else []  # as the features of the gel tower
+        touch_parts += [*gel, init]
+        photo_parts = [init] if is_shipped(start.path) else [*photo_parts, init]
     names = {start.matcher.touch_tower: source.tower, start.matcher.photo_tower: source.photo_tower or source.tower}
     touch, photo = (
         TOWER_SEPARATOR.join(PUBLISHED_TOWER if isinstance(part, str) else names[part] for part in parts)
-        for parts in sources
+        for parts in (touch_parts, photo_parts)
     )
     settings = dataclasses.replace(
         preset.matcher, tower=touch, photo_tower=photo, tower_output=source.tower_output, fingers=fingers
@@ -207,25 +213,14 @@ def combined_matcher(start: Checkpoint, fingers: int, init: str) -> tuple[Config
     training = dataclasses.replace(preset.training, init="random", init_touch="", init_photo="")
     config = dataclasses.replace(preset, matcher=settings, training=training)
     matcher = Matcher(config.matcher, len(config.preprocessing.views)).eval()
-    for tower, parts in zip((matcher.touch_tower, matcher.photo_tower), sources, strict=True):
-        backbones = [each for part in parts for each in ([part] if isinstance(part, str) else part.backbones)]
-        for backbone, weights in zip(tower.backbones, backbones, strict=True):
-            if isinstance(weights, str):
-                backbone.initialise(weights)
+    for tower, parts in ((matcher.touch_tower, touch_parts), (matcher.photo_tower, photo_parts)):
+        weights = [each for part in parts for each in ([part] if isinstance(part, str) else part.backbones)]
+        for backbone, initial in zip(tower.backbones, weights, strict=True):
+            if isinstance(initial, str):
+                backbone.initialise(initial)
             else:
-                backbone.load_state_dict(weights.state_dict())
+                backbone.load_state_dict(initial.state_dict())
     return config, matcher
-
-
-def _tower_sources(start: Checkpoint, init: str) -> tuple[list[Tower | str], list[Tower | str]]:
-    """Return the parts of the touch tower and of the photo tower: towers of the start model, or initial weights."""
-    touch: list[Tower | str] = [start.matcher.touch_tower]
-    photo: list[Tower | str] = [start.matcher.photo_tower]
-    if init == "none":
-        return touch, photo
-    if start.config.matcher.tower_output == "stages":  # as the features of the gel tower
-        touch.append(GEL)
-    return [*touch, init], [init] if is_shipped(start.path) else [*photo, init]
 
 
 # Accuracy on held-out objects ------------------------------------------------------------------------------

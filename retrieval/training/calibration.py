@@ -52,7 +52,6 @@ MIN_GRASPS = 40
 FOREIGN_COUNT = 700
 """Number of foreign pictures for fitting; half as many others are drawn for validation."""
 _SETS = 4
-_SEARCH = {"xatol": 1e-4, "fatol": 1e-9, "maxiter": 2000}
 _NO_EMBEDDINGS = np.zeros((0, 0), np.float32)
 
 
@@ -247,12 +246,9 @@ def fit_posterior_to_trials(trials: Sequence[IdentificationTrials]) -> Posterior
     bounds = [(low, high), (-1e6, 1e6), (0.0, 1.0)][searched]
     first = np.array([start, 0.0, 0.5])[searched]
     simplex = np.vstack([first, first + np.diag([-0.5 if start > 0 else 0.5, 0.5, 0.25][searched])])
+    options = {"xatol": 1e-4, "fatol": 1e-9, "maxiter": 2000, "initial_simplex": simplex}
     found = minimize(
-        lambda parameters: _mean_loss(trials, posterior_of(parameters)),
-        first,
-        method="Nelder-Mead",
-        bounds=bounds,
-        options={**_SEARCH, "initial_simplex": simplex},
+        lambda x: _mean_loss(trials, posterior_of(x)), first, method="Nelder-Mead", bounds=bounds, options=options
     )
     return posterior_of(found.x)
 
@@ -269,9 +265,8 @@ def fit_references(*parts: ScoredTouches, seed: int = 0) -> ReferenceCalibration
 
     None for fewer than three such objects, or for a model without embeddings.
     """
-    encoded = [part for part in parts if part.touch_embeddings.shape[1]]
     many, one = (
-        [found for part in encoded if (found := _reference_trials(part, max_references)) is not None]
+        [found for part in parts if (found := _reference_trials(part, max_references)) is not None]
         for max_references in (MAX_REFERENCES, 1)
     )
     if not many:
@@ -296,13 +291,13 @@ def fit_references(*parts: ScoredTouches, seed: int = 0) -> ReferenceCalibration
 
 
 def _reference_trials(part: ScoredTouches, max_references: int) -> tuple[ScoredTouches, ScoredTouches] | None:
-    """Return C of the other touches with each object, and their match logits with photos; None for too few objects.
+    """Return C of the other touches with each object, and their match logits with photos.
 
-    At most `max_references` touches of each object are references.
+    At most `max_references` touches of each object are references. None for too few objects, or without embeddings.
     """
-    rows = [np.flatnonzero(part.touch_owner == name) for name in np.unique(part.touch_owner)]
-    rows = [mine for mine in rows if len(mine) > 1]
-    if len(rows) < MIN_OBJECTS:
+    of_objects = (np.flatnonzero(part.touch_owner == name) for name in np.unique(part.touch_owner))
+    rows = [mine for mine in of_objects if len(mine) > 1]
+    if len(rows) < MIN_OBJECTS or not part.touch_embeddings.shape[1]:
         return None
     references = []
     for mine in rows:
@@ -352,14 +347,12 @@ class VerificationSequences(NamedTuple):
     Attributes:
         owner: (S,) object of each sequence.
         ratios: (S, G) ratios of the right object after 1, 2, ... grasps.
-        genuine: (G, S) the largest of them so far.
         impostor: (S, O - 1) largest ratio of each other object.
         similar: (S,) largest ratio of the most similar other object.
     """
 
     owner: NDArray[np.int64]
     ratios: Floats
-    genuine: Floats
     impostor: Floats
     similar: Floats
 
@@ -380,15 +373,14 @@ def verification_sequences(
         [IdentificationTrials.of(scored, sets[:, :count], seed).log_ratios(posterior) for count in range(1, grasps + 1)]
     )
     rows, true = np.arange(len(sets)), np.searchsorted(objects, owner)
-    highest = np.maximum.accumulate(ratios, axis=0)
+    highest = ratios.max(0)
     is_impostor = np.arange(len(objects)) != true[:, None]
     similar = _nearest_objects(objects, scored.photo_owner, scored.photo_embeddings)[true]
     return VerificationSequences(
         owner,
         ratios[:, rows, true].T,
-        highest[:, rows, true],
-        highest[-1][is_impostor].reshape(len(sets), -1),
-        highest[-1][rows, similar],
+        highest[is_impostor].reshape(len(sets), -1),
+        highest[rows, similar],
     )
 
 
@@ -405,14 +397,13 @@ def fit_verification(
     if not supports_calibration(sizes):
         return None
     impostors = np.concatenate([each.impostor.ravel() for each in found])
-    genuine = np.concatenate([each.genuine for each in found], axis=1)
-    lowest = np.concatenate([each.ratios[:, :-1].min(1) for each in found])
+    ratios = np.concatenate([each.ratios for each in found])
     return VerificationCalibration(
         sizes,
         _quantiles(impostors, 1 - np.array(LEVELS)),
         _quantiles(np.concatenate([each.similar for each in found])),
-        tuple(map(_quantiles, genuine)),
-        _quantiles(lowest),
+        tuple(map(_quantiles, np.maximum.accumulate(ratios, axis=1).T)),
+        _quantiles(ratios[:, :-1].min(1)),
     )
 
 
@@ -479,18 +470,13 @@ def with_calibrations(
     `verified` are those for verification, by default `scored`.
     """
     posterior = fit_posterior(*scored, seed=seed)
-    checkpoint = dataclasses.replace(
+    return dataclasses.replace(
         checkpoint,
         posterior=posterior,
         references=fit_references(*scored, seed=seed),
         verification=fit_verification(scored if verified is None else verified, posterior, seed),
-    )
-    if not pooled:
-        return checkpoint
-    return dataclasses.replace(
-        checkpoint,
-        pooled_posterior=fit_posterior(*pooled, seed=seed),
-        pooled_references=fit_references(*pooled, seed=seed),
+        pooled_posterior=fit_posterior(*pooled, seed=seed) if pooled else checkpoint.pooled_posterior,
+        pooled_references=fit_references(*pooled, seed=seed) if pooled else checkpoint.pooled_references,
     )
 
 

@@ -167,7 +167,7 @@ def svd(x: Matrix) -> tuple[Matrix, Matrix, Matrix]:
     return left, singular, right
 
 
-def leading_svd(x: Matrix, max_directions: int = MAX_DIRECTIONS) -> tuple[Matrix, Matrix, Matrix]:
+def leading_svd(x: Matrix, max_directions: int) -> tuple[Matrix, Matrix, Matrix]:
     """Return the thin decomposition in the widest directions of many items.
 
     It uses the eigenvectors of X'X or, if that is smaller, of XX'. The squared condition number affects only the
@@ -294,15 +294,11 @@ class _Reduced:
         self.touch = _Modality(features.touch_rows, widths.touch, limit, widths.touch_towers)
         self.photo = _Modality(features.photo, widths.photo, limit)
 
-    def items(self, settings: CcaSettings) -> tuple[Matrix, Matrix]:
-        """Return the reduced touches (n, k) and photos (n, k')."""
-        return self.touch.items(settings), self.photo.items(settings)
-
     def fit(self, rows: Numbers, settings: Sequence[CcaSettings]) -> Iterator[tuple[CcaSettings, CcaProjections]]:
         """Yield the projections of reduced items, fitted on the given rows, for each of the settings."""
         for _, some in groupby(sorted(settings, key=_reduction), _reduction):
             alike = sorted(some)
-            items = [part[rows] for part in self.items(alike[0])]
+            items = [part.items(alike[0])[rows] for part in (self.touch, self.photo)]
             means = [part.mean(0) for part in items]
             touch, photo = (_centred_view(part - mean) for part, mean in zip(items, means, strict=True))
             for (ridge, photo_ridge), powers in groupby(alike, lambda one: one[:2]):
@@ -369,7 +365,7 @@ def select_settings(
     if settings is None:
         settings = GRID if widths.touch_towers == 1 else (*GRID, *(one._replace(last_tower=True) for one in GRID))
     reduced = _Reduced(features, widths, settings)
-    items = {_reduction(one): reduced.items(one) for one in settings}
+    items = {_reduction(one): (reduced.touch.items(one), reduced.photo.items(one)) for one in settings}
     found: dict[CcaSettings, list[tuple[float, CcaProjections]]] = {one: [] for one in settings}
     rows_of = [np.flatnonzero(np.isin(features.object_ids, fold)) for fold in folds]
     for rows in rows_of:

@@ -50,11 +50,6 @@ from retrieval.training import distributed
 from retrieval.training.augmentation import augment_photos, augment_touches
 
 T = TypeVar("T")
-TOUCH_VARIANTS = ("touch", "low_pass", "no_contact")
-"""Inputs of the touch tower: gel images; low-pass gel images (8 x 6); no-contact frames."""
-PHOTO_VARIANTS = ("photo", "margin")
-"""Inputs of the photo tower: whole photos; only the margin, which rarely shows the object."""
-_MARGIN_DIVISOR = 8  # the margin is 1 / _MARGIN_DIVISOR of each side
 _BATCH, _CHUNK = 32, 64
 _FORMAT = 1  # raised if the features of the same images change
 _KEEP_BYTES = 4 << 30
@@ -351,7 +346,7 @@ def _low_pass_matrix(old: int, new: int, sigma: float) -> NDArray[np.float32]:
 
 def photo_margin(image: RgbImage) -> RgbImage:
     """Return a photo (H, W, 3) with only its margin (an eighth of each side); the rest is the margin's mean colour."""
-    high, wide = (max(1, side // _MARGIN_DIVISOR) for side in image.shape[:2])
+    high, wide = (max(1, side // 8) for side in image.shape[:2])
     inside = np.zeros(image.shape[:2], dtype=np.bool_)
     inside[high:-high, wide:-wide] = True
     return np.where(inside[..., None], image[~inside].mean(0), image).astype(np.float32)
@@ -386,22 +381,18 @@ def encode_recording(
         config: The configuration, for preprocessing.
         cache: Folder of the cache of features, whose keys are digests of tower, preprocessing, variant and image files.
             None to store nothing.
-        touch_variant: One of `TOUCH_VARIANTS`.
-        photo_variant: One of `PHOTO_VARIANTS`; "margin" only with whole touches.
+        touch_variant: "touch" for gel images, "low_pass" for low-pass ones (8 x 6), "no_contact" for the no-contact
+            frames, which every grasp must then have.
+        photo_variant: "photo" for whole photos; "margin" for their margin, which rarely shows the object, only with
+            whole touches.
         photo_features_from: Features of at least these grasps; their photo features are used without encoding.
         quiet: No progress on stderr.
 
     Raises:
-        DatasetError: A required no-contact frame is missing, or a file cannot be read.
+        DatasetError: A no-contact frame that the preprocessing requires is missing, or a file cannot be read.
     """
     touched, preprocessing = grasps, config.preprocessing
     if touch_variant == "no_contact":
-        for grasp in grasps:
-            if len(grasp.backgrounds) != len(grasp.touches):
-                raise DatasetError(
-                    f"each finger needs a no-contact frame; {grasp.grasp_id} has {len(grasp.backgrounds)} for "
-                    f"{len(grasp.touches)}; record them, or leave this control out"
-                )
         touched = [dataclasses.replace(grasp, touches=grasp.backgrounds) for grasp in grasps]
     if kind := {"low_pass": _LowPassPreprocessing, "margin": _MarginPreprocessing}.get(
         touch_variant if photo_variant == "photo" else photo_variant
@@ -443,15 +434,19 @@ def _encoded_once(
     """Return the features (len(items), F) of items: read from the cache, or encoded and stored.
 
     `made_by` are variant, tower and preprocessing. `load` returns the image (or images) of an item, `encode` the
-    features (B, F) of a list of images, `files` the files of an item.
+    features (B, F) of a list of images, `files` the files of an item. Raises DatasetError if one cannot be read.
     """
-    unit = "photos" if made_by[0] in PHOTO_VARIANTS else "grasps"
+    unit = "photos" if made_by[0] in ("photo", "margin") else "grasps"
     with (
         Bar(f"encode {made_by[0]}", len(items), unit, quiet=quiet) as bar,
         worker_pool() as pool,
         Cache(cache / "cache.sqlite") if cache else nullcontext() as store,
     ):
-        keys = [_cache_key(made_by, files(item)) for item in items] if store else []
+        try:
+            digests = [[file_digest(path) for path in files(item)] for item in items] if store else []
+        except OSError as error:
+            raise DatasetError(f"{error.filename} cannot be read ({error.strerror}); run `retrieve check`") from error
+        keys = [cache_key("features", _FORMAT, *made_by, each) for each in digests]
         stored = store.get_all(keys) if store else {}
         found = {row: stored[key] for row, key in enumerate(keys) if key in stored}
         missing = [row for row in range(len(items)) if row not in found]
@@ -464,11 +459,3 @@ def _encoded_once(
             found |= encoded
             bar.advance(len(rows))
     return np.stack([np.frombuffer(found[row], np.float32) for row in range(len(items))])
-
-
-def _cache_key(made_by: tuple[str, ...], files: tuple[Path, ...]) -> str:
-    """Return the key of an item. Raises DatasetError if an image cannot be read."""
-    try:
-        return cache_key("features", _FORMAT, *made_by, [file_digest(path) for path in files])
-    except OSError as error:
-        raise DatasetError(f"{error.filename} cannot be read ({error.strerror}); run `retrieve check`") from error

@@ -8,7 +8,7 @@ thresholds are chosen on touches and no-contact frames of validation objects.
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import cycle, pairwise
 from pathlib import Path
 
 import cv2
@@ -38,8 +38,6 @@ PENALTY = 0.02
 there are more foreign pictures."""
 _MAX_PHOTOS, _PHOTO_PX = 400, 256
 """Largest number of photos, and of gel images, for foreign pictures; shorter side of these photos in pixels."""
-
-Readings = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,16 +120,16 @@ def fit_gel_head(fitting: GelCheckFeatures, penalty: float = PENALTY) -> GelHead
     """
     from scipy.optimize import minimize
 
-    kinds = [part.reshape(-1, part.shape[-1]).double().numpy() for part in (fitting.touch, fitting.no_contact)]
-    kinds.append(fitting.foreign.double().numpy())
-    x, labels = np.concatenate(kinds), np.repeat(np.arange(len(GEL_CLASSES)), [len(part) for part in kinds])
+    parts = fitting.touch.flatten(0, 1), fitting.no_contact.flatten(0, 1), fitting.foreign
+    kinds = [part.double().numpy() for part in parts]
+    counts = np.array([len(part) for part in kinds])
+    x, labels = np.concatenate(kinds), np.repeat(np.arange(len(GEL_CLASSES)), counts)
     centre, spread = x.mean(0), x.std(0)
     spread = np.maximum(spread, MIN_RELATIVE_DEVIATION * np.abs(centre))  # the same standardisation as in the matcher
     spread = np.where(spread > 1e-6, spread, 1.0)
     x = (x - centre) / spread
-    present = np.array([len(part) > 0 for part in kinds])
-    weights = np.array([1 / len(part) if len(part) else 0.0 for part in kinds])[labels] / present.sum()
-    targets, absent = np.eye(len(GEL_CLASSES))[labels], np.where(present, 0.0, -1e4)
+    weights = 1 / counts[labels] / np.count_nonzero(counts)
+    targets, absent = np.eye(len(GEL_CLASSES))[labels], np.where(counts > 0, 0.0, -1e4)
 
     def loss(flat: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         matrix = flat.reshape(-1, len(GEL_CLASSES))
@@ -156,9 +154,8 @@ def contact_levels(grasps: Sequence[Grasp]) -> tuple[list[float], list[float]]:
     A no-contact frame is compared with the one of the previous grasp, a touch with its own no-contact frame. The level
     of a grasp is the largest level of its fingers.
     """
-    no_contact = [_largest_level(second, first) for first, second in _consecutive_frames(grasps)]
     touched = [_largest_level(grasp.touches, grasp.backgrounds) for grasp in grasps if grasp.backgrounds]
-    return no_contact, touched
+    return [_largest_level(second, first) for first, second in _consecutive_frames(grasps)], touched
 
 
 def _largest_level(images: Sequence[Path], frames: Sequence[Path]) -> float:
@@ -173,7 +170,7 @@ def fit_gel_check(head: GelHead, test: GelCheckFeatures, levels: tuple[Sequence[
     The logit of a grasp is the highest logit of its fingers.
     """
     touch, no_contact = head(test.touch).numpy(), head(test.no_contact).numpy()  # (G, fingers, 2)
-    foreign: Readings = head(test.foreign[:, None]).numpy()
+    foreign = head(test.foreign[:, None]).numpy()
     gels = np.concatenate([touch, no_contact])[..., 0].max(1)
     check = GelCheck(
         foreign_above=float(np.quantile(gels, 1 - FALSE_ALARM_RATE)) + MARGIN,
@@ -194,7 +191,7 @@ def fit_gel_check(head: GelHead, test: GelCheckFeatures, levels: tuple[Sequence[
 
 
 def contact_threshold(no_contact: ArrayLike, touch: ArrayLike) -> float:
-    """Return the threshold between values of no-contact frames and of touches.
+    """Return the threshold between values of no-contact frames and of touches (n,).
 
     At most `FALSE_ALARM_RATE` of the no-contact values lie above it; if it can be higher, until `LOW_CONTACT_RATE` of
     the touches lie below it.
@@ -221,15 +218,13 @@ def draw_foreign(
     `photos` (H, W, 3) are resized and cut into pieces, `gels` (H, W, 3) recoloured; both may be empty. `px` is at
     least 8.
     """
-    kinds: dict[str, _Draw] = dict(SYNTHETIC_KINDS)
-    if len(photos):
+    kinds = dict(SYNTHETIC_KINDS)
+    if photos:
         kinds |= {"photo": _of_one(photos, _whole), "piece of a photo": _of_one(photos, _piece)}
-    if len(gels):
+    if gels:
         kinds["false colours"] = _of_one(gels, _false_colours)
-    names = list(kinds)
-    for number in range(count):
-        name = names[number % len(names)]
-        picture = kinds[name](np.random.default_rng([seed, number]), px)
+    for number, (name, draw) in zip(range(count), cycle(kinds.items()), strict=False):
+        picture = draw(np.random.default_rng([seed, number]), px)
         yield name, np.ascontiguousarray(np.clip(picture, 0, 1), dtype=np.float32)
 
 
@@ -298,15 +293,15 @@ def _piece(photo: RgbImage, rng: np.random.Generator, px: int) -> np.ndarray:
 def _false_colours(gel: RgbImage, rng: np.random.Generator, px: int) -> np.ndarray:
     """Return a gel image with exchanged, grey, negative, tinted or mixed channels, as if under other lamps."""
     picture = _resized(gel, px, cv2.INTER_AREA)
-    other_orders = ((0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
-    change = int(rng.integers(5))
-    if change == 0:
-        return picture[..., other_orders[int(rng.integers(5))]]
-    if change == 1:
-        return np.repeat(picture.mean(2, keepdims=True), 3, axis=2) * rng.uniform(0.4, 1.6)
-    if change == 2:
-        return 1 - picture
-    return picture * rng.uniform(0.2, 2, 3) if change == 3 else picture @ (np.eye(3) + rng.normal(0, 0.5, (3, 3)))
+    orders = ((0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
+    changes: tuple[Callable[[], np.ndarray], ...] = (
+        lambda: picture[..., orders[int(rng.integers(5))]],
+        lambda: np.repeat(picture.mean(2, keepdims=True), 3, axis=2) * rng.uniform(0.4, 1.6),
+        lambda: 1 - picture,
+        lambda: picture * rng.uniform(0.2, 2, 3),
+        lambda: picture @ (np.eye(3) + rng.normal(0, 0.5, (3, 3))),
+    )
+    return changes[int(rng.integers(5))]()
 
 
 def _resized(picture: np.ndarray, px: int, interpolation: int) -> np.ndarray:

@@ -84,13 +84,17 @@ def train_gate(
     attempts = load_attempts(recording)
     settings = settings or GateSettings(frame="after" if all(attempt.after for attempt in attempts) else "during")
     _require_frames(attempts, settings.frame)
-    _require_both_outcomes(attempts, f"{recording} must contain")
     split = make_split([attempt.grasp for attempt in attempts], validation=VALIDATION, test=0, seed=seed)
     train, validation = (
         [attempt for attempt in attempts if attempt.grasp.object_id in objects]
         for objects in (split.train, split.validation)
     )
-    _require_both_outcomes(train, f"the training objects of seed {seed} must have")
+    held = sum(attempt.held for attempt in train)
+    if held in (0, len(train)):
+        raise DatasetError(
+            f"the training objects of seed {seed} must have both successful and failed grasps; got {held} successful "
+            f"of {len(train)}; collect without a gate to record failures too"
+        )
     load = ImageCache(settings.preprocessing().load_touch)
 
     def differences(attempts: Sequence[Attempt]) -> list[list[NDArray[np.float32]]]:
@@ -107,19 +111,19 @@ def train_gate(
             for part in batches(validation, BATCH):
                 logits += map(max, gate.score(differences(part)))
                 bar.advance(len(part))
-    held, accepted = np.array([attempt.held for attempt in validation]), np.array(logits) >= 0
-    is_correct, outcomes = accepted == held, [attempt.outcome for attempt in validation]
+    is_held, accepted = np.array([attempt.held for attempt in validation]), np.array(logits) >= 0
+    is_correct, outcomes = accepted == is_held, [attempt.outcome for attempt in validation]
     owner = np.array([attempt.grasp.object_id for attempt in validation])
     by_object = [is_correct[owner == name].tolist() for name in np.unique(owner)]
     metrics = {
         "frame": settings.frame,
         "train_grasps": len(train),
-        "train_held": sum(attempt.held for attempt in train),
+        "train_held": held,
         "validation_grasps": len(validation),
         "validation_objects": len(by_object),
         "accuracy": float(is_correct.mean()),
         "interval": grouped_interval(by_object),
-        "chance": float(max(held.mean(), 1 - held.mean())),
+        "chance": float(max(is_held.mean(), 1 - is_held.mean())),
         "accepted": {
             name: (sum(accepted[[each == name for each in outcomes]].tolist()), count)
             for name, count in sorted(Counter(outcomes).items())
@@ -152,15 +156,6 @@ def _require_frames(attempts: Sequence[Attempt], frame: str) -> None:
                     f"a gate compares the frames before and {frame} of each finger; {grasp.grasp_id} has "
                     f"{len(files)} {moment} for {len(grasp.touches)} finger(s); record them (touch_a_{moment})"
                 )
-
-
-def _require_both_outcomes(attempts: Sequence[Attempt], subject: str) -> None:
-    held = sum(attempt.held for attempt in attempts)
-    if held in (0, len(attempts)):
-        raise DatasetError(
-            f"{subject} both successful and failed grasps; got {held} successful of {len(attempts)}; "
-            "collect without a gate to record failures too"
-        )
 
 
 def _train_net(attempts: list[Attempt], differences: Differences, iterations: int, seed: int, quiet: bool) -> GraspNet:

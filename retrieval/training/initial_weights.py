@@ -3,7 +3,7 @@
 from functools import partial
 from pathlib import Path
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from retrieval.data.dataset import DataLicence, recording_licence, stored_licences
 from retrieval.errors import CheckpointError
@@ -46,24 +46,19 @@ def _start_from(matcher: Matcher, path: Path) -> None:
         CheckpointError: The checkpoint cannot be read, has other towers, or one of its layers has another size.
     """
     ours, theirs = matcher.state_dict(), load_checkpoint(path).matcher.state_dict()
-    if missing := [name for name in ours if name.startswith(TOWER_WEIGHTS) and name not in theirs]:
-        raise CheckpointError(
-            f"{path} cannot start this training: it has no {missing[0]}; use its configuration, whose towers are of "
-            "the same kind, or another checkpoint"
-        )
     shared = {name: tensor for name, tensor in theirs.items() if name in ours}
-    for name, tensor in shared.items():
-        if tensor.shape != ours[name].shape:
+    for name, tensor in ours.items():
+        if shared.get(name, tensor).shape != tensor.shape or (name.startswith(TOWER_WEIGHTS) and name not in shared):
             raise CheckpointError(
-                f"{path} cannot start this training: {name} is {tuple(tensor.shape)}, must be "
-                f"{tuple(ours[name].shape)}; use the configuration of that checkpoint, or another checkpoint"
+                f"{path} cannot start this training: it has no {name} of shape {tuple(tensor.shape)}; use its "
+                "configuration, or another checkpoint"
             )
     matcher.load_state_dict(shared, strict=False)
 
 
 def _shipped_tower(fingers: int, side: str) -> dict[str, Tensor]:
-    tower: nn.Module = getattr(load_checkpoint(shipped_model(min(fingers, 2))).matcher, side)
-    return tower.state_dict()
+    weights: dict[str, Tensor] = getattr(load_checkpoint(shipped_model(min(fingers, 2))).matcher, side).state_dict()
+    return weights
 
 
 def training_licences(recording: Path, settings: TrainingConfig) -> list[DataLicence]:

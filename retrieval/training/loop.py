@@ -8,7 +8,7 @@ import json
 import math
 import threading
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -49,21 +49,14 @@ class Plan:
 
 @dataclass(frozen=True)
 class BestStep:
-    """The step whose weights a training run returns.
+    """The step whose weights a training run returns, as the number of completed steps.
 
-    Attributes:
-        step: Number of completed steps.
-        metrics: Result of its validation; the first value is the score, higher is better. Empty without validation:
-            then the last step is the best one.
+    `metrics` is the result of its validation; the first value is the score, higher is better. Without validation they
+    are empty, and the last step is the best one.
     """
 
     step: int = 0
     metrics: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def scores(self) -> list[tuple[str, float]]:
-        """Name and value of the score; empty without validation."""
-        return [*self.metrics.items()][:1]
 
 
 class TrainingInterrupted(JobInterrupted):
@@ -129,11 +122,8 @@ def train_loop(
     """
     done, best, best_weights = 0, BestStep(), dict[str, Tensor]()
     if state and state.path.exists():
-        try:
+        with suppress(CheckpointError) if state.is_replaceable else nullcontext():
             done, best, best_weights = _load(state, module, optimizer)
-        except CheckpointError:
-            if not state.is_replaceable:
-                raise
     is_stopped = False
     with (
         interruption() if state else nullcontext(threading.Event()) as stop,
@@ -157,15 +147,15 @@ def train_loop(
             # from old weights would seem up to date.
             increment_version(list(module.parameters()))
             done += 1
-            best_score = [f"  best {name.replace('_', ' ')} {score:.3f}" for name, score in best.scores]
-            bar.advance(note="".join([f"loss {value:.3f}", *best_score]))
+            scores = [f"  best {name.replace('_', ' ')} {score:.3f}" for name, score in best.metrics.items()]
+            bar.advance(note="".join([f"loss {value:.3f}", *scores[:1]]))
             # All ranks must stop after the same step, or the remaining ranks would wait forever.
             is_stopped = state is not None and distributed.any_rank(stop.is_set(), current.device)
             if is_stopped or done % plan.validate_every == 0 or done == plan.steps:
                 reached = BestStep(done, validate() if validate else {})
                 if not reached.metrics:
                     best = reached
-                elif not best.metrics or reached.scores[0][1] > best.scores[0][1]:
+                elif not best.metrics or next(iter(reached.metrics.values())) > next(iter(best.metrics.values())):
                     best, best_weights = reached, {name: each.clone() for name, each in module.state_dict().items()}
                 if state:
                     if not distributed.rank():
@@ -204,9 +194,11 @@ def _save(
 ) -> None:
     tensors = {f"{_MODULE}{name}": tensor for name, tensor in module.state_dict().items()}
     tensors |= {f"{_BEST}{name}": tensor for name, tensor in best_weights.items()}
-    for name, parameter in module.named_parameters():
-        for quantity, tensor in optimizer.state.get(parameter, {}).items():
-            tensors[f"{_OPTIMIZER}{name}.{quantity}"] = tensor
+    tensors |= {
+        f"{_OPTIMIZER}{name}.{quantity}": tensor
+        for name, parameter in module.named_parameters()
+        for quantity, tensor in optimizer.state.get(parameter, {}).items()
+    }
     header = {"step": done, "best_step": best.step, "metrics": best.metrics, "identity": state.identity}
     write_tensors(state.path, tensors, header)
 

@@ -105,8 +105,8 @@ def train(
         )
     else:
         require_fit(split, grasps)
-    licences = training_licences(recording, settings)
-    return Trainer(config, split, grasps, out, recording_source(recording), licences=licences).run(quiet)
+    source, licences = recording_source(recording), training_licences(recording, settings)
+    return Trainer(config, split, grasps, out, source, licences=licences).run(quiet)
 
 
 _DATA_AND_CODE = ("data_digest", "code")
@@ -155,7 +155,8 @@ class Trainer:
         # On a CPU, PyTorch's default optimizer reads every tensor eight times. The fused optimizer reads it once. On
         # CUDA the default optimizer is fast.
         self.optimizer = torch.optim.Adam(groups, lr=settings.learning_rate, fused=self.device.type == "cpu")
-        for clamp in (self.matcher.clamp_scale, self.losses.clamp):
+        clamps = [term.clamp for term in self.losses.modules() if isinstance(term, Loss)]
+        for clamp in (self.matcher.clamp_scale, *clamps):
             self.optimizer.register_step_post_hook(lambda *_, clamp=clamp: clamp())
         held_out = split.select(grasps, "validation")
         self.validation = self._sampler(held_out).evaluation_pairs() if split.validation else None
@@ -198,10 +199,9 @@ class Trainer:
         """
         settings, touches = self.config.training, self.config.training.touches_per_batch
         quiet = quiet or distributed.rank() > 0
-        identity: dict[str, Any] = {"config": self.config.to_dict(), "split": self.split.to_dict()}
-        identity |= {name: self.provenance.get(name) for name in _DATA_AND_CODE}
-        state = StateFile(state_path(self.out), identity, is_replaceable=replace)
-        interrupted = None
+        made_from = {name: self.provenance.get(name) for name in _DATA_AND_CODE}
+        identity = {"config": self.config.to_dict(), "split": self.split.to_dict(), **made_from}
+        state, interrupted = StateFile(state_path(self.out), identity, is_replaceable=replace), None
         try:
             best = train_loop(
                 self.modules,
@@ -328,12 +328,6 @@ class WeightedLosses(nn.Module):
         self.weights = {name: weight for name, weight in weights.items() if weight > 0}
         dim = matcher.config.embedding_dim
         self.terms = nn.ModuleList(LOSSES.load(name)(dim, objects) for name in self.weights)
-
-    def clamp(self) -> None:
-        """Clamp the losses' parameters to their ranges."""
-        for term in self.terms:
-            if isinstance(term, Loss):
-                term.clamp()
 
 
 def batch_loss(
