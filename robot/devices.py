@@ -36,6 +36,7 @@ class Device(ABC):
 
     Attributes:
         clock: Time in s, the same for all devices of a rig.
+        is_connected: Whether the device can be used.
         refused: Settings that the device refused, each with the requested and the actual value.
         Settings: Dataclass of a driver's settings; its fields are the keyword arguments of the constructor.
     """
@@ -45,26 +46,21 @@ class Device(ABC):
     def __init__(self, name: str, *, clock: Clock = time.monotonic) -> None:
         self.name, self.clock = name, clock
         self.refused: dict[str, str] = {}
-        self._connected = False
-
-    @property
-    def is_connected(self) -> bool:
-        """Whether the device can be used."""
-        return self._connected
+        self.is_connected = False
 
     def connect(self) -> None:
         """Connect completely or not at all; a second call does nothing."""
-        if self._connected:
+        if self.is_connected:
             return
         with _on_error(self._close, f"{self.name} was closed"), self._use("cannot be connected", connected=False):
             self._connect()
-        self._connected = True
+        self.is_connected = True
 
     def close(self) -> None:
         """Close the device if it is connected; it is disconnected afterwards, even if this raises."""
-        if not self._connected:
+        if not self.is_connected:
             return
-        self._connected = False
+        self.is_connected = False
         with self._use("cannot be closed", connected=False):
             self._close()
 
@@ -102,17 +98,16 @@ class Device(ABC):
     @contextlib.contextmanager
     def _use(self, failure: str, *, connected: bool = True) -> Iterator[None]:
         """Convert each OSError into a DeviceError; with `connected`, require that the device is."""
-        if connected and not self._connected:
+        if connected and not self.is_connected:
             raise DeviceError(f"{self.name} must be connected before it is used; call connect() first")
         try:
             yield
         except OSError as error:
             raise DeviceError(f"{self.name} {failure}: {error.strerror or error or type(error).__name__}") from error
 
-    def _check(self, what: str, value: float, low: float, high: float, unit: str) -> float:
+    def _check(self, what: str, value: float, low: float, high: float, unit: str) -> None:
         if not low <= value <= high:  # also rejects NaN
             raise DeviceError(f"{self.name}: {what} must be from {low:g} to {high:g} {unit}, got {value:g}")
-        return float(value)
 
     def _check_age(self, time_s: float, max_age_s: float) -> None:
         age = self.clock() - time_s

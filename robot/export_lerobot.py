@@ -87,8 +87,10 @@ def export_lerobot(recording: Recording, out: Path, progress: Progress | None = 
     per_camera = {"photo": ["photo"] * len(moments)}
     per_camera |= {f"touch_{each}": [f"touch_{each}{suffix}" for suffix in suffixes] for each in fingers}
     first = grasps[0].images()
-    sizes = {name: _read_picture(recording.folder / first[each[0]]).shape[:2] for name, each in per_camera.items()}
-    cameras = [_Camera(name, each, sizes[name]) for name, each in per_camera.items()]
+    cameras = [
+        _Camera(name, each, _read_picture(recording.folder / first[each[0]]).shape[:2])
+        for name, each in per_camera.items()
+    ]
     numbers = [list(MOMENT_SUFFIXES).index(moment) for moment in moments]
     tasks = {name: number for number, name in enumerate(dict.fromkeys(grasp.object_id for grasp in grasps))}
     steps: list[dict[str, Any]] = []
@@ -108,10 +110,15 @@ def export_lerobot(recording: Recording, out: Path, progress: Progress | None = 
                 if progress is not None:
                     progress(episode + 1, len(grasps))
         kinds = {"string": pa.string(), "bool": pa.bool_(), "double": pa.float64(), "list": pa.list_(pa.float64())}
-        _write_table(folder / DATA_PATH.format(**_NUMBERS), steps, {"timestamp": pa.float32()})
         types = {key: kinds[kind] for key, kind in _FIELDS.items()}
-        _write_table(folder / EPISODES_PATH.format(**_NUMBERS), episodes, types)
-        _write_tasks(folder / "meta" / "tasks.parquet", tasks)
+        tables = {
+            DATA_PATH.format(**_NUMBERS): _table(pa, steps, {"timestamp": pa.float32()}),
+            EPISODES_PATH.format(**_NUMBERS): _table(pa, episodes, types),
+            "meta/tasks.parquet": _task_table(pa, tasks),
+        }
+        for path, table in tables.items():
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            import_extra("pyarrow.parquet", _WHAT).write_table(table, folder / path)
         stats = {
             name: _stats([_summary(np.array([[step[name]] for step in steps], np.float64))], len(steps))
             for name in _STEP_COLUMNS
@@ -220,17 +227,14 @@ def _episode(episode: int, grasp: RecordedGrasp, length: int, cameras: Sequence[
     return row | {key: getattr(grasp, key) for key in _FIELDS}
 
 
-def _write_table(path: Path, rows: Sequence[Mapping[str, Any]], types: Mapping[str, Any]) -> None:
-    """Write a Parquet file of rows with the same keys; `types` are those that values do not determine."""
-    pa = import_extra("pyarrow", _WHAT)
-    columns = {key: pa.array([row[key] for row in rows], types.get(key)) for key in rows[0]}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    import_extra("pyarrow.parquet", _WHAT).write_table(pa.table(columns), path)
+def _table(pa: Any, rows: Sequence[Mapping[str, Any]], types: Mapping[str, Any]) -> Any:
+    """Return the pyarrow table of rows with the same keys; `types` are those that values do not determine."""
+    return pa.table({key: pa.array([row[key] for row in rows], types.get(key)) for key in rows[0]})
 
 
-def _write_tasks(path: Path, tasks: Mapping[str, int]) -> None:
-    """Write tasks like a pandas frame with column task_index and the tasks as index, the layout that LeRobot reads."""
-    pa, index = import_extra("pyarrow", _WHAT), "__index_level_0__"
+def _task_table(pa: Any, tasks: Mapping[str, int]) -> Any:
+    """Return tasks like a pandas frame with column task_index and the tasks as index, the layout that LeRobot reads."""
+    index = "__index_level_0__"
     kinds = {"task_index": ("task_index", "int64", "int64"), index: (None, "unicode", "object")}
     columns = [
         {"name": name, "field_name": field, "pandas_type": kind, "numpy_type": numpy_type, "metadata": None}
@@ -238,8 +242,7 @@ def _write_tasks(path: Path, tasks: Mapping[str, int]) -> None:
     ]
     metadata = {"index_columns": [index], "column_indexes": [], "columns": columns, "pandas_version": "2.0.0"}
     table = pa.table({"task_index": pa.array(tasks.values(), pa.int64()), index: pa.array(tasks, pa.string())})
-    table = table.replace_schema_metadata({b"pandas": json.dumps(metadata).encode()})
-    import_extra("pyarrow.parquet", _WHAT).write_table(table, path)
+    return table.replace_schema_metadata({b"pandas": json.dumps(metadata).encode()})
 
 
 def _info(recording: Recording, moments: Sequence[str], cameras: Sequence[_Camera], tasks: int) -> dict[str, Any]:

@@ -169,7 +169,7 @@ def _camera(table: Mapping[str, Any]) -> Camera:
     if file is not None:
         path = Path(typed(file, str, "[camera]: hand_eye", error=RobotConfigError))
         typed(days, float, "[camera]: hand_eye_days", error=RobotConfigError)
-        extrinsics = hand_eye.load_hand_eye(path, max_age_days=days).rigid
+        extrinsics = hand_eye.load_hand_eye(path, days)
     camera: Camera = load_driver("camera", settings, "[camera]", extrinsics=extrinsics)
     if camera.has_depth and file is None:
         raise RobotConfigError(

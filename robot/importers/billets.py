@@ -41,7 +41,7 @@ def import_billets(src: Path, out: Path, progress: Progress | None = None) -> Re
     Raises:
         ImporterError: `src` contains no pair of photo and touch.
     """
-    items = list(_places(Path(src)))
+    items = list(_places(src))
     if not any(isinstance(item, Item) for item in items):
         raise DATA_SET.mismatch_error(src, "it contains no pair")
     return import_items(DATA_SET, items, out, total=len(items), progress=progress)

@@ -76,9 +76,9 @@ def import_feeling_of_success(src: Path, out: Path, progress: Progress | None = 
     Raises:
         ImporterError: `src` contains no HDF5 file, or h5py is missing.
     """
-    files = [path for _, path in numbered_files(Path(src), _FILE)]
+    files = [path for _, path in numbered_files(src, _FILE)]
     if not files:
-        raise DATA_SET.mismatch_error(Path(src), "it contains no HDF5 file")
+        raise DATA_SET.mismatch_error(src, "it contains no HDF5 file")
     h5py = import_extra("h5py", "The Feeling of Success")
     with contextlib.suppress(ImportError):
         import_module("hdf5plugin")  # registers its filters

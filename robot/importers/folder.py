@@ -28,7 +28,6 @@ from robot.errors import ImporterError
 from robot.importers.importing import (
     NOT_STATED,
     DataSet,
-    Images,
     Item,
     Progress,
     Skip,
@@ -68,7 +67,6 @@ def import_folder(
     Raises:
         ImporterError: A pattern is invalid, or no picture matches.
     """
-    src = Path(src)
     if not src.is_dir():
         raise ImporterError(f"{src} must be a folder of pictures")
     matches = _PatternMatches(src, touch, photo, background)
@@ -127,8 +125,8 @@ class _PatternMatches:
             raise ImporterError(f"{both} matches both patterns; change touch or photo so that only one matches")
         self._photos = _MatchingFiles(photo_pattern, self._touch, files)
         self._frames = _MatchingFiles(_Pattern("background", background), self._touch, files if background else ())
-        self.has_background = bool(self._frames)
-        for option, text, matches in (("touch", touch, touches), ("photo", photo, self._photos)):
+        self.has_background = bool(self._frames.files)
+        for option, text, matches in (("touch", touch, touches), ("photo", photo, self._photos.files)):
             if not matches:
                 content = f"only others, such as {files[0]}" if files else "no picture at all"
                 raise ImporterError(
@@ -138,9 +136,8 @@ class _PatternMatches:
         names = sorted({words.get("finger", "") for _, words in touches}, key=natural_sort_key)
         self.fingers = dict(zip(names, ascii_lowercase, strict=False))
         self._repeated: list[str] = []
-        self._grasps: dict[tuple[str, ...], dict[str, str]] = defaultdict(
-            dict
-        )  # words without finger -> finger -> path
+        # The words without finger -> finger -> path.
+        self._grasps: dict[tuple[str, ...], dict[str, str]] = defaultdict(dict)
         for path, words in touches:
             others = (value for key, value in words.items() if key not in ("object", "finger"))
             grasp = self._grasps[words["object"], *others]
@@ -154,19 +151,22 @@ class _PatternMatches:
         yield from (Skip("another picture of the same grasp and finger was found", path) for path in self._repeated)
         for key, paths in self._grasps.items():
             name, words = safe_name(*key), self._touch.match(next(iter(paths.values()))) or {}
-            photos, group = self._photos.of(words)
+            photos, group = self._photos.of(words), self._photos.key(words)
             if len(paths) < len(self.fingers):
                 yield Skip("a finger has no picture", name)
             elif not photos:
                 yield Skip("no photo matches it", name)
             else:
-                images: Images = {"photo": _shared(self.src, photos[assigned[group] % len(photos)])}
+                images: dict[str, Path | SharedImage] = {"photo": self._shared(photos[assigned[group] % len(photos)])}
                 assigned[group] += 1
                 for finger, letter in self.fingers.items():
-                    images = {**images, f"touch_{letter}": self.src / paths[finger]}
-                    if before := self._frames.of(self._touch.match(paths[finger]) or {})[0]:
-                        images[f"touch_{letter}_before"] = _shared(self.src, before[0])
+                    images[f"touch_{letter}"] = self.src / paths[finger]
+                    if before := self._frames.of(self._touch.match(paths[finger]) or {}):
+                        images[f"touch_{letter}_before"] = self._shared(before[0])
                 yield Item(name, key[0], images, {"sequence_id": words.get("sequence")})
+
+    def _shared(self, path: str) -> SharedImage:
+        return SharedImage(sha256(path.encode(errors="surrogateescape")).hexdigest()[:24], self.src / path)
 
 
 class _MatchingFiles:
@@ -174,21 +174,18 @@ class _MatchingFiles:
 
     def __init__(self, pattern: _Pattern, others: _Pattern, files: Iterable[str]) -> None:
         self._words = sorted(pattern.words & others.words)
-        self._files: dict[tuple[str, ...], list[str]] = defaultdict(list)
+        self.files: dict[tuple[str, ...], list[str]] = defaultdict(list)
         for path in files:
             if words := pattern.match(path):
-                self._files[self._key(words)].append(path)
+                self.files[self.key(words)].append(path)
 
-    def __bool__(self) -> bool:
-        return bool(self._files)
-
-    def of(self, words: Words) -> tuple[list[str], tuple[str, ...]]:
-        """Return the files that match a touch, and the values of their common words."""
-        key = self._key(words)
-        return self._files.get(key, []), key
-
-    def _key(self, words: Words) -> tuple[str, ...]:
+    def key(self, words: Words) -> tuple[str, ...]:
+        """Return the values of the common words."""
         return tuple(words[name] for name in self._words)
+
+    def of(self, words: Words) -> list[str]:
+        """Return the files that match a touch."""
+        return self.files.get(self.key(words), [])
 
 
 def _pictures(src: Path) -> list[str]:
@@ -201,7 +198,3 @@ def _pictures(src: Path) -> list[str]:
     paths = (path.relative_to(src) for path in files if path.suffix.lower() in _ENDINGS)
     shown = [path.as_posix() for path in paths if not any(part.startswith(".") for part in path.parts)]
     return sorted(shown, key=natural_sort_key)
-
-
-def _shared(src: Path, path: str) -> SharedImage:
-    return SharedImage(f"{sha256(path.encode(errors='surrogateescape')).hexdigest()[:24]}", src / path)

@@ -173,7 +173,7 @@ def _append(writer: RecordingWriter, item: Item) -> Skip | None:
         for column, source in item.images.items():
             if not isinstance(source, SharedImage):
                 images[column] = picture_bytes(column, source)
-            elif writer.has_shared(source.name):
+            elif writer.shared_path(source.name):
                 images[column] = source
             else:
                 images[column] = SharedImage(source.name, picture_bytes(column, source.source))

@@ -73,10 +73,8 @@ def import_lerobot(
     Raises:
         ImporterError: pyarrow or av is missing, or `src` is not a data set of version 3.
     """
-    src = Path(src)
     if not (src / "meta" / "info.json").is_file():
         raise DATA_SET.mismatch_error(src, "there is no such file")
-    import_extra("pyarrow", _WHAT), import_extra("av", _WHAT)
     source = _LeRobotSource(src, touch, photo)
     total = sum(1 for _ in source.episodes(("episode_index",)))
     return import_items(
@@ -127,6 +125,7 @@ class _LeRobotSource:
     """A data set on disk: its cameras, and its episodes as grasps."""
 
     def __init__(self, src: Path, touch: str, photo: str) -> None:
+        self._av, self._arrow = import_extra("av", _WHAT), import_extra("pyarrow", _WHAT)
         self.src, self._info = src, _read_info(src / "meta" / "info.json")
         kinds = {name: each.dtype for name, each in self._info.features.items() if each.dtype in ("video", "image")}
         self._kinds = kinds
@@ -155,7 +154,7 @@ class _LeRobotSource:
         if not paths:
             raise ImporterError(f"{self.src} must contain meta/episodes/chunk-000/file-000.parquet")
         for path in paths:
-            with _readable(path):
+            with self._readable(path):
                 file = import_extra("pyarrow.parquet", _WHAT).ParquetFile(path)
                 known = [name for name in columns if name in file.schema_arrow.names]
                 for batch in file.iter_batches(256, columns=known):
@@ -189,7 +188,6 @@ class _LeRobotSource:
             yield pictures[0], pictures[1:]
 
     def _video_frames(self, key: str, row: _Row) -> Iterator[Picture]:
-        av = import_extra("av", _WHAT)
         path = self.src / f"videos/{key}/{_file_of(row, f'videos/{key}')}.mp4"
         start = row.get(f"videos/{key}/from_timestamp")
         if not isinstance(start, float) or not path.is_file():
@@ -204,7 +202,7 @@ class _LeRobotSource:
                     if frame.time >= end:
                         return
                     yield frame.to_ndarray(format="rgb24")
-        except (av.error.FFmpegError, OSError, ValueError, IndexError, OverflowError) as error:
+        except (self._av.error.FFmpegError, OSError, ValueError, IndexError, OverflowError) as error:
             self._videos.pop(key, None)
             raise ImporterError("its video cannot be decoded") from error
 
@@ -214,14 +212,14 @@ class _LeRobotSource:
         If it were opened for each episode, its buffers would fragment the heap by several kB per episode.
         """
         if self._videos.get(key, (None, None))[0] != path:
-            self._videos[key] = (path, import_extra("av", _WHAT).open(str(path)))
+            self._videos[key] = (path, self._av.open(str(path)))
         return self._videos[key][1]
 
     def _image_frames(self, key: str, row: _Row) -> Iterator[Picture]:
         """Yield the pictures that the rows of steps contain as PNG or JPEG."""
         path = self.src / f"data/{_file_of(row, 'data')}.parquet"
         dataset = import_extra("pyarrow.dataset", _WHAT)
-        with _readable(path):
+        with self._readable(path):
             is_of_episode = dataset.field("episode_index") == row["episode_index"]
             for batch in dataset.dataset(path).to_batches(
                 columns=[key], filter=is_of_episode, batch_size=16, batch_readahead=1
@@ -233,6 +231,14 @@ class _LeRobotSource:
                         raise ImporterError("a picture of its episode cannot be decoded")
                     yield image
 
+    @contextmanager
+    def _readable(self, path: Path) -> Iterator[None]:
+        """Convert pyarrow's errors for a damaged file to ImporterError."""
+        try:
+            yield
+        except (self._arrow.ArrowException, OSError, ValueError, KeyError) as error:
+            raise ImporterError(f"{path} cannot be read: {str(error)[:200]!r}") from error
+
 
 def _file_of(row: _Row, kind: str) -> str:
     """Return the chunk and file of an episode's data or video."""
@@ -240,13 +246,3 @@ def _file_of(row: _Row, kind: str) -> str:
     if not all(isinstance(number, int) and number >= 0 for number in numbers.values()):
         raise ImporterError(f"its episode does not name the file of its {kind.split('/')[0]}")
     return _FILE.format(**numbers)
-
-
-@contextmanager
-def _readable(path: Path) -> Iterator[None]:
-    """Convert pyarrow's errors for a damaged file to ImporterError."""
-    pa = import_extra("pyarrow", _WHAT)
-    try:
-        yield
-    except (pa.ArrowException, OSError, ValueError, KeyError) as error:
-        raise ImporterError(f"{path} cannot be read: {str(error)[:200]!r}") from error

@@ -6,17 +6,14 @@
     touch/<object>/<instance>.png
     split.json                                      {"train": {"<object>": [instances]}, "val": ..., "test": ...}
 
-The id of an object is its number, because names occur twice in the public list. If `objectfolder_real_metadata.csv`
-(Index, Name, Material) is next to the folders, recording.json lists names and materials under `objects`. A touch gets
-the photo with its own number; without such a photo, touch number i gets photo number i modulo the number of photos. The
-split of a pack is stored if its parts have different objects. Audio is ignored.
+The id of an object is its number, because names occur twice in the public list. A touch gets the photo with its own
+number; without such a photo, touch number i gets photo number i modulo the number of photos. The split of a pack is
+stored if its parts have different objects. Audio is ignored.
 """
 
-import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from robot.errors import ImporterError
 from robot.importers.importing import (
@@ -30,7 +27,7 @@ from robot.importers.importing import (
     subfolders,
 )
 from robot.recording.folder import Recording, SharedImage, safe_name
-from robot.storage import read_content, read_json_object
+from robot.storage import read_json_object
 
 DATA_SET = DataSet(
     source="ObjectFolder",
@@ -48,7 +45,6 @@ DATA_SET = DataSet(
     unverified=("whether the split of each pack is by object or by picture",),
 )
 _PICTURE = re.compile(r"(\d+)\.(png|jpg)")
-_NAMES = "objectfolder_real_metadata.csv"
 _PARTS = {"train": "train", "val": "validation", "test": "test"}
 
 
@@ -58,7 +54,6 @@ def import_objectfolder(src: Path, out: Path, progress: Progress | None = None) 
     Raises:
         ImporterError: `src` contains neither.
     """
-    src = Path(src)
     is_pack = (src / "vision").is_dir() and (src / "touch").is_dir()
     if is_pack:
         folders = [(folder.name, folder, src / "vision" / folder.name) for folder in subfolders(src / "touch")]
@@ -71,14 +66,12 @@ def import_objectfolder(src: Path, out: Path, progress: Progress | None = None) 
     }
     if not objects:
         raise DATA_SET.mismatch_error(src, "it contains no touch of that kind")
-    names = _names(src / _NAMES)
     return import_items(
         DATA_SET,
         _items(objects),
         out,
         total=sum(len(touches) for touches, _ in objects.values()),
         progress=progress,
-        objects={name: names.get(name, {}) for name in objects},
         split=_split(src / "split.json") if is_pack else None,
     )
 
@@ -96,21 +89,6 @@ def _items(objects: Mapping[str, tuple[_Files, _Files]]) -> Iterator[Item | Skip
             photo = photos.get(match[1]) or list(photos.values())[number % len(photos)]
             shared = SharedImage(safe_name(name, "photo", photo.stem), photo)
             yield Item(safe_name(name, match[1]), name, {"photo": shared, "touch_a": path})
-
-
-def _names(path: Path) -> Mapping[str, Mapping[str, Any]]:
-    """Return name and material of each object; nothing without the table."""
-    if not path.is_file():
-        return {}
-    try:
-        rows = csv.DictReader(read_content(path, ImporterError).decode("utf-8-sig").splitlines())
-        return {
-            str(row["Index"]).strip(): {"name": row["Name"], "material": row["Material"]}
-            for row in rows
-            if row.get("Index")
-        }
-    except (csv.Error, KeyError, UnicodeDecodeError) as error:
-        raise ImporterError(f"{path} must be CSV with the columns Index, Name, Material: {error}") from error
 
 
 def _split(path: Path) -> Mapping[str, Sequence[str]] | None:

@@ -65,7 +65,6 @@ def import_open_x_tactile(
     Raises:
         ImporterError: zarr is missing, or a store does not have this layout.
     """
-    src = Path(src)
     paths = sorted(
         path
         for path in (src, *(src.glob("*") if src.is_dir() else ()))

@@ -63,7 +63,6 @@ def import_physiclear(src: Path, out: Path, progress: Progress | None = None, *,
     Raises:
         ImporterError: There is no video, or av is missing.
     """
-    src = Path(src)
     typed(frames, Count, "frames", error=ImporterError)
     videos = numbered_files(src / "dataset" if (src / "dataset").is_dir() else src, _VIDEO)
     if not videos:

@@ -57,7 +57,6 @@ def import_rct(
     Raises:
         ImporterError: The table is missing, or no row has its pictures.
     """
-    src = Path(src)
     table = src / "metadata" / "force_metadata.csv"
     if not table.is_file():
         raise DATA_SET.mismatch_error(src, "it has no metadata/force_metadata.csv")

@@ -33,7 +33,7 @@ from functools import partial
 from itertools import chain
 from pathlib import Path
 from string import ascii_lowercase
-from typing import Annotated, Any, NamedTuple, Self
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from msgspec import Meta
@@ -74,7 +74,8 @@ DATA_SET = DataSet(
 _Contact = Annotated[float, Meta(gt=0, le=1)]
 _SUFFIXES = (".bag", ".mcap", ".db3")
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-_CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1}
+_RGB_OF = {"rgb8": [0, 1, 2], "bgr8": [2, 1, 0], "mono8": [0, 0, 0]}
+"""Channels of red, green and blue in each encoding."""
 _REPAIR = "if its recording was cut off, repair it: rosbag reindex (ROS 1), mcap recover (MCAP)"
 
 
@@ -99,7 +100,6 @@ def import_rosbag(
     Raises:
         ImporterError: There is no bag, rosbags is missing, or no bag can be read.
     """
-    src = Path(src)
     typed(contact, _Contact, "contact", error=ImporterError)
     typed(settle_s, NonNegative, "settle_s", error=ImporterError)
     paths = _bag_paths(src)
@@ -150,14 +150,6 @@ def _storage_files(path: Path) -> list[Path]:
     return [file for _, file in numbered_files(path, re.compile(r".*\.(mcap|db3)", re.DOTALL)) if file.is_file()]
 
 
-class BagMessage(NamedTuple):
-    """A message that is not yet decoded: its topic, when the bag recorded it, and a function that decodes it."""
-
-    topic: str
-    time_ns: int
-    decode: Callable[[], Any]
-
-
 class Bag(contextlib.AbstractContextManager["Bag"]):
     """An open bag: a .bag, .mcap or .db3 file, or the folder of a ROS 2 bag.
 
@@ -182,12 +174,12 @@ class Bag(contextlib.AbstractContextManager["Bag"]):
             raise ImporterError(f"its bag cannot be read: {error}; {_REPAIR}") from error
         self.topics = {connection.topic: connection.msgtype for connection in self._reader.connections}
 
-    def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
-        """Yield the messages of some topics in the order in which they were recorded."""
+    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Callable[[], Any]]]:
+        """Yield topic, time in ns and decoder of the messages of some topics, in the order of recording."""
         connections = [connection for connection in self._reader.connections if connection.topic in topics]
         try:
             for connection, time_ns, data in self._reader.messages(connections):
-                yield BagMessage(connection.topic, time_ns, partial(self._decode, data, connection))
+                yield connection.topic, time_ns, partial(self._decode, data, connection)
         except Exception as error:
             raise ImporterError(f"its bag is damaged: {error}; {_REPAIR}") from error
 
@@ -197,10 +189,7 @@ class Bag(contextlib.AbstractContextManager["Bag"]):
         except Exception as error:
             raise ImporterError(f"a message of {connection.topic} cannot be decoded: {error}") from error
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, *_: object) -> None:
         self._reader.close()
 
 
@@ -212,9 +201,10 @@ def picture_of(message: Any) -> NDArray[np.uint8] | bytes:
     """
     if not hasattr(message, "encoding"):
         return bytes(message.data)
-    if message.encoding not in _CHANNELS:
-        raise ImporterError(f"the encoding of its images must be {', '.join(_CHANNELS)}, got {message.encoding!r}")
-    channels = _CHANNELS[message.encoding]
+    if message.encoding not in _RGB_OF:
+        raise ImporterError(f"the encoding of its images must be {', '.join(_RGB_OF)}, got {message.encoding!r}")
+    red_green_blue = _RGB_OF[message.encoding]
+    channels = len(set(red_green_blue))
     data = np.frombuffer(message.data, np.uint8)  # rclpy: array.array
     if data.size != message.height * message.step or message.step < message.width * channels:
         raise ImporterError(
@@ -222,9 +212,7 @@ def picture_of(message: Any) -> NDArray[np.uint8] | bytes:
         )
     rows = data.reshape(message.height, message.step)
     pixels = rows[:, : message.width * channels].reshape(message.height, message.width, channels)
-    if channels == 1:
-        return np.repeat(pixels, 3, axis=2)
-    return pixels if message.encoding == "rgb8" else pixels[..., ::-1]
+    return pixels[..., red_green_blue]
 
 
 @dataclass(frozen=True)
@@ -325,11 +313,12 @@ class _Grasp(NamedTuple):
 
 def _find_grasps(scan: _Scan, topics: _Topics, contact: float, settle_s: float) -> list[_Grasp | str]:
     """Return the grasps of a bag in order of time; a text is the reason why one is not usable."""
-    first, *others = (np.array(scan.times[topic], np.int64) for topic in topics.touch)
-    if not len(first) or not all(map(len, others)):
+    times = [np.array(scan.times[topic], np.int64) for topic in topics.touch]
+    if not times or not all(map(len, times)):
         return []
     # Everything is on the clock of the first finger: the other fingers' images nearest in time belong to its images.
-    numbers = [np.arange(len(first)), *(_nearest(times, first) for times in others)]
+    first = times[0]
+    numbers = [_nearest(own, first) for own in times]
     fingers = list(zip(topics.touch, numbers, strict=True))
     if topics.grasp:
         is_held = np.array([bool(scan.latest_value(topics.grasp, time_ns)) for time_ns in first.tolist()])
@@ -337,7 +326,7 @@ def _find_grasps(scan: _Scan, topics: _Topics, contact: float, settle_s: float) 
         is_held = np.any([np.array(scan.changed[topic])[number] >= contact for topic, number in fingers], axis=0)
     strength = np.sum([np.array(scan.changes[topic])[number] for topic, number in fingers], axis=0)
     photos = np.array(scan.times[topics.photo], np.int64)
-    clocks = [clock[number] for clock, number in zip((first, *others), numbers, strict=True)]
+    clocks = [own[number] for own, number in zip(times, numbers, strict=True)]
     found: list[_Grasp | str] = []
     released = 0
     for start, stop in _intervals(first, is_held, int(settle_s * 1e9)):
@@ -380,7 +369,7 @@ def _items(
 ) -> Iterator[Item | Skip]:
     """Yield the grasps of a bag, in one more pass over its images; only those of one grasp are in memory."""
     places: dict[tuple[str, int], list[tuple[str, str]]] = defaultdict(list)
-    fields: dict[str, dict[str, Any]] = {}
+    found: dict[str, tuple[str, dict[str, Any]]] = {}
     with Bag(path) as bag:
         for number, grasp in enumerate(grasps, start=1):
             name = safe_name(bag.name, f"{number:03}")
@@ -391,21 +380,20 @@ def _items(
             if object_id is None:
                 yield Skip(f"there is no message of {topics.object} before it", name)
                 continue
-            time_s = (grasp.touch[0] - start_ns) / 1e9
             sequence = f"{bag.name}-{object_id}" if topics.object else bag.name
-            facts = {"object_id": object_id, "sequence_id": sequence, "time_s": time_s}
-            fields[name] = {**facts, **_fields(grasp, scan, topics)}
+            facts = {"sequence_id": sequence, "time_s": (grasp.touch[0] - start_ns) / 1e9}
+            found[name] = str(object_id), {**facts, **_fields(grasp, scan, topics)}
             places[topics.photo, grasp.photo].append((name, "photo"))
             for finger, topic, rest, touch in zip(ascii_lowercase, topics.touch, *grasp[1:], strict=False):
                 places[topic, touch].append((name, f"touch_{finger}"))
                 places[topic, rest].append((name, f"touch_{finger}_before"))
         images: dict[str, dict[str, Source]] = defaultdict(dict)
-        for message in bag.messages((*topics.touch, topics.photo)):
-            for name, column in places.pop((message.topic, message.time_ns), ()):
-                images[name][column] = partial(lambda decode: picture_of(decode()), message.decode)
+        for topic, time_ns, decode in bag.messages((*topics.touch, topics.photo)):
+            for name, column in places.pop((topic, time_ns), ()):
+                images[name][column] = partial(lambda decode: picture_of(decode()), decode)
                 if len(images[name]) == 1 + 2 * len(topics.touch):
-                    facts = fields.pop(name)
-                    yield Item(name, str(facts.pop("object_id")), images.pop(name), facts)
+                    object_id, fields = found.pop(name)
+                    yield Item(name, object_id, images.pop(name), fields)
 
 
 def _fields(grasp: _Grasp, scan: _Scan, topics: _Topics) -> dict[str, float]:

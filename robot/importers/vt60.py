@@ -68,7 +68,6 @@ def import_vt60(src: Path, out: Path, progress: Progress | None = None) -> Recor
     Raises:
         ImporterError: `src` has no touch/ or vision/ with classes.
     """
-    src = Path(src)
     for part in ("touch", "vision"):
         if not (src / part).is_dir():
             raise DATA_SET.mismatch_error(src, f"it has no {part}/ (the folder is code/data/vt60 of the repository)")

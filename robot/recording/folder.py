@@ -237,7 +237,7 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
         for column, source in images.items():
             name = f"{grasp_id}_{column}"
             if isinstance(source, SharedImage):
-                if stored := self._shared(source.name):
+                if stored := self.shared_path(source.name):
                     paths[f"{column}_file_name"] = stored
                     continue
                 name, source = f"{source.name}_shared", source.source
@@ -256,11 +256,8 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
         self._grasp_ids[grasp_id] = None
         return grasp
 
-    def has_shared(self, name: str) -> bool:
-        """Return whether the recording contains the shared image `name`."""
-        return self._shared(name) is not None
-
-    def _shared(self, name: str) -> str | None:
+    def shared_path(self, name: str) -> str | None:
+        """Return the path of the shared image `name`; None if the recording does not contain it."""
         _check_id("the name of a shared image", name)
         paths = (f"{IMAGES_FOLDER}/{name}_shared{suffix}" for suffix in (".png", ".jpg"))
         return next((path for path in paths if (self.folder / path).is_file()), None)

@@ -14,12 +14,11 @@ from robot.recording.grasp import RecordedGrasp
 from robot.storage import storage_errors
 
 Picture = npt.NDArray[np.uint8]
-TILE_PX = 160
-_CAPTION_PX = 24
+MAX_ROWS, TILE_PX, _CAPTION_PX = 12, 160, 24
 
 
-def write_preview(folder: str | Path, out: str | Path, rows: int = 12) -> Path:
-    """Write a PNG with one grasp of each of up to `rows` objects of a recording, evenly chosen; return its path.
+def write_preview(folder: str | Path, out: str | Path) -> Path:
+    """Write a PNG with one grasp of each of up to `MAX_ROWS` objects of a recording, evenly chosen; return its path.
 
     Raises:
         RecordingError: The recording is invalid or empty.
@@ -31,7 +30,7 @@ def write_preview(folder: str | Path, out: str | Path, rows: int = 12) -> Path:
         first.setdefault(grasp.object_id, grasp)
     if not first:
         raise RecordingError("a preview needs a recording with at least one grasp; this one has none")
-    picked = np.linspace(0, len(first) - 1, min(rows, len(first))).round().astype(int)
+    picked = np.linspace(0, len(first) - 1, min(MAX_ROWS, len(first))).round().astype(int)
     grasps = [list(first.values())[index] for index in picked]
     columns = list(dict.fromkeys(column for grasp in grasps for column in grasp.images() if "after" not in column))
     header = np.hstack([_caption(column, TILE_PX) for column in columns])
@@ -61,8 +60,7 @@ def _tile(path: Path | None) -> Picture:
         image = cv2.applyColorMap(level, cv2.COLORMAP_VIRIDIS) * (image > 0)[..., None]
     elif image.ndim == 2:
         image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
-    scale = (TILE_PX - 4) / max(image.shape[:2])
-    width, height = round(image.shape[1] * scale), round(image.shape[0] * scale)
+    height, width = (round(side * (TILE_PX - 4) / max(image.shape[:2])) for side in image.shape[:2])
     top, left = (TILE_PX - height) // 2, (TILE_PX - width) // 2
     tile[top : top + height, left : left + width] = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     return tile

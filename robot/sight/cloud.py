@@ -88,7 +88,8 @@ def find_table(depth_mm: Depth, rays: Rays) -> TablePlane:
         plane = np.asarray(np.linalg.lstsq(design, inside[:, 2], rcond=None)[0], np.float64)
     off = near[:, 2] - _heights(plane, near)
     noise = 1.4826 * float(np.median(np.abs(off))) / max(rays.steepness, 0.1)
-    return TablePlane(*map(float, plane), max(noise, 0.3))
+    a, b, c = map(float, plane)
+    return TablePlane(a, b, c, max(noise, 0.3))
 
 
 def _best_plane(points: Array) -> Array:

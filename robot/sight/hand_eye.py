@@ -120,8 +120,8 @@ class _Document:
     residuals_mm: tuple[float, ...]
 
 
-def load_hand_eye(path: Path, max_age_days: float | None = None, now: datetime | None = None) -> HandEye:
-    """Load a saved calibration of at most `max_age_days` at the time `now`; None for any age, and for the clock.
+def load_hand_eye(path: Path, max_age_days: float) -> Points:
+    """Return the (4, 4) motion of a saved calibration that is at most `max_age_days` old.
 
     Raises:
         RobotConfigError: The file is not a calibration, or it is too old.
@@ -132,13 +132,12 @@ def load_hand_eye(path: Path, max_age_days: float | None = None, now: datetime |
         raise RobotConfigError(
             f"{path} is not a hand-eye calibration: {error}; make it again with `retrieve rig calibrate`"
         ) from error
-    written = document.written.astimezone(UTC)
-    age = (now or datetime.now(UTC)) - written
+    age = datetime.now(UTC) - document.written.astimezone(UTC)
     if age < -_MAX_CLOCK_ERROR:
         raise RobotConfigError(f"{path} was written {-age.days} days in the future; set the clock, or calibrate again")
-    if max_age_days is not None and age > timedelta(days=max_age_days):
+    if age > timedelta(days=max_age_days):
         raise RobotConfigError(
             f"{path} must be at most {max_age_days:g} days old, got {age / timedelta(days=1):.0f}; calibrate again, or "
             "allow more days"
         )
-    return HandEye(np.array(document.rigid), np.array(document.residuals_mm), written)
+    return np.array(document.rigid)

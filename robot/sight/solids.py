@@ -12,6 +12,7 @@ from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.distance import cdist
 
 Array = npt.NDArray[np.float64]
 
@@ -61,9 +62,8 @@ class Solid(ABC):
         local, directions = self.local_surface()
         surface, normals = local @ turn + [self.x, self.y, 0.0], directions @ turn
         facing = surface[((eye - surface) * normals).sum(1) > 0]
-        missed = np.minimum(
-            _nearest_squared_distance(facing, _subsample(points)) / max(noise_mm, _SPACING_MM) ** 2, OUTLIER_CUT**2
-        )
+        nearest = cdist(facing, _subsample(points), "sqeuclidean").min(1)
+        missed = np.minimum(nearest / max(noise_mm, _SPACING_MM) ** 2, OUTLIER_CUT**2)
         return float(squared.sum() + len(points) * missed.mean()) + self.parameters * math.log(len(points))
 
 
@@ -130,13 +130,6 @@ class LyingCylinder(Solid):
         return np.concatenate([side, end]), np.concatenate(normals)
 
 
-def _nearest_squared_distance(points: Array, others: Array) -> Array:
-    """Return the (N,) squared distances to the nearest of others, by |a|^2 + |b|^2 - 2 a b about their mean."""
-    middle = others.mean(0)
-    a, b = points - middle, others - middle
-    return np.asarray(np.maximum(((a**2).sum(1) + ((b**2).sum(1)[:, None] - 2 * b @ a.T).min(0)), 0.0))
-
-
 def _grid(first: Array, second: Array) -> tuple[Array, Array]:
     """Return all pairs, flattened."""
     a, b = np.meshgrid(first, second)
@@ -179,7 +172,7 @@ def fit_circle(plan: Array, noise_mm: float, away: Array, largest_mm: float) -> 
     if not good.any():
         return None
     centres, radii = centres[good], radii[good]
-    gap = np.sqrt((some[:, 0] - centres[:, :1]) ** 2 + (some[:, 1] - centres[:, 1:]) ** 2) - radii[:, None]
+    gap = cdist(centres, some) - radii[:, None]
     behind = (some @ away)[None] - (centres @ away)[:, None] > _NEAR_SIDE * radii[:, None]
     cost = np.where(behind, OUTLIER_CUT**2, np.minimum((gap / noise_mm) ** 2, OUTLIER_CUT**2))
     best = int(cost.sum(1).argmin())

@@ -188,7 +188,7 @@ class SimRig(Rig):
             attempt=attempt,
             planner=load_planner(options.planner, "mesh" if self.meshes else "cylinder"),
         )
-        self.attempt.grasp.check(self.arm, self.gripper)
+        self.attempt.grasp.check(self.gripper)
 
     def object_ids(self, count: int) -> list[str]:
         """Return the first `count` objects; raise RobotConfigError if it exceeds 100000 or the number of meshes."""

@@ -1,6 +1,6 @@
 """A pack of the benchmark: four real objects (10 precedes 100), and a split by objects.
 
-`write_samples`: two samples of ObjectFolder Real, with the table of names.
+`write_samples`: two samples of ObjectFolder Real.
 """
 
 import json
@@ -36,5 +36,3 @@ def write_samples(folder: Path) -> None:
         picture(folder / str(number) / "visual/0.png", number, (27, 48))
         picture(folder / str(number) / "tactile/0.png", 50 + number, (24, 32))
         (folder / str(number) / "audio").mkdir()
-    table = "Index,Name,Material\n3,Ladle,Wood\n20,Ladle,Steel\n"
-    (folder / "objectfolder_real_metadata.csv").write_text(table)

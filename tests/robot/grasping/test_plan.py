@@ -12,7 +12,7 @@ from robot.grasping.planner import plan_grasp
 from robot.grasping.settings import GraspSettings
 from robot.readings import Region
 from robot.sight.cylinder import CylinderFit
-from tests.fake_rig import WORKSPACE, FakeArm, FakeGripper, FakeRigState
+from tests.fake_rig import WORKSPACE, FakeGripper, FakeRigState
 
 FIT = CylinderFit(12.0, -7.0, 100.0, 30.0, 0.5, "circle", (30.0, 30.0))
 STROKE = 110.0
@@ -122,8 +122,8 @@ def test_a_setting_out_of_range_is_refused(name, value):
 
 
 def test_forces_outside_the_grippers_range_are_refused_before_any_motion():
-    arm, gripper = FakeArm(FakeRigState(0)), FakeGripper(FakeRigState(0))
-    GraspSettings().check(arm, gripper)
+    gripper = FakeGripper(FakeRigState(0))
+    GraspSettings().check(gripper)
     for force in ((4.0, 25.0), (5.0, 81.0)):
         with pytest.raises(RobotConfigError, match="force_n must be within 5 to 80 N, the range of fake gripper"):
-            GraspSettings(force_n=force).check(arm, gripper)
+            GraspSettings(force_n=force).check(gripper)

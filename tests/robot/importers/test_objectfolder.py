@@ -48,8 +48,7 @@ def test_an_invalid_split_is_refused(pack, tmp_path, content):
         import_objectfolder(pack, tmp_path / "out")
 
 
-def test_each_sample_of_real_is_an_object_with_its_name(tmp_path):
+def test_each_sample_of_real_is_an_object(tmp_path):
     objectfolder.write_samples(tmp_path / "src")
     recording = import_objectfolder(tmp_path / "src", tmp_path / "out")
     assert [(grasp.grasp_id, grasp.object_id) for grasp in recording.grasps] == [("3-0", "3"), ("20-0", "20")]
-    assert recording.info["objects"]["20"] == {"name": "Ladle", "material": "Steel"}

