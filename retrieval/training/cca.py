@@ -74,8 +74,7 @@ class Standardiser:
 
 
 def _flat(x: NDArray[Any]) -> NDArray[np.float64]:
-    x = np.asarray(x)
-    return np.asarray(x.reshape(len(x), int(np.prod(x.shape[1:]))), dtype=np.float64)
+    return x.reshape(len(x), int(np.prod(x.shape[1:]))).astype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)

@@ -64,9 +64,10 @@ def distil(
     Raises:
         NumericalError: The loss is not finite; the matcher is unchanged.
     """
-    seed, steps = settings.training.seed, settings.training.distil_steps
-    sizes = {name: getattr(settings.matcher, name) for name in ("candidate_width", "candidate_linear")}
-    config = dataclasses.replace(matcher.config, **sizes)
+    seed, steps, sizes = settings.training.seed, settings.training.distil_steps, settings.matcher
+    config = dataclasses.replace(
+        matcher.config, candidate_width=sizes.candidate_width, candidate_linear=sizes.candidate_linear
+    )
     touch_partials, photo_partials = (part[:, : config.pooled_width] for part in (touch_partials, photo_partials))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -169,10 +170,9 @@ def exhaustive_top1_ranks(matcher: Matcher, touch_partials: Tensor, photo_partia
 def feature_partials(matcher: Matcher, features: Features) -> tuple[Tensor, Tensor]:
     """Return partial activations (G, P) of the touches and of the photos of features."""
     # One part after another, because the hidden layer of the cells takes more memory than the features.
-    touch, photo = (torch.split(torch.from_numpy(each), ROWS) for each in (features.touch, features.photo))
-    touch_partials = [matcher.touch_encoding(part.flatten(1)).partial for part in touch]
-    photo_partials = [matcher.photo_encoding(part).partial for part in photo]
-    return torch.cat(touch_partials), torch.cat(photo_partials)
+    touch, photo = (torch.from_numpy(part).split(ROWS) for part in (features.touch_rows, features.photo))
+    touch_partials = torch.cat([matcher.touch_encoding(part).partial for part in touch])
+    return touch_partials, torch.cat([matcher.photo_encoding(part).partial for part in photo])
 
 
 def select_queries(touch_partials: Tensor, seed: int) -> NDArray[np.float16] | None:
@@ -208,8 +208,8 @@ def with_candidate_encoder(
         photos = torch.cat([train[1], validation[1]])
         is_candidate = exhaustive_top1_ranks(matcher, touches, photos) < max(1, round(CANDIDATE_FRACTION * len(photos)))
         metrics = metrics | {"candidate_agreement_at_1_percent": float(is_candidate.mean())}
-    about = checkpoint.provenance | {"metrics": metrics}
-    return dataclasses.replace(checkpoint, matcher=matcher, config=config, provenance=about, queries=queries)
+    provenance = checkpoint.provenance | {"metrics": metrics}
+    return dataclasses.replace(checkpoint, config=config, provenance=provenance, queries=queries)
 
 
 def add_candidate_encoder(

@@ -275,8 +275,7 @@ class Features:
 
     def of_objects(self, object_ids: Iterable[str]) -> "Features":
         """Return the grasps of these objects."""
-        names = set(object_ids)
-        return self.select(np.array([row for row, name in enumerate(self.object_ids) if name in names], np.int64))
+        return self.select(np.flatnonzero(np.isin(self.object_ids, list(object_ids))))
 
     def concatenate(self, others: "Features") -> "Features":
         """Return these grasps, followed by those of `others`."""

@@ -49,7 +49,6 @@ BATCH = 32
 LEARNING_RATE = 3e-3  # halved after each quarter of the steps, as the authors do
 VALIDATION = 0.25  # fraction of the objects, as the authors use
 BRIGHTNESS, CONTRAST = 20 / 255, 0.1  # largest change of the lamps between two frames
-_GREY_LEVEL = 1 / 255
 
 Differences = Callable[[Sequence[Attempt]], list[list[NDArray[np.float32]]]]
 
@@ -163,7 +162,7 @@ def _train_net(attempts: list[Attempt], differences: Differences, iterations: in
         torch.manual_seed(seed)
         net = GraspNet()
     first = touch_batch(differences(draw_batch(attempts, 0, seed)[0]))
-    net.scale.fill_(max(float(first.square().mean().sqrt()), _GREY_LEVEL))
+    net.scale.fill_(max(float(first.square().mean().sqrt()), 1 / 255))  # at least a grey level
 
     def loss(step: int, _: int) -> Tensor:
         batch, rng = draw_batch(attempts, step, seed)
