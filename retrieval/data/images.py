@@ -4,6 +4,7 @@ Pillow reads and checks every file. (OpenCV fills the missing part of a truncate
 16-bit colour Pillow keeps the high byte; 16-bit grey keeps all bits. Colour profiles and gamma chunks are not applied.
 """
 
+import hashlib
 import io
 import struct
 import warnings
@@ -46,14 +47,21 @@ def read_rgb(path: str | Path) -> RgbImage:
     return decode_rgb(read_bytes(path), path)
 
 
-def read_bytes(path: str | Path) -> bytes:
-    """Return the bytes of a regular file of at most MAX_BYTES. Raises ImageError."""
+def read_bytes(path: str | Path, digest: str | None = None) -> bytes:
+    """Return the bytes of a regular file of at most MAX_BYTES.
+
+    Raises:
+        ImageError: The file cannot be read, or its SHA-256 is not `digest`, that of the picture in the index.
+    """
     try:
-        return read_regular(path, MAX_BYTES)
+        data = read_regular(path, MAX_BYTES)
     except FileNotFoundError:
         raise ImageError(path, "no such file") from None
     except (OSError, ValueError, MemoryError) as error:
         raise ImageError(path, f"cannot be read: {_reason(error)}") from error
+    if digest is not None and hashlib.sha256(data).hexdigest() != digest:
+        raise ImageError(path, "has changed since the index was built; run `retrieve build-index` again")
+    return data
 
 
 def decode_rgb(data: bytes, name: str | Path) -> RgbImage:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from retrieval.console.files import write_output
-from retrieval.data.images import read_rgb
+from retrieval.data.images import decode_rgb, read_bytes
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import resize
 
@@ -16,13 +16,13 @@ COLUMNS = 2
 """Photos per row of a contact sheet."""
 
 
-def thumbnail(path: Path, px: int) -> bytes:
+def thumbnail(path: Path, px: int, digest: str | None = None) -> bytes:
     """Return the picture at `path` as a JPEG file whose longer side has at most `px` pixels.
 
     Raises:
-        ImageError: The picture cannot be read.
+        ImageError: The picture cannot be read, or its file has another SHA-256 than `digest`.
     """
-    image = read_rgb(path)
+    image = decode_rgb(read_bytes(path, digest), path)
     height, width = image.shape[:2]
     scale = min(1.0, px / max(height, width))
     image = resize(image, (max(1, round(height * scale)), max(1, round(width * scale))))

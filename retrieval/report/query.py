@@ -23,7 +23,7 @@ def query_page(result: QueryResult, catalogue: Path) -> str:
 
     Args:
         result: The result.
-        catalogue: Folder of the photos; a missing photo is left blank.
+        catalogue: Folder of the photos; a photo that is missing or has changed since the build is left blank.
 
     Returns:
         The page; it embeds its pictures.
@@ -51,12 +51,15 @@ def _touch(number: int, check: str, paths: list[str]) -> Card:
 
 
 def _match(match: Match, catalogue: Path, is_answer: bool) -> Card:
-    pictures, lines = [(_uri(catalogue / match.photo), f"photo of {match.object_id}")], []
+    pictures, lines = [(_uri(catalogue / match.photo, match.photo_digest), f"photo of {match.object_id}")], []
     if match.probability is not None and match.probability_if_present is not None:
         lines += [probability(match.probability), f"{probability(match.probability_if_present)} if present"]
     lines += [f"match logit {match.logit:+.2f}", match.photo]
     if nearest := match.reference:
-        pictures += [(_uri(catalogue / path), "reference touch") for path in nearest.touch]
+        pictures += [
+            (_uri(catalogue / path, digest), "reference touch")
+            for path, digest in zip(nearest.touch, nearest.digests, strict=True)
+        ]
         added = "no photo: scored by its touches only"
         if nearest.adds is not None:
             added = f"references add {nearest.adds:+.2f} to the logit"
@@ -93,9 +96,9 @@ def _facts(result: QueryResult) -> list[tuple[str, str]]:
     return [*rows, ("not scored", f"{unscored} of {found['objects']} objects, with a total probability of {total}")]
 
 
-def _uri(path: Path) -> str:
-    """Return a thumbnail of the picture as a data URI; empty if the picture cannot be read."""
+def _uri(path: Path, digest: str | None = None) -> str:
+    """Return a thumbnail of the picture as a data URI; empty if it cannot be read, or has another SHA-256."""
     try:
-        return data_uri(thumbnail(path, _THUMBNAIL_PX), "jpeg")
+        return data_uri(thumbnail(path, _THUMBNAIL_PX, digest), "jpeg")
     except ImageError:
         return ""

@@ -29,17 +29,28 @@ class NearestReference:
 
     Attributes:
         touch: Paths of its gel images in the catalogue.
+        digests: SHA-256 of these files in the index.
         cosine: Cosine with the nearest grasp.
         adds: Difference that all references of the object make to the logit of its photos, perhaps negative; None for
             an object without photos.
     """
 
     touch: tuple[str, ...]
+    digests: tuple[str, ...]
     cosine: float
     adds: float | None
 
 
-_MATCH_FIELDS = ("rank", "object_id", "logit", "probability", "probability_if_present", "photo", "metadata")
+_MATCH_FIELDS = (
+    "rank",
+    "object_id",
+    "logit",
+    "probability",
+    "probability_if_present",
+    "photo",
+    "photo_digest",
+    "metadata",
+)
 
 
 @dataclass(frozen=True)
@@ -53,6 +64,7 @@ class Match:
         probability: P(object | touches, catalogue), which sums to 1 over all objects and "none of these"; None if the
             model is not calibrated.
         photo: Path of the best photo in the catalogue.
+        photo_digest: SHA-256 of the photo in the index. The file may have changed since.
         metadata: The user's metadata of the photo.
         photo_path: Absolute path of the photo on the disk.
         reference: Nearest reference touch of the object; None, and absent from JSON, if it has none.
@@ -70,6 +82,7 @@ class Match:
     logit: float
     probability: float | None
     photo: str
+    photo_digest: str
     metadata: dict[str, Any]
     photo_path: Path
     reference: NearestReference | None = None
@@ -180,7 +193,7 @@ def _match(document: dict[str, Any], catalogue: Path) -> Match:
     own = {name: value for name, value in document.items() if name != "reference"}
     reference = document.get("reference")
     if reference is not None:
-        reference = NearestReference(**{**reference, "touch": tuple(reference["touch"])})
+        reference = NearestReference(**{**reference, **{name: tuple(reference[name]) for name in ("touch", "digests")}})
     return Match(**own, photo_path=catalogue / document["photo"], reference=reference)
 
 

@@ -132,7 +132,7 @@ class Objects:
         numbers = np.array([number_of[one.object_id] for one in listed.touches], dtype=np.int64)
         order = np.argsort(numbers, kind="stable")
         order = order[numbers[order] >= 0]  # an object without a readable photo has no number
-        self._touches = [self._references.touches[place].touch for place in order]
+        self._touches = [listed.touches[place] for place in order]
         partials = documents.get(REFERENCE_PARTIALS, np.empty((0, columns.stop), np.float32))
         self._codes = unit_embeddings(partials[order], columns)
         self._owners = numbers[order]
@@ -222,4 +222,5 @@ class Objects:
         cosines = (unit_embeddings(partials, self._columns) @ self._codes[start:stop].T).max(0)
         best = int(cosines.argmax())
         adds = float(scored.logits[place] - scored.photo_logits[place])
-        return NearestReference(self._touches[start + best], float(cosines[best]), None if np.isnan(adds) else adds)
+        nearest, adds_or_none = self._touches[start + best], None if np.isnan(adds) else adds
+        return NearestReference(nearest.touch, nearest.digests, float(cosines[best]), adds_or_none)

@@ -340,6 +340,7 @@ class Searcher:
                     one.logit,
                     None if probabilities is None else float(probabilities.objects[place]),
                     one.photo.path,
+                    one.photo.digest,
                     one.photo.metadata,
                     self.catalogue.absolute() / one.photo.path,
                     one.reference,

@@ -76,19 +76,18 @@ def photo(
         return Response(status_code=304, headers=headers)
     path = generation.searcher.catalogue / listed.path
     try:
-        data = read_bytes(path) if px is None else b""
+        data = read_bytes(path, listed.digest) if px is None else b""
         if not data.startswith(tuple(IMAGE_TYPES)):
             data = _thumbnail(path, listed.digest, px or MAX_PHOTO_PX)
     except ImageError as error:
-        detail = f"The photo {photo!r} cannot be read any more. Run `retrieve build-index` again."
-        raise HttpProblem("unknown", detail) from error
+        raise HttpProblem("unknown", f"The photo {photo!r} cannot be shown: it {error.reason}.") from error
     return image_response(data, headers)
 
 
 @lru_cache(512)
 def _thumbnail(path: Path, digest: str, px: int) -> bytes:
     """Return a photo as a small JPEG file; the digest of its content identifies it in the cache."""
-    return thumbnail(path, px)
+    return thumbnail(path, px, digest)
 
 
 def image_response(data: bytes, headers: Mapping[str, str] | None = None) -> Response:

@@ -72,8 +72,9 @@ class Generations:
             await asyncio.sleep(pause_s)
             pause_s = self._settings.poll_s
             try:
-                name = (await asyncio.to_thread(manifest_of, self._settings.index)).generation
-                if name != self.current.name:
+                manifest = await asyncio.to_thread(manifest_of, self._settings.index)
+                # A folder that was deleted and built again counts its generations from 1: compare the contents.
+                if manifest != self.current.searcher.manifest:
                     await asyncio.to_thread(self.open)
                     log.warning("Generation %s is now served.", self.current.name)
             except Exception as error:

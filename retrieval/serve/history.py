@@ -163,11 +163,12 @@ def _resolve_feedback(
 def _read_photo(generation: ServedGeneration, photo: str) -> bytes | None:
     """Return the file of a catalogue photo.
 
-    None if the file is gone, or if the row is a gel image of a reference touch: the feedback is stored, not recorded.
+    None if the file is gone or has changed, or if the row is a gel image of a reference touch: the feedback is stored,
+    not recorded.
     """
     (found,) = generation.shard.photos([photo])
     if found is None or found.is_touch:
         return None
     with suppress(ImageError):
-        return read_bytes(generation.searcher.catalogue / found.path)
+        return read_bytes(generation.searcher.catalogue / found.path, found.digest)
     return None

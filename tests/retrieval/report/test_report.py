@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from _touch_retrieval.files import file_digest
 from retrieval.indexing.build import build_index
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.posterior import Posterior
@@ -29,24 +30,37 @@ POSTERIOR = Posterior(slope=0.75, offset=-1.25, dependence=0.5, tests=9).to_dict
 }
 
 
-def result_of(*matches, touches=(("a.png", "b.png"),), **fields):
+def digest_of(path):
+    return file_digest(path) if path.is_file() else ""
+
+
+def result_of(*matches, catalogue=Path("catalog"), touches=(("a.png", "b.png"),), **fields):
     """Return a result with these (object, logit, probability, photo, metadata)."""
     index = {"path": "index", "generation": "gen-000001", "kind": "flat", "photos": 1, "objects": 1, "scored": 1}
-    index |= {"catalogue": "catalog", "model": "m.safetensors", "trained_on": "nothing"}
+    index |= {"catalogue": str(catalogue), "model": "m.safetensors", "trained_on": "nothing"}
     known = {"verdict": "match", "none_probability": 0.2, "posterior": POSTERIOR} | fields
     if "grasps" not in known:
         known["grasps"] = ["contact"] * len(touches)
     present = 1 - (known["none_probability"] or 0)
     ranked = [
-        Match(rank, *match, Path("catalog", match[3]), None, match[2] and match[2] / present)
-        for rank, match in enumerate(matches, start=1)
+        Match(
+            rank,
+            *scores,
+            photo,
+            digest_of(catalogue / photo),
+            metadata,
+            catalogue / photo,
+            None,
+            scores[2] and scores[2] / present,
+        )
+        for rank, (*scores, photo, metadata) in enumerate(matches, start=1)
     ]
     touches = [list(touch) for touch in touches]
     return QueryResult(touches=touches, index=index, timing_ms={"decode": 1.0}, results=ranked, **known)
 
 
 def page_of(*matches, catalogue=Path("nowhere"), **fields):
-    return HtmlPage(query_page(result_of(*matches, **fields), catalogue))
+    return HtmlPage(query_page(result_of(*matches, catalogue=catalogue, **fields), catalogue))
 
 
 def marked(page):
@@ -153,7 +167,7 @@ def test_the_verdict_match_marks_the_first_card_and_gives_no_advice():
 
 def test_the_advice_for_an_object_with_reference_touches_requests_more():
     result = result_of(CLEAR, verdict="none of these", none_probability=0.9)
-    match = dataclasses.replace(result.top, reference=NearestReference(("mug/touch_0_a.png",), 0.9, 0.1))
+    match = dataclasses.replace(result.top, reference=NearestReference(("mug/touch_0_a.png",), ("",), 0.9, 0.1))
     assert "More reference touches of mug would help." in dataclasses.replace(result, results=[match]).advice
 
 

@@ -15,7 +15,7 @@ from retrieval.search.answer import Match
 from tests.serving import listening
 
 TOKEN = "a token of some length"
-MATCH = Match(1, "mug", 0.0, None, "mug/1.jpg", {}, Path("/data/mug/1.jpg"))
+MATCH = Match(1, "mug", 0.0, None, "mug/1.jpg", "", {}, Path("/data/mug/1.jpg"))
 
 
 @pytest.fixture(scope="module")
