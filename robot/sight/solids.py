@@ -12,7 +12,6 @@ from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.distance import cdist
 
 Array = npt.NDArray[np.float64]
 
@@ -62,7 +61,7 @@ class Solid(ABC):
         local, directions = self.local_surface()
         surface, normals = local @ turn + [self.x, self.y, 0.0], directions @ turn
         facing = surface[((eye - surface) * normals).sum(1) > 0]
-        nearest = cdist(facing, _subsample(points), "sqeuclidean").min(1)
+        nearest = ((facing[:, None] - _subsample(points)) ** 2).sum(-1).min(1)
         missed = np.minimum(nearest / max(noise_mm, _SPACING_MM) ** 2, OUTLIER_CUT**2)
         return float(squared.sum() + len(points) * missed.mean()) + self.parameters * math.log(len(points))
 
@@ -172,7 +171,7 @@ def fit_circle(plan: Array, noise_mm: float, away: Array, largest_mm: float) -> 
     if not good.any():
         return None
     centres, radii = centres[good], radii[good]
-    gap = cdist(centres, some) - radii[:, None]
+    gap = np.linalg.norm(centres[:, None] - some, axis=-1) - radii[:, None]
     behind = (some @ away)[None] - (centres @ away)[:, None] > _NEAR_SIDE * radii[:, None]
     cost = np.where(behind, OUTLIER_CUT**2, np.minimum((gap / noise_mm) ** 2, OUTLIER_CUT**2))
     best = int(cost.sum(1).argmin())
