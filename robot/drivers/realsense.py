@@ -117,15 +117,10 @@ class RealSense(Camera):
                 pipeline.stop()
 
     def _recover(self) -> None:
-        """Close the camera despite errors, then connect completely or not at all."""
+        """Close the camera despite errors, then connect again."""
         with contextlib.suppress(DeviceError, OSError):
             self._close()
-        try:
-            self._connect()
-        except BaseException:
-            with contextlib.suppress(DeviceError, OSError):
-                self._close()
-            raise
+        self._connect()
 
     def _wait(self) -> Any:
         return self._pipeline.wait_for_frames(round(1000 * self._options.timeout_s))
@@ -139,8 +134,8 @@ class RealSense(Camera):
             time_s = self.clock()
             if depth:
                 frames = self._align.process(frames)
-            colour = _copy_pixels(frames.get_color_frame(), "colour")
-            raw = _copy_pixels(frames.get_depth_frame(), "depth") if depth else None
+            colour = np.array(frames.get_color_frame().get_data())  # a copy: the package reuses the memory
+            raw = np.array(frames.get_depth_frame().get_data()) if depth else None
         if (lens_map := self._undistortion) is not None:
             colour = np.asarray(cv2.remap(colour, lens_map, None, cv2.INTER_LINEAR), np.uint8)
             raw = None if raw is None else cv2.remap(raw, lens_map, None, cv2.INTER_NEAREST, borderValue=0)
@@ -156,10 +151,3 @@ def _undistortion(rs: Any, lens: Any) -> npt.NDArray[np.float32]:
         for column in range(lens.width):
             found[row, column] = rs.rs2_project_point_to_pixel(lens, [(column - lens.ppx) / lens.fx, y, 1.0])
     return found
-
-
-def _copy_pixels(frame: Any, what: str) -> npt.NDArray[Any]:
-    """Copy the pixels, because the package reuses the frame's memory."""
-    if not frame:
-        raise DeviceError(f"realsense returned a picture without {what}")
-    return np.array(frame.get_data())

@@ -35,7 +35,6 @@ FORCE_N = (5.0, 80.0)
 
 _MESH_UNITS = UNITS | {"pose": f"{UNITS['pose']}; then its tilt in radian, where it does not point straight down"}
 _ATTEMPT_S = 40.0
-_MAX_OBJECTS = 100_000
 _WORKSPACE = Region((-150.0, -150.0, 0.5 * PAD_MM[0]), (150.0, 150.0, 500.0))
 _TABLE_MM = 15.0
 """Largest distance of objects from the centre of the workspace, in x and in y."""
@@ -191,9 +190,7 @@ class SimRig(Rig):
         self.attempt.grasp.check(self.gripper)
 
     def object_ids(self, count: int) -> list[str]:
-        """Return the first `count` objects; raise RobotConfigError if it exceeds 100000 or the number of meshes."""
-        if count > _MAX_OBJECTS:
-            raise RobotConfigError(f"the simulated rig has at most {_MAX_OBJECTS} objects per seed, got {count}")
+        """Return the first `count` objects; raise RobotConfigError if there are fewer meshes."""
         if self.meshes is not None:
             return self.meshes.object_ids(count)
         return [_procedural(self._seed, index, self._families).object_id for index in range(count)]

@@ -66,7 +66,6 @@ COMMAND_TIMEOUT = (f"{_LIMB}joint_command_timeout", "std_msgs/Float64")
 ENABLE = ("/robot/set_super_enable", "std_msgs/Bool")
 IK_SERVICE = "/ExternalTools/right/PositionKinematicsNode/IKService"
 
-_POSITION_MODE = 1
 _SEED_AUTO, _SEED_USER = 0, 1
 _IK_FAILURES = {
     -1: "no joint angles reach it",
@@ -184,7 +183,7 @@ def tip_of(message: Message, tip: str) -> Message:
 def joint_command(positions: Joints) -> dict[str, Any]:
     """Return an intera_core_msgs/JointCommand in position mode (rad)."""
     return {
-        "mode": _POSITION_MODE,
+        "mode": 1,  # POSITION_MODE
         "names": list(JOINTS),
         "position": positions.tolist(),
         "velocity": [],
@@ -270,6 +269,8 @@ def _about_z(point: npt.NDArray[np.float64], angle: float) -> npt.NDArray[np.flo
 
 # Motion of the hand along a straight line --------------------------------------------------------------------
 
+_RAMP_S = 0.3
+"""Duration of the acceleration to full speed."""
 STEP_MM, STEP_RAD = 10.0, math.radians(5.0)
 """Largest distance between way-points.
 
@@ -290,30 +291,29 @@ def waypoints(start: Pose, goal: Pose) -> list[Pose]:
 
 @dataclass(frozen=True)
 class JointTrajectory:
-    """Joint angles (N, 7) in rad, accelerated to full speed within `ramp_s`, and decelerated.
+    """Joint angles (N, 7) in rad, accelerated to full speed within _RAMP_S, and decelerated.
 
     `times` (N,) are those in s at which full speed without ramps would reach the way-points.
     """
 
     joints: Joints
     times: npt.NDArray[np.float64]
-    ramp_s: float
 
     @classmethod
     def from_waypoints(
-        cls, poses: Sequence[Pose], joints: Joints, speed_mm_s: float, joint_speed_rad_s: float, ramp_s: float
+        cls, poses: Sequence[Pose], joints: Joints, speed_mm_s: float, joint_speed_rad_s: float
     ) -> "JointTrajectory":
         """Return the fastest trajectory within the speeds of the hand and of the joints."""
         lengths = [math.dist(a.as_tuple()[:3], b.as_tuple()[:3]) for a, b in pairwise(poses)]
         turns = np.abs(np.diff(joints, axis=0)).max(1)
         steps = np.maximum(np.array(lengths) / speed_mm_s, turns / joint_speed_rad_s)
-        return cls(joints, np.concatenate([[0.0], np.cumsum(steps)]), ramp_s)
+        return cls(joints, np.concatenate([[0.0], np.cumsum(steps)]))
 
     @property
     def duration_s(self) -> float:
         """Time in s until the last angles are commanded."""
         full = float(self.times[-1])
-        return full + self.ramp_s if full >= self.ramp_s else 2 * math.sqrt(full * self.ramp_s)
+        return full + _RAMP_S if full >= _RAMP_S else 2 * math.sqrt(full * _RAMP_S)
 
     def at(self, seconds: float) -> Joints:
         """Return the joint angles (7,) at a time after the start."""
@@ -321,13 +321,11 @@ class JointTrajectory:
         return np.array([np.interp(now, self.times, column) for column in self.joints.T])
 
     def _progress(self, seconds: float) -> float:
-        """Return the equivalent time at full speed; its rate rises from 0 to at most 1 and falls, by 1 / ramp_s."""
+        """Return the equivalent time at full speed; its rate rises from 0 to at most 1 and falls, by 1 / _RAMP_S."""
         full, duration = float(self.times[-1]), self.duration_s
-        if self.ramp_s <= 0:
-            return seconds
-        rise = min(self.ramp_s, duration / 2)
+        rise = min(_RAMP_S, duration / 2)
         if seconds <= rise:
-            return seconds**2 / (2 * self.ramp_s)
+            return seconds**2 / (2 * _RAMP_S)
         if seconds >= duration - rise:
-            return full - (duration - seconds) ** 2 / (2 * self.ramp_s)
-        return seconds - self.ramp_s / 2
+            return full - (duration - seconds) ** 2 / (2 * _RAMP_S)
+        return seconds - _RAMP_S / 2

@@ -69,8 +69,7 @@ class RosbridgeLink:
         self._changed = threading.Condition()
         self._numbers = itertools.count(1)
         self._topics: dict[str, deque[ReceivedMessage]] = {}
-        self._awaited: dict[str, str] = {}
-        self._replies: dict[str, Message] = {}
+        self._replies: dict[str, Message | None] = {}
         self._contexts = contextlib.ExitStack()
         self._socket: Any = None
         self._reader: threading.Thread | None = None
@@ -129,14 +128,13 @@ class RosbridgeLink:
         """Call a ROS service once and return its values; raise DeviceError if it fails or does not answer in time."""
         identity = f"{service}#{next(self._numbers)}"
         with self._changed:
-            self._awaited[identity] = service
+            self._replies[identity] = None
         try:
             self._send({"op": "call_service", "id": identity, "service": service, "args": arguments})
-            reply = self._wait(lambda: self._replies.get(identity), f"answer of {service}")
+            reply = self._wait(lambda: self._replies[identity], f"answer of {service}")
         finally:
             with self._changed:
-                del self._awaited[identity]
-                self._replies.pop(identity, None)
+                del self._replies[identity]
         values = reply.get("values")
         if reply.get("result", True) is not True or not isinstance(values, dict):
             raise DeviceError(f"{service} failed: {_shorten(values)}")
@@ -193,15 +191,15 @@ class RosbridgeLink:
     def _handle(self, text: str | bytes) -> None:
         """Store a message of a topic or the answer of a call; log errors of rosbridge; ignore all else."""
         operation = decode(text) or {}
-        kind, identity, message = operation.get("op"), operation.get("id"), operation.get("msg")
+        kind, message = operation.get("op"), operation.get("msg")
+        identity, topic = str(operation.get("id")), str(operation.get("topic"))
         with self._changed:
-            service = self._awaited.get(identity) if isinstance(identity, str) else None
-            if kind == "publish" and isinstance(message, dict) and operation.get("topic") in self._topics:
-                self._topics[operation["topic"]].append(ReceivedMessage(message, self.clock()))
-            elif kind == "service_response" and service and operation.get("service", service) == service:
-                self._replies[str(identity)] = operation
-            elif kind == "status" and service and operation.get("level") == "error":
-                self._replies[str(identity)] = {"result": False, "values": message}
+            if kind == "publish" and isinstance(message, dict) and topic in self._topics:
+                self._topics[topic].append(ReceivedMessage(message, self.clock()))
+            elif kind == "service_response" and identity in self._replies:
+                self._replies[identity] = operation
+            elif kind == "status" and identity in self._replies and operation.get("level") == "error":
+                self._replies[identity] = {"result": False, "values": message}
             elif kind == "status":
                 _LOG.warning("rosbridge at %s reports: %s", self.url, _shorten(message))
             self._changed.notify_all()
@@ -228,8 +226,6 @@ _STILL_RAD, _STILL_S = 1e-3, 0.1
 """An arm is still if no joint moves by more than _STILL_RAD within _STILL_S."""
 _TICK_S, _COMMAND_TIMEOUT_S = 0.01, 0.2
 """Time between two commands; time without commands after which the robot ends the motion."""
-_RAMP_S = 0.3
-"""Duration of the acceleration to full speed."""
 _ARRIVAL_RAD, _SETTLE_S = 0.01, 5.0
 """Tolerance of every joint at the goal, and time to arrive after the last command."""
 _BACK_OFF_S, _LONGEST_BACK_OFF_S = 0.25, 5.0
@@ -403,7 +399,7 @@ class Sawyer(Arm):
         for waypoint in poses[1:]:
             solved.append(self._solve(waypoint, solved[-1], start))
         joints = np.array(solved)
-        schedule = JointTrajectory.from_waypoints(poses, joints, speed_mm_s, self._options.joint_speed_rad_s, _RAMP_S)
+        schedule = JointTrajectory.from_waypoints(poses, joints, speed_mm_s, self._options.joint_speed_rad_s)
         self._follow(schedule, began)
         self._settle(joints[-1], began)
         return self._pose_since(self.clock())

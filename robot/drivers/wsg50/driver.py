@@ -128,14 +128,10 @@ class Link:
         """Close the port if it is open; never raises."""
         port, self._port, self.has_echoed = self._port, None, False
         sock = getattr(port, "_socket", None)
-        try:
-            if port is not None:
-                port.close()
-        except Exception:
-            return
-        finally:
-            if sock is not None:  # pyserial leaves its socket open if the peer closed first
-                sock.close()
+        with contextlib.suppress(Exception):  # also that of None, which was closed before
+            port.close()
+        if sock is not None:  # pyserial leaves its socket open if the peer closed first
+            sock.close()
 
     def query(self, packet: Packet, parse: Callable[[bytes], _T]) -> _T:
         """Send an idempotent command and return its parsed reply; send it again if no valid reply arrives."""
@@ -421,35 +417,27 @@ class WSG50(Gripper):
 
     def _recover(self) -> None:
         """Open a lost link again, with increasing waits, then restore reference and settings as on connecting."""
-        tries = self._options.reconnect_tries
         with self._moving("cannot recover"):
-            for number in range(tries):
-                try:
-                    self._link.open()
-                    self._link.sync()
-                    self._set_up()
-                    return
-                except (LinkLost, NoEcho) as error:
-                    self._link.close()
-                    if number == tries - 1:
-                        raise DeviceError(f"{self.name} cannot be reached after {tries} tries: {error}") from error
-                    wait_s = min(self._options.reconnect_s * 2**number, _LONGEST_WAIT_S)
-                    _log.warning("%s: no connection (%s); trying again in %.2g s", self.name, error, wait_s)
-                time.sleep(wait_s)
+            self._reconnecting(self._connect, self._options.reconnect_tries)
 
     def _stop(self) -> None:
         """Stop the jaws; after a motion, open a lost link again first."""
-        tries = self._options.reconnect_tries if self._may_be_moving else 1
-        for tries_left in reversed(range(tries)):
+        self._reconnecting(self._stop_over_link, self._options.reconnect_tries if self._may_be_moving else 1)
+
+    def _reconnecting(self, action: Callable[[], None], tries: int) -> None:
+        """Open the link and call `action`; after a loss of the link do it again, with increasing waits."""
+        for number in range(tries):
             try:
                 self._link.open()
-                self._stop_over_link()
+                action()
                 return
-            except LinkLost:
-                if not tries_left:
-                    raise
-            _log.warning("%s: lost the link during a possible motion: opening it again to stop the jaws", self.name)
-            time.sleep(self._options.reconnect_s)
+            except (LinkLost, NoEcho) as error:
+                self._link.close()
+                if number == tries - 1:
+                    raise LinkLost(f"{self.name} cannot be reached after {tries} tries: {error}") from error
+                wait_s = min(self._options.reconnect_s * 2**number, _LONGEST_WAIT_S)
+                _log.warning("%s: no connection (%s); trying again in %.2g s", self.name, error, wait_s)
+            time.sleep(wait_s)
 
     def _state(self) -> GripperState:
         return self._as_state(self._read())
@@ -666,42 +654,36 @@ class WSG50(Gripper):
             if not self.may_move:
                 raise DeviceError(f"{self.name} has lost its reference and must be homed, but motion is not allowed")
             _log.warning("%s has lost its reference: homing, the jaws move", self.name)
-            self._run(codec.home(), _HOMING_S, lambda reading: bool(reading.system & SystemState.REFERENCED))
+            self._run(codec.HOME, _HOMING_S, lambda reading: bool(reading.system & SystemState.REFERENCED))
         if self._read().grasping is not GraspingState.HOLDING:  # with a smaller force, the held object would fall
             self._set_force(self.min_force_n)
         self.stroke_mm = limits.stroke_mm
         self._check("grasp_width_mm", options.grasp_width_mm, 0.0, self.stroke_mm, "mm")
 
     def _end_fast_stop(self) -> None:
-        """Log a FAST STOP, and acknowledge it if allowed."""
+        """Acknowledge a FAST STOP and log it, or raise DeviceError if this is not allowed."""
         system = self._query(CommandId.SYSTEM_STATE, codec.system_state)
         if not system & SystemState.FAST_STOP:
             return
-        _log.warning("%s is in FAST STOP: %s", self.name, system.faults)
         if not self._options.acknowledge_faults:
             raise DeviceError(f"{self.name} is in FAST STOP: {system.faults}; {_ACTION}")
-        try:
-            self._link.send(codec.acknowledge())
-        except CommandFailed as error:  # a repeated command has nothing to acknowledge
-            _log.warning("%s: %s", self.name, error)
+        _log.warning("%s is in FAST STOP (%s): acknowledging it", self.name, system.faults)
+        with contextlib.suppress(CommandFailed):  # a repeated command has nothing to acknowledge
+            self._link.send(codec.ACKNOWLEDGE)
         if self._query(CommandId.SYSTEM_STATE, codec.system_state) & SystemState.FAST_STOP:
             raise DeviceError(f"{self.name} is still in FAST STOP after acknowledgement: {system.faults}")
-        _log.warning("%s: FAST STOP acknowledged", self.name)
 
     # Settings.
 
     def _set_force(self, force_n: float) -> None:
         """Set the force limit and read it back; raise DeviceError if the gripper would clamp harder."""
-        limit_n, ceiling_n = (
-            max(each / self._options.finger_share, self._limits.min_force_n)
-            for each in (force_n, self._options.max_force_n)
-        )
+        limit_n = max(force_n / self._options.finger_share, self._limits.min_force_n)
         self._link.send(codec.command(CommandId.SET_FORCE_LIMIT, limit_n))
         has = self._query(CommandId.GET_FORCE_LIMIT, codec.number)
         self.refused.pop("force_n", None)
         if not math.isclose(has, limit_n, rel_tol=0.01):
             self.refused["force_n"] = f"requested {force_n:g}, has {self._options.to_finger_force(has):g}"
-        if has > min(limit_n, ceiling_n) * (1 + _ROUNDING):
+        if has > limit_n * (1 + _ROUNDING):
             raise DeviceError(
                 f"{self.name}: the force limit (both fingers) must be {limit_n:g} N, but the gripper has "
                 f"{has:g} N; the jaws do not close"

@@ -106,10 +106,6 @@ class LedOptics:
     shadow: float = 0.25
     gamma: float = 1.0
 
-    def backdrop(self, field: Field) -> Array:
-        """Return the three backdrops (rows, cols, 3)."""
-        return _backdrop(self.backdrops, field)
-
     def colours(self, surface: Surface, slopes: tuple[Array, Array]) -> Array:
         """Return the picture (rows, cols, 3) of the surface with these slopes, those of its flaws included."""
         field = surface.field
@@ -119,13 +115,14 @@ class LedOptics:
             for shade, cast in zip(shades, cast_shadows(surface, self.bars), strict=True):
                 shade -= np.float32(self.shadow) * cast
         axes, mix, ambient = (x.ravel(), y.ravel()), np.array(self.mix, np.float32), np.float32(self.ambient)
-        out, backdrop = np.empty((field.rows, field.cols, 3), np.float32), self.backdrop(field)
+        out, backdrop = np.empty((field.rows, field.cols, 3), np.float32), backdrop_of(self.backdrops, field)
         _shade_by_bars(np.stack(slopes), leds, strengths, axes, shades, mix, ambient, backdrop, out)
         return out if self.gamma == 1 else backdrop * (out / backdrop) ** np.float32(self.gamma)
 
 
 @lru_cache(maxsize=16)
-def _backdrop(backdrops: tuple[GaussianBackdrop, ...], field: Field) -> Array:
+def backdrop_of(backdrops: tuple[GaussianBackdrop, ...], field: Field) -> Array:
+    """Return the unpressed gel (rows, cols, 3)."""
     whole = np.stack([backdrop(field) for backdrop in backdrops], axis=-1)
     whole.flags.writeable = False
     return whole

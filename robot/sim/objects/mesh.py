@@ -44,42 +44,20 @@ class Mesh:
     faces: Faces
 
     @cached_property
-    def corners(self) -> Vectors:
-        """Corners of the faces, (F, 3, 3)."""
-        return self.vertices[self.faces]
-
-    @cached_property
     def face_normals(self) -> Vectors:
         """Unit normals of the faces, (F, 3)."""
-        return np.asarray(self._crosses / np.maximum(np.linalg.norm(self._crosses, axis=1, keepdims=True), 1e-300))
-
-    @cached_property
-    def _crosses(self) -> Vectors:
-        a, b, c = self.corners.transpose(1, 0, 2)
-        return np.cross(b - a, c - a)
+        return np.asarray(self.solid.face_normals)
 
     @cached_property
     def corner_normals(self) -> Vectors:
         """A normal for each corner of each face, (F, 3, 3): the vertex's mean, or the face's own at a crease.
 
-        Faces are weighted by their angle at the vertex (Thuermer and Wuethrich 1998), so the triangulation of a flat
+        trimesh weights faces by their angle at the vertex (Thuermer and Wuethrich 1998), so the triangulation of a flat
         side has no effect.
         """
-        total = np.zeros_like(self.vertices)
-        for corner in range(3):
-            a, b, c = (self.corners[:, (corner + turn) % 3] for turn in range(3))
-            wide = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-            angle = np.arctan2(wide, np.einsum("ij,ij->i", b - a, c - a))
-            np.add.at(total, self.faces[:, corner], angle[:, None] * self.face_normals)
-        total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
-        shared, own = total[self.faces], self.face_normals[:, None, :]
+        shared, own = self.solid.vertex_normals[self.faces], self.face_normals[:, None, :]
         is_smooth = np.sum(shared * own, axis=2, keepdims=True) > _CREASE_COSINE
         return np.where(is_smooth, shared, own)
-
-    @cached_property
-    def areas(self) -> Vectors:
-        """Areas of the faces in mm2."""
-        return np.asarray(np.linalg.norm(self._crosses, axis=1) / 2)
 
     @cached_property
     def solid(self) -> Any:
@@ -95,8 +73,8 @@ class Mesh:
 
     def normals_at(self, face: Faces, points: Vectors) -> Vectors:
         """Interpolate the corner normals at points (N, 3) on the faces."""
-        a, b, c = self.corners[face].transpose(1, 0, 2)
-        cross = self._crosses[face]
+        a, b, c = self.vertices[self.faces[face]].transpose(1, 0, 2)
+        cross = np.cross(b - a, c - a)
         square = np.maximum(np.einsum("ij,ij->i", cross, cross), 1e-300)
         v = np.einsum("ij,ij->i", np.cross(points - a, c - a), cross) / square
         w = np.einsum("ij,ij->i", np.cross(b - a, points - a), cross) / square
@@ -129,17 +107,17 @@ class MeshBody(Body):
     @cached_property
     def _samples(self) -> tuple[cKDTree, Vectors, Vectors]:
         """Points about 1 mm apart on the surface, and the normals of their faces."""
-        count = int(np.clip(self.mesh.areas.sum(), 4000, 60000))
+        ends = np.cumsum(self.mesh.solid.area_faces)
+        count = int(np.clip(ends[-1], 4000, 60000))
         rng = np.random.default_rng(5)
-        ends = np.cumsum(self.mesh.areas)
         face = np.minimum(np.searchsorted(ends, rng.uniform(0, ends[-1], count)), len(ends) - 1)
         weights = rng.dirichlet(np.ones(3), count)
-        places = np.einsum("ij,ijk->ik", weights, self.mesh.corners[face])
+        places = np.einsum("ij,ijk->ik", weights, self.mesh.vertices[self.mesh.faces[face]])
         return cKDTree(places), places, self.mesh.face_normals[face]
 
     def volumes_mm3(self, shell_mm: float) -> tuple[float, float]:
         """Return the exact volume; the shell's volume is area times thickness, at most the whole."""
-        return self.mesh.solid.volume, min(self.mesh.solid.volume, float(self.mesh.areas.sum()) * shell_mm)
+        return self.mesh.solid.volume, min(self.mesh.solid.volume, self.mesh.solid.area * shell_mm)
 
     def _cast(self, rays: Rays, step_mm: float) -> Vectors:
         ahead = np.flatnonzero(rays.near_mm <= rays.far_mm)
@@ -162,7 +140,7 @@ class MeshBody(Body):
         """Return the first mesh face along each ray (-1 for a miss), and for each hit the distance to its plane."""
         face = np.asarray(self._caster.intersects_first(origins, directions), np.int64)
         hit = face >= 0
-        normal, corner = self.mesh.face_normals[face[hit]], self.mesh.corners[face[hit], 0]
+        normal, corner = self.mesh.face_normals[face[hit]], self.mesh.vertices[self.mesh.faces[face[hit], 0]]
         speed = np.einsum("ij,ij->i", directions[hit], normal)
         offset = np.einsum("ij,ij->i", corner - origins[hit], normal)
         return face, offset / np.where(np.abs(speed) < 1e-12, 1e-12, speed)
@@ -239,12 +217,10 @@ def read_mesh(path: str | Path) -> Mesh:
     """
     file = Path(path)
     vertices, faces = _read(file)
-    if faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces) or vertices.ndim != 2:
+    if not len(faces):
         raise SceneError(f"{file} has no triangles; export the surface, not points or curves")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise SceneError(f"{file} has faces that refer to missing vertices; export it again")
-    if not np.isfinite(vertices[faces]).all():
-        raise SceneError(f"{file} has vertices that are NaN or infinite; export it again")
+    if faces.min() < 0 or faces.max() >= len(vertices) or not np.isfinite(vertices[faces]).all():
+        raise SceneError(f"{file} has corners that are missing, NaN or infinite; export it again")
     size = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max()) or 1.0
     _, first, number = np.unique(np.rint(vertices / (1e-7 * size)), axis=0, return_index=True, return_inverse=True)
     vertices, faces = vertices[first], number.reshape(-1)[faces]

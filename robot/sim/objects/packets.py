@@ -19,12 +19,12 @@ LANES = 256
 MAX_STEPS = 600
 OPERATIONS = (
     *("add", "subtract", "multiply", "divide", "maximum", "minimum", "absolute", "sqrt", "rint"),
-    *("floor", "copysign", "greater", "sin", "cos", "exp", "log", "log1p", "where"),
+    *("copysign", "greater", "sin", "cos", "exp", "log", "log1p", "where"),
 )
 """Names of the operations; a formula refers to them by index."""
 
 (_ADD, _SUBTRACT, _MULTIPLY, _DIVIDE, _MAXIMUM, _MINIMUM, _ABSOLUTE, _SQRT, _RINT) = range(9)
-(_FLOOR, _COPYSIGN, _GREATER, _SIN, _COS, _EXP, _LOG, _LOG1P, _WHERE) = range(9, 18)
+(_COPYSIGN, _GREATER, _SIN, _COS, _EXP, _LOG, _LOG1P, _WHERE) = range(9, 17)
 
 
 class Formula(NamedTuple):
@@ -133,9 +133,6 @@ def _evaluate(code, r, count):  # type: ignore[no-untyped-def]
         elif name == _RINT:
             for i in range(count):
                 r[d, i] = np.rint(r[a, i])
-        elif name == _FLOOR:
-            for i in range(count):
-                r[d, i] = np.floor(r[a, i])
         elif name == _COPYSIGN:
             for i in range(count):
                 r[d, i] = np.copysign(r[a, i], r[b, i])

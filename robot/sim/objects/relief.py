@@ -85,6 +85,13 @@ class Sheet:
         blurred = cv2.GaussianBlur(wide, (0, 0), sigmaX=sigma[1], sigmaY=sigma[0])
         return np.asarray(blurred[:, pad : pad + self.columns])
 
+    def resample(self, image: Floats, pad: int, interpolation: int) -> Floats:
+        """Return a coarser image over the same wall, with `pad` repeated columns on each side, at the nodes."""
+        u = pad + np.arange(self.columns, dtype=np.float32) * np.float32((image.shape[1] - 2 * pad) / self.columns)
+        v = np.arange(self.rows, dtype=np.float32) * np.float32((len(image) - 1) / max(self.rows - 1, 1))
+        x, y = np.meshgrid(u, v)
+        return np.asarray(cv2.remap(image, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE))
+
     def scatter(self, rng: Rng, pitch_mm: float, *, aspect: float = 1.0, jitter: float = 0.35) -> Floats:
         """Return the distance in mm to the nearest of points about one pitch apart, stretched by `aspect` along t.
 
@@ -197,12 +204,7 @@ def hammered(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
     if relief.aspect > 1.3:
         sigma = relief.pitch_mm * 0.22 * relief.aspect / coarse.pixel_mm[0]
         image = cv2.GaussianBlur(image, (1, 2 * int(3 * sigma) + 1), sigmaX=0.1, sigmaY=sigma)
-    # Resample at the sheet's nodes.
-    wide = cv2.copyMakeBorder(image, 0, 0, 2, 2, cv2.BORDER_WRAP)
-    u = 2 + np.arange(sheet.columns, dtype=np.float32) * np.float32(image.shape[1] / sheet.columns)
-    v = np.arange(sheet.rows, dtype=np.float32) * np.float32((image.shape[0] - 1) / max(sheet.rows - 1, 1))
-    x, y = np.meshgrid(u, v)
-    image = cv2.remap(wide, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    image = sheet.resample(cv2.copyMakeBorder(image, 0, 0, 2, 2, cv2.BORDER_WRAP), 2, cv2.INTER_CUBIC)
     return _crest(image / np.float32(2 * image.std() + 1e-9), relief.sharpness)
 
 

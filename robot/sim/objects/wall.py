@@ -101,7 +101,7 @@ def _relief_weights(shape: Shape, sheet: Sheet, amplitude_mm: float) -> tuple[Fl
     weight = (smoothstep(facing, 0.35, 0.8) * gain).reshape(rows, columns) * np.clip(2.2 * room - 0.2, 0, 1)
     weight *= ends_weight(coarse.t, coarse.height_mm, max(1.5, 0.8 * amplitude_mm))[:, None]
     used = np.where(weight > 0.02, room, 1).min(axis=1)
-    return _upsample_weights(weight.astype(np.float32), coarse, sheet, amplitude_mm), np.asarray(1 / used, np.float32)
+    return _upsample_weights(weight.astype(np.float32), sheet, amplitude_mm), np.asarray(1 / used, np.float32)
 
 
 def _cast_chart_rays(shape: Shape, s: Floats, t: Floats) -> tuple[Points, NDArray[np.bool_], Points, Points]:
@@ -134,13 +134,10 @@ def ends_weight(t: Points, height_mm: float, fade_mm: float) -> Points:
     return smoothstep(np.minimum(t, height_mm - t), 0.3, 0.3 + fade_mm)
 
 
-def _upsample_weights(weight: Floats, coarse: Sheet, sheet: Sheet, amplitude_mm: float) -> Floats:
+def _upsample_weights(weight: Floats, sheet: Sheet, amplitude_mm: float) -> Floats:
     """Interpolate the weights at the fine nodes, shrunk from their edges and smoothed."""
     wide = cv2.copyMakeBorder(weight, 0, 0, 4, 4, cv2.BORDER_WRAP)
     shrunk = cv2.erode(wide, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
     shrunk = cv2.GaussianBlur(shrunk, (0, 0), sigmaX=max(0.7, 0.4 * amplitude_mm / _CELL_MM))
-    u = 4 + np.arange(sheet.columns, dtype=np.float32) * np.float32(coarse.columns / sheet.columns)
-    v = np.arange(sheet.rows, dtype=np.float32) * np.float32((coarse.rows - 1) / (sheet.rows - 1))
-    x, y = np.meshgrid(u, v)
-    fine = cv2.remap(shrunk, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    fine = sheet.resample(shrunk, 4, cv2.INTER_LINEAR)
     return np.asarray(fine * ends_weight(sheet.t, sheet.height_mm, 1.0)[:, None], np.float32)

@@ -62,12 +62,12 @@ def test_values_that_json_cannot_express_are_not_sent(value):
 
 
 def test_a_call_accepts_only_the_answer_with_its_id():
-    """A late answer to another call, one for another service and noise arrive first."""
+    """A late answer to another call and noise arrive first."""
 
     def answer(operation):
         wrong = reply_to(operation, id="other", values={"x": 2})
-        other = reply_to(operation, service="/other", values={"x": 3})
-        return [wrong, other, "noise", b"\xff", "[]", '{"op": "dance"}', reply_to(operation, service="/s")]
+        strange = [reply_to(operation, id=["other"]), {"op": "publish", "topic": {}, "msg": {}}]
+        return [wrong, *strange, "noise", b"\xff", "[]", '{"op": "dance"}', reply_to(operation)]
 
     with linked(answer) as link:
         assert link.call("/s", {"a": 1}) == {"x": 1}

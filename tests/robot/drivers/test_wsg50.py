@@ -168,7 +168,7 @@ def test_a_fast_stop_is_named_and_never_acknowledged_silently(port, caplog):
         caplog.clear()
         gripper.connect()
         texts = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
-        assert texts == ["WSG-50 is in FAST STOP: current fault", "WSG-50: FAST STOP acknowledged"]
+        assert texts == ["WSG-50 is in FAST STOP (current fault): acknowledging it"]
 
 
 def test_after_a_fast_stop_every_call_raises_until_recovery():

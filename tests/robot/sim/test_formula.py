@@ -21,7 +21,7 @@ def numbers(count, size, seed=0):
 def everything(a, b):
     """Use each operation once, and constants of every kind."""
     inside = np.where(np.abs(a) > np.float32(3), b, 2.0 * a)
-    angle = np.copysign(np.rint(inside / 7), -b) + np.floor(a)
+    angle = np.copysign(np.rint(inside / 7), -b)
     angle *= 0.5
     waves = np.sin(angle) + np.cos(angle) - np.minimum(a, b) * (a < b)
     return (

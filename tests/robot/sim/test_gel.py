@@ -14,7 +14,7 @@ from robot.sim.gel import optics
 from robot.sim.gel import sensor as gel
 from robot.sim.gel.fitted_optics import FITTED
 from robot.sim.gel.marks import Flaws, Markers, flaw_maps, marker_positions
-from robot.sim.gel.optics import LedBar, LedOptics, cast_shadows
+from robot.sim.gel.optics import LedBar, LedOptics, backdrop_of, cast_shadows
 from robot.sim.gel.sensor import OPTICS, GelSensor, Noise, draw_sensor
 from robot.sim.gel.surface import Field, Surface, resized
 
@@ -120,7 +120,7 @@ def test_light_of_a_bar_is_the_near_field_formula(points):
     bar = LedBar(math.radians(30), points=points, order=1.7)
     one = LedOptics((bar,) * 3, mix=tuple(map(tuple, np.eye(3))), ambient=0.0, shadow=0.0)
     flat = Surface(np.zeros((5, 6)), field)
-    light = one.colours(flat, (slope_x, slope_y))[..., 1] / one.backdrop(field)[..., 1]
+    light = one.colours(flat, (slope_x, slope_y))[..., 1] / backdrop_of(one.backdrops, field)[..., 1]
     np.testing.assert_allclose(light, by_two_loops(bar, field, slope_x, slope_y), rtol=1e-4, atol=1e-5)
     assert (light == 0).any() or points > 1
 
@@ -166,7 +166,7 @@ def test_a_flat_gel_shows_the_backdrop_and_render_of_nothing_is_the_background(k
     sensor = replace(draw_sensor(1, "a", optics=kind), flaws=None, blur_px=0.0, tint=(1.0, 1.0, 1.0), exposure=1.0)
     sensor = replace(sensor, markers=None, detail=1.0, jpeg_quality=None)
     if isinstance(sensor.optics, LedOptics):
-        backdrop = sensor.optics.backdrop(sensor.field)
+        backdrop = backdrop_of(sensor.optics.backdrops, sensor.field)
         np.testing.assert_allclose(sensor.render_clean(np.zeros((3, 4))), backdrop, atol=1e-3)
         quiet = replace(sensor, noise=SILENT).background(0)
         assert np.abs(quiet - np.clip(np.rint(backdrop), 0, 255)).max() <= 1  # a tie may round either way
@@ -217,7 +217,7 @@ def test_drawn_sensors_differ_by_seed_and_finger_and_known_settings_replace_draw
 def test_gamma_is_the_exponent_of_the_light_relative_to_the_flat_gel():
     plain, steep = (small_sensor(optics=LedOptics(gamma=gamma, shadow=0.0)) for gamma in (1.0, 2.0))
     surface = Surface(dome(), SMALL)
-    backdrop = plain.optics.backdrop(SMALL)
+    backdrop = backdrop_of(plain.optics.backdrops, SMALL)
     light = plain.optics.colours(surface, surface.slopes) / backdrop
     np.testing.assert_allclose(steep.optics.colours(surface, surface.slopes), backdrop * light**2, rtol=1e-4)
     flat = Surface(np.zeros((1, 1)), SMALL)

@@ -42,9 +42,10 @@ def mesh_rig(folder, seed=0, **settings):
 def surface(mesh, per_mm2=0.3):
     """Return points all over a mesh."""
     rng = np.random.default_rng(0)
-    count = int(per_mm2 * mesh.areas.sum())
-    face = rng.choice(len(mesh.areas), count, p=mesh.areas / mesh.areas.sum())
-    return np.einsum("ij,ijk->ik", rng.dirichlet(np.ones(3), count), mesh.corners[face])
+    areas = mesh.solid.area_faces
+    count = int(per_mm2 * areas.sum())
+    face = rng.choice(len(areas), count, p=areas / areas.sum())
+    return np.einsum("ij,ijk->ik", rng.dirichlet(np.ones(3), count), mesh.vertices[mesh.faces[face]])
 
 
 # Resting poses ----------------------------------------------------------------------------------------------

@@ -80,7 +80,7 @@ class Revolution(Shape):
         self.relief_limit_mm = relief_limit(2 * self.radius_mm)
         if hollow is not None:
             self.relief_limit_mm = min(self.relief_limit_mm, (self.radius_mm - hollow.radius_mm) / 2)
-            self.mask_slope = 1 / self._mask_width
+            self.mask_slope = 1 / (0.6 * (self.radius_mm - hollow.radius_mm))
         self._cut_top = len(parts) > 1 or parts[0].top_mm > height_mm
 
     def distance_xyz(self, x: Floats, y: Floats, z: Floats) -> Floats:
@@ -95,16 +95,12 @@ class Revolution(Shape):
             distance = np.maximum(distance, z - np.float32(self.height_mm))
         return np.maximum(distance, -z)
 
-    @property
-    def _mask_width(self) -> float:
-        return 0.6 * (self.radius_mm - self.hollow.radius_mm) if self.hollow is not None else 1.0
-
     def mask(self, x: Floats, y: Floats, z: Floats) -> Floats | None:
         """Return 0 inside the hollow, 1 on the outer wall; None without a hollow."""
         if self.hollow is None:
             return None
         inner = length(x, y) - np.float32(self.hollow.radius_mm)
-        weight: Floats = np.clip(inner * np.float32(1 / self._mask_width), 0, 1)
+        weight: Floats = np.clip(inner * np.float32(self.mask_slope), 0, 1)
         return weight
 
 
