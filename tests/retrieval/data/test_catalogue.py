@@ -7,7 +7,7 @@ import os
 import pytest
 from PIL import Image
 
-from retrieval.data.catalogue import CatalogueTouch, SkippedPhoto, list_catalogue
+from retrieval.data.catalogue import SkippedPhoto, list_catalogue
 from retrieval.data.images import read_rgb
 from retrieval.data.naming import Naming
 from retrieval.errors import DatasetError, ImageError
@@ -73,17 +73,16 @@ def test_other_files_are_ignored_or_skipped_with_a_reason_and_dotfiles_not_liste
 
 def test_a_missing_folder_a_file_and_an_empty_folder_give_different_errors(tmp_path):
     fill(tmp_path, "file.png")
-    with pytest.raises(DatasetError, match=r"does not exist: put photos in <object_id>/<photo>"):
-        list_catalogue(tmp_path / "none")
-    with pytest.raises(DatasetError, match="is a file"):
-        list_catalogue(tmp_path / "file.png")
     (tmp_path / "empty" / "mug").mkdir(parents=True)
-    with pytest.raises(DatasetError, match=r"no photo \(\.avif, \.bmp, .*/empty: put"):
-        list_catalogue(tmp_path / "empty")
-    with pytest.raises(
-        DatasetError, match=r"only 1 other file\(s\) such as b\.txt; a\.gif: \.gif pictures are not read"
-    ):
-        list_catalogue(fill(tmp_path / "wrong", "a.gif", "b.txt"))
+    fill(tmp_path / "wrong", "a.gif", "b.txt")
+    for name, message in {
+        "none": r"does not exist: put photos in <object_id>/<photo>",
+        "file.png": "is a file",
+        "empty": r"no photo \(\.avif, \.bmp, .*/empty: put",
+        "wrong": r"only 1 other file\(s\) such as b\.txt; a\.gif: \.gif pictures are not read",
+    }.items():
+        with pytest.raises(DatasetError, match=message):
+            list_catalogue(tmp_path / name)
 
 
 def test_a_naming_names_objects_and_skips_photos_that_do_not_fit(tmp_path):
@@ -96,11 +95,8 @@ def test_a_naming_names_objects_and_skips_photos_that_do_not_fit(tmp_path):
     }
     assert catalogue.skipped == (SkippedPhoto("cover.png", "does not fit --objects-from {split}/{object}/{photo}"),)
     assert catalogue.ignored == ("train/notes.txt",)
-
-
-def test_a_naming_that_no_photo_fits_is_an_error_with_an_example(tmp_path):
     with pytest.raises(DatasetError, match=r"fits --objects-from stem; the first of 2: cup/0\.png"):
-        list_catalogue(fill(tmp_path, "mug/0.png", "cup/0.png"), Naming("stem"))
+        list_catalogue(fill(tmp_path / "none", "mug/0.png", "cup/0.png"), Naming("stem"))
 
 
 def test_links_to_outside_folders_are_followed_once_and_loops_do_not_hang(tmp_path):
@@ -233,48 +229,25 @@ def test_broken_files_are_listed_and_reading_them_gives_the_reason(tmp_path):
 # Touches ---------------------------------------------------------------------------------------------------
 
 
-def listed(tmp_path, *names, metadata=(), naming=None):
-    return list_catalogue(write_metadata(fill(tmp_path, *names), *metadata), naming)
-
-
-def test_gel_images_next_to_photos_are_touches_and_not_photos(tmp_path):
-    found = listed(
-        tmp_path, "mug/1.jpg", "mug/touch_0_b.png", "mug/touch_0_a.png", "mug/touch_1_a.png", "tin/touch.jpg"
-    )
-    assert [photo.path for photo in found.photos] == ["mug/1.jpg", "tin/touch.jpg"]
-    assert found.touches == (
-        CatalogueTouch("mug", ("mug/touch_0_a.png", "mug/touch_0_b.png")),
-        CatalogueTouch("mug", ("mug/touch_1_a.png",)),
-    )
-
-
 @pytest.mark.parametrize(
-    ("paths", "touches"),
+    ("paths", "touches", "rule"),
     [
-        (["mug/touch_7.png", "mug/touch_7_b.png"], [("mug/touch_7.png", "mug/touch_7_b.png")]),
-        (["mug/second/touch_rim_left_a.jpg"], [("mug/second/touch_rim_left_a.jpg",)]),
-        (["mug/touch_a.png", "mug/touch_b.png"], [("mug/touch_a.png",), ("mug/touch_b.png",)]),  # names, not fingers
-        (["touch_7.png", "mug/touched.png", "touch_1/view.png"], []),  # photos
+        (["mug/1.jpg", "mug/touch_0_b.png", "mug/touch_0_a.png"], ["mug: mug/touch_0_a.png mug/touch_0_b.png"], ""),
+        (["mug/touch_7.png", "mug/touch_7_b.png"], ["mug: mug/touch_7.png mug/touch_7_b.png"], ""),
+        (["mug/second/touch_rim_left_a.jpg"], ["mug: mug/second/touch_rim_left_a.jpg"], ""),
+        (["mug/touch_a.png", "mug/touch_b.png"], ["mug: mug/touch_a.png", "mug: mug/touch_b.png"], ""),  # no fingers
+        (["touch_7.png", "mug/touched.png", "touch_1/view.png", "tin/touch.jpg"], [], ""),  # photos
+        (["all/touch_1.png"], [], "stem"),  # every picture is a photo if file stems name the objects
+        (["test/mug/touch_1.png"], ["mug: test/mug/touch_1.png"], "{split}/{object}/{photo}"),
     ],
 )
-def test_the_file_name_gives_touch_and_finger(tmp_path, paths, touches):
-    found = listed(tmp_path, *paths)
-    assert [touch.paths for touch in found.touches] == touches
+def test_gel_images_next_to_photos_are_touches_and_the_file_name_gives_touch_and_finger(tmp_path, paths, touches, rule):
+    found = list_catalogue(fill(tmp_path, *paths), Naming(rule or "folder"))
+    assert [f"{touch.object_id}: {' '.join(touch.paths)}" for touch in found.touches] == touches
     assert sorted(found.paths) == sorted(paths)
 
 
-def test_every_picture_is_a_photo_if_file_stems_name_the_objects(tmp_path):
-    found = listed(tmp_path, "all/touch_1.png", naming=Naming("stem"))
-    assert [photo.object_id for photo in found.photos] == ["touch"]
-    assert found.touches == ()
-
-
-def test_a_pattern_names_the_object_of_a_touch(tmp_path):
-    found = listed(tmp_path, "test/mug/touch_1.png", naming=Naming("{split}/{object}/{photo}"))
-    assert [touch.object_id for touch in found.touches] == ["mug"]
-
-
 def test_objects_may_have_only_touches_and_these_have_metadata(tmp_path):
-    found = listed(tmp_path, "mug/touch_1.png", metadata=[{"object_id": "mug", "shelf": 3}])
+    found = list_catalogue(write_metadata(fill(tmp_path, "mug/touch_1.png"), {"object_id": "mug", "shelf": 3}))
     assert (len(found.photos), found.object_ids, found.notes) == (0, ("mug",), ())
     assert found.touches[0].metadata == {"shelf": 3}

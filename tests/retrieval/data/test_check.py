@@ -12,7 +12,6 @@ from retrieval.commands.main import main
 from retrieval.data.check.recording import check_gel_layout, check_recording
 from retrieval.data.check.split import check_split
 from retrieval.data.dataset import Split, load_grasps, make_split
-from retrieval.errors import DatasetError
 from tests import synthetic
 
 GELS = ("touch_a", "touch_b", "touch_a_before", "touch_b_before")
@@ -111,10 +110,9 @@ def test_a_clean_recording_and_a_drawn_split_have_no_finding(clean, capsys):
     assert "check: 150/150 images" in output.err  # 30 grasps; a photo, two touches, two no-contact frames
 
 
-@pytest.mark.parametrize(("seed", "fingers"), [(1, "a"), (2, "ab")])
-def test_other_clean_recordings_have_no_finding(tmp_path, seed, fingers):
-    objects = synthetic.make_objects(6, seed=seed)
-    folder = synthetic.write_recording(tmp_path / "r", objects, 2, seed=seed, fingers=fingers, before=False, misses=1)
+def test_another_clean_recording_with_one_finger_has_no_finding(tmp_path):
+    objects = synthetic.make_objects(6, seed=1)
+    folder = synthetic.write_recording(tmp_path / "r", objects, 2, seed=1, fingers="a", before=False, misses=1)
     assert remarks(folder) == []
 
 
@@ -123,11 +121,6 @@ def test_a_clean_simulated_recording_has_no_finding(tmp_path):
     options = ["--objects", "5", "--grasps", "4", "--seed", "0", "--out", str(tmp_path / "r")]
     assert main(["collect", "--rig", "sim", *options]) == 0
     assert [finding for finding in remarks(tmp_path / "r") if finding.kind != "one-grasp"] == []
-
-
-def test_a_folder_that_is_not_a_recording_is_an_error(tmp_path):
-    with pytest.raises(DatasetError, match=r"recording\.json"):
-        check_recording(tmp_path)
 
 
 # Files and single grasps -----------------------------------------------------------------------------------

@@ -16,9 +16,8 @@ pillow_heif = pytest.importorskip("pillow_heif")
 KINDS = ["HEIF", "AVIF"]
 
 
-@pytest.fixture(autouse=True)
-def _registered():
-    pillow_heif.register_heif_opener()  # to write such files
+pillow_heif.register_heif_opener()  # to write such files
+HEIC, AVIF = (saved(Image.new("RGB", (64, 64)), kind) for kind in KINDS)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -58,18 +57,13 @@ def test_a_file_cut_at_any_length_is_refused(kind):
             decode_rgb(data[:length], "x")
 
 
-def test_a_heic_picture_without_its_package_gives_an_error_that_names_the_extra(monkeypatch):
-    data = saved(Image.new("RGB", (16, 16)), "HEIF")
+def test_a_missing_decoder_is_an_error_that_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
-    with pytest.raises(ImageError, match=r"photo\.heic: a HEIC picture.*pip install 'touch-retrieval\[heif\]'"):
-        decode_rgb(data, "photo.heic")
-
-
-def test_an_avif_picture_and_pillow_without_avif_give_an_error_that_says_so(monkeypatch):
-    data = saved(Image.new("RGB", (16, 16)), "AVIF")
     monkeypatch.setattr(features, "check", lambda name: False)
+    with pytest.raises(ImageError, match=r"photo\.heic: a HEIC picture.*pip install 'touch-retrieval\[heif\]'"):
+        decode_rgb(HEIC, "photo.heic")
     with pytest.raises(ImageError, match=r"this Pillow was built without AVIF"):
-        decode_rgb(data, "photo.avif")
+        decode_rgb(AVIF, "photo.avif")
 
 
 def test_a_video_is_not_a_picture():
@@ -79,8 +73,7 @@ def test_a_video_is_not_a_picture():
 
 
 def test_a_header_with_too_many_pixels_is_refused_before_decoding(monkeypatch):
-    data = {kind: saved(Image.new("RGB", (64, 64)), kind) for kind in KINDS}
     monkeypatch.setattr(images, "MAX_PIXELS", 64 * 64 - 1)
-    for kind in KINDS:
+    for data in (HEIC, AVIF):
         with pytest.raises(ImageError, match="4096 pixels; at most 4095 are decoded"):
-            decode_rgb(data[kind], kind)
+            decode_rgb(data, "x")

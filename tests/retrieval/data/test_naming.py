@@ -72,19 +72,22 @@ def test_an_invalid_rule_is_refused_with_the_valid_forms(rule, message):
 # Warnings --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["train", "VAL", "images"])
-def test_a_folder_called_train_gives_a_warning(name):
-    (warning,) = naming_warnings({name: 40, "mug": 3}, Naming())
-    assert warning.startswith(f"{name} is used as the name of an object, with 40 photo(s)")
-    assert "--objects-from '{split}/{object}/{photo}'" in warning
+WARNED = [
+    ({"train": 40, "mug": 3}, "train is used as the name of an object, with 40 photo(s)"),
+    ({"VAL": 4, "images": 3, "mug": 3}, "VAL, images are used as the name of an object, with 7 photo(s)"),
+    (
+        {"mug_0": 1, "mug_1": 1, "cup (1)": 1, "cup (2)": 1, "ball": 1},
+        "the names of 4 of 5 objects differ from another name only by a number: cup (1), cup (2), mug_0 and 1 more",
+    ),
+    ({"mug": 1, "mug (2)": 1}, "the names of 2 of 2 objects differ"),
+]
 
 
-def test_names_that_differ_only_by_a_number_give_a_warning():
-    (warning,) = naming_warnings({"mug_0": 1, "mug_1": 1, "cup (1)": 1, "cup (2)": 1, "ball": 1}, Naming())
-    assert warning.startswith("the names of 4 of 5 objects differ from another name only by a number: ")
-    assert "cup (1), cup (2), mug_0 and 1 more" in warning
-    (warning,) = naming_warnings({"mug": 1, "mug (2)": 1}, Naming())
-    assert "2 of 2" in warning
+@pytest.mark.parametrize(("photos", "start"), WARNED)
+def test_folders_of_many_objects_and_names_that_differ_by_a_number_give_a_warning(photos, start):
+    (warning,) = naming_warnings(photos, Naming())
+    assert warning.startswith(start)
+    assert "--objects-from" in warning
 
 
 def test_plausible_names_give_no_warning():
