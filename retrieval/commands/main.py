@@ -59,15 +59,6 @@ def application(names: Sequence[str] = COMMANDS) -> typer.Typer:
     return app
 
 
-def named_commands(words: Sequence[str]) -> Sequence[str]:
-    """Return the command that the words name, or all commands for a help text or a wrong word.
-
-    The other commands take a tenth of the time of a query to import.
-    """
-    first = next((word for word in words if not word.startswith("-")), None)
-    return [first] if first in COMMANDS else COMMANDS
-
-
 def _print_version(is_given: bool) -> None:
     if is_given:
         show(f"touch-retrieval {__version__}")
@@ -92,7 +83,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Words after the program name; None for those of `sys.argv`.
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    names = named_commands(words)
+    first = next((word for word in words if not word.startswith("-")), None)
+    # A help text or a wrong word needs all commands; to import them takes a tenth of the time of a query.
+    names = [first] if first in COMMANDS else COMMANDS
     if argv is None:  # the process ends with the command: its end need not search all objects for reference cycles
         atexit.register(gc.freeze)
         if KEEP_FREED_MEMORY.issuperset(names):

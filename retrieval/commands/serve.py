@@ -13,7 +13,6 @@ from retrieval.console.output import say
 from retrieval.errors import BadInput
 
 if TYPE_CHECKING:
-    from retrieval.search.opening import OpenShards
     from robot.recording.folder import RecordingWriter
 
 TOKEN_VARIABLE = "RETRIEVE_TOKEN"
@@ -95,7 +94,18 @@ def serve(
     )
     with ExitStack() as stack:
         writer = _feedback_writer(settings.history, path, stack) if settings.history else None
-        open_shards = _ray_shards(path, stack, replicas or 1, shard_timeout or 5.0) if cluster else None
+        open_shards = None
+        if cluster:
+            from indexes.store.sharded import is_sharded
+            from retrieval.cluster.serving import Deployments, ReplicaSettings
+            from retrieval.cluster.session import ray_session
+
+            if not is_sharded(path):
+                raise BadInput(f"{path} has no shards; build a sharded index with `retrieve build-index --shards`")
+            replica_settings = ReplicaSettings(replicas=replicas or 1, wait_s=shard_timeout or 5.0)
+            deployments = Deployments(stack.enter_context(ray_session()), replica_settings)
+            stack.callback(deployments.close)
+            open_shards = deployments.open
         app = create_app(settings, load_live_rig(rig, path), writer, trials, open_shards)
 
         def on_start(bound_port: int) -> None:
@@ -104,32 +114,12 @@ def serve(
         run(app, on_start)
 
 
-def _ray_shards(index: Path, stack: ExitStack, replicas: int, wait_s: float) -> "OpenShards":
-    """Return the function that opens shards on Ray, in a session that the stack closes; join or start Ray first.
-
-    Raises:
-        BadInput: The index is not sharded.
-    """
-    from indexes.store.sharded import is_sharded
-    from retrieval.cluster.serving import Deployments, ReplicaSettings
-    from retrieval.cluster.session import ray_session
-
-    if not is_sharded(index):
-        raise BadInput(f"{index} has no shards; build a sharded index with `retrieve build-index --shards`")
-    settings = ReplicaSettings(replicas=replicas, wait_s=wait_s)
-    deployments = Deployments(stack.enter_context(ray_session()), settings)
-    stack.callback(deployments.close)
-    return deployments.open
-
-
 def _feedback_writer(folder: Path, index: str | Path, stack: ExitStack) -> "RecordingWriter":
-    """Open the writer of the recording of people's feedback. Raises BadInput if the history is a file."""
+    """Open the writer of the recording of people's feedback."""
     from retrieval.model.checkpoint_info import read_checkpoint_info
     from retrieval.search.opening import manifest_of, model_of
     from robot.recording.folder import RecordingWriter
 
-    if folder.exists() and not folder.is_dir():
-        raise BadInput(f"the history must be a folder, but {folder} is a file; name another one with --history")
     stored = read_checkpoint_info(model_of(manifest_of(index)))
     info = {"source": "feedback on queries", "sensor": f"as {stored.provenance.get('source', 'unknown')}"}
     say(f"queries and feedback are stored in {folder}")

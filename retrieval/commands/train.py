@@ -1,6 +1,6 @@
 """`retrieve train`: train a matcher, or a gate for `retrieve collect`."""
 
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -17,9 +17,6 @@ from retrieval.commands.options import (
 )
 from retrieval.console.output import say
 from retrieval.errors import BadInput
-
-if TYPE_CHECKING:
-    from retrieval.data.dataset import DataLicence
 
 
 def train(
@@ -63,7 +60,8 @@ def train(
         from retrieval.data.dataset import recording_licence
         from retrieval.training.grasp_success import train_gate
 
-        _show_licences([recording_licence(recording)])
+        licence = recording_licence(recording)
+        say(f"licence of {licence.source}: {licence}")
         steps: dict[str, Any] = {} if iterations is None else {"iterations": iterations}
         found = train_gate(recording, out, **steps)
         trained = f"trained on {found['train_grasps']} grasps, {found['train_held']} of them held"
@@ -82,7 +80,8 @@ def train(
 
     try:
         settings = training_config(config, iterations, init=init)
-        _show_licences(training_licences(recording, settings.training))
+        for licence in training_licences(recording, settings.training):
+            say(f"licence of {licence.source}: {licence}")
         objects = read_split(split)
         if cluster:
             from retrieval.cluster.training import train_on_ray
@@ -96,8 +95,3 @@ def train(
         distributed.stop()
     figures = [f"{name.replace('_', ' ')} {value:.3f}" for name, value in checkpoint.provenance["metrics"].items()]
     say(", ".join([f"{out}: best step {checkpoint.provenance['step']}", *figures]))
-
-
-def _show_licences(licences: "list[DataLicence]") -> None:
-    for licence in licences:
-        say(f"licence of {licence.source}: {licence}")

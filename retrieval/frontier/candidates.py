@@ -33,13 +33,13 @@ DEFAULT_KIND = "flat"
 """Kind that `build-index` uses unless `--kind` names another one."""
 TOLERANCE = round(100 * (1 - TARGET), 6)
 """Default tolerance of `build-index`: percent of exhaustive top-1 photos that the candidates may miss."""
-NO_EMBEDDINGS = "this model has no trained embeddings and reranks every photo"
+NO_EMBEDDINGS = "Left out: this model has no trained embeddings and reranks every photo."
 
 
 def candidates(sample: Sample) -> ApproximationResult:
     """Measure numbers of candidates k: exact search by each embedding of the model, then reranking."""
     if not sample.embeddings:
-        return ApproximationResult("Candidates", "", skipped=NO_EMBEDDINGS)
+        return ApproximationResult("Candidates", NO_EMBEDDINGS)
     photos, best, default = sample.catalogue["partial"], sample.exhaustive_top1, default_k(sample)
     points, works = list[Tradeoff](), list[Callable[[], object]]()
     for name in sample.embeddings:
@@ -63,7 +63,7 @@ def candidates(sample: Sample) -> ApproximationResult:
 def index_kinds(sample: Sample) -> ApproximationResult:
     """Measure every kind with several settings on the blended catalogue, with the embedding that search uses."""
     if not sample.embeddings:
-        return ApproximationResult("Kind of index", "", skipped=NO_EMBEDDINGS)
+        return ApproximationResult("Kind of index", NO_EMBEDDINGS)
     name = sample.embeddings[0]
     embeddings, queries = sample.catalogue[name], sample.queries[name]
     k = min(default_k(sample), len(embeddings) // 4)

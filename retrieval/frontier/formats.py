@@ -74,15 +74,11 @@ def encoders(checkpoint: Checkpoint) -> Iterator[tuple[str, Encode, bool]]:
     emulated = "" if has_fast_bfloat16(torch.device("cpu")) else " (emulated here)"
     yield f"bfloat16, folded{emulated}", partial(_touch_partials, fast, bfloat16=True), False
     if all(find_spec(name) for name in ("onnx", "onnxruntime")):
-        yield "float32, ONNX Runtime", _onnx(checkpoint), False
-
-
-def _onnx(checkpoint: Checkpoint) -> Encode:
-    with TemporaryDirectory() as folder:
-        path = Path(folder, "model.onnx")
-        path.write_bytes(touch_encoder_to_onnx(checkpoint))
-        encoder = OnnxEncoder(path, checkpoint.digest, threads=1)
-    return lambda images: encoder.encode(images)[0]
+        with TemporaryDirectory() as folder:
+            path = Path(folder, "model.onnx")
+            path.write_bytes(touch_encoder_to_onnx(checkpoint))
+            encoder = OnnxEncoder(path, checkpoint.digest, threads=1)
+        yield "float32, ONNX Runtime", lambda images: encoder.encode(images)[0], False
 
 
 @torch.inference_mode()

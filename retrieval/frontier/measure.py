@@ -24,7 +24,7 @@ from retrieval.version import __version__
 if TYPE_CHECKING:
     from retrieval.frontier import Approximations
 
-FORMAT = 4
+FORMAT = 5
 
 
 def measure_frontier(

@@ -111,19 +111,17 @@ class ApproximationResult:
 
     Attributes:
         title: Title of the approximation.
-        text: What it is and how it was measured.
-        panels: The measurements.
-        skipped: Why it was not measured, else None.
+        text: What it is and how it was measured, or why it was left out.
+        panels: The measurements; none if it was left out.
     """
 
     title: str
     text: str
     panels: tuple[Panel, ...] = ()
-    skipped: str | None = None
 
     def lines(self) -> list[str]:
         """Return one line of text for each panel."""
-        return [panel.line() for panel in self.panels] or [f"{self.title}: left out, {self.skipped}"]
+        return [panel.line() for panel in self.panels] or [f"{self.title}: {self.text}"]
 
 
 def format_duration(seconds: float) -> str:

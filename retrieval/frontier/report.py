@@ -59,21 +59,20 @@ def _lead(rows: Mapping[str, ApproximationResult], machine: Mapping[str, Any], q
         yield Text("A quick run: too few queries and repetitions for conclusions.", warn=True)
     yield Table(
         ("approximation", "error", "reference", "tolerance", "recommended", "default"),
-        tuple(_summary(row.title, panel) for row in rows.values() for panel in row.panels),
+        tuple(
+            (
+                *(row.title, panel.title, panel.reference, f"{panel.tolerance:g} {panel.unit}"),
+                *(panel.describe(panel.recommended), panel.describe_default()),
+            )
+            for row in rows.values()
+            for panel in row.panels
+        ),
         words=frozenset({1, 2, 3, 4, 5}),
     )
 
 
-def _summary(title: str, panel: Panel) -> tuple[str, ...]:
-    tolerance, best = f"{panel.tolerance:g} {panel.unit}", panel.describe(panel.recommended)
-    return (title, panel.title, panel.reference, tolerance, best, panel.describe_default())
-
-
 def _section(name: str, row: ApproximationResult) -> Iterator[Block]:
-    if row.text:
-        yield Text(row.text)
-    if row.skipped:
-        yield Text(f"Left out: {row.skipped}.", warn=True)
+    yield Text(row.text, warn=not row.panels)
     if row.panels:
         lines = row.lines()
         caption = " ".join(f"{capitalized(line)}." for line in lines)
@@ -137,8 +136,8 @@ def _front(axes: Axes, panel: Panel, floor: float) -> None:
     axes.plot(*zip(*(_place(point, floor) for point in front), strict=True), color=MUTED_COLOUR, lw=1.2, zorder=0)
     if used:
         axes.plot(*_place(used, floor), "o", ms=14, mfc="none", mec="#222222", mew=1.3, clip_on=False, label="default")
-    star: Any = {"ms": 11, "color": "#c8382e", "mec": "white", "mew": 0.6, "clip_on": False, "label": "recommended"}
-    axes.plot(*_place(best, floor), "*", **star)
+    mark = {"mec": "white", "mew": 0.6, "clip_on": False, "label": "recommended"}
+    axes.plot(*_place(best, floor), "*", ms=11, color="#c8382e", **mark)
     step = 1 if len(front) < 8 else 2  # a long front has a label at every second point
     for number, point in enumerate({id(one): one for one in (*front[::step], best)}.values()):
         text = point.setting or point.series

@@ -6,12 +6,9 @@ Both are made from the same blocks, so their contents agree. Every report and th
 import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
-from typing import ClassVar
 
 import jinja2
-from markupsafe import Markup
 from PIL import Image
 
 from retrieval.console.files import write_output
@@ -25,7 +22,6 @@ _PAGE_DPI = 96
 class Text:
     """A paragraph; `warn` highlights it."""
 
-    kind: ClassVar[str] = "text"
     text: str
     warn: bool = False
 
@@ -34,7 +30,6 @@ class Text:
 class Table:
     """A table of plain text cells, with paragraphs below it; the columns `words` contain text and are left-aligned."""
 
-    kind: ClassVar[str] = "table"
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     notes: tuple[str, ...] = ()
@@ -45,7 +40,6 @@ class Table:
 class Picture:
     """A figure, written to figures/NAME.png next to the document, with a text alternative and a caption."""
 
-    kind: ClassVar[str] = "picture"
     name: str
     alt: str
     caption: str
@@ -78,7 +72,6 @@ class Card:
 class Cards:
     """Cards next to each other; Markdown has their text only."""
 
-    kind: ClassVar[str] = "cards"
     cards: tuple[Card, ...]
 
 
@@ -86,7 +79,6 @@ class Cards:
 class Section:
     """A heading and blocks; a page shows a section within another one folded."""
 
-    kind: ClassVar[str] = "section"
     title: str
     blocks: tuple["Block", ...]
 
@@ -139,15 +131,9 @@ def to_html(document: Document, folder: Path) -> str:
         with Image.open(folder / picture.file) as image:
             return round(image.width * _PAGE_DPI / FIGURE_DPI)
 
-    def anchor(title: str) -> str:
-        return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
-
-    templates = resources.files("retrieval") / "templates"
-    template, script = ((templates / name).read_text("utf-8") for name in ("document.html", "tables.js"))
-    environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    return environment.from_string(template).render(
-        document=document, uri=uri, width=width, anchor=anchor, script=Markup(script)
-    )
+    templates = jinja2.PackageLoader("retrieval")
+    environment = jinja2.Environment(loader=templates, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    return environment.get_template("document.html").render(document=document, uri=uri, width=width)
 
 
 # Markdown --------------------------------------------------------------------------------------------

@@ -238,10 +238,9 @@ def _reliability(view: ProtocolView, name: str, details: Details) -> Iterator[Bl
 def _reject(view: ProtocolView) -> Blocks:
     found = {name: details.reject for name, details in view.details.items() if details.reject}
     if found:
-        areas = ", ".join(f"{view.label(name)} {percent(one.auroc.value[0])} %" for name, one in found.items())
         yield Picture(
             view.figure_name("reject"),
-            f"ROC curves; areas under them: {areas}.",
+            "ROC curves; the table below has the areas under them.",
             "Each query is used twice: with its object in the gallery, and without it. ROC curve of the decision that "
             "the gallery contains the object; the grey line marks 95 % true accepts.",
             lambda: plots.reject(view),

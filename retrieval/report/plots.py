@@ -1,6 +1,6 @@
 """Plots of an evaluation: each function returns a matplotlib figure of one protocol."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -24,10 +24,10 @@ _LABELLED_OBJECTS = 130
 
 def overview(view: ProtocolView, keys: Sequence[str]) -> Figure:
     """Plot value, interval and chance: a line for each row, a panel for each measure."""
-    figure = canvas(10.5, 0.9 + 0.32 * len(view.rows))
+    figure = canvas(10.5, 0.9 + 0.32 * len(view.result.rows))
     panels = figure.subplots(1, len(keys), sharey=True, squeeze=False)[0]
     for panel, key in zip(panels, keys, strict=True):
-        for place, name in enumerate(view.rows):
+        for place, name in enumerate(view.result.rows):
             if summary := view.summary(name, key):
                 value, low, high = _first(summary)
                 panel.plot([low, high], [place, place], color=style_of(name).colour, lw=2.2, solid_capstyle="butt")
@@ -37,7 +37,7 @@ def overview(view: ProtocolView, keys: Sequence[str]) -> Figure:
         panel.set_xlabel("%")
         panel.tick_params(axis="y", length=0)
         panel.grid(axis="y", visible=False)
-    panels[0].set_yticks(range(len(view.rows)), list(map(view.label, view.rows)))
+    panels[0].set_yticks(range(len(view.result.rows)), list(map(view.label, view.result.rows)))
     panels[0].invert_yaxis()
     return figure
 
@@ -62,11 +62,11 @@ def topn_curves(view: ProtocolView, keys: Sequence[str]) -> Figure:
         panel.set(title=f"{key.removeprefix('topn_k')} candidate objects", xlabel="N")
         panel.xaxis.get_major_locator().set_params(integer=True)
         percent_axis(panel, "object among the first N answers, %")
-    _legend(figure, view, view.rows)
+    _legend(figure, view, view.result.rows)
     return figure
 
 
-def _legend(figure: Figure, view: ProtocolView, names: Sequence[str]) -> None:
+def _legend(figure: Figure, view: ProtocolView, names: Iterable[str]) -> None:
     from matplotlib.lines import Line2D
 
     handles = [
@@ -82,8 +82,8 @@ def grasps(view: ProtocolView) -> Figure:
     figure = canvas(8, 4.4)
     panel = figure.subplots()
     keys = {key: count for count in SET_SIZES if view.summaries(key := grasps_metric_name(count))}
-    for place, name in enumerate(view.rows):
-        shift, style = 0.055 * (place - (len(view.rows) - 1) / 2), style_of(name)
+    for place, name in enumerate(view.result.rows):
+        shift, style = 0.055 * (place - (len(view.result.rows) - 1) / 2), style_of(name)
         found = [(at, summary) for at, key in enumerate(keys) if (summary := view.summary(name, key))]
         points = np.array([(at + shift, *_first(summary)) for at, summary in found]).reshape(-1, 4)
         panel.plot(points[:, 0], points[:, 1], color=style.colour, marker=style.marker, ls=style.line, ms=5)
@@ -93,7 +93,7 @@ def grasps(view: ProtocolView) -> Figure:
     panel.set_xticks(range(len(keys)), list(map(str, keys.values())))
     panel.set_xlabel("grasps of the same object in one query")
     percent_axis(panel, "top-1 accuracy among 5 objects, %")
-    _legend(figure, view, view.rows)
+    _legend(figure, view, view.result.rows)
     return figure
 
 
@@ -163,7 +163,7 @@ def reject(view: ProtocolView) -> Figure:
     panel.set(xlabel="accepted, object absent (false accepts), %", ylabel="accepted, object present, %")
     panel.set(xlim=(-1, 101), ylim=(-1, 101))
     panel.set_aspect("equal", adjustable="box")
-    _legend(figure, view, list(rejections))
+    _legend(figure, view, rejections)
     return figure
 
 
@@ -193,5 +193,5 @@ def accuracy_and_time(view: ProtocolView, key: str) -> Figure:
         logarithmic(panel.xaxis)
         panel.set_xlabel(title)
     percent_axis(panels[0], f"{view.measure_label(key)}, %")
-    _legend(figure, view, view.rows)
+    _legend(figure, view, view.result.rows)
     return figure

@@ -20,11 +20,6 @@ HEADLINES = ("pair_accuracy", "topn_k5", "topn_k10", grasps_metric_name(5), "map
 """Measures of the overview of a protocol with many measures."""
 
 
-def method_label(name: str) -> str:
-    """Return the report's label of a method."""
-    return METHOD_LABELS.get(name, name.rpartition(":")[2].replace("_", " "))
-
-
 @dataclass(frozen=True)
 class ProtocolView:
     """Results of one protocol, with labels.
@@ -42,19 +37,14 @@ class ProtocolView:
     is_only: bool
 
     @property
-    def rows(self) -> list[str]:
-        """Names of the rows."""
-        return list(self.result.rows)
-
-    @property
     def learned(self) -> list[str]:
         """The rows without random scores."""
-        return [name for name in self.rows if name != CHANCE]
+        return [name for name in self.result.rows if name != CHANCE]
 
     @property
     def main_row(self) -> str:
         """The row that is shown in detail."""
-        return (self.learned or self.rows)[0]
+        return next(iter(self.learned or self.result.rows))
 
     @property
     def details(self) -> dict[str, Details]:
@@ -70,8 +60,9 @@ class ProtocolView:
     def label(self, row: str) -> str:
         """Return the label of a row: that of its method, or the name of a checkpoint that scores as it is."""
         found = self.result.rows.get(row)
-        is_method = found is None or found.method == row or found.model is None
-        return method_label(row) if is_method else f"{row} (unadapted)"
+        if found and found.method != row and found.model is not None:
+            return f"{row} (unadapted)"
+        return METHOD_LABELS.get(row, row.rpartition(":")[2].replace("_", " "))
 
     def measure_label(self, key: str) -> str:
         """Return the label of a measure."""
@@ -83,7 +74,7 @@ class ProtocolView:
 
     def summaries(self, key: str) -> dict[str, Summary]:
         """Return a measure of all rows that have it."""
-        return {row: found for row in self.rows if (found := self.summary(row, key))}
+        return {row: found for row in self.result.rows if (found := self.summary(row, key))}
 
     @property
     def times(self) -> ProtocolTimes | None:

@@ -224,8 +224,7 @@ def _supported_rate(rate: Rate) -> str:
     """Return a rate with its interval in percent, or the number of objects that it needs."""
     if rate.value is not None and rate.low is not None and rate.high is not None:
         return interval(rate.value, rate.low, rate.high)
-    needed = rate.objects_needed
-    return "refused: no errors" if needed is None else f"refused: needs {needed:,} objects"
+    return "refused: " + (f"needs {rate.objects_needed:,} objects" if rate.objects_needed else "no errors")
 
 
 # Times and objects -----------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ import torch
 from benchmarks import again, rerank, scale
 from benchmarks.frontier import APPROXIMATIONS, NEED_NO_MODEL
 from benchmarks.frontier.__main__ import main
+from retrieval import frontier
 from retrieval.frontier.sample import Sample, Scale
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.checkpoint_info import read_checkpoint_info
@@ -55,9 +56,10 @@ def test_the_frontier_of_kernels_plots_a_row_without_a_recording(model, tmp_path
     assert not (tmp_path / "recording").exists()
 
 
-def test_the_performance_page_names_every_approximation():
+def test_the_performance_page_names_every_approximation_of_kernels_and_counts_those_of_a_search():
     text = (ROOT / "docs" / "performance.md").read_text("utf-8")
     assert [name for name in APPROXIMATIONS if f"`{name}`" not in text] == []
+    assert f" {len(frontier.APPROXIMATIONS)} approximations of a search" in text
 
 
 def test_time_against_the_number_of_photos(tmp_path):

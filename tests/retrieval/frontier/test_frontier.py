@@ -20,7 +20,7 @@ from retrieval.frontier.candidates import default_k, ranks
 from retrieval.frontier.clock import time_points
 from retrieval.frontier.formats import FORMATS, encoders
 from retrieval.frontier.measure import measure_frontier
-from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, format_duration, miss_rate_point
+from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, miss_rate_point
 from retrieval.frontier.report import figure, write_frontier
 from retrieval.frontier.sample import Sample, Scale
 from retrieval.indexing.build import build_index
@@ -30,7 +30,6 @@ from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import encode_touches
 from retrieval.training.features import BatchImages
 from tests import synthetic
-from tests.documents import ROOT
 
 TINY = Scale(photos=700, queries=6, repeats=1, quick=True)
 
@@ -52,12 +51,6 @@ def sample(unseen, model, tmp_path_factory):
     return Sample(model, lambda: unseen, tmp_path_factory.mktemp("features"), TINY, quiet=True)
 
 
-@pytest.fixture(scope="module")
-def rows(sample):
-    """Every row, measured once."""
-    return {name: APPROXIMATIONS.load(name)(sample) for name in APPROXIMATIONS}
-
-
 # Points ----------------------------------------------------------------------------------------------------
 
 
@@ -66,29 +59,23 @@ def test_the_front_has_the_points_that_no_other_beats_in_both():
     assert [point.setting for point in made.pareto()] == ["s0", "s2", "s4"]
 
 
-def test_the_fastest_within_the_tolerance_is_recommended_else_that_of_the_smallest_error():
-    made = panel((1, 5), (3, 0.5), (2, 1.0), (4, 0.0))
-    assert made.recommended.setting == "s2"
-    assert "cheapest within 1: s2: 1 %, 2 s; default: none" in made.line()
-    made = panel((1, 5), (3, 2), (2, 2))
-    assert made.recommended.setting == "s2"
-    assert "none within 1, smallest error: s2" in made.line()
-
-
-@pytest.mark.parametrize(("used", "words"), [(0, "default: the same"), (1, "default: s1: 0 %, 2 s")])
-def test_a_line_compares_the_default_with_the_recommended_point(used, words):
-    made = panel((1, 0.5), (2, 0))
-    points = [dataclasses.replace(point, is_default=row == used) for row, point in enumerate(made.points)]
-    assert dataclasses.replace(made, points=tuple(points)).line().endswith(words)
+@pytest.mark.parametrize(
+    ("points", "default", "line"),
+    [
+        (((1, 5), (3, 0.5), (2e-3, 1.0), (4, 0.0)), None, "cheapest within 1: s2: 1 %, 2 ms; default: none"),
+        (((1, 5), (3, 2), (2, 2)), 0, "none within 1, smallest error: s2: 2 %, 2 s; default: s0: 5 %, 1 s"),
+        (((4.5e-5, 0.5), (2, 0)), 0, "cheapest within 1: s0: 0.500 %, 45 us; default: the same"),
+    ],
+)
+def test_the_fastest_within_the_tolerance_is_recommended_else_that_of_the_smallest_error(points, default, line):
+    made = panel(*points)
+    marked = [dataclasses.replace(point, is_default=row == default) for row, point in enumerate(made.points)]
+    assert dataclasses.replace(made, points=tuple(marked)).line() == f"errors (against the truth); {line}"
 
 
 def test_a_miss_rate_is_in_percent_with_its_exact_interval():
     point = miss_rate_point("a", "b", [True, False, False, False])
     assert (point.error, point.interval) == (25.0, pytest.approx((0.6, 80.6), abs=0.05))  # Clopper and Pearson
-
-
-def test_durations_are_short():
-    assert [format_duration(seconds) for seconds in (2.0, 0.0123, 4.5e-5)] == ["2 s", "12.3 ms", "45 us"]
 
 
 def test_timed_works_take_turns():
@@ -104,11 +91,10 @@ def test_timed_works_take_turns():
 
 
 @pytest.mark.parametrize("name", sorted(APPROXIMATIONS))
-def test_every_row_has_points_a_reference_and_one_default(name, rows):
-    row = rows[name]
+def test_every_row_has_points_a_reference_and_one_default(name, sample):
+    row = APPROXIMATIONS.load(name)(sample)
     assert row.title
     assert row.text
-    assert row.skipped is None
     assert row.panels
     for each in row.panels:
         assert each.reference
@@ -170,19 +156,12 @@ def test_grasps_provide_a_photo_or_a_touch_and_every_object_both(sample):
         assert len({sample.grasps[row].object_id for row in rows}) == 8
 
 
-def test_trained_objects_are_left_out(model, recording, tmp_path):
-    split = load_checkpoint(model).split
+def test_trained_objects_are_left_out_and_too_few_others_refused(model, recording, tmp_path):
     own = Sample(model, lambda: recording, tmp_path, TINY, quiet=True)
-    assert {grasp.object_id for grasp in own.grasps} == set(split.test)
-
-
-def test_a_recording_of_trained_objects_only_is_refused(model, tmp_path):
-    split = load_checkpoint(model).split
+    assert {grasp.object_id for grasp in own.grasps} == set(load_checkpoint(model).split.test)
     few = synthetic.write_recording(tmp_path / "few", synthetic.make_objects(12)[:1], 3)
-    own = Sample(model, lambda: few, tmp_path, TINY, quiet=True)
-    assert split is not None
     with pytest.raises(DatasetError, match="at least 2 objects that the model was not trained on"):
-        _ = own.grasps
+        _ = Sample(model, lambda: few, tmp_path, TINY, quiet=True).grasps
 
 
 def test_ranks_count_the_photos_nearer_than_the_exhaustive_top1():
@@ -220,48 +199,28 @@ def one(sample):
 
 def other(sample):
     CALLS.append("other")
+    if CALLS.count("other") == 1:
+        raise KeyboardInterrupt
     return ApproximationResult("other", "text", (panel((1e-3, 2)),))
 
 
-@pytest.fixture
-def measure(model, tmp_path):
-    """Function that measures rows of one point each, without a recording."""
-
-    def run(*only, **changed):
+def test_finished_rows_are_reused_until_their_inputs_change_or_the_cache_is_damaged(model, tmp_path):
+    def measure(*only, **changed):
         options = {"table": TABLE, "model_free": TABLE, "quick": True, "quiet": True} | changed
         return measure_frontier(tmp_path, model, not_needed, only=only, **options)
 
-    CALLS.clear()
-    return run
-
-
-def test_rows_that_need_no_recording_collect_none(measure, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        measure()
     document = measure()
-    assert list(document["rows"]) == CALLS == ["one", "other"]
-    assert json.loads((tmp_path / "frontier.json").read_text()) == document
+    assert list(document["rows"]) == ["one", "other"]
+    assert CALLS == ["one", "other", "other"]
+    assert json.loads((tmp_path / "frontier.json").read_text()) == document == measure()
     point = document["rows"]["one"]["panels"][0]["points"][0]
     assert (point["setting"], point["error"], point["seconds"]) == ("s0", 2, 1e-3)
-
-
-def test_a_row_is_measured_again_only_if_its_inputs_change_or_the_cache_is_damaged(measure, tmp_path):
-    assert measure("one") == measure("one")
-    assert CALLS == ["one"]
     measure("one", queries=3)
     (tmp_path / "cache.sqlite").write_bytes(b"damaged")
     measure("one")
-    assert CALLS == ["one"] * 3
-
-
-def test_a_stopped_run_reuses_its_finished_rows(measure, monkeypatch):
-    def stop(sample):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as stopping:
-        stopping.setitem(globals(), "other", stop)
-        with pytest.raises(KeyboardInterrupt):
-            measure()
-    measure()
-    assert CALLS == ["one", "other"]
+    assert CALLS[3:] == ["one", "one"]
 
 
 def test_an_unknown_row_is_refused_before_anything_is_measured(model, tmp_path):
@@ -281,7 +240,7 @@ def test_a_page_has_the_plot_the_reason_of_a_skipped_row_and_every_point(errors,
     made = Panel("missed", "one query", "%", "every photo reranked", 1.5, points)
     rows = {
         "candidates": ApproximationResult("Candidates", "What is measured.", (made,)),
-        "towers": ApproximationResult("Towers", "", skipped="nothing to measure"),
+        "towers": ApproximationResult("Towers", "Left out: nothing to measure."),
     }
     machine = {"processor": "a <fast> one", "cores": 2, "system": "Linux"}
     _, page, plot = write_frontier(tmp_path, rows, machine, True)
@@ -302,11 +261,6 @@ def test_the_tolerance_is_drawn_at_its_value_and_no_point_below_the_floor(tolera
     (dashed,) = [line for line in axes.lines if line.get_label() == "tolerance"]
     assert dashed.get_ydata()[0] == (tolerance or lowest)
     assert min(line.get_ydata()[0] for line in axes.lines if line is not dashed and len(line.get_ydata())) == lowest
-
-
-def test_the_performance_page_has_the_number_of_approximations():
-    text = " ".join((ROOT / "docs" / "performance.md").read_text().split())
-    assert f" {len(APPROXIMATIONS)} approximations of a search" in text
 
 
 def test_the_command_writes_a_page_and_prints_a_line_for_each_panel(model, recording, tmp_path, capsys):
