@@ -47,13 +47,9 @@ def normal_logits(objects, touches, photos, apart, alike, seed=0):
     return ScoredTouches(logits, owner, photo_owner, np.zeros(same.shape, dtype=bool))
 
 
-def changed(scored, scale, shift):
-    return ScoredTouches(scale * scored.logits + shift, scored.touch_owner, scored.photo_owner, scored.own)
-
-
 def test_the_fit_recovers_planted_parameters():
     true = normal_logits(300, 1, 1, apart=2.5, alike=0)
-    found = fit_posterior(changed(true, 4, 10))  # log ratio = logit / 4 - 10 / 4
+    found = fit_posterior(dataclasses.replace(true, logits=4 * true.logits + 10))  # log ratio = logit / 4 - 10 / 4
     assert found.slope == pytest.approx(1 / 4, rel=0.1)
     for log_ratio in (-1.0, 0.0, 2.0):
         assert found.slope * (4 * log_ratio + 10) + found.offset == pytest.approx(log_ratio, abs=0.3)
@@ -70,8 +66,7 @@ def test_the_fit_recognises_independent_grasps_and_equal_ones():
 
 def test_logits_without_errors_have_a_finite_slope():
     owner = np.arange(20)
-    scored = ScoredTouches(np.where(np.eye(20, dtype=bool), 5.0, -5.0), owner, owner, np.zeros((20, 20), dtype=bool))
-    found = fit_posterior(scored)
+    found = fit_posterior(ScoredTouches(10 * np.eye(20) - 5, owner, owner, np.zeros((20, 20), dtype=bool)))
     assert SLOPE_BOUNDS[0] < found.slope < 3
     logits = [5.0] + [-5.0] * 18
     assert 0.5 < found.probabilities_given(logits, found.mass(logits)).objects[0] < 1
@@ -79,11 +74,10 @@ def test_logits_without_errors_have_a_finite_slope():
 
 def test_a_photo_of_the_touchs_own_grasp_never_counts():
     scored = normal_logits(30, 2, 2, apart=2, alike=0)
-    own = np.zeros_like(scored.own)
-    own[np.arange(60), np.arange(60)] = True
-    with_secret = np.where(own, 1e6, scored.logits)
-    hidden = ScoredTouches(with_secret, scored.touch_owner, scored.photo_owner, own)
-    plain = ScoredTouches(np.where(own, 0.0, scored.logits), scored.touch_owner, scored.photo_owner, own)
+    own = np.eye(60, dtype=bool)
+    hidden, plain = (
+        dataclasses.replace(scored, own=own, logits=np.where(own, value, scored.logits)) for value in (1e6, 0.0)
+    )
     assert fit_posterior(hidden) == fit_posterior(plain)
 
 
@@ -116,8 +110,7 @@ def test_near_touches_get_a_large_weight_and_noise_a_small_one():
 
 def test_without_photos_only_the_touches_are_fitted():
     found = fit_references(reference_touches(photos=False))
-    assert found.with_photos is None
-    assert found.weight is None
+    assert (found.with_photos, found.weight) == (None, None)
     assert found.touch_only.slope > 1
 
 
@@ -128,26 +121,24 @@ def test_too_few_objects_touches_or_dimensions_give_no_calibration():
     assert fit_references(dataclasses.replace(touches, touch_embeddings=touches.touch_embeddings[:, :0])) is None
 
 
-@pytest.mark.parametrize("references", [1, 3])
-def test_one_reference_and_three_are_both_calibrated(references):
+def test_one_reference_and_three_are_both_calibrated():
     """On other objects, the mean probability of the best object equals its accuracy."""
-    calibration = fit_references(reference_touches(objects=80, touches=8, noise=0.2, photos=False))
-    others = reference_touches(objects=80, touches=8, noise=0.2, photos=False, seed=1)
-    embeddings = others.touch_embeddings.reshape(80, 8, -1)
-    shown, queries = embeddings[:, :references].reshape(80 * references, -1), embeddings[:, 4:].reshape(320, -1)
-    near = reference_similarity(queries @ shown.T, np.arange(80) * references)
-    ratios = np.array([calibration.touch_only.log_ratio(row, 1) for row in near])
-    likelihoods = np.exp(ratios - ratios.max(1, keepdims=True))
-    confidence = (likelihoods.max(1) / likelihoods.sum(1)).mean()
-    accuracy = (ratios.argmax(1) == np.repeat(np.arange(80), 4)).mean()
-    assert confidence == pytest.approx(accuracy, abs=0.1)
+    touches, others = (reference_touches(80, touches=8, noise=0.2, photos=False, seed=seed) for seed in (0, 1))
+    calibration, embeddings = fit_references(touches), others.touch_embeddings.reshape(80, 8, -1)
+    for references in (1, 3):
+        shown, queries = embeddings[:, :references].reshape(80 * references, -1), embeddings[:, 4:].reshape(320, -1)
+        near = reference_similarity(queries @ shown.T, np.arange(80) * references)
+        ratios = np.array([calibration.touch_only.log_ratio(row, 1) for row in near])
+        likelihoods = np.exp(ratios - ratios.max(1, keepdims=True))
+        confidence = (likelihoods.max(1) / likelihoods.sum(1)).mean()
+        accuracy = (ratios.argmax(1) == np.repeat(np.arange(80), 4)).mean()
+        assert confidence == pytest.approx(accuracy, abs=0.1)
 
 
 # Verification ------------------------------------------------------------------------------------------------
 
 
 POSTERIOR = Posterior(slope=1.0, offset=-2.0, dependence=0.5)
-EMBEDDING_DIM = 4
 
 
 def scored_objects(objects, seed, grasps=MAX_GRASPS + 1):
@@ -160,33 +151,23 @@ def scored_objects(objects, seed, grasps=MAX_GRASPS + 1):
     of_objects = rng.normal(size=(objects, objects)) * 1.5
     logits = of_objects[owner][:, owner] + rng.normal(size=(len(owner), len(owner))) * 1.3
     logits += 3.0 * (owner[:, None] == owner)
-    embeddings = rng.normal(size=(len(owner), EMBEDDING_DIM))
+    embeddings = rng.normal(size=(len(owner), 4))
     return ScoredTouches(logits, owner, owner, np.eye(len(owner), dtype=bool), embeddings, embeddings)
 
 
 def plain_sequences(scored, seed=3):
-    """Return log likelihood ratios (S, O) after 1 to MAX_GRASPS grasps of each object, by plain loops."""
-    rng = np.random.default_rng(seed)
-    objects = np.unique(scored.touch_owner)
-    found, true = [], []
+    """Return log likelihood ratios (S, G, O) after 1 to MAX_GRASPS grasps of each object, by plain loops."""
+    rng, objects = np.random.default_rng(seed), np.unique(scored.touch_owner)
+    found = np.empty((len(objects), MAX_GRASPS, len(objects)))
     for name in objects:
         touches = rng.permutation(np.flatnonzero(scored.touch_owner == name))[:MAX_GRASPS]
-        rows = []
         for count in range(1, MAX_GRASPS + 1):
-            weight = POSTERIOR.weight(count)
-            row = []
+            allowed, weight = ~scored.own[touches[:count]].any(0), POSTERIOR.weight(count)
             for other in objects:
-                photos = [
-                    photo
-                    for photo in np.flatnonzero(scored.photo_owner == other)
-                    if not scored.own[touches[:count], photo].any()
-                ]
+                photos = np.flatnonzero((scored.photo_owner == other) & allowed)
                 sums = scored.logits[np.ix_(touches[:count], photos)].sum(0)
-                row.append(np.log(np.mean(np.exp(weight * sums))) + POSTERIOR.offset)
-            rows.append(row)
-        found.append(rows)
-        true.append(name)
-    return np.array(found), np.array(true)
+                found[name, count - 1, other] = np.log(np.mean(np.exp(weight * sums))) + POSTERIOR.offset
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -196,31 +177,25 @@ def fitted():
 
 def test_the_stated_false_accept_rate_holds_on_other_objects_whenever_the_decision_falls(fitted):
     """The naive quantile of single grasps, applied after each grasp, accepts more impostors over a sequence."""
-    ratios, true = plain_sequences(scored_objects(60, seed=1))
-    bounds = fitted.bounds(0.02)
-    impostor = np.ones(ratios[:, 0].shape, dtype=bool)
-    impostor[np.arange(len(true)), true] = False
-    accepted = (ratios.max(1) >= bounds.accept)[impostor].mean()
-    assert 0.01 <= accepted <= 0.03
-    genuine = (ratios.max(1)[np.arange(len(true)), true] < bounds.accept).mean()
+    ratios, bounds = plain_sequences(scored_objects(60, seed=1)), fitted.bounds(0.02)
+    impostor = ~np.eye(60, dtype=bool)
+    assert 0.01 <= (ratios.max(1) >= bounds.accept)[impostor].mean() <= 0.03
+    genuine = (ratios.max(1).diagonal() < bounds.accept).mean()
     assert bounds.false_rejects.low <= genuine <= bounds.false_rejects.high
     naive = np.quantile(ratios[:, 0][impostor], 0.98)
     assert (ratios.max(1) >= naive)[impostor].mean() > 0.03
 
 
-def test_a_rate_that_the_objects_cannot_support_is_refused_with_the_number_that_would():
-    small = fit_verification([scored_objects(20, seed=2)], POSTERIOR)  # 190 pairs: 0.158, rounded up
+def test_a_rate_that_the_objects_cannot_support_is_refused_with_the_number_that_would(fitted):
+    small = dataclasses.replace(fitted, group_sizes=(20,))  # 190 pairs: 0.158, rounded up
     with pytest.raises(BadInput, match=r"0\.1 needs 25 validation objects; the model has 20, enough for 0\.16"):
         small.bounds(0.1)  # 30 errors need 300 pairs, which 25 objects have
     assert small.bounds(0.2).false_accepts.value == 0.2
-
-
-@pytest.mark.parametrize("objects", [21, 50, 200])
-def test_the_rate_that_a_refusal_proposes_is_supported(fitted, objects):
-    calibration = dataclasses.replace(fitted, group_sizes=(objects,))
-    with pytest.raises(BadInput) as refused:
-        calibration.bounds(1e-4)
-    calibration.bounds(float(re.search(r"enough for ([\d.]+)", str(refused.value))[1]))
+    for objects in (21, 50, 200):  # the proposed rate is supported
+        found = dataclasses.replace(fitted, group_sizes=(objects,))
+        with pytest.raises(BadInput) as refused:
+            found.bounds(1e-4)
+        found.bounds(float(re.search(r"enough for ([\d.]+)", str(refused.value))[1]))
 
 
 @pytest.mark.parametrize("far", [0, 1, -0.1, 0.6, float("nan"), None])

@@ -5,17 +5,7 @@ import pytest
 import scipy.linalg
 
 from retrieval.errors import BadInput
-from retrieval.methods.cca import Cca
-from retrieval.methods.method import MethodSettings
-from retrieval.model.config import Config
-from retrieval.training.cca import (
-    CanonicalCorrelations,
-    Standardiser,
-    canonical_correlations,
-    decompose,
-    unit_rows,
-)
-from retrieval.training.features import Features
+from retrieval.training.cca import CanonicalCorrelations, Standardiser, canonical_correlations, decompose
 
 
 def linked(rhos, n=200, touch=12, photo=10, seed=0):
@@ -33,46 +23,25 @@ def paired(x, y, ridge=0.0) -> CanonicalCorrelations:
     return canonical_correlations(decompose(x), decompose(y), np.arange(len(x)), ridge)
 
 
-def variates(found, x, y):
-    return Standardiser.fit(x)(x) @ found.touch_weights, Standardiser.fit(y)(y) @ found.photo_weights
-
-
-def correlation(a, b):
-    return np.corrcoef(a, b)[0, 1]
-
-
 def test_planted_correlations_are_recovered():
     rhos = [0.95, 0.9, 0.8, 0.3]
     x, y = linked(rhos)
     found = paired(x, y)
     np.testing.assert_allclose(found.correlations[:4], rhos, atol=1e-6)
     np.testing.assert_allclose(found.correlations[4:], 0, atol=1e-6)
-    a, b = variates(found, x, y)
-    np.testing.assert_allclose([correlation(a[:, i], b[:, i]) for i in range(4)], rhos, atol=1e-6)
+    a, b = Standardiser.fit(x)(x) @ found.touch_weights, Standardiser.fit(y)(y) @ found.photo_weights
+    np.testing.assert_allclose([np.corrcoef(a[:, i], b[:, i])[0, 1] for i in range(4)], rhos, atol=1e-6)
     np.testing.assert_allclose(a.T @ a / len(a), np.eye(10), atol=1e-6)  # uncorrelated, variance 1
 
 
-@pytest.mark.parametrize("ridges", [(0.0, 0.0), (0.1, 0.1), (0.1, 0.5)])
-def test_the_correlations_solve_the_eigenproblem_of_the_covariances(ridges):
-    """(C_xx + ridge)^-1/2 C_xy (C_yy + ridge)^-1/2 on standardised features, whose mean variance is 1."""
-    views = [Standardiser.fit(view)(view) for view in linked([0.9, 0.5], n=80, touch=5, photo=4, seed=3)]
-    roots = [
-        np.linalg.inv(scipy.linalg.sqrtm(v.T @ v / len(v) + ridge * np.eye(v.shape[1])))
-        for v, ridge in zip(views, ridges, strict=True)
-    ]
-    expected = np.linalg.svd(roots[0] @ (views[0].T @ views[1] / 80) @ roots[1])[1]
-    found = canonical_correlations(*map(decompose, views), np.arange(80), *ridges)
-    np.testing.assert_allclose(found.correlations, expected, atol=1e-9)
-
-
-@pytest.mark.parametrize("ridge", [0.0, 0.5])
-def test_pairing_by_object_equals_that_over_every_pair(ridge):
+@pytest.mark.parametrize("ridges", [(0.0, 0.0), (0.5, 0.1)])
+def test_the_correlations_solve_the_eigenproblem_of_the_covariances_over_every_pair_of_an_object(ridges):
     """Objects with 1 to 6 grasps; each pair of an object with m grasps has weight 1 / m."""
     rng = np.random.default_rng(5)
     owner = np.repeat(np.arange(9), [1, 2, 3, 6, 4, 4, 2, 5, 6])[rng.permutation(33)]
     latent = rng.standard_normal((9, 3))[owner]
     x, y = (latent @ rng.standard_normal((3, d)) + rng.standard_normal((33, d)) for d in (4, 5))
-    found = canonical_correlations(decompose(x), decompose(y), owner, ridge)
+    found = canonical_correlations(decompose(x), decompose(y), owner, *ridges)
     x, y = Standardiser.fit(x)(x), Standardiser.fit(y)(y)
     cross, touch_own, photo_own = np.zeros((4, 5)), np.zeros((4, 4)), np.zeros((5, 5))
     for i in range(33):
@@ -82,7 +51,10 @@ def test_pairing_by_object_equals_that_over_every_pair(ridge):
                 cross += weight * np.outer(x[i], y[j])
                 touch_own += weight * np.outer(x[i], x[i])
                 photo_own += weight * np.outer(y[j], y[j])
-    roots = [np.linalg.inv(scipy.linalg.sqrtm(own + ridge * np.eye(len(own)))) for own in (touch_own, photo_own)]
+    roots = [
+        np.linalg.inv(scipy.linalg.sqrtm(own + ridge * np.eye(len(own))))
+        for own, ridge in zip((touch_own, photo_own), ridges, strict=True)
+    ]
     expected = np.linalg.svd(roots[0] @ cross @ roots[1])[1]
     np.testing.assert_allclose(found.correlations, expected, atol=1e-9)
 
@@ -100,10 +72,9 @@ def spoiled(name, x):
     }[name]()
 
 
-SPOILED = ["duplicated", "constant", "collinear", "nearly duplicated", "scaled 1e-6 to 1e6", "far from 0"]
-
-
-@pytest.mark.parametrize("name", SPOILED)
+@pytest.mark.parametrize(
+    "name", ["duplicated", "constant", "collinear", "nearly duplicated", "scaled 1e-6 to 1e6", "far from 0"]
+)
 def test_ill_conditioned_features_give_the_same_correlations(name):
     rhos = [0.95, 0.9, 0.8]
     x, y = linked(rhos)
@@ -111,17 +82,6 @@ def test_ill_conditioned_features_give_the_same_correlations(name):
     np.testing.assert_allclose(found.correlations[:3], rhos, atol=1e-6)
     assert len(found.correlations) == 10  # the ranks are 12 and 10, whatever was added
     assert np.abs(found.touch_weights).max() < 100
-
-
-@pytest.mark.parametrize("name", SPOILED)
-@pytest.mark.parametrize("ridge", [0.0, 1e-3, 100.0])
-def test_fewer_items_than_features_give_finite_results(name, ridge):
-    rng = np.random.default_rng(2)
-    x, y = spoiled(name, rng.standard_normal((30, 40))), rng.standard_normal((30, 60))
-    found = paired(x, y, ridge)
-    assert len(found.correlations) == 29
-    assert all(np.isfinite(part).all() for part in (found.correlations, found.touch_weights, found.photo_weights))
-    assert ((found.correlations >= 0) & (found.correlations <= 1)).all()
 
 
 def test_a_constant_view_is_refused():
@@ -148,49 +108,3 @@ def test_if_the_fast_decomposition_fails_the_slow_one_is_used(monkeypatch):
 
     monkeypatch.setattr(np.linalg, "svd", failing)
     np.testing.assert_allclose(paired(x, y).correlations, expected, atol=1e-12)
-
-
-def first_hits(touch, photo):
-    return np.mean((unit_rows(touch) @ unit_rows(photo).T).argmax(1) == np.arange(len(touch)))
-
-
-def test_cosine_needs_dimensions_weighted_by_their_correlation():
-    """Of 60 canonical dimensions 6 are real; unweighted, the other 54 dominate."""
-    rng = np.random.default_rng(7)
-    maps = rng.standard_normal((6, 60)), rng.standard_normal((6, 60))
-
-    def views(n):
-        latent = rng.standard_normal((n, 6))
-        return [latent @ part + rng.standard_normal((n, 60)) * 1.5 for part in maps]
-
-    x, y = views(300)
-    found = paired(x, y, ridge=1e-3)
-    new_x, new_y = views(200)
-    a, b = Standardiser.fit(x)(new_x) @ found.touch_weights, Standardiser.fit(y)(new_y) @ found.photo_weights
-    weights = found.correlations**4
-    assert first_hits(a, b) < 0.6 * first_hits(a * weights, b * weights)
-
-
-def features(objects, each, seed, name, touch=8, photo=10, noise=0.3):
-    """Return touch and photo features that are linear in three numbers of the object, with noise."""
-    shared, rng = np.random.default_rng(77), np.random.default_rng(seed)
-    maps = shared.standard_normal((3, 2 * touch)), shared.standard_normal((3, photo))
-    latent = np.repeat(rng.standard_normal((objects, 3)), each, axis=0)
-    n = objects * each
-    views = [(latent @ m + noise * rng.standard_normal((n, m.shape[1]))).astype(np.float32) for m in maps]
-    return Features(
-        tuple(f"{name}{row}" for row in range(n)),
-        tuple(f"{name}{row // each}" for row in range(n)),
-        views[0].reshape(n, 2, touch),
-        views[1],
-    )
-
-
-def test_the_best_parameters_are_reported_and_do_not_exceed_the_rank():
-    fitted = Cca(MethodSettings(Config()))
-    fitted.fit(features(6, 5, 0, "train"), features(4, 5, 1, "validation"))
-    best_params = fitted.best_params
-    assert 1 <= best_params["components"] <= best_params["max_components"]
-    assert best_params["validation_auc"] > 0.8
-    assert best_params["max_components"] == 5  # one less than the training objects
-    assert best_params["rank"] == {"touch": 16, "photo": 10}

@@ -83,13 +83,6 @@ def test_the_loss_is_the_divergence_plus_the_weighted_error():
     assert loss.item() == pytest.approx(divergence + distil.SQUARED_ERROR_WEIGHT * error)
 
 
-def test_the_loss_is_finite_for_distant_logits_although_probabilities_give_nan():
-    scores, logits = torch.tensor([[-300.0, 300.0]]), torch.tensor([[300.0, -300.0]])
-    targets = logits.softmax(1)
-    assert (targets * (targets / scores.softmax(1)).log()).sum().isnan()
-    assert distil.distillation_loss(scores, logits).item() > 600
-
-
 def test_a_loss_that_is_not_finite_is_an_error_and_the_matcher_is_unchanged(matcher, partials):
     with torch.no_grad():
         matcher.head.out.bias.fill_(torch.inf)
@@ -102,17 +95,14 @@ def test_a_loss_that_is_not_finite_is_an_error_and_the_matcher_is_unchanged(matc
 # Its data --------------------------------------------------------------------------------------------------
 
 
+@torch.no_grad()
 def test_a_blend_of_partials_is_the_partial_of_blended_features(matcher):
     features = torch.randn(5, matcher.photo_tower.feature_count)
-    blends = [
-        distil.blend(rows, 50, torch.Generator().manual_seed(1)) for rows in (features, _partial(matcher, features))
-    ]
-    torch.testing.assert_close(_partial(matcher, blends[0]), blends[1], rtol=1e-4, atol=1e-5)
-
-
-@torch.no_grad()
-def _partial(matcher, features):
-    return matcher.photo_encoding(features).partial
+    rows, partials = (
+        distil.blend(part, 50, torch.Generator().manual_seed(1))
+        for part in (features, matcher.photo_encoding(features).partial)
+    )
+    torch.testing.assert_close(matcher.photo_encoding(rows).partial, partials, rtol=1e-4, atol=1e-5)
 
 
 def test_photos_of_the_pool_are_nearer_to_the_touches_than_random_blends_until_it_is_renewed(matcher, partials):
@@ -163,16 +153,12 @@ def test_only_the_candidate_encoder_changes_and_depends_on_the_seed_alone(matche
     assert same(before, after)
     assert {name.split(".")[0] for name in after.keys() - before.keys()} == {"candidate_encoder"}
     assert matcher.config == dataclasses.replace(WITHOUT_CANDIDATE_ENCODER, candidate_width=32)
-    others = [part.grad for name, part in matcher.named_parameters() if "candidate_encoder" not in name]
-    assert others == [None] * len(others)
     assert same(distilled(matcher, partials), first)  # also after an earlier distillation
     assert torch.equal(torch.get_rng_state(), state)
     assert not same(distilled(matcher, partials, seed=1), first)
 
 
-def test_with_a_cosine_in_the_logit_linear_values_rank_the_exhaustive_top1_higher_than_a_network_alone(
-    partials,
-):
+def test_with_a_cosine_in_the_logit_linear_values_rank_the_top1_higher_than_a_network_alone(partials):
     """The logit is only the cosine of embeddings that vary in two directions."""
     torch.manual_seed(3)
     config = dataclasses.replace(WITHOUT_CANDIDATE_ENCODER, cosine=True)
@@ -198,26 +184,16 @@ def test_with_a_cosine_in_the_logit_linear_values_rank_the_exhaustive_top1_highe
 @pytest.fixture
 def checkpoint(matcher, tmp_path):
     about = {"step": 1, "source": "test", "data_digest": "0", "metrics": {"validation_auc": 0.75}}
-    return Checkpoint(
-        path=tmp_path / "m.safetensors",
-        digest="",
-        matcher=matcher,
-        config=Config(WITHOUT_CANDIDATE_ENCODER),
-        split=None,
-        gel_check=None,
-        verification=None,
-        provenance=about,
-    )
+    config = Config(WITHOUT_CANDIDATE_ENCODER)
+    return Checkpoint(tmp_path / "m.safetensors", digest="", matcher=matcher, config=config, provenance=about)
 
 
 def test_a_checkpoint_gets_a_candidate_encoder_and_with_validation_objects_queries_and_a_metric(checkpoint, partials):
     held_out = drawn(30, 8, sign=1), drawn(50, 9, sign=-1)
     assert not checkpoint.config.has_embeddings
-    path = checkpoint.path
-    store_checkpoint(
-        distil.with_candidate_encoder(checkpoint, config_with_encoder(), partials, held_out, quiet=True), path
-    )
-    made = load_checkpoint(path)
+    made = distil.with_candidate_encoder(checkpoint, config_with_encoder(), partials, held_out, quiet=True)
+    store_checkpoint(made, made.path)
+    made = load_checkpoint(made.path)
     assert made.config == config_with_encoder()
     assert made.config.has_embeddings
     np.testing.assert_array_equal(made.queries, held_out[0].half().numpy())
@@ -226,7 +202,7 @@ def test_a_checkpoint_gets_a_candidate_encoder_and_with_validation_objects_queri
     )
     metrics = made.provenance["metrics"]
     assert metrics == {"validation_auc": 0.75, "candidate_agreement_at_1_percent": (ranks < 4).mean()}
-    assert "candidate agreement at 1 percent" in path.with_suffix(".md").read_text()
+    assert "candidate agreement at 1 percent" in made.path.with_suffix(".md").read_text()
     without = distil.with_candidate_encoder(checkpoint, config_with_encoder(2), partials, quiet=True)
     assert (without.queries, without.provenance["metrics"]) == (None, {"validation_auc": 0.75})
 
@@ -255,10 +231,8 @@ def test_with_a_candidate_encoder_the_best_candidate_is_late_fusions_best_photo(
     split = make_split(grasps, validation=0.25, test=0.2, seed=0)
     parts = [features.of_objects(part) for part in (split.train, split.validation)]
     best = []
-    for method in (
-        LateFusion(MethodSettings(config, folder=tmp_path)),
-        RetrieveRerank(MethodSettings(config, folder=tmp_path)),
-    ):
+    for kind in (LateFusion, RetrieveRerank):
+        method = kind(MethodSettings(config, folder=tmp_path))
         method.fit(*parts)
         best.append(method.score(method.encode_touch(features.touch), method.encode_photo(features.photo)).argmax(1))
     assert method.best_params["reranked_fraction"] == 0.25
@@ -266,13 +240,9 @@ def test_with_a_candidate_encoder_the_best_candidate_is_late_fusions_best_photo(
 
 
 def test_partial_activations_of_parts_are_those_of_all_features(matcher, monkeypatch):
-    rng = np.random.default_rng(0)
-    names = tuple(map(str, range(7)))
-    count = matcher.touch_tower.feature_count
-    touch, photo = (rng.normal(size=shape).astype(np.float32) for shape in ((7, 1, count), (7, count)))
-    expected = distil.feature_partials(matcher, Features(names, names, touch, photo))
+    names, count = tuple(map(str, range(7))), matcher.touch_tower.feature_count
+    touch, photo = np.random.default_rng(0).normal(size=(2, 7, count)).astype(np.float32)
+    features = Features(names, names, touch[:, None], photo)
+    expected = distil.feature_partials(matcher, features)
     monkeypatch.setattr(distil, "ROWS", 3)
-    for got, whole in zip(
-        distil.feature_partials(matcher, Features(names, names, touch, photo)), expected, strict=True
-    ):
-        torch.testing.assert_close(got, whole)
+    torch.testing.assert_close(distil.feature_partials(matcher, features), expected)

@@ -116,18 +116,6 @@ def test_a_variant_changes_only_its_modality(grasps, matcher, plain, encode):
     np.testing.assert_array_equal(part.photo, plain.photo[:5])
 
 
-def test_low_pass_keeps_colour_and_size_and_removes_fine_detail():
-    image = np.full((60, 80, 3), 0.25, dtype=np.float32)
-    image[::2] += 0.5  # stripes a pixel wide, mean 0.5
-    plain = low_pass(image)
-    assert plain.shape == image.shape
-    np.testing.assert_allclose(plain, 0.5, atol=0.02)
-    edge = np.zeros((60, 80, 3), dtype=np.float32)
-    edge[:, 40:] = 1  # coarse structure remains
-    assert low_pass(edge)[:, :10].max() < 0.1
-    assert low_pass(edge)[:, -10:].min() > 0.9
-
-
 @pytest.mark.parametrize("size", [(240, 320), (32, 48), (7, 9), (1, 3)])
 def test_low_pass_equals_a_gaussian_blur_reduced_and_enlarged_again(size):
     image = np.random.default_rng(0).random((*size, 3), dtype=np.float32)
@@ -136,21 +124,17 @@ def test_low_pass_equals_a_gaussian_blur_reduced_and_enlarged_again(size):
 
 
 def test_the_margin_of_a_photo_remains_and_the_inside_is_removed():
-    image = np.zeros((80, 160, 3), dtype=np.float32)
-    image[:10], image[-10:], image[:, :20], image[:, -20:] = 1, 1, 1, 1
-    image[40, 80] = 0.5
-    assert (photo_margin(image) == 1).all()
     noise = np.random.default_rng(1).random((80, 160, 3), dtype=np.float32)
     found = photo_margin(noise)
     np.testing.assert_array_equal(found[:10], noise[:10])
+    np.testing.assert_array_equal(found[:, :20], noise[:, :20])
     assert len(np.unique(found[10:-10, 20:-20].reshape(-1, 3), axis=0)) == 1
     assert photo_margin(noise[:1, :1]).shape == (1, 1, 3)
 
 
 @pytest.mark.parametrize("part", ["touch", "photo"])
-@pytest.mark.parametrize("value", [np.nan, -np.inf])
-def test_a_feature_that_is_not_finite_is_an_error_that_names_its_grasp(part, value, plain):
+def test_a_feature_that_is_not_finite_is_an_error_that_names_its_grasp(part, plain):
     invalid = getattr(plain, part).copy()
-    invalid[1, ..., 0] = value
+    invalid[1, ..., 0] = np.nan if part == "touch" else -np.inf
     with pytest.raises(NumericalError, match=f"{part} features must be finite; grasp {plain.grasp_ids[1]} has"):
         dataclasses.replace(plain, **{part: invalid})

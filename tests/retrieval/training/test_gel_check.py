@@ -30,13 +30,11 @@ def test_every_kind_takes_its_turn_and_a_seed_draws_the_same_pictures_again():
     photo, gel = np.full((40, 60, 3), 0.4, dtype=np.float32), np.full((30, 40, 3), 0.6, dtype=np.float32)
     drawn = list(draw_foreign(24, 16, [photo], [gel], seed=3))
     assert [name for name, _ in drawn[:8]] == [*SYNTHETIC_KINDS, "photo", "piece of a photo", "false colours"]
-    for _, picture in drawn:
-        assert picture.shape == (16, 16, 3)
-        assert picture.dtype == np.float32
-        assert (picture >= 0).all()
-        assert (picture <= 1).all()
-    again = list(draw_foreign(24, 16, [photo], [gel], seed=3))
-    assert all((one == other).all() for (_, one), (_, other) in zip(drawn, again, strict=True))
+    pictures = np.array([picture for _, picture in drawn])
+    assert (pictures.shape, pictures.dtype) == ((24, 16, 16, 3), np.float32)
+    assert 0 <= pictures.min() < pictures.max() <= 1
+    again = np.array([picture for _, picture in draw_foreign(24, 16, [photo], [gel], seed=3)])
+    np.testing.assert_array_equal(pictures, again)
     assert {name for name, _ in draw_foreign(9, 16, [], [])} == set(SYNTHETIC_KINDS)
 
 
@@ -59,10 +57,10 @@ def pictures(seed, no_contact=60):
 def test_distant_kinds_are_separated_on_other_pictures_of_the_same_kinds():
     head = fit_gel_head(pictures(0))
     check = fit_gel_check(head, pictures(1), levels=([0.5, 0.7, 0.9], [12.0, 30.0]))
-    assert check.rates["foreign_rejected"] == 1
-    assert check.rates["touches_rejected_as_foreign"] <= 0.02
-    assert check.rates["touches_rejected_as_no_contact"] == 0.025  # 2 of 80, the accepted loss
-    assert check.rates["no_contact_accepted"] == 0
+    rates = dict(check.rates)
+    assert rates.pop("touches_rejected_as_foreign") <= 0.02
+    accepted_loss = {"touches_rejected_as_no_contact": 0.025}  # 2 of 80
+    assert rates == {"foreign_rejected": 1, "no_contact_accepted": 0} | accepted_loss
     assert check.level_above == pytest.approx(12.36)  # 2 % of the way from 12 to 30
     with torch.inference_mode():
         others = pictures(2)

@@ -95,27 +95,21 @@ def gate(trained):
 
 
 def test_failed_grasps_are_read_for_the_gate_and_left_out_for_the_matcher(attempts):
-    rows = [json.loads(line) for line in (attempts / "metadata.jsonl").read_text().splitlines()]
     read = load_attempts(attempts)
-    assert [item.grasp.grasp_id for item in read] == [row["grasp_id"] for row in rows]
     assert [item.outcome for item in read] == list(OUTCOMES) * len(OBJECTS)
     assert [item.held for item in read] == [True, True, False, False] * len(OBJECTS)
-    assert read[0].after == tuple(attempts / rows[0][f"touch_{finger}_after_file_name"] for finger in "ab")
+    assert [path.stem for path in read[0].after] == [path.stem + "_after" for path in read[0].grasp.touches]
     assert len(load_grasps(attempts)) == 2 * len(OBJECTS)
 
 
-def test_the_outcome_counts_and_not_the_decision_of_another_gate(tmp_path):
-    folder = write(tmp_path / "r", ("held", "slipped"), grasped=True)
+def test_the_outcome_counts_and_without_it_the_field_grasped(tmp_path):
+    """The decision of another gate does not count."""
+    folder = write(tmp_path / "outcomes", ("held", "slipped"), grasped=True)
     assert [item.held for item in load_attempts(folder)] == [True, False] * len(OBJECTS)
-
-
-def test_without_outcomes_the_field_grasped_counts(tmp_path):
-    with RecordingWriter(tmp_path / "r", {"source": "test", "sensor": "drawn"}) as writer:
-        for number, grasped in enumerate((True, False, None)):
-            fields = {} if grasped is None else {"grasped": grasped}
+    with RecordingWriter(tmp_path / "grasped", {"source": "test", "sensor": "drawn"}) as writer:
+        for number, fields in enumerate(({"grasped": True}, {"grasped": False}, {}, {"outcome": "no_plan"})):
             writer.append(str(number), "mug", {"photo": LEAN, "touch_a": LEAN}, **fields)
-        writer.append("3", "mug", {"photo": LEAN, "touch_a": LEAN}, outcome="no_plan", grasped=False)
-    read = load_attempts(tmp_path / "r")
+    read = load_attempts(tmp_path / "grasped")
     assert [(item.grasp.grasp_id, item.outcome) for item in read] == [("0", "held"), ("1", "failed")]
 
 
@@ -132,8 +126,8 @@ def test_the_frame_after_the_lift_shows_a_slip_that_the_frame_during_the_grasp_d
 
 def test_the_report_and_the_file_state_accuracy_chance_and_accepted_grasps_of_other_objects(trained, attempts):
     out, report = trained["after"]
-    assert [report[f"train_{name}"] for name in ("grasps", "held")] == [24, 12]
-    assert [report[f"validation_{name}"] for name in ("grasps", "objects")] == [8, 2]
+    counts = [report[name] for name in ("train_grasps", "train_held", "validation_grasps", "validation_objects")]
+    assert counts == [24, 12, 8, 2]
     assert (report["accuracy"], report["chance"]) == (1.0, 0.5)
     assert report["interval"] == pytest.approx((0.025 ** (1 / 8), 1.0))
     header = read_tensors(out)[1]
@@ -177,13 +171,11 @@ def test_the_same_seed_gives_the_same_file_and_the_global_random_state_is_unchan
 
 def test_batches_contain_equal_numbers_of_both_kinds_and_depend_only_on_seed_and_step(attempts):
     few = load_attempts(attempts)[:8]
-    batch, rng = draw_batch(few, 0, seed=3)
-    again, same = draw_batch(few, 0, seed=3)
+    batch, again, next_step, other = (draw_batch(few, *at)[0] for at in ((0, 3), (0, 3), (1, 3), (0, 4)))
     assert [item.held for item in batch] == [True] * (BATCH // 2) + [False] * (BATCH // 2)
     assert batch == again
-    assert rng.random() == same.random()
-    assert batch != draw_batch(few, 1, seed=3)[0]
-    assert batch != draw_batch(few, 0, seed=4)[0]
+    assert batch != next_step
+    assert batch != other
 
 
 def test_the_loss_uses_the_deciding_finger_and_an_idle_finger_gets_no_gradient():
@@ -205,14 +197,11 @@ def test_augmentation_flips_and_relights_each_finger_independently():
     changed = augment(images, np.random.default_rng(0))
     corners = changed[..., [0, 0, -1, -1], [0, -1, 0, -1]]
     assert (corners.argmax(-1)[:, 0] != corners.argmax(-1)[:, 1]).any()
-    for corner in range(4):
-        assert 0.15 < (corners.argmax(-1)[..., 0] == corner).float().mean() < 0.35
+    assert corners.argmax(-1)[..., 0].unique().tolist() == [0, 1, 2, 3]
     brightness = changed[..., 4, 4]
-    assert brightness.abs().max() <= 20 / 255
-    assert brightness.min() < -18 / 255 < 18 / 255 < brightness.max()
+    assert 18 / 255 < brightness.abs().max() <= 20 / 255
     contrast = (corners.amax(-1) - brightness) / 0.5
-    assert 0.9 - 1e-6 <= contrast.min() < 0.92
-    assert 1.08 < contrast.max() <= 1.1 + 1e-6
+    assert 0.9 - 1e-6 <= contrast.min() < 0.92 < 1.08 < contrast.max() <= 1.1 + 1e-6
     assert torch.equal(brightness[..., 0], brightness[..., 2])  # a lamp changes all colours equally
 
 
@@ -237,36 +226,20 @@ def test_a_recording_that_cannot_train_a_gate_is_refused(tmp_path, case):
         train_gate(write(tmp_path / "r", **options), tmp_path / "g.safetensors", settings=settings, quiet=True)
 
 
-def test_settings_and_an_output_that_are_impossible_are_refused(attempts, tmp_path):
+def test_settings_and_files_that_are_not_of_a_gate_are_refused(attempts, model, trained, tmp_path):
     with pytest.raises(ConfigError, match=r"gate\.frame must be one of 'after', 'during'"):
         GateSettings(frame="later")
-    with pytest.raises(ConfigError, match="touch_px"):
-        GateSettings(touch_px=0)
     with pytest.raises(CheckpointError, match="is a folder"):
         train_gate(attempts, tmp_path, quiet=True)
-
-
-def test_a_matcher_is_not_a_gate_and_a_gate_is_not_a_matcher(model, trained):
     with pytest.raises(CheckpointError, match="retrieve train --task"):
         load_gate(model)
     with pytest.raises(CheckpointError, match="retrieve collect --gate"):
         load_checkpoint(trained["after"][0])
-
-
-def test_a_damaged_gate_and_a_gate_with_other_settings_are_refused(trained, tmp_path):
-    path = trained["after"][0]
-    data = path.read_bytes()
-    (tmp_path / "bent.safetensors").write_bytes(data[:-3] + bytes([data[-3] ^ 1]) + data[-2:])
-    with pytest.raises(CheckpointError, match="damaged"):
-        load_gate(tmp_path / "bent.safetensors")
-    state, header = read_tensors(path)
-    for number, change in enumerate(({"gate": {"depth": 3}}, {"gate": {"touch_px": 0}}, {"gate": None})):
-        write_tensors(tmp_path / f"{number}.safetensors", state, header | change)
+    state, header = read_tensors(trained["after"][0])
+    for change in ({"depth": 3}, {"touch_px": 0}, None):
+        write_tensors(tmp_path / "gate.safetensors", state, header | {"gate": change})
         with pytest.raises(CheckpointError, match="is not a gate that this version can use"):
-            load_gate(tmp_path / f"{number}.safetensors")
-    write_tensors(tmp_path / "less.safetensors", {"scale": state["scale"]}, header)
-    with pytest.raises(CheckpointError, match="weights do not fit"):
-        load_gate(tmp_path / "less.safetensors")
+            load_gate(tmp_path / "gate.safetensors")
 
 
 # Use -------------------------------------------------------------------------------------------------------
@@ -298,26 +271,21 @@ def test_a_logit_that_is_not_finite_is_an_error_and_not_a_failed_grasp():
         GraspSuccessGate(net, DURING)(fingers(0))
 
 
-def test_a_change_of_one_grey_level_does_not_wrap(gate):
+def test_a_change_of_one_grey_level_does_not_wrap_and_flat_pictures_give_finite_logits(gate):
     """In uint8 arithmetic, one level darker becomes 255 brighter."""
     darker = LEAN - np.uint8(1)
     assert (darker - LEAN).min() == 255
     assert not gate({"a": Frames(LEAN, LEAN, darker)})
-
-
-@pytest.mark.parametrize("level", [0, 255])
-def test_black_white_and_unchanged_pictures_give_finite_logits(gate, level):
-    flat = np.full((24, 32, 3), level, np.uint8)
-    logits = gate.logits({"a": Frames(flat, flat, flat), "b": Frames(flat, flat, 255 - flat)})
-    assert all(np.isfinite(value) for value in logits.values())
+    black, white = np.zeros((24, 32, 3), np.uint8), np.full((24, 32, 3), 255, np.uint8)
+    logits = gate.logits({"a": Frames(black, black, black), "b": Frames(black, black, white)})
+    assert np.isfinite(list(logits.values())).all()
 
 
 def test_a_fingers_logit_does_not_depend_on_other_fingers_or_the_image_size(gate):
     frames = fingers(78, after="a")
-    both = gate.logits(frames)
     large = Frames(*(picture.repeat(4, 0).repeat(4, 1) for picture in vars(frames["a"]).values()))
-    assert gate.logits({"a": frames["a"]})["a"] == pytest.approx(both["a"], rel=1e-4)
-    assert gate.logits({"x": frames["b"], "c": frames["a"]})["c"] == pytest.approx(both["a"], rel=1e-4)
+    alone = gate.logits({"a": frames["a"]})["a"]
+    assert gate.logits({"x": frames["b"], "c": frames["a"]})["c"] == pytest.approx(alone, rel=1e-4)
     assert gate({"a": large})
 
 

@@ -1,14 +1,12 @@
 """The training loop: learning rates, validation, the best step, the state file."""
 
 import math
-import os
-import signal
 from itertools import pairwise
 
 import pytest
 import torch
 
-from retrieval.errors import CheckpointError, JobInterrupted, NumericalError
+from retrieval.errors import CheckpointError, NumericalError
 from retrieval.model.config import SCHEDULES
 from retrieval.training.loop import RATE, Plan, StateFile, train_loop
 
@@ -100,29 +98,11 @@ def test_a_run_continues_from_its_state_with_the_bits_of_an_uninterrupted_run(tm
     assert run(path) == ([], best, last)  # a finished run makes no step
 
 
-def test_ctrl_c_ends_after_the_current_step_which_is_validated_and_stored(tmp_path):
-    state, module = (
-        StateFile(tmp_path / "s.safetensors", {}),
-        torch.nn.ParameterList([torch.nn.Parameter(torch.zeros(1))]),
-    )
-
-    def loss(step, _):
-        if step == 2:
-            os.kill(os.getpid(), signal.SIGINT)
-        return module[0].sum()
-
-    with pytest.raises(JobInterrupted, match=r"step 3 of 9.*run the same command") as stopped:
-        descend(Plan(9, 0.1, validate_every=5), loss, module, validate=lambda: {"score": 0.5}, state=state)
-    assert stopped.value.best.step == 3
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    assert len(descend(Plan(9, 0.1, validate_every=5), module=module, state=state)[0]) == 6
-
-
 def test_the_state_of_another_run_is_an_error_or_replaced(tmp_path):
     path = tmp_path / "s.safetensors"
     with pytest.raises(ZeroDivisionError):
         run(path, at=5, config={"seed": 0})
-    with pytest.raises(CheckpointError, match=r"another config; .* delete the file"):
+    with pytest.raises(CheckpointError, match="delete the file"):
         run(path, config={"seed": 1})
     replaceable = StateFile(path, {"config": {"seed": 1}}, is_replaceable=True)
     assert len(descend(Plan(6, 0.1), state=replaceable)[0]) == 6

@@ -6,7 +6,6 @@ gradients are compared with towers in training, and results with frozen towers.
 """
 
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -26,7 +25,7 @@ from tests.waiting import run_process, wait_until
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3]), "OMP_NUM_THREADS": "1"}
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-TINY_TOML = """
+MATCHER = """
 [matcher]
 tower = "small"
 tower_output = "pooled"
@@ -34,18 +33,23 @@ hidden = 16
 candidate_width = 8
 embedding_dim = 8
 standardise = true
-[training]
-init = "random"
-iterations = 40
-touches_per_batch = 2
-distil_steps = 3
-validate_every = 30
-validation_fraction = 0.25
-contrastive_weight = 1.0
 [preprocessing]
 touch_px = 32
 photo_px = 32
+[training]
+init = "random"
+touches_per_batch = 2
+distil_steps = 3
+validation_fraction = 0.25
+contrastive_weight = 1.0
 """
+
+
+def write_config(folder, **training):
+    """Write the settings of a training and return their file."""
+    path = folder / "tiny.toml"
+    path.write_text(MATCHER + "\n".join(f"{name} = {value}" for name, value in training.items()))
+    return path
 
 
 def command(recording, out, config, ranks=2):
@@ -59,27 +63,10 @@ def run(arguments):
     assert "Warning" not in done.stderr
 
 
-@pytest.fixture
-def settings(tmp_path):
-    """Function that writes the settings of a training with changed values and returns the file."""
-
-    def write(**changes):
-        text = TINY_TOML
-        for name, value in changes.items():
-            line = f"{name} = {value}"
-            text, found = re.subn(rf"^{name} = .*$", line, text, flags=re.MULTILINE)
-            text = text if found else text.replace("[training]", f"[training]\n{line}")
-        path = tmp_path / "tiny.toml"
-        path.write_text(text)
-        return path
-
-    return write
-
-
 @pytest.mark.slow
-def test_two_ranks_give_the_results_of_one_process(recording, settings, tmp_path):
+def test_two_ranks_give_the_results_of_one_process(recording, tmp_path):
     """No rank looks for the files before the other has written them."""
-    config, made = settings(freeze_towers="true", validate_every=20), []
+    config, made = write_config(tmp_path, freeze_towers="true", iterations=40, validate_every=20), []
     for ranks in (1, 2):
         out = tmp_path / f"{ranks}.safetensors"
         run(command(recording, out, config, ranks))
@@ -92,8 +79,8 @@ def test_two_ranks_give_the_results_of_one_process(recording, settings, tmp_path
 
 @pytest.mark.slow
 @pytest.mark.parametrize("victim", [0, -1])
-def test_a_killed_rank_ends_the_job_and_the_same_command_continues_it(victim, recording, settings, tmp_path):
-    out, config = tmp_path / "m.safetensors", settings(iterations=100_000, validate_every=5)
+def test_a_killed_rank_ends_the_job_and_the_same_command_continues_it(victim, recording, tmp_path):
+    out, config = tmp_path / "m.safetensors", write_config(tmp_path, iterations=100_000, validate_every=5)
     with run_process(command(recording, out, config), env=ENVIRONMENT) as process:
         wait_until(lambda: state_path(out).exists() or process.poll() is not None, limit_s=240)
         ranks = sorted(ray_processes.processes_named(r".*-m retrieval train|.*-u -m retrieval", process.pid))

@@ -1,12 +1,10 @@
 """Folds of held-out objects: half of each kind, so that some similar objects train and some do not."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
 from retrieval.training.features import Features
-from retrieval.training.selection import appearance_order, held_out_folds
+from retrieval.training.selection import held_out_folds
 
 KINDS = [[f"{kind}{number}" for number in range(4)] for kind in "abcdefghi"]
 NAMES = sorted(name for kind in KINDS for name in kind)
@@ -36,12 +34,6 @@ def test_half_of_each_kind_is_held_out_together_even_without_named_kinds(named):
     overlaps = [sorted(len(set(kind) & set(fold)) for fold in folds) for kind in KINDS]
     assert overlaps.count([0, 0, 2, 2]) == 8  # of four similar objects two are held out, two train
     assert overlaps.count([1, 1, 1, 1]) == 1  # except the kind in the middle, which the chunks divide
-
-
-def test_objects_that_look_alike_are_neighbours():
-    order = appearance_order(features_of(KINDS))
-    assert sorted(order) == NAMES
-    assert sum(one[0] != other[0] for one, other in pairwise(order)) == len(KINDS) - 1
 
 
 def test_named_kinds_override_appearance_unless_the_kind_of_an_object_is_missing():
