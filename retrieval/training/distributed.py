@@ -47,8 +47,7 @@ def world_size() -> int:
 def rank_rows(count: int) -> list[int]:
     """Return the rows of a batch of `count` that this rank encodes: equally many on each rank, padded by the last."""
     size = -(-count // world_size())
-    start_row = rank() * size
-    return [min(row, count - 1) for row in range(start_row, start_row + size)]
+    return [min(rank() * size + row, count - 1) for row in range(size)]
 
 
 def gather_rows(local: Tensor, count: int) -> Tensor:

@@ -6,13 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.training.cca import (
-    CanonicalCorrelations,
-    Standardiser,
-    canonical_correlations,
-    decompose,
-    unit_rows,
-)
+from retrieval.training.cca import CanonicalCorrelations, Standardiser, canonical_correlations, decompose, unit_rows
 from tests.hard_case import HardCase, error_of
 
 Matrix = NDArray[np.float64]
@@ -167,36 +161,19 @@ def _constant_feature() -> HardCase:
     x = np.random.default_rng([15]).normal(size=(50, 2)).astype(np.float32)
     x[:, 1] = np.float32(0.1) * (1 + np.float32(6e-8) * (np.arange(50) % 2))
     naive = float(np.abs((x - x.mean(0)) / x.std(0)).max(0)[1])
-    columns = Standardiser.fit(x).columns.tolist()
-    expected = "dropped"
-    words = f"its last digit amplified to {naive:.3g} deviations"
-    return HardCase(
-        "standardising",
-        "a feature of 0.1 + rounding",
-        expected,
-        words,
-        f"columns {columns}",
-        columns == [0],
-        naive < 1e-3,
-    )
+    columns, case = Standardiser.fit(x).columns.tolist(), "a feature of 0.1 + rounding"
+    words, ours = f"its last digit amplified to {naive:.3g} deviations", f"columns {columns}"
+    return HardCase("standardising", case, "dropped", words, ours, columns == [0], naive < 1e-3)
 
 
 def _far_feature() -> HardCase:
     """10,000 +- 0.1: the mean of squares minus the square of the mean cancels in float32."""
     x = (1e4 + 0.1 * np.random.default_rng([16]).normal(size=(400, 1))).astype(np.float32)
     naive = float(np.sqrt((x * x).mean() - x.mean() ** 2))
-    ours = float(Standardiser.fit(x).scale[0])
-    must = float(x.astype(np.float64).std())
-    correct = [abs(value - must) < 1e-6 * must for value in (naive, ours)]
-    return HardCase(
-        "standardising",
-        "a feature of 10000 +- 0.1",
-        f"{must:.6g}",
-        f"{naive:.6g}",
-        f"{ours:.6g}",
-        correct[1],
-        correct[0],
-    )
+    ours, must = float(Standardiser.fit(x).scale[0]), float(x.astype(np.float64).std())
+    words = [f"{value:.6g}" for value in (must, naive, ours)]
+    correct = [abs(value - must) < 1e-6 * must for value in (ours, naive)]
+    return HardCase("standardising", "a feature of 10000 +- 0.1", *words, *correct)
 
 
 # Cosine ------------------------------------------------------------------------------------------------------

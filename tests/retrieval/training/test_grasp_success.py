@@ -2,8 +2,7 @@
 
 import json
 import pickle
-from dataclasses import dataclass
-from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -26,8 +25,7 @@ OUTCOMES = ("held", "held", "missed", "slipped")
 LEAN = np.linspace(100, 150, 32).astype(np.uint8)[None, :, None].repeat(24, 0).repeat(3, 2)  # a gel without contact
 
 
-@dataclass(frozen=True)
-class Frames:
+class Frames(NamedTuple):
     """One finger's frames, as a rig returns them."""
 
     before: np.ndarray | None
@@ -53,21 +51,19 @@ def fingers(seed, during="ab", after="ab"):
 
 def write(folder, outcomes=OUTCOMES, objects=OBJECTS, columns=("during", "before", "after"), **fields):
     """Write a grasp of each outcome for each object: a slip looks held until the lift, a miss never does."""
-    suffix = {"during": "", "before": "_before", "after": "_after"}
+    touched = {"held": ("ab", "ab"), "slipped": ("ab", ""), "missed": ("", "")}
     with RecordingWriter(folder, {"source": "test", "sensor": "drawn"}) as writer:
         for number, name in enumerate(objects):
             for turn, outcome in enumerate(outcomes):
-                touched = {"held": ("ab", "ab"), "slipped": ("ab", ""), "missed": ("", "")}.get(outcome, ("", ""))
-                shots = fingers([number, turn], *touched)
                 images = {
-                    f"touch_{finger}{suffix[column]}": getattr(frames, column)
-                    for finger, frames in shots.items()
+                    f"touch_{finger}_{column}".removesuffix("_during"): getattr(frames, column)
+                    for finger, frames in fingers([number, turn], *touched[outcome]).items()
                     for column in columns
                 }
                 values = {"outcome": outcome, "grasped": outcome == "held"} | fields
                 values = {key: value for key, value in values.items() if value is not None}
                 writer.append(f"{name}-{turn}", name, {"photo": LEAN, **images}, **values)
-    return Path(folder)
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -131,10 +127,9 @@ def test_the_report_and_the_file_state_accuracy_chance_and_accepted_grasps_of_ot
     assert (report["accuracy"], report["chance"]) == (1.0, 0.5)
     assert report["interval"] == pytest.approx((0.025 ** (1 / 8), 1.0))
     header = read_tensors(out)[1]
-    provenance = header["provenance"]
-    assert (provenance["source"], provenance["iterations"], provenance["seed"]) == ("test", ENOUGH, 0)
-    assert provenance["outcomes"] == {"held": 16, "missed": 8, "slipped": 8}
-    assert provenance["metrics"]["accuracy"] == report["accuracy"]
+    expected = {"source": "test", "iterations": ENOUGH, "seed": 0, "outcomes": {"held": 16, "missed": 8, "slipped": 8}}
+    assert expected.items() <= header["provenance"].items()
+    assert header["provenance"]["metrics"]["accuracy"] == report["accuracy"]
     assert not set(header["split"]["train"]) & set(header["split"]["validation"])
     assert str(attempts) not in json.dumps(header)
 
@@ -161,12 +156,12 @@ def test_the_frame_after_the_lift_is_used_if_there_is_one_and_only_its_files_are
 
 
 def test_the_same_seed_gives_the_same_file_and_the_global_random_state_is_unchanged(attempts, tmp_path):
-    files, state = [tmp_path / f"{name}.safetensors" for name in "xyz"], torch.get_rng_state()
-    for path, seed in zip(files, (1, 1, 2), strict=True):
+    path, state, files = tmp_path / "gate.safetensors", torch.get_rng_state(), []
+    for seed in (1, 1, 2):
         train_gate(attempts, path, iterations=3, seed=seed, quiet=True)
+        files.append(path.read_bytes())
     assert torch.equal(torch.get_rng_state(), state)
-    assert files[0].read_bytes() == files[1].read_bytes()
-    assert files[0].read_bytes() != files[2].read_bytes()
+    assert files[0] == files[1] != files[2]
 
 
 def test_batches_contain_equal_numbers_of_both_kinds_and_depend_only_on_seed_and_step(attempts):
@@ -283,7 +278,7 @@ def test_a_change_of_one_grey_level_does_not_wrap_and_flat_pictures_give_finite_
 
 def test_a_fingers_logit_does_not_depend_on_other_fingers_or_the_image_size(gate):
     frames = fingers(78, after="a")
-    large = Frames(*(picture.repeat(4, 0).repeat(4, 1) for picture in vars(frames["a"]).values()))
+    large = Frames(*(picture.repeat(4, 0).repeat(4, 1) for picture in frames["a"]))
     alone = gate.logits({"a": frames["a"]})["a"]
     assert gate.logits({"x": frames["b"], "c": frames["a"]})["c"] == pytest.approx(alone, rel=1e-4)
     assert gate({"a": large})
@@ -291,8 +286,7 @@ def test_a_fingers_logit_does_not_depend_on_other_fingers_or_the_image_size(gate
 
 def test_a_brighter_lamp_gives_no_frame_around_the_picture():
     """With zero padding, a change of the whole picture would have an edge."""
-    layers = GraspNet().layers
-    for layer, even in ((layers[0], True), (torch.nn.Conv2d(3, 16, 5, stride=2, padding=2), False)):
+    for layer, even in ((GraspNet().layers[0], True), (torch.nn.Conv2d(3, 16, 5, stride=2, padding=2), False)):
         maps = layer(torch.full((1, 3, 64, 64), 0.08)).flatten(2)
         assert bool((maps.amax(2) - maps.amin(2)).max() < 1e-5) is even
 

@@ -11,22 +11,17 @@ from retrieval.model.config import SCHEDULES
 from retrieval.training.loop import RATE, Plan, StateFile, train_loop
 
 
+def one_weight():
+    return torch.nn.ParameterList([torch.nn.Parameter(torch.zeros(1))])
+
+
 def descend(plan, loss=None, module=None, **options):
     """Train one weight from 0 on a slope of 1; return the weight after each step, and the result of the loop."""
-    module = module or torch.nn.ParameterList([torch.nn.Parameter(torch.zeros(1))])
+    module = module or one_weight()
     optimizer, weights = torch.optim.Adam(module.parameters()), []
     optimizer.register_step_post_hook(lambda *_: weights.append(module[0].item()))
-    best = train_loop(
-        module,
-        optimizer,
-        plan,
-        lambda steps: steps,
-        loss or (lambda step, _: module[0].sum()),
-        title="fit",
-        quiet=True,
-        **options,
-    )
-    return weights, best
+    loss = loss or (lambda step, _: module[0].sum())
+    return weights, train_loop(module, optimizer, plan, lambda steps: steps, loss, title="fit", quiet=True, **options)
 
 
 @pytest.mark.parametrize(
@@ -52,7 +47,7 @@ def test_each_step_has_the_learning_rate_of_its_schedule_and_group(schedule, fac
 
 
 def test_a_loss_that_is_not_finite_stops_before_the_step_and_names_the_remedy():
-    module = torch.nn.ParameterList([torch.nn.Parameter(torch.zeros(1))])
+    module = one_weight()
     with pytest.raises(NumericalError, match=r"step 0, gave inf; lower learning_rate"):
         descend(Plan(2, 0.1), lambda *_: module[0].sum() + math.inf, module)
     assert module[0].item() == 0
@@ -60,7 +55,7 @@ def test_a_loss_that_is_not_finite_stops_before_the_step_and_names_the_remedy():
 
 def test_the_weights_of_the_best_step_are_restored_not_the_last():
     """Validation follows every second step and the last one; among equal scores the first step is the best."""
-    module = torch.nn.ParameterList([torch.nn.Parameter(torch.zeros(1))])
+    module = one_weight()
     scores, validated = iter([0.6, 0.9, 0.9, 0.3]), []
 
     def validate():
@@ -75,7 +70,7 @@ def test_the_weights_of_the_best_step_are_restored_not_the_last():
 
 def run(path, at=None, validations=3, **identity):
     """Train, with a power cut in step `at`; the last `validations` of three validations are left."""
-    module = torch.nn.ParameterList([torch.nn.Parameter(torch.zeros(1))])
+    module = one_weight()
     scores = iter([0.6, 0.9, 0.1][3 - validations :])
     weights, best = descend(
         Plan(6, 0.1, validate_every=2),
