@@ -361,8 +361,8 @@ def select_settings(
     Only the reduction to the widest directions also sees the held-out grasps, but no object ids. The objects of each of
     `folds` are held out together. Default settings: `GRID`, and with several touch towers the same for the last one.
     """
-    if settings is None:
-        settings = GRID if widths.touch_towers == 1 else (*GRID, *(one._replace(last_tower=True) for one in GRID))
+    last_tower = (one._replace(last_tower=True) for one in GRID if widths.touch_towers > 1)
+    settings = settings or (*GRID, *last_tower)
     reduced = _Reduced(features, widths, settings)
     items = {_reduction(one): (reduced.touch.items(one), reduced.photo.items(one)) for one in settings}
     found: dict[CcaSettings, list[tuple[float, CcaProjections]]] = {one: [] for one in settings}

@@ -83,13 +83,11 @@ def appearance_order(features: Features) -> list[str]:
     """Return the objects in an order in which neighbours look alike.
 
     The order is that of the leaves of average linkage, optimally ordered (Bar-Joseph, Gifford and Jaakkola 2001), over
-    the mean photo features of each object, standardised over the objects.
+    the mean photo features of each object, standardised over the objects, of which there are at least two.
     """
     from scipy.cluster.hierarchy import leaves_list, linkage  # slow to import
 
     names, owner = sorted(set(features.object_ids)), features.owner
-    if len(names) < 3:
-        return names
     means = np.stack([features.photo[owner == place].mean(0, dtype=np.float64) for place in range(len(names))])
     spread = means.std(0)
     scaled = (means - means.mean(0))[:, spread > 0] / spread[spread > 0]
