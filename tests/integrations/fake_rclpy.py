@@ -9,6 +9,7 @@ import re
 import sys
 from array import array
 from contextlib import contextmanager
+from functools import partial
 from importlib import import_module
 from types import ModuleType, SimpleNamespace
 from typing import Any, ClassVar
@@ -42,6 +43,7 @@ def _definitions():
 
 DEFINED, DEFAULTS = _definitions()
 CLASSES: dict[str, Any] = {}
+LEVELS = ("info", "warning")
 
 
 def message_class(name):
@@ -63,7 +65,7 @@ class FakeMessage:
 
     def __init__(self, **values):
         for field, kind in self._fields.items():
-            default = DEFAULTS.get((self._name, field), _default(kind))
+            default = DEFAULTS.get((self._name, field), _class(kind)[0]())
             setattr(self, field, values.pop(field, default))
         assert not values, f"{self._name} has no field {', '.join(values)}"
 
@@ -72,25 +74,19 @@ class FakeMessage:
         object.__setattr__(self, field, value)
 
 
-def _default(kind):
+def _class(kind):
+    """Return the class of the values of a field, and the type of the items of a list."""
     node, what = kind
     if node == Nodetype.BASE:
-        return b"\0" if what[0] == "byte" else NUMBERS[what[0]]()
+        return (partial(bytes, 1) if what[0] == "byte" else NUMBERS[what[0]]), None
     if node == Nodetype.NAME:
-        return message_class(what)()
-    return array("B") if what[0][1][0] == "uint8" else []
+        return message_class(what), None
+    return (partial(array, "B"), None) if what[0][1][0] == "uint8" else (list, what[0])
 
 
 def _has_type(value, kind):
-    node, what = kind
-    if node == Nodetype.BASE:
-        is_byte = what[0] == "byte"
-        return isinstance(value, bytes) and len(value) == 1 if is_byte else isinstance(value, NUMBERS[what[0]])
-    if node == Nodetype.NAME:
-        return isinstance(value, message_class(what))
-    if what[0][1][0] == "uint8":
-        return isinstance(value, array)
-    return isinstance(value, list) and all(_has_type(item, what[0]) for item in value)
+    made, item_kind = _class(kind)
+    return isinstance(value, type(made())) and (not item_kind or all(_has_type(item, item_kind) for item in value))
 
 
 def from_bag(message):
@@ -149,10 +145,7 @@ class FakeNode:
         return SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=self.now_ns, to_msg=to_msg))
 
     def get_logger(self):
-        def at(level):
-            return lambda text: self.log.append((level, text))
-
-        return SimpleNamespace(info=at("info"), warning=at("warning"))
+        return SimpleNamespace(**{level: lambda text, at=level: self.log.append((at, text)) for level in LEVELS})
 
     def destroy_node(self):
         self.is_destroyed = True
@@ -192,6 +185,9 @@ class FakeGoal:
     def __init__(self, server, request, on_feedback):
         self.server, self.request, self.on_feedback = server, request, on_feedback
         self.status, self.is_cancel_requested = "", False
+        self.succeed, self.abort, self.canceled = (
+            partial(self._set, status) for status in ("succeeded", "aborted", "canceled")
+        )
 
     def publish_feedback(self, message):
         assert isinstance(message, self.server.kind.Feedback)
@@ -204,15 +200,6 @@ class FakeGoal:
     def _set(self, status):
         assert not self.status
         self.status = status
-
-    def succeed(self):
-        self._set("succeeded")
-
-    def abort(self):
-        self._set("aborted")
-
-    def canceled(self):
-        self._set("canceled")
 
 
 class ExternalShutdownException(Exception):

@@ -2,6 +2,7 @@
 
 import ast
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -70,11 +71,9 @@ def test_the_readme_lists_all_parameters_with_their_defaults():
     assert documented == {name: {"": '""', "False": "false"}.get(value, value) for name, value in parameters.items()}
 
 
-class Recorded(SimpleNamespace):
-    """A part of a launch file, with its arguments."""
-
-    def __init__(self, *args, **fields):
-        super().__init__(args=args, **fields)
+def recorded(*args, **fields):
+    """Return a part of a launch file, with its arguments."""
+    return SimpleNamespace(args=args, **fields)
 
 
 def test_the_launch_file_gives_the_node_its_arguments_as_parameters(monkeypatch):
@@ -87,9 +86,8 @@ def test_the_launch_file_gives_the_node_its_arguments_as_parameters(monkeypatch)
         ("launch_ros.parameter_descriptions", "ParameterValue"),
     ):
         monkeypatch.setitem(sys.modules, name, ModuleType(name))
-        setattr(sys.modules[name], member, Recorded)
-    content = {}
-    exec(compile((ROS / "launch" / "touch_retrieval.launch.py").read_text(), "launch", "exec"), content)
+        setattr(sys.modules[name], member, recorded)
+    content = runpy.run_path(str(ROS / "launch" / "touch_retrieval.launch.py"))
     *arguments, node = content["generate_launch_description"]().args[0]
     (parameters,) = node.parameters
     assert [argument.args[0] for argument in arguments] == list(parameters)

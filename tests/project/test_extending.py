@@ -38,27 +38,24 @@ def workplace(tmp_path_factory):
     return root
 
 
-@pytest.fixture(scope="module")
-def installed(workplace):
-    """The environment with the package, installed by pip without a network."""
-    target = workplace / "site"
-    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
-    done = subprocess.run(
-        [*pip, "--target", target, workplace / "touch-extras"], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (target, ROOT)))}
-
-
-def run(command, folder, environment):
+def run(arguments, folder, environment):
+    command = [sys.executable, *arguments]
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     return done.returncode, done.stdout, done.stderr
 
 
+@pytest.fixture(scope="module")
+def installed(workplace):
+    """The environment with the package, installed by pip without a network."""
+    target = workplace / "site"
+    pip = ["-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
+    code, _, error = run([*pip, "--target", target, workplace / "touch-extras"], workplace, None)
+    assert code == 0, error
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (target, ROOT)))}
+
+
 def retrieve(line, folder, environment):
-    words = line.split()
-    assert words[0] == "retrieve"
-    return run([sys.executable, "-m", "retrieval", *words[1:]], folder, environment)
+    return run(["-m", "retrieval", *line.removeprefix("retrieve").split()], folder, environment)
 
 
 @pytest.mark.slow
@@ -88,7 +85,7 @@ def test_the_program_of_the_page_prints_its_method_and_the_weight_of_its_loss(wo
     shutil.copytree(workplace / "made", folder / "tiny")
     shutil.copy(workplace / "try_parts.py", folder)
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    code, output, error = run([sys.executable, "try_parts.py"], folder, environment)
+    code, output, error = run(["try_parts.py"], folder, environment)
     assert code == 0, error
     assert [line.split()[0] for line in output.splitlines()] == ["late_fusion", "__main__:Brightness", "chance", "0.5"]
 
@@ -105,7 +102,7 @@ try:
 except Exception as error:
     print(error)
 """
-    done, output, error = run([sys.executable, "-c", code], workplace, installed)
+    done, output, error = run(["-c", code], workplace, installed)
     assert done == 0, error
     assert output.splitlines()[0] == "(120, 160, 3)"
     assert "[gripper]: driver 'latest_file' must be a Gripper" in output

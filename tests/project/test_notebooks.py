@@ -10,6 +10,7 @@ import pytest
 from benchmarks.notebooks import FOLDER, execute, kinds
 from retrieval.model.gel_check import CONTACT, GelCheck
 from tests import synthetic
+from tests.documents import README, blocks
 
 TINY = {
     "comparing_baselines": {
@@ -68,10 +69,6 @@ def code_cells(name):
     return [cell for cell in notebook(name)["cells"] if cell["cell_type"] == "code"]
 
 
-def committed(name):
-    return [cell["outputs"] for cell in code_cells(name)]
-
-
 @pytest.fixture
 def demo_folder(tmp_path, monkeypatch):
     """A folder next to the notebooks with a recording and a catalogue in the demo's sizes."""
@@ -89,7 +86,7 @@ def test_a_notebook_runs_and_its_committed_outputs_have_the_same_kinds(name, dem
     monkeypatch.setattr(GelCheck, "classify", lambda self, readings, levels=None: [CONTACT] * len(readings))
     tiny = "\n".join(f"{key} = {value!r}" for key, value in TINY[name].items())
     found = [kinds(outputs) for outputs in execute(notebook(name), parameters=tiny)]
-    assert found == [kinds(outputs) for outputs in committed(name)]
+    assert found == [kinds(cell["outputs"]) for cell in code_cells(name)]
     assert any("picture" in kind for kind in found)
 
 
@@ -108,7 +105,7 @@ def test_the_first_code_cell_contains_only_the_parameters(name):
 
 @every_notebook
 def test_committed_outputs_are_small_without_errors_and_without_local_paths(name):
-    outputs = [output for outputs in committed(name) for output in outputs]
+    outputs = [output for cell in code_cells(name) for output in cell["outputs"]]
     assert {output["output_type"] for output in outputs} <= {"stream", "execute_result", "display_data"}
     assert not any(output.get("name") == "stderr" for output in outputs)
     texts = json.dumps([output.get("text", output.get("data", {}).get("text/plain")) for output in outputs])
@@ -129,15 +126,10 @@ def test_a_notebook_contains_no_logic_and_has_a_title(name):
     assert not set(document["metadata"]) - {"kernelspec", "language_info"}
 
 
-def _readme_blocks():
-    text = (FOLDER.parent / "README.md").read_text("utf-8")
-    return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-
-
 def test_notebooks_and_the_readme_use_only_public_names_of_the_packages():
     for name in sorted(TINY):
         _require_public(name, *("".join(cell["source"]) for cell in code_cells(name)))
-    _require_public("README.md", *_readme_blocks())
+    _require_public("README.md", *blocks("python", README))
 
 
 def _require_public(where, *sources):

@@ -39,14 +39,17 @@ def test_a_built_in_name_is_imported_when_it_is_loaded():
 
 
 def test_an_installed_package_adds_a_name_and_cannot_replace_ours(tmp_path, monkeypatch):
-    plugins.install(tmp_path, monkeypatch, shapes={"square": f"{HERE}:Square", "shape": f"{HERE}:Stone"})
+    added = {"square": f"{HERE}:Square", "shape": f"{HERE}:Stone", "broken": "no_such_package:Thing"}
+    plugins.install(tmp_path, monkeypatch, shapes=added)
     registry = make()
-    assert registry.names() == ["shape", "square"]
+    assert registry.names() == ["shape", "broken", "square"]
     assert list(registry) == ["shape"]
     assert (registry.load("square"), registry.load("shape")) == (Square, Shape)
     assert registry.name_of("square") == registry.name_of(Square) == "square"
-    with pytest.raises(LookupError, match=r"one of shape, square; got 'blob'.*group touch_retrieval\.shapes"):
+    with pytest.raises(LookupError, match=r"one of shape, broken, square; got 'blob'.*group touch_retrieval\.shapes"):
         registry.load("blob")
+    with pytest.raises(LookupError, match="shape 'broken' cannot be imported: No module named 'no_such_package'"):
+        registry.load("broken")
 
 
 def test_a_user_can_name_any_module_and_a_file_only_an_imported_one(tmp_path, monkeypatch):
@@ -80,9 +83,3 @@ def test_an_object_has_a_name_that_resolves_to_it():
 def test_an_object_of_another_type_and_a_failed_import_are_refused(place):
     with pytest.raises(LookupError, match=r"must be a Shape|cannot be imported|must be one of shape"):
         make().name_of(place)
-
-
-def test_an_error_names_a_broken_package(tmp_path, monkeypatch):
-    plugins.install(tmp_path, monkeypatch, shapes={"broken": "no_such_package:Thing"})
-    with pytest.raises(LookupError, match="shape 'broken' cannot be imported: No module named 'no_such_package'"):
-        make().load("broken")

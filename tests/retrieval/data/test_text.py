@@ -5,7 +5,6 @@ import shutil
 
 import pytest
 
-from retrieval.data.text import replace_surrogates
 from retrieval.indexing.build import build_index
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.serve.errors import HttpProblem
@@ -24,11 +23,6 @@ def test_a_lone_surrogate_in_a_recording_is_refused_with_its_line(recording, tmp
     (tmp_path / "metadata.jsonl").write_text(f"{line}\n{json.dumps({**row, 'grasp_id': 'other'})}\n")
     with pytest.raises(RecordingError, match=r"metadata.jsonl, line 2: it must be"):
         read_recording(tmp_path)
-
-
-def test_valid_text_is_returned_as_the_same_object():
-    document = {"a": ["é", "\U0001f600", 1.5, None]}
-    assert replace_surrogates(document) is document
 
 
 def test_a_problem_response_with_a_file_name_that_is_not_utf8_is_valid_json():
