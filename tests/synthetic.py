@@ -24,8 +24,9 @@ from robot.recording.folder import RecordingWriter
 FloatImage = NDArray[np.float32]
 Picture = NDArray[np.uint8]
 
-PX_PER_MM = 8.0  # of the relief field, and of a touch 160 px wide
+PX_PER_MM = 8.0  # of the relief field, and of a touch
 FIELD_PX = 512  # the field is a 64 mm square, mirrored beyond its edges
+TOUCH_PX = (160, 120)
 TOUCH_WIDTH_MM = 20.0
 PHOTO_WIDTH_MM = 44.0
 FORCE_N = (4.0, 15.0)
@@ -63,18 +64,14 @@ def make_object(seed: int) -> DrawnObject:
         family=family,
         pitch_mm=float(np.exp(relief_rng.uniform(np.log(1.6), np.log(6.5)))),
         depth_mm=float(np.exp(relief_rng.uniform(np.log(0.25), np.log(0.9)))),
-        anisotropy=float(relief_rng.uniform()),
-        regularity=float(relief_rng.uniform()),
-        sharpness=float(relief_rng.uniform()),
+        anisotropy=relief_rng.uniform(),
+        regularity=relief_rng.uniform(),
+        sharpness=relief_rng.uniform(),
         colour=_colour(appearance_rng),
         paint=_colour(appearance_rng),
-        paint_fraction=float(appearance_rng.uniform(0.0, 0.35)),
-        gloss=float(appearance_rng.uniform(0.0, 0.35)),
-        outline=(
-            float(appearance_rng.uniform(0.36, 0.47)),
-            float(appearance_rng.uniform(0.36, 0.47)),
-            float(appearance_rng.uniform(2, 8)),
-        ),
+        paint_fraction=appearance_rng.uniform(0.0, 0.35),
+        gloss=appearance_rng.uniform(0.0, 0.35),
+        outline=tuple(appearance_rng.uniform(low, high) for low, high in ((0.36, 0.47), (0.36, 0.47), (2, 8))),
     )
 
 
@@ -85,19 +82,11 @@ def make_objects(count: int, seed: int = 0) -> list[DrawnObject]:
 
 def _colour(rng: np.random.Generator) -> tuple[float, float, float]:
     """Return a stock colour with small noise: many objects have it, so colour does not identify an object."""
-    red, green, blue = np.array(_STOCK[int(rng.integers(len(_STOCK)))]) + rng.normal(0, 0.02, 3)
-    return float(red), float(green), float(blue)
+    return tuple((_STOCK[rng.integers(len(_STOCK))] + rng.normal(0, 0.02, 3)).tolist())
 
 
 # Steel, plaster, sand, terracotta, slate blue, olive.
-_STOCK = (
-    (0.6, 0.62, 0.64),
-    (0.8, 0.78, 0.75),
-    (0.72, 0.62, 0.46),
-    (0.7, 0.42, 0.33),
-    (0.4, 0.48, 0.6),
-    (0.52, 0.56, 0.4),
-)
+_STOCK = np.array([60, 62, 64, 80, 78, 75, 72, 62, 46, 70, 42, 33, 40, 48, 60, 52, 56, 40]).reshape(6, 3) / 100
 
 
 # Relief: one field for photo and touch -----------------------------------------------------------------------
@@ -241,9 +230,8 @@ def _patch(obj: DrawnObject, px: tuple[int, int], width_mm: float, angle: float,
 
 def _slopes(height: FloatImage, mm_per_px: float) -> tuple[FloatImage, FloatImage]:
     """Return central differences along x and y, without unit."""
-    x = cv2.Sobel(height, cv2.CV_32F, 1, 0, ksize=3, scale=1 / (8 * mm_per_px), borderType=cv2.BORDER_REPLICATE)
-    y = cv2.Sobel(height, cv2.CV_32F, 0, 1, ksize=3, scale=1 / (8 * mm_per_px), borderType=cv2.BORDER_REPLICATE)
-    return x, y
+    options = {"ksize": 3, "scale": 1 / (8 * mm_per_px), "borderType": cv2.BORDER_REPLICATE}
+    return cv2.Sobel(height, cv2.CV_32F, 1, 0, **options), cv2.Sobel(height, cv2.CV_32F, 0, 1, **options)
 
 
 def _grid(px: tuple[int, int]) -> tuple[FloatImage, FloatImage]:
@@ -336,16 +324,11 @@ def _outline(
 
 
 def draw_touch(
-    obj: DrawnObject,
-    seed: int,
-    px: tuple[int, int] = (160, 120),
-    fingers: Sequence[str] = ("a", "b"),
-    force_n: float | None = None,
-    sensor: int = 0,
+    obj: DrawnObject, seed: int, fingers: Sequence[str] = ("a", "b"), force_n: float | None = None
 ) -> dict[str, Picture]:
     """Return the gel pictures of one grasp by finger; each finger touches another patch of the relief."""
     force = grasp_force(obj, seed) if force_n is None else force_n
-    return {finger: _draw_finger(obj, seed, px, finger, force, sensor) for finger in fingers}
+    return {finger: _draw_finger(obj, seed, finger, force) for finger in fingers}
 
 
 def grasp_force(obj: DrawnObject, seed: int) -> float:
@@ -353,31 +336,26 @@ def grasp_force(obj: DrawnObject, seed: int) -> float:
     return float(np.random.default_rng([_GRASP, obj.seed, seed]).uniform(*FORCE_N))
 
 
-def draw_background(seed: int, finger: str = "a", px: tuple[int, int] = (160, 120), sensor: int = 0) -> Picture:
+def draw_background(seed: int, finger: str = "a") -> Picture:
     """Return a no-contact frame: the tint of the sensor with the noise of this frame."""
     rng = np.random.default_rng([_FRAME, seed, *finger.encode()])
-    return _to_picture(_tint(finger, px, sensor), rng, 1.5)
+    return _to_picture(_tint(finger), rng, 1.5)
 
 
-def _draw_finger(obj: DrawnObject, seed: int, px: tuple[int, int], finger: str, force_n: float, sensor: int) -> Picture:
+def _draw_finger(obj: DrawnObject, seed: int, finger: str, force_n: float) -> Picture:
     rng = np.random.default_rng([_TOUCH, obj.seed, seed, *finger.encode()])
-    mm_per_px = TOUCH_WIDTH_MM / px[0]
-    height = _patch(obj, px, TOUCH_WIDTH_MM, rng.uniform(0, 2 * np.pi), rng.uniform(10, 54, 2))
-    dent = _indent(height + _body(rng, px, mm_per_px), force_n, mm_per_px)
+    mm_per_px = TOUCH_WIDTH_MM / TOUCH_PX[0]
+    height = _patch(obj, TOUCH_PX, TOUCH_WIDTH_MM, rng.uniform(0, 2 * np.pi), rng.uniform(10, 54, 2))
+    dent = _indent(height + _body(rng), force_n, mm_per_px)
     sx, sy = _slopes(dent, mm_per_px)
-    light = np.stack([1 + 0.75 * np.tanh(1.1 * (sx * c + sy * s)) for c, s in _lamps()], -1)
-    values = _tint(finger, px, sensor) * light * (1 - 0.06 * dent)[..., None]
-    return _to_picture(values, rng, 1.5)
+    light = np.stack([1 + 0.75 * np.tanh(1.1 * (sx * c + sy * s)) for c, s in _LAMPS], -1)
+    return _to_picture(_tint(finger) * light * (1 - 0.06 * dent)[..., None], rng, 1.5)
 
 
-def _body(rng: np.random.Generator, px: tuple[int, int], mm_per_px: float) -> FloatImage:
+def _body(rng: np.random.Generator) -> FloatImage:
     """Return the curvature of the object under the finger, random for each touch, so it identifies nothing."""
-    x, y = (axis * px[0] * mm_per_px / 2 for axis in _grid(px))
-    x, y = x - rng.uniform(-2, 2), y - rng.uniform(-2, 2)
-    turn, radii = (
-        rng.uniform(0, math.pi),
-        [math.exp(rng.uniform(math.log(25), math.log(200))) for _ in range(2)],
-    )
+    x, y = (axis * TOUCH_WIDTH_MM / 2 - rng.uniform(-2, 2) for axis in _grid(TOUCH_PX))
+    turn, radii = rng.uniform(0, math.pi), np.exp(rng.uniform(math.log(25), math.log(200), 2)).tolist()
     u, v = _turned(x, y, turn)
     return -u * u / (2 * radii[0]) - v * v / (2 * radii[1])
 
@@ -394,18 +372,17 @@ def _indent(surface: FloatImage, force_n: float, mm_per_px: float) -> FloatImage
     return cv2.GaussianBlur(skirt, (0, 0), 0.16 / mm_per_px)
 
 
-def _lamps() -> list[tuple[float, float]]:
-    """Return the directions of the red, green and blue lamps."""
-    return [(math.cos(angle), math.sin(angle)) for angle in (2.6, 4.7, 0.5)]
+_LAMPS = [(math.cos(angle), math.sin(angle)) for angle in (2.6, 4.7, 0.5)]
+"""Directions of the red, green and blue lamps."""
 
 
-@lru_cache(maxsize=16)
-def _tint(finger: str, px: tuple[int, int], sensor: int) -> FloatImage:
-    """Return the gel without contact: lamps are brighter on their side, edges are darker; it varies with the sensor."""
-    rng = np.random.default_rng([_SENSOR, sensor, *finger.encode()])
+@lru_cache
+def _tint(finger: str) -> FloatImage:
+    """Return the gel without contact: lamps are brighter on their side, edges are darker."""
+    rng = np.random.default_rng([_SENSOR, 0, *finger.encode()])
     base = np.array([142, 124, 134], np.float32) + rng.normal(0, 7, 3).astype(np.float32)
-    x, y = _grid(px)
-    lean = [1 - rng.uniform(0.1, 0.22) * (x * c + y * s) for c, s in _lamps()]
+    x, y = _grid(TOUCH_PX)
+    lean = [1 - rng.uniform(0.1, 0.22) * (x * c + y * s) for c, s in _LAMPS]
     tint: FloatImage = base * np.stack(lean, -1) * (1 - rng.uniform(0.1, 0.2) * (x * x + y * y))[..., None]
     return tint
 
@@ -436,7 +413,7 @@ def write_recording(
                 images |= _touch_files(obj, key, fingers, force_n, before)
                 fields = {"force_n": force_n, "grasped": not missed, "sequence_id": f"of-{obj.object_id}"}
                 writer.append(f"{obj.object_id}-{key:06d}", obj.object_id, images, **fields)
-    return Path(folder)
+    return folder
 
 
 def _touch_files(obj: DrawnObject, key: int, fingers: Sequence[str], force_n: float, before: bool) -> dict[str, bytes]:
@@ -448,14 +425,13 @@ def _touch_files(obj: DrawnObject, key: int, fingers: Sequence[str], force_n: fl
     return files
 
 
-def write_catalogue(folder: Path, objects: Sequence[DrawnObject], photos_per_object: int = 3, seed: int = 0) -> Path:
+def write_catalogue(folder: Path, objects: Sequence[DrawnObject], photos_per_object: int = 3) -> Path:
     """Write `<folder>/<object_id>/<n>.jpg`, photos that are in no recording. Returns the folder."""
     for obj in objects:
-        (Path(folder) / obj.object_id).mkdir(parents=True, exist_ok=True)
+        (folder / obj.object_id).mkdir(parents=True, exist_ok=True)
         for number in range(photos_per_object):
-            photo = draw_photo(obj, _CATALOGUE + 1000 * seed + number)
-            (Path(folder) / obj.object_id / f"{number + 1}.jpg").write_bytes(_jpeg(photo))
-    return Path(folder)
+            (folder / obj.object_id / f"{number + 1}.jpg").write_bytes(_jpeg(draw_photo(obj, _CATALOGUE + number)))
+    return folder
 
 
 def put_touch(catalogue: Path, object_id: str, number: int, files: Sequence[Path]) -> None:
@@ -466,33 +442,24 @@ def put_touch(catalogue: Path, object_id: str, number: int, files: Sequence[Path
 
 
 def write_queries(
-    folder: Path,
-    objects: Sequence[DrawnObject],
-    touches_per_object: int = 1,
-    seed: int = 0,
-    fingers: Sequence[str] = ("a", "b"),
+    folder: Path, objects: Sequence[DrawnObject], touches_per_object: int = 1
 ) -> dict[str, list[tuple[Path, ...]]]:
     """Write `<folder>/<object_id>/<n>_<finger>.png`, new touches. Returns the files of each touch by object_id."""
     queries: dict[str, list[tuple[Path, ...]]] = {}
     for obj in objects:
-        (Path(folder) / obj.object_id).mkdir(parents=True, exist_ok=True)
+        (folder / obj.object_id).mkdir(parents=True, exist_ok=True)
         for number in range(touches_per_object):
-            touch = draw_touch(obj, _QUERIES + 1000 * seed + number, fingers=fingers)
-            files = {Path(folder) / obj.object_id / f"{number + 1}_{finger}.png": touch[finger] for finger in fingers}
+            touch = draw_touch(obj, _QUERIES + number)
+            files = {folder / obj.object_id / f"{number + 1}_{finger}.png": touch[finger] for finger in touch}
             for path, picture in files.items():
                 path.write_bytes(_png(picture))
             queries.setdefault(obj.object_id, []).append(tuple(files))
     return queries
 
 
-def _jpeg(picture: Picture) -> bytes:
-    return _encode(picture, ".jpg", [cv2.IMWRITE_JPEG_QUALITY, 92])
+def _jpeg(picture: Picture) -> bytes:  # OpenCV requires BGR
+    return bytes(cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])[1])
 
 
 def _png(picture: Picture) -> bytes:
-    return _encode(picture, ".png", [cv2.IMWRITE_PNG_COMPRESSION, 1])
-
-
-def _encode(picture: Picture, suffix: str, settings: list[int]) -> bytes:
-    """Return the bytes of the file; OpenCV requires BGR."""
-    return bytes(cv2.imencode(suffix, picture[..., ::-1], settings)[1])
+    return bytes(cv2.imencode(".png", picture[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])

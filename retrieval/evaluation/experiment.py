@@ -22,7 +22,7 @@ from retrieval.evaluation.aggregate import Aggregation, MeasuresBySeed, protocol
 from retrieval.evaluation.details import SeedDetails, combine, describe
 from retrieval.evaluation.inputs import Row, TowerEncoder, thin_grasps
 from retrieval.evaluation.protocol import Protocol, RecordingFacts
-from retrieval.evaluation.queries import MethodScores, Queries, draw_queries, score_queries, timed
+from retrieval.evaluation.queries import MethodScores, draw_queries, score_queries, timed
 from retrieval.evaluation.results import MethodTimes, ProtocolResult, ProtocolTimes, RowResult
 from retrieval.methods import CHANCE, METHODS
 from retrieval.methods.late_fusion import LateFusion
@@ -66,6 +66,7 @@ class Experiment:
         row: Method and towers.
         kind: Kind of inputs (`inputs.INPUTS`).
         fold: Number of the fold.
+        split: Split of the fold.
         seed: Seed of the fit.
         draw_seed: Seed of folds, queries, pairs and tests.
         is_control: Whether the method is fitted in any case, also if the row's towers are those of a whole model.
@@ -75,6 +76,7 @@ class Experiment:
     row: Row
     kind: str
     fold: int
+    split: Split
     seed: int
     draw_seed: int
     is_control: bool = False
@@ -95,10 +97,12 @@ class Experiment:
                 f"as {min(shared)}. Give a model that was not trained on them, or a split without them in its test "
                 "part."
             )
+        grasps = thin_grasps(self.of.facts.grasps, self._max_grasps)
+        queries = draw_queries(grasps, self.split, self.draw_seed, protocol.max_grasps)
         method, fit_s = self._fit()
-        scores = score_queries(method, self.features, self.queries, fit_s, self.draw_seed, protocol.allows_own_photos)
+        scores, seconds = score_queries(method, self.features, queries, self.draw_seed, protocol.allows_own_photos)
         details = describe(method, scores, self.features) if protocol.in_depth and not self.is_control else None
-        outcome = Outcome(self._measures(scores), scores.best_params, scores.seconds, details)
+        outcome = Outcome(self._measures(scores), method.best_params, {"fit": fit_s, **seconds}, details)
         cache.add({self.key: msgspec.msgpack.encode(outcome, enc_hook=_encode_array)})
         if not protocol.in_depth:  # the fits of all folds take gigabytes
             shutil.rmtree(self._folder, ignore_errors=True)
@@ -133,11 +137,6 @@ class Experiment:
         )
 
     @property
-    def split(self) -> Split:
-        """The split of the fold."""
-        return self.of.folds[self.draw_seed][self.fold]
-
-    @property
     def _folder(self) -> Path:
         """Folder of fits; methods of the same towers, inputs and split have one in common."""
         return self.of.out / "fits" / self.of.name / f"{self.kind}-{self.fold}"
@@ -151,12 +150,6 @@ class Experiment:
     def features(self) -> Features:
         """Features of all grasps, as the method takes them: without cells, or with them."""
         return self.row.towers.inputs(self.kind, METHODS.load(self.row.method).uses_cells, self._max_grasps)
-
-    @cached_property
-    def queries(self) -> Queries:
-        """Touches and photos to score."""
-        grasps = thin_grasps(self.of.facts.grasps, self._max_grasps)
-        return draw_queries(grasps, self.split, self.draw_seed, self.of.protocol.max_grasps)
 
     @property
     def _max_grasps(self) -> int | None:
@@ -191,7 +184,7 @@ class Experiment:
 
     def _measures(self, scores: MethodScores) -> dict[str, Measure]:
         """Return the measures of each gallery, pooled."""
-        protocol, facts, objects = self.of.protocol, self.of.facts, self.queries.objects
+        protocol, facts, objects = self.of.protocol, self.of.facts, scores.queries.objects
         tables, found = scores.tables("pair_accuracy" in self.measures), defaultdict(list)
         for gallery in sorted(set(self._gallery_of.values())):
             of_gallery = _of_gallery(tables, np.array([self._gallery_of.get(name) == gallery for name in objects]))
@@ -224,7 +217,7 @@ def _of_gallery(tables: MethodScoreTables, mine: NDArray[np.bool_]) -> MethodSco
 def permute_touches(features: Features, seed: int) -> Features:
     """Return the features with touches randomly assigned to grasps."""
     order = np.random.default_rng([seed, 13]).permutation(len(features))
-    return Features(features.grasp_ids, features.object_ids, features.touch[order], features.photo)
+    return replace(features, touch=features.touch[order])
 
 
 def _encode_array(value: Any) -> Any:
@@ -285,7 +278,16 @@ class ProtocolRun:
                     for experiment in experiments:
                         found.append(experiment.run(cache))
                         bar.advance(note=" ".join(filter(None, job)))
-        rows = {row.name: self._row(row, outcomes[row.name, "touch"]) for row in self.rows}
+        rows = {}
+        for row in self.rows:
+            of_row = outcomes[row.name, "touch"]
+            details = [one.details for by_fold in of_row for one in by_fold if one.details]
+            rows[row.name] = RowResult(
+                row.method,
+                row.towers.checkpoint.digest if row.towers.checkpoint else None,
+                best_params=[[one.best_params for one in by_fold] for by_fold in of_row],
+                details=combine(details, self.seeds[0]) if details else None,
+            )
         times = {row.name: _method_times(outcomes[row.name, "touch"]) for row in self.rows}
         if {"late_fusion", "retrieve_rerank"} <= set(times):  # both use one training run
             times["retrieve_rerank"] = replace(times["retrieve_rerank"], fit_s=times["late_fusion"].fit_s)
@@ -319,18 +321,12 @@ class ProtocolRun:
             is_one_fit = is_control or is_whole_model or not method.is_seeded
             seeds = dict.fromkeys(self.seeds[:1] if is_one_fit else self.seeds, self.seeds[0])
         return [
-            [Experiment(self, row, kind, fold, seed, draw, is_control) for fold in range(len(self.folds[draw]))]
+            [
+                Experiment(self, row, kind, fold, split, seed, draw, is_control)
+                for fold, split in enumerate(self.folds[draw])
+            ]
             for seed, draw in seeds.items()
         ]
-
-    def _row(self, row: Row, outcomes: Sequence[Sequence[Outcome]]) -> RowResult:
-        details = [one.details for by_fold in outcomes for one in by_fold if one.details]
-        return RowResult(
-            row.method,
-            row.towers.checkpoint.digest if row.towers.checkpoint else None,
-            best_params=[[one.best_params for one in by_fold] for by_fold in outcomes],
-            details=combine(details, self.seeds[0]) if details else None,
-        )
 
     def _by_seed(self, outcomes: Iterable[Sequence[Outcome]]) -> MeasuresBySeed:
         """Return the measures of each seed, over the queries of all folds; with `choices`, those of each fold."""

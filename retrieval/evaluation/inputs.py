@@ -113,11 +113,8 @@ class TowerEncoder:
         if kind == "no_contact":
             return missing_no_contact_reason(self.grasps)
         if kind == "photo_to_photo":
-            features = self.inputs("touch")
-            photos = {
-                (owner, row.tobytes()) for owner, row in zip(features.owner.tolist(), features.photo, strict=True)
-            }
-            return None if len(photos) > len(set(features.object_ids)) else "no object has two different photos"
+            photos = {grasp.photo: grasp.object_id for grasp in self.grasps}
+            return None if len(photos) > len(set(photos.values())) else "no object has two photos"
         return None
 
     def _inputs(self, kind: str, with_cells: bool, max_grasps: int | None) -> Features:
@@ -162,7 +159,7 @@ class Row:
 def with_fingers(grasps: Sequence[Grasp], fingers: int) -> list[Grasp]:
     """Return the grasps for a model of this many fingers: each finger gets the touch of a grasp that has only one."""
     copies = fingers if len(grasps[0].touches) == 1 else 1
-    return [replace(one, touches=one.touches * copies, backgrounds=one.backgrounds * copies) for one in grasps]
+    return [replace(grasp, touches=grasp.touches * copies, backgrounds=grasp.backgrounds * copies) for grasp in grasps]
 
 
 def missing_no_contact_reason(grasps: Sequence[Grasp]) -> str | None:
@@ -176,15 +173,16 @@ def missing_no_contact_reason(grasps: Sequence[Grasp]) -> str | None:
 
 def thin_grasps(grasps: Sequence[Grasp], max_grasps: int | None) -> list[Grasp]:
     """Return at most `max_grasps` grasps of each object, evenly spaced in the order of its grasps; None for all."""
+    if max_grasps is None:
+        return list(grasps)
     rows_of: dict[str, list[int]] = defaultdict(list)
     for row, grasp in enumerate(grasps):
         rows_of[grasp.object_id].append(row)
-    counts = {name: min(max_grasps or len(rows), len(rows)) for name, rows in rows_of.items()}
-    selected = {
+    selected = [
         rows[place]
-        for name, rows in rows_of.items()
-        for place in np.linspace(0, len(rows) - 1, counts[name]).astype(int)
-    }
+        for rows in rows_of.values()
+        for place in np.linspace(0, len(rows) - 1, min(max_grasps, len(rows))).astype(int)
+    ]
     return [grasps[row] for row in sorted(selected)]
 
 

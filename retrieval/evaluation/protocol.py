@@ -1,6 +1,6 @@
 """Protocols: the split of a recording or data set, the galleries, the controls and the measures."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -135,14 +135,14 @@ def fold(
 
     A quarter of `rest`, at least 2, is for validation if that is fewer than `validation_objects`.
     """
-    order = np.random.default_rng([*seed, 17]).permutation(len(rest))
+    order = np.random.default_rng([*seed, 17]).permutation(rest).tolist()
     count = max(2, min(validation_objects, len(rest) // 4))
-    return Split(
-        seed=seed[0],
-        train=tuple(sorted(rest[place] for place in order[count:])),
-        validation=tuple(sorted(rest[place] for place in order[:count])),
-        test=tuple(sorted(test)),
-    )
+    return split_of(seed[0], order[count:], order[:count], test)
+
+
+def split_of(seed: int, *parts: Iterable[str]) -> Split:
+    """Return the split with these training, validation and test objects."""
+    return Split(seed, *(tuple(sorted(part)) for part in parts))
 
 
 def folds(names: Sequence[str], tests: Sequence[Sequence[str]], seed: int) -> list[Split]:
@@ -155,10 +155,8 @@ def folds(names: Sequence[str], tests: Sequence[Sequence[str]], seed: int) -> li
 
 def topn_accuracy(k: int, *, grasps: int = 1, photos: int = 1) -> dict[str, Metric]:
     """Return the metric of top-1..top-k accuracy among k objects, by touches of a query and photos of a candidate."""
-    name = f"topn_k{k}" + (f"_g{grasps}" if grasps > 1 else "") + (f"_p{photos}" if photos > 1 else "")
-    label = f"top-1 of {k}"
-    label += f", {grasps} touches" if grasps > 1 else ""
-    label += f", {photos} photos" if photos > 1 else ""
+    name = f"topn_k{k}" + f"_g{grasps}" * (grasps > 1) + f"_p{photos}" * (photos > 1)
+    label = f"top-1 of {k}" + f", {grasps} touches" * (grasps > 1) + f", {photos} photos" * (photos > 1)
     return {
         name: Metric(
             label,

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,8 +142,7 @@ class MethodScores:
         queries: The queries.
         scores: (Q, P) of touches with photos.
         set_scores: By number of grasps, (S, P) of sets of grasps with photos.
-        best_params: Parameters that the method selected on validation objects.
-        seconds: Run times; no result depends on them.
+        threshold: The checkpoint's own threshold of a match.
         seed: Seed of drawn tests and pairs.
         allows_own_photos: Whether a touch is compared with the photo of its own grasp.
     """
@@ -151,8 +150,7 @@ class MethodScores:
     queries: Queries
     scores: NDArray[np.float32]
     set_scores: dict[int, NDArray[np.float32]]
-    best_params: dict[str, Any]
-    seconds: dict[str, float]
+    threshold: float | None
     seed: int
     allows_own_photos: bool = False
 
@@ -195,8 +193,8 @@ class MethodScores:
 
         Fewer than `MIN_THRESHOLD_OBJECTS` validation objects give none, because one for so few objects is arbitrary.
         """
-        if (own := self.best_params.get("pair_threshold")) is not None:
-            return PairThreshold(own, "the checkpoint")
+        if self.threshold is not None:
+            return PairThreshold(self.threshold, "the checkpoint")
         count = len(self.touches("validation").with_targets.objects)
         if count >= MIN_THRESHOLD_OBJECTS and self.posterior:
             return PairThreshold(self.posterior.threshold, "validation objects")
@@ -206,14 +204,12 @@ class MethodScores:
 
 @one_thread()
 def score_queries(
-    method: Method,
-    features: Features,
-    queries: Queries,
-    fit_s: float = 0.0,
-    seed: int = 0,
-    allows_own_photos: bool = False,
-) -> MethodScores:
-    """Score all queries with a fitted method, on one thread; `features` are those of all grasps."""
+    method: Method, features: Features, queries: Queries, seed: int = 0, allows_own_photos: bool = False
+) -> tuple[MethodScores, dict[str, float]]:
+    """Score all queries with a fitted method, on one thread; return the scores and the run times in seconds.
+
+    `features` are those of all grasps. "query" is the time of one touch against the whole gallery, from its features.
+    """
     touch, photo = features.touch[queries.touches], features.photo[queries.photos]
     touch_encodings, touch_s = timed(lambda: method.encode_touch(touch))
     photo_encodings, photo_s = timed(lambda: method.encode_photo(photo))
@@ -226,13 +222,13 @@ def score_queries(
         timed(lambda: method.score(method.encode_touch(touch[:1]), photo_encodings))[1] for _ in range(_QUERY_REPEATS)
     ]
     seconds = {
-        "fit": fit_s,
         "encode_touch": touch_s / len(touch),
         "encode_photo": photo_s / len(photo),
         "score": score_s / scores.size,
-        "query": float(np.median(query_s)),  # of one touch against the whole gallery, from its features
+        "query": float(np.median(query_s)),
     }
-    return MethodScores(queries, scores, sets, method.best_params, seconds, seed, allows_own_photos)
+    threshold = method.best_params.get("pair_threshold")
+    return MethodScores(queries, scores, sets, threshold, seed, allows_own_photos), seconds
 
 
 def timed(work: Callable[[], T]) -> tuple[T, float]:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 import msgspec
 
@@ -11,8 +11,6 @@ from retrieval.errors import BadInput
 from retrieval.metrics.intervals import Difference, Summary
 from retrieval.metrics.measure import Measure
 
-SCHEMA_VERSION = 5
-"""Schema version of results.json."""
 T = TypeVar("T")
 M = TypeVar("M", Measure, Summary)
 
@@ -215,14 +213,14 @@ class Results:
         protocols: Protocols by name.
         skipped: Protocol -> the reason why it was not run.
         software: Version of the writer.
-        schema_version: `SCHEMA_VERSION`.
+        schema_version: The only one that is read.
     """
 
     setting: Setting
     protocols: dict[str, ProtocolResult]
     skipped: dict[str, str]
     software: str
-    schema_version: int = SCHEMA_VERSION
+    schema_version: Literal[5] = 5
 
 
 @dataclass(frozen=True)
@@ -265,11 +263,8 @@ def read_results(path: Path, kind: type[T]) -> T:
         BadInput: The file cannot be read, or another version wrote it.
     """
     try:
-        found = msgspec.json.decode(path.read_bytes(), type=kind)
+        return msgspec.json.decode(path.read_bytes(), type=kind)
     except (OSError, msgspec.MsgspecError) as error:
         raise BadInput(
-            f"{path} must contain the results of an evaluation ({error}). Run `retrieve evaluate`."
+            f"{path} must contain the results of an evaluation by this version ({error}). Run `retrieve evaluate`."
         ) from error
-    if getattr(found, "schema_version", SCHEMA_VERSION) != SCHEMA_VERSION:
-        raise BadInput(f"{path} must have schema version {SCHEMA_VERSION}. Run `retrieve evaluate` again.")
-    return found

@@ -73,7 +73,7 @@ class Method(ABC):
     def __init__(self, settings: MethodSettings) -> None:
         self.settings = settings
         self.best_params: dict[str, Any] = {}
-        self._shapes: tuple[tuple[int, ...], tuple[int, ...]] | None = None
+        self._shapes: tuple[tuple[int, ...], ...] = ()
 
     def fit(self, train: "Features", validation: "Features") -> None:
         """Fit on the grasps of training objects; choose settings on those of validation objects.
@@ -90,11 +90,11 @@ class Method(ABC):
 
     def encode_touch(self, touch: NDArray[Any]) -> Array:
         """Return encodings (T, ...) of touch features (T, fingers, F). Raises BadInput unless shaped as in the fit."""
-        return self._encode_touch(_checked("touch features", touch, None, *self._fitted_shapes()[0]))
+        return self._encode_touch(_checked("touch features", touch, None, *self._shapes[0]))
 
     def encode_photo(self, photo: NDArray[Any]) -> Array:
         """Return encodings (N, ...) of photo features (N, F). Raises BadInput unless shaped as in the fit."""
-        return self._encode_photo(_checked("photo features", photo, None, *self._fitted_shapes()[1]))
+        return self._encode_photo(_checked("photo features", photo, None, *self._shapes[1]))
 
     def score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
         """Return scores (T, N) of every touch with every photo: by default, inner products of the encodings.
@@ -128,12 +128,6 @@ class Method(ABC):
     def _score_sets(self, touch_encodings: Array, photo_encodings: Array, sets: NDArray[np.int64]) -> Array:
         used, place = np.unique(sets, return_inverse=True)
         return sum_over_sets(self._score(touch_encodings[used], photo_encodings), place.reshape(sets.shape))
-
-    def _fitted_shapes(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """Return the shapes of a touch's and of a photo's features in the fit."""
-        if self._shapes is None:
-            raise BadInput(f"a method must be fitted before use; call fit on this {type(self).__name__} first")
-        return self._shapes
 
 
 def sum_over_sets(scores: Array, sets: NDArray[np.int64]) -> Array:

@@ -5,14 +5,13 @@ drift of the capture identifies them.
 """
 
 from collections import defaultdict
-from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
 from retrieval.data.dataset import Split
 from retrieval.errors import DatasetError
-from retrieval.evaluation.protocol import Protocol, RecordingFacts, topn_accuracy
+from retrieval.evaluation.protocol import Protocol, RecordingFacts, split_of, topn_accuracy
 from retrieval.metrics.registry import METRICS
 
 _PARTS = 4
@@ -36,10 +35,6 @@ def by_billet(facts: RecordingFacts) -> dict[str, list[str]]:
     return billets
 
 
-def _split(seed: int, *parts: Iterable[str]) -> Split:
-    return Split(seed, *(tuple(sorted(part)) for part in parts))
-
-
 def _unseen(facts: RecordingFacts, seed: int) -> list[Split]:
     billets = by_billet(facts)
     names, found = list(billets), []
@@ -47,18 +42,18 @@ def _unseen(facts: RecordingFacts, seed: int) -> list[Split]:
         others = names[number + 1 :] + names[:number]
         validation = others[seed % len(others)]
         train = [place for other in others if other != validation for place in billets[other]]
-        found.append(_split(seed, train, billets[validation], billets[name]))
+        found.append(split_of(seed, train, billets[validation], billets[name]))
     return found
 
 
 def _places(facts: RecordingFacts, seed: int) -> list[Split]:
     parts: list[list[str]] = [[] for _ in range(_PARTS)]
     for number, places in enumerate(by_billet(facts).values()):
-        order = np.random.default_rng([seed, 29, number]).permutation(len(places))
-        for turn, place in enumerate(order):
-            parts[turn % _PARTS].append(places[place])
+        order = np.random.default_rng([seed, 29, number]).permutation(places).tolist()
+        for turn, part in enumerate(parts):
+            part.extend(order[turn::_PARTS])
     turned = [parts[number:] + parts[:number] for number in range(_PARTS)]  # test, validation, and two to train
-    return [_split(seed, [*first, *second], validation, test) for test, validation, first, second in turned]
+    return [split_of(seed, [*first, *second], validation, test) for test, validation, first, second in turned]
 
 
 UNSEEN = Protocol(

@@ -13,9 +13,8 @@ _OBJECTS, _TEST = 98, 18  # of Lin, Calandra and Levine
 
 
 def _five_folds(facts: RecordingFacts, seed: int) -> list[Split]:
-    names = facts.names
-    order = [names[place] for place in np.random.default_rng([seed, 31]).permutation(len(names))]
-    return folds(names, [order[turn::_RCT_FOLDS] for turn in range(_RCT_FOLDS)], seed)
+    order = np.random.default_rng([seed, 31]).permutation(facts.names).tolist()
+    return folds(facts.names, [order[turn::_RCT_FOLDS] for turn in range(_RCT_FOLDS)], seed)
 
 
 RCT = Protocol(
@@ -65,8 +64,7 @@ OBJECTFOLDER = Protocol(
 
 def _paper(facts: RecordingFacts, seed: int) -> list[Split]:
     """Return one split, as in the paper; the seed changes only the validation objects."""
-    rng = np.random.default_rng(37)
-    names = [facts.names[place] for place in rng.permutation(len(facts.names))[:_OBJECTS]]
+    names = np.random.default_rng(37).permutation(facts.names)[:_OBJECTS].tolist()
     tests = max(2, round(_TEST / _OBJECTS * len(names)))
     return [fold(names[tests:], names[:tests], (seed, 0), MIN_THRESHOLD_OBJECTS)]
 

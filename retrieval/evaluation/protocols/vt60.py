@@ -81,15 +81,14 @@ def _one_of_each_class(facts: RecordingFacts, split: Split) -> dict[str, str]:
 
 def _random(facts: RecordingFacts, seed: int) -> list[Split]:
     names = _names(by_class(facts))
-    order = [names[place] for place in np.random.default_rng([seed, 19]).permutation(len(names))]
+    order = np.random.default_rng([seed, 19]).permutation(names).tolist()
     count = max(1, len(names) // GALLERY)
     return folds(names, [order[turn::count] for turn in range(count)], seed)
 
 
 def _classes(facts: RecordingFacts, seed: int) -> list[Split]:
     classes = by_class(facts)
-    kinds = list(classes)
-    order = [kinds[place] for place in np.random.default_rng([seed, 23]).permutation(len(kinds))]
+    order = np.random.default_rng([seed, 23]).permutation(list(classes)).tolist()
     groups = [order[start : start + _CLASSES_OF_A_FOLD] for start in range(0, len(order), _CLASSES_OF_A_FOLD)]
     return folds(_names(classes), [[name for kind in group for name in classes[kind]] for group in groups], seed)
 

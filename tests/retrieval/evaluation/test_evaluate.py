@@ -11,14 +11,15 @@ import torch
 from retrieval.commands.main import main
 from retrieval.data.dataset import Split, load_grasps
 from retrieval.errors import BadInput, ConfigError, DatasetError, JobInterrupted
-from retrieval.evaluation import PROTOCOLS, UNSEEN_OBJECTS
+from retrieval.evaluation import UNSEEN_OBJECTS
 from retrieval.evaluation.evaluate import evaluate
-from retrieval.evaluation.experiment import Experiment, ProtocolRun, permute_touches
-from retrieval.evaluation.inputs import Row, TowerEncoder
+from retrieval.evaluation.experiment import permute_touches
+from retrieval.evaluation.inputs import TowerEncoder
 from retrieval.evaluation.protocol import read_recording_facts
 from retrieval.evaluation.protocols.recording import with_split
 from retrieval.evaluation.results import Timings, read_results
 from retrieval.methods.cca import Cca
+from retrieval.methods.late_fusion import LateFusion
 from retrieval.methods.method import Method
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.report.evaluation import write_report
@@ -45,9 +46,6 @@ class Constant(Method):
 
     def _encode_photo(self, photo):
         return np.zeros((len(photo), 1), np.float32)
-
-    def _score(self, touch_encodings, photo_encodings):
-        return np.zeros((len(touch_encodings), len(photo_encodings)), np.float32)
 
 
 CONSTANT = f"{__name__}:Constant"
@@ -83,6 +81,13 @@ def made(run, tmp_path_factory):
     return run(out, seeds=2), out
 
 
+def count_fits(monkeypatch):
+    """Return a list that gets the name of each method that is fitted."""
+    fitted, fit = [], Method.fit
+    monkeypatch.setattr(Method, "fit", lambda self, *parts: fitted.append(type(self).__name__) or fit(self, *parts))
+    return fitted
+
+
 def no_fits(monkeypatch):
     monkeypatch.setattr(Method, "fit", lambda *_: pytest.fail("fitted"))
     monkeypatch.setattr(Trainer, "run", lambda *_: pytest.fail("trained"))
@@ -109,18 +114,16 @@ def test_results_describe_data_settings_and_measures_with_intervals(made):
 def test_late_interaction_changes_the_features_of_late_fusion_and_of_no_method_without_cells(grasped, tmp_path):
     matcher = dataclasses.replace(CONFIG.matcher, tower_output="stages")
     cells = dataclasses.replace(matcher, cell_dim=4, touch_cells=2, photo_cells=2)
-    facts, found = read_recording_facts(grasped), {}
-    for name, one in (("plain", matcher), ("cells", cells)):
-        config = dataclasses.replace(CONFIG, matcher=one)
-        towers = TowerEncoder.of(facts.grasps, config, 0, tmp_path, quiet=True)
-        for method in ("late_fusion", "cca"):
-            row = Row(method, method, towers)
-            run = ProtocolRun("x", PROTOCOLS.load(UNSEEN_OBJECTS), facts, [row], [0], tmp_path, True)
-            for kind in ("touch", "touch_to_touch"):
-                found[name, method, kind] = Experiment(run, row, kind, 0, 0, 0).features
+    grasps = load_grasps(grasped)
+    plain, with_cells = (
+        TowerEncoder.of(grasps, dataclasses.replace(CONFIG, matcher=one), 0, tmp_path, quiet=True)
+        for one in (matcher, cells)
+    )
     for kind in ("touch", "touch_to_touch"):
-        assert found["cells", "cca", kind].digest == found["plain", "cca", kind].digest
-        assert found["cells", "late_fusion", kind].touch.shape[2] > found["plain", "late_fusion", kind].touch.shape[2]
+        late = [towers.inputs(kind, LateFusion.uses_cells) for towers in (plain, with_cells)]
+        cca = [towers.inputs(kind, Cca.uses_cells) for towers in (plain, with_cells)]
+        assert cca[0].digest == cca[1].digest
+        assert late[0].touch.shape[2] < late[1].touch.shape[2]
 
 
 def test_details_and_measures_of_each_method(made):
@@ -174,25 +177,19 @@ def test_measures_equal_plain_loops_over_images_and_the_checkpoint_of_the_fit(ma
 
 
 def test_a_stopped_run_resumes_and_ends_byte_identical_without_paths_and_times(made, run, tmp_path, monkeypatch):
-    out, fitted, fit = tmp_path / "out", [], Method.fit
+    out, fitted = tmp_path / "out", count_fits(monkeypatch)
 
-    def fitting(self, *parts):
-        fitted.append(type(self).__name__)
-        return fit(self, *parts)
-
-    def stopping(self, *parts):
-        if isinstance(self, Cca):
-            raise KeyboardInterrupt
-        return fitting(self, *parts)
+    def stop(*_):
+        raise KeyboardInterrupt
 
     with monkeypatch.context() as during:
-        during.setattr(Method, "fit", stopping)
+        during.setattr(Cca, "_fit", stop)
         with pytest.raises(JobInterrupted, match="run the same command to continue"):
             run(out, seeds=2)
-    assert fitted == ["LateFusion", "LateFusion", "RetrieveRerank", "RetrieveRerank"]
-    monkeypatch.setattr(Method, "fit", fitting)
+    assert fitted == ["LateFusion", "LateFusion", "RetrieveRerank", "RetrieveRerank", "Cca"]
+    fitted.clear()
     run(out, seeds=2)
-    assert fitted[4:] == ["Cca", "Constant", *["LateFusion"] * 3, "Cca", "Cca"]  # last: the controls and the ceilings
+    assert fitted == ["Cca", "Constant", *["LateFusion"] * 3, "Cca", "Cca"]  # last: the controls and the ceilings
     text = (out / "results.json").read_text()
     assert text == (made[1] / "results.json").read_text()
     assert not [part for part in (str(tmp_path), '_s"', '_ms"') if part in text]
@@ -205,9 +202,8 @@ def test_a_second_run_fits_only_new_and_edited_methods_of_a_user(made, run, monk
     with monkeypatch.context() as during:
         no_fits(during)
         assert run(made[1], seeds=2) == made[0]
-    fitted, fit = [], Method.fit
+    fitted = count_fits(monkeypatch)
     monkeypatch.setattr("inspect.getsource", lambda _: "edited in between")
-    monkeypatch.setattr(Method, "fit", lambda self, *parts: fitted.append(type(self).__name__) or fit(self, *parts))
     added = run(made[1], methods=("late_fusion", "cca", Constant, "chance"), seeds=2)
     assert fitted == ["Constant", "Chance", "Chance"]
     assert {name: of(added).rows[name] for name in ("cca", CONSTANT)} == {
@@ -240,21 +236,14 @@ def test_a_control_is_left_out_without_no_contact_frames(run, tmp_path):
 def test_ceilings_compare_touches_with_touches_and_photos_with_photos(tmp_path):
     touch, photo = np.arange(24, dtype=np.float32).reshape(4, 2, 3), np.ones((4, 5), np.float32)
     features = Features(tuple("1234"), tuple("aabb"), touch, photo)
-    towers = TowerEncoder(
-        [],
-        CONFIG,
-        None,
-        None,
-        tmp_path,
-        True,
-        dict.fromkeys([("touch", cells, None) for cells in (True, False)], features),
-    )
+    encoded = {("touch", False, None): features, ("touch", True, None): features}
+    towers = TowerEncoder([], CONFIG, None, None, tmp_path, True, encoded)
     touches, photos = (towers.inputs(kind, with_cells=False) for kind in ("touch_to_touch", "photo_to_photo"))
     np.testing.assert_array_equal(touches.photo, touch.reshape(4, 6))
     np.testing.assert_array_equal(photos.touch, photo[:, None])
     assert touches.touch is touch
     assert photos.photo is photo
-    assert towers.missing_reason("photo_to_photo") == "no object has two different photos"
+    assert towers.missing_reason("photo_to_photo") == "no object has two photos"
 
 
 @pytest.fixture(scope="module")
@@ -264,9 +253,7 @@ def model(grasped, tmp_path_factory):
 
 
 def test_a_checkpoint_is_evaluated_on_its_unseen_objects(model, run, tmp_path, monkeypatch):
-    fitted = []
-    fit = Method.fit
-    monkeypatch.setattr(Method, "fit", lambda self, *parts: fitted.append(type(self).__name__) or fit(self, *parts))
+    fitted = count_fits(monkeypatch)
     results = run(tmp_path / "out", model=model.path, methods=("late_fusion", "cca"), seeds=2)
     assert fitted == ["Cca", *["LateFusion"] * 3, "Cca", "Cca"]  # the controls and the ceilings
     assert set(of(results).folds[0][0]["test"]) == set(model.split.test)

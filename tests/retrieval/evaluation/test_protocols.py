@@ -26,9 +26,9 @@ def facts(sequence_of, about=None, splits=None):
     return RecordingFacts(Path("drawn"), "drawn", grasps, about or {}, splits or {})
 
 
-def vt60(instances=4):
+def vt60():
     classes = ["bottleempty", "ball", "bottlefull", *(f"kind{number}" for number in range(7))]
-    about = {f"{kind}-{n}": kind for kind in classes for n in range(instances)}
+    about = {f"{kind}-{n}": kind for kind in classes for n in range(4)}
     return facts(dict.fromkeys(about), about)
 
 
@@ -38,12 +38,8 @@ def billets():
 
 
 RECORDINGS = {
-    "vt60-choices": vt60(),
-    "vt60-seen-classes": vt60(),
-    "vt60-random": vt60(),
-    "vt60-classes": vt60(),
-    "billets-unseen": billets(),
-    "billets-places": billets(),
+    **dict.fromkeys(("vt60-choices", "vt60-seen-classes", "vt60-random", "vt60-classes"), vt60()),
+    **dict.fromkeys(("billets-unseen", "billets-places"), billets()),
     "objectfolder": facts(
         dict.fromkeys("abcdefgh"), splits={"published": Split(0, tuple("abcd"), tuple("ef"), tuple("gh"))}
     ),
@@ -80,20 +76,15 @@ def test_parts_are_disjoint_and_every_seed_tests_the_same_objects_each_once(name
         assert [set(one.train) for one in folds(name, 0)] != [set(one.train) for one in folds(name, 1)]
 
 
-def test_choices_hold_out_all_pairs_of_instance_numbers_then_random_ones():
-    splits = folds("vt60-choices")
-    assert [len(split.test) for split in splits] == [18] * 15
-    assert [len(split.train + split.validation) for split in splits] == [18] * 15
-    numbers = [[{name[-1] for name in split.test}, Counter(name[:-2] for name in split.test)] for split in splits]
-    assert [sorted(one) for one, _ in numbers[:6]] == [list(f"{i}{j}") for i in range(4) for j in range(i + 1, 4)]
-    assert all(set(classes.values()) == {2} for _, classes in numbers)
+def test_choices_hold_out_all_pairs_of_instance_numbers_then_random_ones_in_two_galleries_of_each_class():
+    splits, protocol = folds("vt60-choices"), PROTOCOLS.load("vt60-choices")
     assert len({split.test for split in splits}) == 15
+    pairs = [sorted({name[-1] for name in split.test}) for split in splits[:6]]
+    assert pairs == [list(f"{i}{j}") for i in range(4) for j in range(i + 1, 4)]
     assert [split.test for split in folds("vt60-choices", 1)][:6] == [split.test for split in splits[:6]]
-
-
-def test_a_choice_has_two_galleries_of_one_object_of_each_class():
-    protocol = PROTOCOLS.load("vt60-choices")
-    for split in folds("vt60-choices"):
+    for split in splits:
+        assert len(split.train + split.validation) == 18
+        assert set(Counter(name[:-2] for name in split.test).values()) == {2}
         gallery_of = protocol.gallery_of(RECORDINGS["vt60-choices"], split)
         assert set(gallery_of) == set(split.test)
         for gallery in set(gallery_of.values()):
@@ -152,20 +143,16 @@ def test_clock_features_are_similar_for_near_places_only():
 def test_no_contact_control_needs_one_frame_per_grasp():
     grasps = RECORDINGS["rct"].grasps[:4]
     assert "lacks" in missing_no_contact_reason(grasps)
-
-    def with_frames(names):
-        return [replace(one, backgrounds=(Path(name),)) for one, name in zip(grasps, names, strict=True)]
-
-    assert "share one no-contact frame" in missing_no_contact_reason(with_frames("xxxx"))
-    assert missing_no_contact_reason(with_frames("xxxy")) is None
+    for names, reason in (("xxxx", "all touches share one no-contact frame"), ("xxxy", "None")):
+        framed = [replace(one, backgrounds=(Path(name),)) for one, name in zip(grasps, names, strict=True)]
+        assert str(missing_no_contact_reason(framed)).startswith(reason)
 
 
-ABOVE = Difference(0.1, 0.01, 0.2, False, 0.01)
-
-
-@pytest.mark.parametrize(("low", "high", "counts"), [(0.01, 0.2, True), (-0.01, 0.2, False), (0.0, 0.2, False)])
+@pytest.mark.parametrize(("low", "counts"), [(0.01, True), (-0.01, False), (0.0, False)])
 @pytest.mark.parametrize("control", ["low_pass", "order"])
-def test_a_result_counts_as_touch_only_if_both_intervals_are_above_0(low, high, counts, control):
-    summary = Summary([0.4], [0.3], [0.5], [0.2], 10, 10, False, "ten", [[0.4]])
-    found = verdict(summary, {"low_pass": ABOVE, "order": ABOVE, control: Difference(0.1, low, high, False, 0.1)})
-    assert found == Verdict(counts_as_touch=counts, above_chance=True)
+def test_a_result_counts_as_touch_only_if_both_intervals_are_above_0(low, counts, control):
+    above, found = (Difference(0.1, end, 0.2, False, 0.01) for end in (0.01, low))
+    for chance in (0.2, 0.3):
+        summary = Summary([0.4], [0.3], [0.5], [chance], 10, 10, False, "ten", [[0.4]])
+        expected = Verdict(counts_as_touch=counts, above_chance=chance == 0.2)
+        assert verdict(summary, {"low_pass": above, "order": above, control: found}) == expected

@@ -9,7 +9,6 @@ import pytest
 from retrieval.data.dataset import Grasp, Split
 from retrieval.errors import DatasetError
 from retrieval.evaluation.queries import (
-    SET_SIZES,
     SETS_OF_AN_OBJECT,
     MethodScores,
     Queries,
@@ -19,6 +18,7 @@ from retrieval.evaluation.queries import (
 from retrieval.evaluation.results import PairThreshold
 from retrieval.methods.chance import Chance
 from retrieval.methods.method import MethodSettings
+from retrieval.metrics.registry import SET_SIZES
 from retrieval.training.features import Features
 from tests.conftest import TINY
 
@@ -103,17 +103,17 @@ class Largest(Chance):
 
 def test_scores_are_those_of_the_method_for_touches_and_sets(features):
     method = fitted(Chance, features)
-    found = score_queries(method, features, QUERIES)
+    found, _ = score_queries(method, features, QUERIES)
     codes = method.encode_touch(features.touch[QUERIES.touches]), method.encode_photo(features.photo[QUERIES.photos])
     np.testing.assert_allclose(found.scores, method.score(*codes), atol=1e-6)  # float32 sums
-    largest = score_queries(fitted(Largest, features), features, QUERIES)
+    largest, _ = score_queries(fitted(Largest, features), features, QUERIES)
     for size, sets in QUERIES.sets.items():
         np.testing.assert_allclose(found.set_scores[size], method.score_sets(*codes, sets), rtol=1e-6, atol=1e-6)
         np.testing.assert_array_equal(largest.set_scores[size], [found.scores[list(row)].max(0) for row in sets])
 
 
 def test_tables_have_the_rows_and_photos_of_their_parts_and_mark_photos_of_own_grasps(features):
-    found = score_queries(fitted(Chance, features), features, QUERIES)
+    found, _ = score_queries(fitted(Chance, features), features, QUERIES)
     tables = found.tables(with_threshold=False)
     assert [set(table.photo_owner) for table in (tables.test, tables.all_objects)] == [{4, 5}, set(range(6))]
     for table in (tables.test, tables.all_objects):
@@ -129,12 +129,12 @@ def test_tables_have_the_rows_and_photos_of_their_parts_and_mark_photos_of_own_g
 
 
 def test_pair_accuracy_uses_the_threshold_of_the_checkpoint_or_of_a_posterior_of_ten_validation_objects():
-    def threshold(objects, **best_params):
+    def threshold(objects, own=None):
         owner, places = np.repeat(np.arange(objects), 4), np.arange(4 * objects)
         scores = np.random.default_rng(0).normal(2.0 * (owner[:, None] == owner) + 5).astype(np.float32)
         parts = ("validation",) * objects
         queries = Queries(places, places, places, owner, owner, tuple(map(str, range(objects))), parts, {})
-        return MethodScores(queries, scores, {}, best_params, {}, 0)
+        return MethodScores(queries, scores, {}, own, 0)
 
     few, enough = threshold(9).pair_threshold, threshold(10)
     assert (few.at, few.source) == (None, None)
@@ -142,4 +142,4 @@ def test_pair_accuracy_uses_the_threshold_of_the_checkpoint_or_of_a_posterior_of
     assert enough.pair_threshold.source == "validation objects"
     assert enough.posterior.log_ratio(enough.pair_threshold.at, 1) == pytest.approx(0, abs=1e-9)
     assert 5 < enough.pair_threshold.at < 7  # between the means of wrong and right pairs
-    assert threshold(2, pair_threshold=1.5).pair_threshold == PairThreshold(1.5, "the checkpoint")
+    assert threshold(2, own=1.5).pair_threshold == PairThreshold(1.5, "the checkpoint")

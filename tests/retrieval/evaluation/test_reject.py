@@ -12,20 +12,21 @@ from retrieval.model.posterior import Posterior
 from tests.retrieval.metrics.test_registry import table_of
 
 
-def planted(objects=12, grasps=8, gap=3.0, seed=0, scale=1.0):
+def planted(objects=12, grasps=8, gap=3.0, seed=0):
     """Return noise of deviation 1, with scores of true pairs higher by `gap`."""
     rng = np.random.default_rng(seed)
     owner = np.repeat(np.arange(objects), grasps)
-    return table_of(scale * (gap * (owner[:, None] == owner) + rng.normal(size=(len(owner),) * 2)), owner)
+    return table_of(gap * (owner[:, None] == owner) + rng.normal(size=(len(owner),) * 2), owner)
 
 
 def rejection(gap, **more):
     return reject(fit(planted(gap=gap, seed=1, **more)), planted(gap=gap, seed=2, **more))
 
 
-def statistics(ratios, true):
+def statistics(posterior, table):
     """Return the statistics with the object in the gallery and without it."""
-    return tuple(statistic(gallery) for gallery in galleries(ratios, true))
+    ratios = identification_trials(table).log_ratios(posterior)
+    return [statistic(gallery) for gallery in galleries(ratios, table.touch_owner[:, None] == table.objects)]
 
 
 def value(measure):
@@ -60,7 +61,7 @@ def test_a_larger_gallery_with_the_object_makes_an_uninformative_scorer_seem_bet
     odds, true = rng.normal(size=(20_000, 3)), np.tile([True, False, False], (20_000, 1))
     naive = [odds.max(1), odds[:, 1:].max(1)]
     assert np.mean(naive[0] > rng.permutation(naive[1])) == pytest.approx(0.6, abs=0.015)
-    present, absent = statistics(odds, true)
+    present, absent = map(statistic, galleries(odds, true))
     assert np.mean(present > rng.permutation(absent)) == pytest.approx(0.5, abs=0.015)
 
 
@@ -72,7 +73,7 @@ def test_area_and_balanced_accuracy_equal_plain_loops():
         others = [(table.photo_owner == name) & (np.arange(len(scores)) != row) for name in table.objects]
         likelihoods = [np.mean([np.exp(posterior.slope * float(score)) for score in scores[mine]]) for mine in others]
         ratios.append(np.log(likelihoods) + posterior.offset)
-    present, absent = statistics(np.array(ratios), table.touch_owner[:, None] == table.objects)
+    present, absent = map(statistic, galleries(np.array(ratios), table.touch_owner[:, None] == table.objects))
     won = [1.0 if a > b else 0.5 if a == b else 0.0 for a in present for b in absent]
     assert value(found.auroc) == pytest.approx(np.mean(won))
     accepted = [np.mean([each >= 0 for each in part]) for part in (present, absent)]
@@ -93,8 +94,7 @@ def test_false_accepts_use_the_threshold_with_95_percent_true_accepts():
     """Of 200 sorted queries the 190th is the last accepted one."""
     posterior, table = Posterior(), planted(objects=100, grasps=2, gap=1.5)
     found = reject(posterior, table)
-    ratios, true = identification_trials(table).log_ratios(posterior), table.touch_owner[:, None] == table.objects
-    present, absent = statistics(ratios, true)
+    present, absent = statistics(posterior, table)
     threshold = sorted(present, reverse=True)[190 - 1]
     assert value(found.false_accepts_at_95) == pytest.approx(np.mean(absent >= threshold))
 

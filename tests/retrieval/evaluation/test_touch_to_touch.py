@@ -11,16 +11,9 @@ from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.data.images import read_rgb
 from retrieval.errors import DatasetError
 from retrieval.evaluation.results import Results, read_results
-from retrieval.evaluation.touch_to_touch import (
-    Sequences,
-    leave_one_out_scores,
-    with_common_frame,
-)
+from retrieval.evaluation.touch_to_touch import Sequences, leave_one_out_scores, with_common_frame
 from robot.importers.physiclear import import_physiclear
 from tests.miniatures import physiclear
-
-RNG = np.random.default_rng(3)
-
 
 # Scores ----------------------------------------------------------------------------------------------------
 
@@ -40,12 +33,11 @@ def by_plain_loops(vectors, components):
     return scores
 
 
-@pytest.mark.parametrize("components", [1, 3, 8])
+@pytest.mark.parametrize("components", [1, 8])
 def test_scores_are_cosines_of_principal_components_without_the_query(components):
-    vectors = RNG.normal(size=(11, 20)) * np.linspace(0.1, 30, 20) + 5
-    np.testing.assert_allclose(
-        leave_one_out_scores(vectors, components), by_plain_loops(vectors, components), atol=1e-5
-    )
+    vectors = np.random.default_rng(3).normal(size=(11, 20)) * np.linspace(0.1, 30, 20) + 5
+    expected = by_plain_loops(vectors, components)
+    np.testing.assert_allclose(leave_one_out_scores(vectors, components), expected, atol=1e-5)
 
 
 # Sequences -------------------------------------------------------------------------------------------------

@@ -55,22 +55,13 @@ def encodings(method, part):
     return method.encode_touch(part.touch), method.encode_photo(part.photo)
 
 
-@torch.inference_mode()
-def two_loops(matcher, part):
-    """Return match logits of every touch with every photo, pair by pair."""
-    table = np.empty((len(part), len(part)))
-    for row, touch_features in enumerate(part.touch):
-        for column, photo_features in enumerate(part.photo):
-            touch = matcher.touch_encoding(torch.from_numpy(touch_features).reshape(1, -1))
-            photo = matcher.photo_encoding(torch.from_numpy(photo_features)[None])
-            table[row, column] = matcher.head(touch.partial, photo.partial).item()
-    return table
-
-
 def test_scores_are_the_match_logits_of_every_pair(fitted, parts):
-    matcher = load_checkpoint(fitted.settings.folder / "late_fusion-0.safetensors").matcher
-    expected = two_loops(matcher, parts[2])
-    np.testing.assert_allclose(fitted.score(*encodings(fitted, parts[2])), expected, rtol=1e-4, atol=1e-5)
+    matcher, part = load_checkpoint(fitted.settings.folder / "late_fusion-0.safetensors").matcher, parts[2]
+    with torch.inference_mode():
+        touches = matcher.touch_encoding(torch.from_numpy(part.touch).flatten(1)).partial
+        photos = matcher.photo_encoding(torch.from_numpy(part.photo)).partial
+        expected = [[matcher.head(touch[None], photo[None]).item() for photo in photos] for touch in touches]
+    np.testing.assert_allclose(fitted.score(*encodings(fitted, part)), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_the_method_trains_the_same_model_as_the_command_line(recording, split, fitted, tmp_path):
