@@ -28,7 +28,7 @@ def measure(sizes: MatcherConfig, candidates: int = CANDIDATES, repetitions: int
     photos = generator.normal(size=(candidates, sizes.partial_width)).astype(np.float32)
     cells = photos[:, width:].reshape(candidates, -1, sizes.cell_dim)
     cells /= np.linalg.norm(cells, axis=2, keepdims=True)
-    scorer = FusionHead(1, 1, sizes.hidden, 0.0, sizes.embedding_dim, sizes.cell_dim).scorer
+    scorer = FusionHead(1, 1, sizes).scorer
     arrays = {"with": to_stored(photos, width), "without": to_stored(photos[:, :width], width)}
     size = {name: sum(array.nbytes for array in each.values()) // candidates for name, each in arrays.items()}
     ms: dict[str, list[float]] = {name: [] for name in arrays}

@@ -235,7 +235,7 @@ def risk_against_coverage(ratios: OpenSetRatios) -> dict[str, list[float]]:
 def evaluate_inputs(made: Checkpoint, folder: Path, jobs: int) -> Iterator[dict[str, Any]]:
     """Yield a row for each kind of input: their number, and their verdicts."""
     assert made.gel_check is not None
-    fast = for_inference(made.matcher, ["touch_tower"])
+    fast = for_inference(made.matcher, "touch_tower")
     for name, expected, pictures in inputs(made, folder, jobs):
         readings = []
         for start in range(0, len(pictures), 16):

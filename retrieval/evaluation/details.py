@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -60,7 +60,7 @@ def describe(method: Method, scores: MethodScores, features: Features) -> SeedDe
         confusions=[
             Confusion(objects[true], objects[other], fraction) for true, other, fraction in confusions(test, seed=seed)
         ],
-        posterior=posterior.to_dict() if posterior else None,
+        posterior=asdict(posterior) if posterior else None,
         reliability=reliability(posterior, test, seed=seed) if posterior else {},
     )
     return SeedDetails(

@@ -68,7 +68,7 @@ def encoders(checkpoint: Checkpoint) -> Iterator[tuple[str, Encode, bool]]:
     ONNX Runtime is included if it is installed.
     """
     matcher = checkpoint.matcher
-    fast = for_inference(matcher)
+    fast = for_inference(matcher, "touch_tower")
     yield "float32, as trained", partial(_touch_partials, matcher), False
     yield "float32, folded", partial(_touch_partials, fast), True
     emulated = "" if has_fast_bfloat16(torch.device("cpu")) else " (emulated here)"

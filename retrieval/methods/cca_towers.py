@@ -1,6 +1,7 @@
 """CCA of concatenated towers (`retrieval.training.cca`), as `retrieve adapt` fits it."""
 
 from contextlib import suppress
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from retrieval.errors import BadInput
@@ -35,7 +36,7 @@ class CcaTowers(Method):
         self._projections = choice.projections
         with suppress(BadInput):  # too few held-out objects, or one photo of each
             posterior = fit_posterior(*choice.held_out_touches)
-            self.best_params["posterior"] = posterior.to_dict()
+            self.best_params["posterior"] = asdict(posterior)
 
     def _encode_touch(self, touch: Array) -> Array:
         return unit_rows(self._projections.touch(touch.reshape(len(touch), -1)))

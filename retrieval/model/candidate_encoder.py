@@ -84,7 +84,7 @@ class PartialStatistics(NamedTuple):
     scale: Tensor
 
     @classmethod
-    def of(cls, partials: Tensor, embedding_dim: int = 0) -> Self:
+    def of(cls, partials: Tensor, embedding_dim: int) -> Self:
         """Return the statistics of (N, partial), whose rows end with an embedding; a constant part has scale 1."""
         end = partials.shape[1] - embedding_dim
         parts = [part for part in (partials[:, :end], partials[:, end:]) if part.shape[1]]

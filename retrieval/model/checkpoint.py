@@ -76,9 +76,8 @@ def store_checkpoint(checkpoint: Checkpoint, path: Path) -> None:
     require_writable(path)
     header: dict[str, Any] = {"config": checkpoint.config.to_dict(), "provenance": checkpoint.provenance}
     for name in ("split", *PARTS):
-        if checkpoint.config.matcher.cell_dim or not name.startswith("pooled"):
-            part = getattr(checkpoint, name)
-            header[name] = None if part is None else asdict(part)
+        part = getattr(checkpoint, name)
+        header[name] = None if part is None else asdict(part)
     state = checkpoint.matcher.state_dict()
     if checkpoint.queries is not None:
         state[_QUERIES] = torch.from_numpy(checkpoint.queries)
@@ -88,10 +87,8 @@ def store_checkpoint(checkpoint: Checkpoint, path: Path) -> None:
 
 def require_writable(path: Path) -> None:
     """Raise CheckpointError if no checkpoint can be written to `path`: checked before hours of training."""
-    if path.is_dir():
-        raise CheckpointError(f"{path} is a folder; name the file to write, such as {path / 'model.safetensors'}")
-    if path.suffix != ".safetensors":
-        raise CheckpointError(f"a checkpoint must be named *.safetensors, such as {path.stem}.safetensors; got {path}")
+    if path.suffix != ".safetensors" or path.is_dir():
+        raise CheckpointError(f"a checkpoint must be a file *.safetensors, such as {path.stem}.safetensors; got {path}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with NamedTemporaryFile(dir=path.parent):

@@ -101,8 +101,6 @@ def checkpoint_info(path: Path, header: dict[str, Any], digest: str | None = Non
             f"{path} is a {header['task']} classifier, not a matcher; use it with `retrieve collect --gate`, "
             "or train a matcher with `retrieve train`"
         )
-    if not isinstance(header.get("provenance", {}), dict):
-        raise unusable(path, "its provenance must be an object")
     if lacking := [name for name in ("config", "split", "provenance") if name not in header]:
         raise CheckpointError(
             f"{path} is not a checkpoint: its header has no {lacking[0]}; a .state.safetensors file is the state of "
@@ -110,6 +108,7 @@ def checkpoint_info(path: Path, header: dict[str, Any], digest: str | None = Non
         )
     try:
         config = Config.from_dict(header["config"])
+        provenance = typed(header["provenance"], dict[str, Any], "provenance", error=BadInput)
         parts = {
             name: typed(header[name], kind, name, complete=True, error=BadInput)
             for name, kind in PARTS.items()
@@ -117,7 +116,7 @@ def checkpoint_info(path: Path, header: dict[str, Any], digest: str | None = Non
         }
     except BadInput as error:
         raise unusable(path, error) from error
-    return CheckpointInfo(path, digest or file_digest(path), config, header["provenance"], **parts)
+    return CheckpointInfo(path, digest or file_digest(path), config, provenance, **parts)
 
 
 def read_scorer(info: CheckpointInfo) -> FusionScorer:

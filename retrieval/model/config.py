@@ -155,10 +155,10 @@ class TrainingConfig:
     workers: Annotated[int, Meta(ge=0)] | Literal["auto"] = field(default="auto", compare=False)
 
     def __post_init__(self) -> None:
-        others = {name: self.weights[name] for name in sorted(self.weights) if name not in LOSSES}
-        weights = {name: self.weights.get(name, 0.0) for name in LOSSES} | others
-        for name, weight in weights.items():
-            weights[name] = typed(weight, NonNegative, f"training.{name}{WEIGHT_SUFFIX}", error=ConfigError)
+        weights = {
+            name: typed(weight, NonNegative, f"training.{name}{WEIGHT_SUFFIX}", error=ConfigError)
+            for name, weight in (dict.fromkeys(LOSSES, 0.0) | dict(sorted(self.weights.items()))).items()
+        }
         object.__setattr__(self, "weights", weights)
         check_fields(self, "training", ConfigError)
         held_out = (self.validation_fraction, self.test_fraction)

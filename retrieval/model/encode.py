@@ -9,7 +9,7 @@ import copy
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -37,23 +37,18 @@ def touch_batch(touches: Sequence[Sequence[Image]], device: torch.device | str =
     return stacked.permute(0, 1, 4, 2, 3).to(device)
 
 
-TOWERS = ("touch_tower", "photo_tower")
-
-
-def for_inference(matcher: Matcher, towers: Sequence[str] = TOWERS) -> Matcher:
-    """Return a matcher that runs faster, for forward passes without gradients; the named towers are copies.
+def for_inference(matcher: Matcher, tower: Literal["touch_tower", "photo_tower"]) -> Matcher:
+    """Return a matcher that runs faster, for forward passes of one tower without gradients; this tower is a copy.
 
     On the shipped checkpoint the features differ by at most 3e-5 of the largest one. A tower in training mode is used
     unchanged, because its batch normalisation depends on the batch.
     """
-    fast = copy.copy(matcher)
+    fast, original = copy.copy(matcher), matcher.get_submodule(tower)
     fast._modules = dict(matcher._modules)
-    for name in towers:
-        tower = matcher.get_submodule(name)
-        if not tower.training:
-            tower = copy.deepcopy(tower).requires_grad_(False)
-            _fold_batch_norm(tower)
-            fast.add_module(name, tower.to(memory_format=torch.channels_last))  # type: ignore[call-overload]  # torch's stub lacks it
+    if not original.training:
+        folded = copy.deepcopy(original).requires_grad_(False)
+        _fold_batch_norm(folded)
+        fast.add_module(tower, folded.to(memory_format=torch.channels_last))  # type: ignore[call-overload]  # torch's stub lacks it
     return fast
 
 
@@ -69,22 +64,22 @@ def _fold_batch_norm(module: nn.Module) -> None:
         _fold_batch_norm(child)
 
 
-def touch_features(matcher: Matcher, touches: Iterable[Sequence[Image]], batch: int = 32) -> Tensor:
+def touch_features(matcher: Matcher, touches: Iterable[Sequence[Image]]) -> Tensor:
     """Return features (B, fingers * features) of touches, each a sequence of finger images (H, W, 3) in 0..1."""
-    fast = for_inference(matcher, ["touch_tower"])
+    fast = for_inference(matcher, "touch_tower")
     device = next(fast.parameters()).device
-    return _in_batches(touches, batch, lambda part: fast.touch_features(touch_batch(part, device)))
+    return _in_batches(touches, 32, lambda part: fast.touch_features(touch_batch(part, device)))
 
 
-def photo_features(matcher: Matcher, photos: Iterable[Image], batch: int = 16) -> Tensor:
+def photo_features(matcher: Matcher, photos: Iterable[Image]) -> Tensor:
     """Return features (B, features) of photos (H, W, 3) in 0..1."""
-    fast = for_inference(matcher, ["photo_tower"])
+    fast = for_inference(matcher, "photo_tower")
     device = next(fast.parameters()).device
-    return _in_batches(photos, batch, lambda part: fast.photo_features(to_batch(part, device)))
+    return _in_batches(photos, 16, lambda part: fast.photo_features(to_batch(part, device)))
 
 
 @torch.inference_mode()
-def encode_touches(matcher: Matcher, touches: Iterable[Sequence[Image]], batch: int = 32) -> ImageEncoding:
+def encode_touches(matcher: Matcher, touches: Iterable[Sequence[Image]]) -> ImageEncoding:
     """Return partial activations and embeddings of touches, each a sequence of finger images (H, W, 3), on the CPU.
 
     >>> checkpoint = retrieval.load_checkpoint("model.safetensors")
@@ -92,12 +87,11 @@ def encode_touches(matcher: Matcher, touches: Iterable[Sequence[Image]], batch: 
     >>> retrieval.encode_touches(checkpoint.matcher, [gels]).embedding.shape
     torch.Size([1, 16])
     """
-    encoding = matcher.touch_search_encoding(touch_features(matcher, touches, batch))
-    return ImageEncoding(encoding.partial.cpu(), encoding.embedding.cpu())
+    return ImageEncoding(*(part.cpu() for part in matcher.touch_search_encoding(touch_features(matcher, touches))))
 
 
 @torch.inference_mode()
-def encode_photos(matcher: Matcher, photos: Iterable[Image], batch: int = 16) -> ImageEncoding:
+def encode_photos(matcher: Matcher, photos: Iterable[Image]) -> ImageEncoding:
     """Return partial activations and embeddings of photos (H, W, 3), on the CPU.
 
     >>> checkpoint = retrieval.load_checkpoint("model.safetensors")
@@ -105,8 +99,7 @@ def encode_photos(matcher: Matcher, photos: Iterable[Image], batch: int = 16) ->
     >>> retrieval.encode_photos(checkpoint.matcher, [photo]).partial.shape
     torch.Size([1, 32])
     """
-    encoding = matcher.photo_search_encoding(photo_features(matcher, photos, batch))
-    return ImageEncoding(encoding.partial.cpu(), encoding.embedding.cpu())
+    return ImageEncoding(*(part.cpu() for part in matcher.photo_search_encoding(photo_features(matcher, photos))))
 
 
 class TorchEncoder:
@@ -116,7 +109,7 @@ class TorchEncoder:
 
     def __init__(self, matcher: Matcher, threads: int | None = None) -> None:
         """Prepare the towers; PyTorch computes with `threads` from then on, in the whole process (None: no change)."""
-        self._fast, self._threads = for_inference(matcher, ["touch_tower"]), threads
+        self._fast, self._threads = for_inference(matcher, "touch_tower"), threads
 
     @torch.inference_mode()
     def encode(self, touches: Sequence[Sequence[Image]]) -> TouchEncodings:
@@ -132,7 +125,7 @@ PhotoEncoder = Callable[[Sequence[Image]], EncodedTouches]
 
 def torch_photo_encoder(matcher: Matcher) -> PhotoEncoder:
     """Return an encoder by a matcher's own towers."""
-    fast = for_inference(matcher, ["photo_tower"])
+    fast = for_inference(matcher, "photo_tower")
     device = next(matcher.parameters()).device
 
     @torch.inference_mode()

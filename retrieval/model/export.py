@@ -118,7 +118,7 @@ def choose_photo_encoder(checkpoint: Checkpoint) -> PhotoEncoder:
 
 def touch_encoder_to_onnx(checkpoint: Checkpoint) -> bytes:
     """Return the touch encoder as an ONNX model with the checkpoint's digest, for any number of touches at once."""
-    matcher, side = for_inference(checkpoint.matcher, ["touch_tower"]), checkpoint.config.preprocessing.touch_px
+    matcher, side = for_inference(checkpoint.matcher, "touch_tower"), checkpoint.config.preprocessing.touch_px
     outputs = ["partial", "embedding"] + (["readings"] if matcher.gel_head else [])
     encoder = _Encoder(matcher, lambda images: matcher.encode_touches(images.permute(0, 1, 4, 2, 3)))
     return _trace(encoder, (matcher.config.fingers, side, side, 3), outputs, checkpoint)
@@ -126,7 +126,7 @@ def touch_encoder_to_onnx(checkpoint: Checkpoint) -> bytes:
 
 def photo_encoder_to_onnx(checkpoint: Checkpoint) -> bytes:
     """Return the photo encoder as ONNX: images (B, H, views * W, 3) to partial activations and embeddings."""
-    matcher, side = for_inference(checkpoint.matcher, ["photo_tower"]), checkpoint.config.preprocessing.photo_px
+    matcher, side = for_inference(checkpoint.matcher, "photo_tower"), checkpoint.config.preprocessing.photo_px
     encoder = _Encoder(
         matcher, lambda images: matcher.photo_search_encoding(matcher.photo_features(images.permute(0, 3, 1, 2)))
     )

@@ -72,30 +72,13 @@ class FusionHead(nn.Module):
     logit. The cosine of the embeddings and the late interaction of the cells add to it, if the matcher has them.
     """
 
-    def __init__(
-        self,
-        touch_features: int,
-        photo_features: int,
-        hidden: int,
-        dropout: float,
-        cosine_dim: int = 0,
-        cell_dim: int = 0,
-    ) -> None:
-        """Make the layers, `hidden` wide, with random weights.
-
-        Args:
-            touch_features: Features of a touch.
-            photo_features: Features of a photo.
-            hidden: Width of the two layers.
-            dropout: Dropout probability.
-            cosine_dim: Numbers of a partial activation that are a scaled embedding; 0 without the cosine.
-            cell_dim: Length of a cell's vector; 0 without late interaction.
-        """
+    def __init__(self, touch_features: int, photo_features: int, config: MatcherConfig) -> None:
+        """Make the layers for this number of features of a touch and of a photo, with random weights."""
         super().__init__()
-        self.cosine_end, self.cell_dim = hidden + cosine_dim, cell_dim
+        self.cosine_end, self.cell_dim, hidden = config.pooled_width, config.cell_dim, config.hidden
         self.touch_partial = nn.Linear(touch_features, hidden)
         self.photo_partial = nn.Linear(photo_features, hidden, bias=False)
-        self.dropout = nn.Dropout(dropout)
+        self.dropout = nn.Dropout(config.dropout)
         self.second = nn.Linear(hidden, hidden)
         self.out = nn.Linear(hidden, 1)
         # PyTorch's default for the concatenated layer: uniform within 1 / sqrt(all inputs).
@@ -108,7 +91,7 @@ class FusionHead(nn.Module):
         pooled = slice(self.second.in_features, self.cosine_end)
         logits = self._fusion(touch_partial, photo_partial)
         logits = logits + (touch_partial[..., pooled] * photo_partial[..., pooled]).sum(-1)
-        if self._have_cells(photo_partial):
+        if photo_partial.shape[-1] > self.cosine_end:
             logits = logits + paired_cell_scores(self._cells(touch_partial), self._cells(photo_partial))
         return logits
 
@@ -117,7 +100,7 @@ class FusionHead(nn.Module):
         pooled = slice(self.second.in_features, self.cosine_end)
         logits = self._fusion(touch_partials[:, None], photo_partials[None])
         logits = logits + touch_partials[:, pooled] @ photo_partials[:, pooled].T
-        if self._have_cells(photo_partials):
+        if photo_partials.shape[-1] > self.cosine_end:
             logits = logits + cell_scores(self._cells(touch_partials), self._cells(photo_partials))
         return logits
 
@@ -135,9 +118,6 @@ class FusionHead(nn.Module):
             for part in (self.second.weight, self.second.bias, self.out.weight[0], self.out.bias)
         )
         return FusionScorer(second, bias, out, out_bias, cosine_dim=self.cosine_end - len(out), cell_dim=self.cell_dim)
-
-    def _have_cells(self, partial: Tensor) -> bool:
-        return partial.shape[-1] > self.cosine_end
 
     def _cells(self, partial: Tensor) -> Tensor:
         """Return the vectors (..., cells, cell_dim) of the cells of partial activations (..., partial)."""
@@ -183,10 +163,7 @@ class Matcher(nn.Module):
             self.photo_tower.divide(config.photo_cells)
         touch_features = config.fingers * self.touch_tower.feature_count
         photo_features = views * self.photo_tower.feature_count
-        cosine_dim = config.embedding_dim if config.cosine else 0
-        self.head = FusionHead(
-            touch_features, photo_features, config.hidden, config.dropout, cosine_dim, config.cell_dim
-        )
+        self.head = FusionHead(touch_features, photo_features, config)
         # Created after the head: its random initial weights are then those of the paper's model.
         self.touch_projection = _projection(touch_features, config)
         self.photo_projection = _projection(photo_features, config)
@@ -264,7 +241,7 @@ class Matcher(nn.Module):
     ) -> ImageEncoding:
         """Return the encoding of features (B, F) and cells (B, cells * channels) by the layers of a modality."""
         pooled = norm(pooled)
-        parts, embedding = [partial(pooled)], _unit(projection(pooled))
+        parts, embedding = [partial(pooled)], functional.normalize(projection(pooled).float(), dim=-1, eps=1e-6)
         if self.cosine_scale is not None:
             parts.append(embedding * self.cosine_scale.clamp(min=0.0).sqrt())
         if cell_encoder is not None:
@@ -336,7 +313,3 @@ def _projection(features: int, config: MatcherConfig) -> nn.Module:
         nn.Dropout(config.dropout),
         nn.Linear(config.projection_hidden, config.embedding_dim),
     )
-
-
-def _unit(x: Tensor) -> Tensor:
-    return functional.normalize(x.float(), dim=-1, eps=1e-6)

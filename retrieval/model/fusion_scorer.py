@@ -22,8 +22,6 @@ CELL_BLOCK = 64
 PARTIALS, CELLS = "partials", "cells"
 """Names of the two arrays of an index."""
 _LARGEST = 127
-_BLOCK_ROWS = 8192
-Layout = dict[str, tuple[np.dtype[Any], tuple[int, ...]]]
 
 
 class StoredPartials:
@@ -50,12 +48,10 @@ class StoredPartials:
         return found
 
 
-def stored_layout(pooled_width: int, partial_width: int) -> Layout:
+def stored_layout(pooled_width: int, partial_width: int) -> dict[str, tuple[np.dtype[Any], tuple[int, ...]]]:
     """Return the type and shape of a row of each array."""
-    layout: Layout = {PARTIALS: (np.dtype(np.float16), (pooled_width,))}
-    if partial_width > pooled_width:
-        layout[CELLS] = (np.dtype(np.int8), (partial_width - pooled_width,))
-    return layout
+    pooled, cells = (np.dtype(np.float16), (pooled_width,)), (np.dtype(np.int8), (partial_width - pooled_width,))
+    return {PARTIALS: pooled, CELLS: cells} if partial_width > pooled_width else {PARTIALS: pooled}
 
 
 def to_stored(partials: NDArray[np.float32], pooled_width: int) -> dict[str, NDArray[Any]]:
@@ -69,8 +65,7 @@ def to_stored(partials: NDArray[np.float32], pooled_width: int) -> dict[str, NDA
 
 def largest_rounding(partials: NDArray[np.float16]) -> float:
     """Return the largest possible rounding error of stored partial activations (N, pooled): half a last place."""
-    starts = range(0, len(partials), _BLOCK_ROWS)
-    return max(float(np.abs(partials[start : start + _BLOCK_ROWS]).max()) for start in starts) * 2.0**-11
+    return max(float(partials.max()), -float(partials.min())) * 2.0**-11
 
 
 Partials = NDArray[np.floating[Any]] | StoredPartials

@@ -47,19 +47,13 @@ class GelCheck:
             readings: (G, fingers, 2) log-odds of "no gel image" and of contact.
             levels: (G, fingers) differences of the images from their no-contact frames in grey levels, if available.
         """
+        signs, above = readings[..., 1], self.contact_above
         if levels is not None and self.level_above is not None:
-            has_contact = levels.max(1) >= self.level_above
-        elif self.contact_above is not None:
-            has_contact = readings[..., 1].max(1) >= self.contact_above
-        else:
-            has_contact = np.ones(len(readings), dtype=bool)
-        is_gel = np.ones(len(readings), dtype=bool)
-        if self.foreign_above is not None:
-            is_gel = readings[..., 0].max(1) <= self.foreign_above
-        return [
-            (CONTACT if contact else NO_CONTACT) if gel else NOT_A_GEL
-            for gel, contact in zip(is_gel, has_contact, strict=True)
-        ]
+            signs, above = levels, self.level_above
+        has_contact = True if above is None else signs.max(1) >= above
+        is_gel = True if self.foreign_above is None else readings[..., 0].max(1) <= self.foreign_above
+        classes = np.where(is_gel, np.where(has_contact, CONTACT, NO_CONTACT), NOT_A_GEL)
+        return [str(name) for name in np.broadcast_to(classes, len(readings))]
 
 
 def contact_level(touch: RgbImage, no_contact: RgbImage) -> float:

@@ -28,8 +28,8 @@ A single pair of a touch and a photo is classified as a match above the logit wi
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Annotated, Any
+from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from msgspec import Meta
@@ -152,15 +152,10 @@ class Posterior:
     def mass(self, logits: ArrayLike, grasps: int = 1, *, unscored: int = 0, sample: ArrayLike = ()) -> EvidenceMass:
         """Return the evidence mass of objects with logits (J,), J >= 1, and `unscored` others.
 
-        sample (S,) are the logits of a random sample of the others, required if there are any. Raises BadInput, and
-        NumericalError for a logit that is not finite.
+        sample (S,) are the logits of a random sample of the others, required if there are any. Raises NumericalError
+        for a logit that is not finite.
         """
         known, drawn = _finite(logits, "every logit"), _finite(sample, "every logit of the sample")
-        if not len(known) or unscored < 0 or (unscored and not len(drawn)):
-            raise BadInput(
-                "a posterior requires a scored object, and a sample of the objects that were not scored; got "
-                f"{len(known)} scored, {unscored} unscored, and a sample of {len(drawn)}"
-            )
         weighted, others = self.weight(grasps) * known, self.weight(grasps) * drawn
         top = float(max(weighted.max(), others.max() if unscored else -math.inf))
         rest = -math.inf
@@ -197,10 +192,6 @@ class Posterior:
             if self.weight(total) * total * logit / grasps > needed:
                 return total - grasps
         return None
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return a plain dictionary, as stored in checkpoints."""
-        return asdict(self)
 
 
 def require_prior(none_prior: float) -> None:

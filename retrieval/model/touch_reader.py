@@ -160,11 +160,8 @@ class TouchReader:
                 return self._preprocessing.touch(image, reference), level
 
         with ThreadPoolExecutor(DECODERS, "decode") as threads:
-            jobs = [
-                [threads.submit(view, source, frame) for source, frame in zip(grasp, no_contact_frames, strict=True)]
-                for grasp in grasps
-            ]
-            return [[job.result() for job in grasp] for grasp in jobs]
+            views = [threads.map(view, grasp, no_contact_frames) for grasp in grasps]
+            return list(map(list, views))
 
     def _resized(self, source: InputImage) -> RgbImage:
         """Return an image (px, px, 3) in 0..1. Raises ImageError; IncompleteSearch if it was read for another model."""

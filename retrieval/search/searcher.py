@@ -303,7 +303,7 @@ class Searcher:
             if verdict == NONE_OF_THESE and is_clear(float(probabilities.objects_if_present[0])):
                 more_grasps = posterior.more_grasps(logits[0], found.mass.objects, count, none_prior)
             formula = {
-                **posterior.to_dict(),
+                **asdict(posterior),
                 "none_prior": none_prior,
                 "grasps": count,
                 "objects": manifest.objects,

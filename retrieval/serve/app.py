@@ -29,7 +29,7 @@ def create_app(
     trials: Path | None = None,
     shards: OpenShards | None = None,
 ) -> FastAPI:
-    """Create the service for the index of `settings`, which opens when the application starts.
+    """Create the service, and open the index of `settings`.
 
     Args:
         settings: Options of the operator.
@@ -40,6 +40,7 @@ def create_app(
 
     Raises:
         BadInput: An input cannot be used.
+        RetrievalError: The errors of `Searcher.open`.
     """
     app = FastAPI(
         title="touch-retrieval",
@@ -62,11 +63,9 @@ def create_app(
 
 @asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
-    """Open the index and start the parts; close them after the requests in flight are done."""
+    """Start the parts; close them after the requests in flight are done."""
     parts: Service = app.state.service
     anyio.to_thread.current_default_thread_limiter().total_tokens = THREADS
-    if not parts.generations.ready:
-        await asyncio.to_thread(parts.generations.open)
     await parts.decoders.start()
     if parts.history_writer:
         await asyncio.to_thread(parts.history_writer.record_pending)

@@ -27,17 +27,17 @@ MAX_PHOTO_PX = 4096
 """Maximum longer side, in pixels, of a photo that is converted to JPEG."""
 
 
-Offset = Annotated[int, Query(ge=0, le=2**31)]
-Limit = Annotated[int, Query(ge=1, le=500, description="Photos per page.")]
-Search = Annotated[
-    str, Query(max_length=200, description="Words that must all occur in the object, the path or the metadata.")
-]
-ObjectFilter = Annotated[str | None, Query(max_length=1000, alias="object", description="Only photos of this object.")]
-
-
 @router.get("/v1/catalogue")
 def catalogue(
-    parts: Parts, offset: Offset = 0, limit: Limit = 100, search: Search = "", name: ObjectFilter = None
+    parts: Parts,
+    offset: Annotated[int, Query(ge=0, le=2**31)] = 0,
+    limit: Annotated[int, Query(ge=1, le=500, description="Photos per page.")] = 100,
+    search: Annotated[
+        str, Query(max_length=200, description="Words that must all occur in the object, the path or the metadata.")
+    ] = "",
+    name: Annotated[
+        str | None, Query(max_length=1000, alias="object", description="Only photos of this object.")
+    ] = None,
 ) -> dict[str, Any]:
     """Return one page of the index's photos, in index order.
 
@@ -106,7 +106,6 @@ def index(parts: Parts) -> dict[str, Any]:
     """
     generation = parts.generations.current
     searcher, info = generation.searcher, generation.searcher.manifest
-    measured = info.about.get("candidates") or {}
     return {
         "generation": generation.name,
         "kind": info.kind,
@@ -114,11 +113,8 @@ def index(parts: Parts) -> dict[str, Any]:
         "objects": info.objects,
         "model": replace_surrogates(searcher.checkpoint.path.name),
         "trained_on": replace_surrogates(str(searcher.checkpoint.provenance.get("source", "unknown"))),
-        "encoder": searcher.encoder.name,
         "fingers": generation.fingers,
         "background": searcher.checkpoint.config.preprocessing.background,
-        "calibrated": searcher.posterior is not None,
-        "candidates": measured.get("k"),
         "sensors": sorted(parts.rig.sensors),
         "can_grasp": parts.rig.grasp is not None,
         "can_verify": searcher.can_verify,

@@ -4,6 +4,7 @@ import base64
 import os
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any, Self, TypedDict, Unpack
 from urllib.parse import quote
@@ -129,28 +130,19 @@ class Client:
 
 def _document(response: httpx.Response, *keys: str) -> dict[str, Any]:
     """Return the JSON object of a response, or raise RetrievalError if one of `keys` is missing."""
-    try:
+    with suppress(ValueError):  # not JSON
         found = response.json()
-    except ValueError as error:
-        raise _unexpected_response(response) from error
-    if not isinstance(found, dict) or not all(key in found for key in keys):
-        raise _unexpected_response(response)
-    return found
-
-
-def _unexpected_response(response: httpx.Response) -> RetrievalError:
-    return RetrievalError(
+        if isinstance(found, dict) and all(key in found for key in keys):
+            return found
+    raise RetrievalError(
         f"{response.url}: unexpected response ({response.status_code}); not a `retrieve serve` service."
     )
 
 
 def _error(response: httpx.Response) -> RetrievalError:
     """Return the exception for a problem document."""
-    try:
-        problem = response.json()
-        kind, detail = problem["type"].rpartition(":")[2], problem["detail"]
-    except (ValueError, KeyError, TypeError, AttributeError):
-        return _unexpected_response(response)
+    problem = _document(response, "type", "detail")
+    kind, detail = str(problem["type"]).rpartition(":")[2], str(problem["detail"])
     if kind == "bad-image":
         name, _, reason = detail.partition(": ")
         return ImageError(name, reason)

@@ -12,7 +12,6 @@ from functools import cached_property
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.search.opening import OpenShards, manifest_of
 from retrieval.search.searcher import Searcher
-from retrieval.serve.errors import HttpProblem
 from retrieval.serve.settings import ServiceSettings
 
 log = logging.getLogger(__name__)
@@ -39,28 +38,18 @@ class ServedGeneration:
 
 
 class Generations:
-    """The current generation of one index, replaced when a new generation appears."""
+    """`current`: the generation of one index that answers, replaced when a new generation appears."""
 
-    def __init__(self, settings: ServiceSettings, shards: OpenShards | None = None) -> None:
+    current: ServedGeneration
+
+    def __init__(self, settings: ServiceSettings, shards: OpenShards | None) -> None:
+        """Open the newest generation."""
         self._settings, self._shards = settings, shards
-        self._current: ServedGeneration | None = None
+        self._open()
 
-    @property
-    def ready(self) -> bool:
-        """Whether a generation is open."""
-        return self._current is not None
-
-    @property
-    def current(self) -> ServedGeneration:
-        """The generation that answers; raises HttpProblem before the first one is open."""
-        if self._current is None:
-            raise HttpProblem("not-ready", "No index is open yet.", {"retry-after": "1"})
-        return self._current
-
-    def open(self) -> None:
-        """Open the newest generation; raises the errors of `Searcher.open`."""
+    def _open(self) -> None:
         settings = self._settings
-        self._current = ServedGeneration(
+        self.current = ServedGeneration(
             Searcher.open(settings.index, model=settings.model, threads=settings.threads, shards=self._shards)
         )
         gc.collect()  # free reference cycles of the previous generation
@@ -75,7 +64,7 @@ class Generations:
                 manifest = await asyncio.to_thread(manifest_of, self._settings.index)
                 # A folder that was deleted and built again counts its generations from 1: compare the contents.
                 if manifest != self.current.searcher.manifest:
-                    await asyncio.to_thread(self.open)
+                    await asyncio.to_thread(self._open)
                     log.warning("Generation %s is now served.", self.current.name)
             except Exception as error:
                 pause_s = _RETRY_S

@@ -19,7 +19,6 @@ from retrieval.serve.store import NONE, OBJECT, RIGHT, HistoryWriter, StoredQuer
 from retrieval.serve.uploads import RequestBody
 
 router = APIRouter(tags=["history"])
-FeedbackValue = Literal["right", "object", "none"]
 
 
 class FeedbackBody(RequestBody):
@@ -30,7 +29,7 @@ class FeedbackBody(RequestBody):
     """
 
     query: str = Field(min_length=1, max_length=64, description="The X-Query-Id of the answer.")
-    feedback: FeedbackValue
+    feedback: Literal["right", "object", "none"]
     object_id: str | None = Field(None, min_length=1, max_length=1000)
 
 

@@ -81,11 +81,14 @@ async def verify(request: Request, parts: Parts) -> DocumentResponse:
 
 MAX_OBJECT_NAMES = 1000
 """Maximum number of objects among which a random one is chosen for a grasp."""
-ObjectParameter = Annotated[str | None, Query(max_length=1000, alias="object", description="Object to grasp.")]
 
 
 @router.post("/v1/grasp", tags=["live"])
-async def grasp(request: Request, parts: Parts, name: ObjectParameter = None) -> dict[str, Any]:
+async def grasp(
+    request: Request,
+    parts: Parts,
+    name: Annotated[str | None, Query(max_length=1000, alias="object", description="Object to grasp.")] = None,
+) -> dict[str, Any]:
     """Grasp one of the catalogue's objects: the named one, else a random one.
 
     The rig makes one grasp at a time. touches, background: a PNG file in base64 for each finger; object_id: the object.

@@ -5,7 +5,6 @@ name the foreign host or origin, and are refused.
 """
 
 import asyncio
-import hashlib
 import hmac
 import logging
 from http.cookies import CookieError, SimpleCookie
@@ -54,8 +53,7 @@ HEADERS = {
 
 def same_token(candidate: str, token: str) -> bool:
     """Compare two tokens in constant time."""
-    digests = [hashlib.sha256(text.encode("utf-8", "replace")).digest() for text in (candidate, token)]
-    return hmac.compare_digest(*digests)
+    return hmac.compare_digest(candidate.encode("utf-8", "replace"), token.encode())
 
 
 class Guard:

@@ -116,10 +116,8 @@ def serve(app: FastAPI, on_started: Callable[[int], object]) -> None:
 
     Raises:
         BadInput: The server cannot listen at the host and port.
-        RetrievalError: The errors of `Searcher.open`.
     """
     parts: Service = app.state.service
-    parts.generations.open()
     host, port = parts.settings.host, parts.settings.port
     try:
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]

@@ -73,7 +73,7 @@ class Service:
         self.frames = {name: self._queue(frames) for name in self.rig.sensors}
         self.history_writer = None
         if settings.history and recorder:
-            self.history_writer = HistoryWriter(settings.history, recorder, settings.history_max_queries)
+            self.history_writer = HistoryWriter(settings.history, recorder)
         self.trials = Trials(trials) if trials else None
         self.stopping = Event()
 

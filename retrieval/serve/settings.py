@@ -41,7 +41,6 @@ class ServiceSettings:
         body_s: Time limit for the body of a request to arrive.
         poll_s: Interval of the checks for a new generation of the index.
         history: Folder for queries and feedback; None to store nothing.
-        history_max_queries: Maximum number of stored queries without feedback.
 
     Raises:
         ConfigError: An option is out of its range.
@@ -58,10 +57,8 @@ class ServiceSettings:
     body_s: Wait = 10.0
     poll_s: Wait = 1.0
     history: Path | None = None
-    history_max_queries: Count = 5_000
 
     def __post_init__(self) -> None:
-        """Check the ranges of the options."""
         check_fields(self, "", ConfigError)
         if self.token is None and not self.is_local:
             raise ConfigError(

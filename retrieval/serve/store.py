@@ -85,11 +85,6 @@ class TrialChoice:
     model: int
 
 
-def new_id() -> str:
-    """Return an unguessable id; later ids sort after earlier ones."""
-    return f"{time.time_ns() // 1_000_000:011x}{secrets.token_hex(6)}"
-
-
 class HistoryStore:
     """The database in one file, which is created if it is missing, with at most `max_queries` without feedback.
 
@@ -97,7 +92,7 @@ class HistoryStore:
         BadInput: The file is not a database of this version.
     """
 
-    def __init__(self, path: Path, max_queries: int) -> None:
+    def __init__(self, path: Path, max_queries: int = 5_000) -> None:
         self.path, self._max_queries, self._lock = path, max_queries, Lock()
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -264,13 +259,13 @@ class Recorder(Protocol):
 class HistoryWriter:
     """Writer of the database, and of the recording in the same folder (`recorder`)."""
 
-    def __init__(self, folder: Path, recorder: Recorder, max_queries: int) -> None:
-        self.store = HistoryStore(folder / "history.sqlite", max_queries)
+    def __init__(self, folder: Path, recorder: Recorder) -> None:
+        self.store = HistoryStore(folder / "history.sqlite")
         self._recorder, self._lock = recorder, Lock()
 
     async def add_query(self, pictures: RequestPictures, result: QueryResult) -> str | None:
         """Store a query; return its id, or None if it cannot be stored, such as on a full disk."""
-        query_id = new_id()
+        query_id = f"{time.time_ns() // 1_000_000:011x}{secrets.token_hex(6)}"  # sorts by time; nobody can guess it
         try:
             await asyncio.to_thread(self.store.add_query, query_id, pictures.files, pictures.background, result)
         except Exception as error:

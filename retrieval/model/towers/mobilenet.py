@@ -98,18 +98,20 @@ class MobileNetV2(Tower):
                 nn.init.zeros_(module.bias)
 
     def _encode(self, images: Tensor) -> Tensor:
-        with without_autocast(images):
-            x = self.features[:_FLOAT32_LAYERS](images)
         if self.output == "stages":
-            return stage_statistics(self._stages(x))
-        x = nn.functional.adaptive_avg_pool2d(self.features[_FLOAT32_LAYERS:](x), 1).flatten(1)
+            return stage_statistics(self._stages(images))
+        x = self.features[_FLOAT32_LAYERS:](self._first(images))
+        x = nn.functional.adaptive_avg_pool2d(x, 1).flatten(1)
         return x if self.classifier is None else self.classifier(x)
 
     def _encode_with_map(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        with without_autocast(images):
-            x = self.features[:_FLOAT32_LAYERS](images)
-        maps = list(self._stages(x))
+        maps = list(self._stages(images))
         return stage_statistics(maps), torch.cat(maps[1:3], dim=1)  # cells: the two stages at stride 16
+
+    def _first(self, images: Tensor) -> Tensor:
+        with without_autocast(images):
+            first: Tensor = self.features[:_FLOAT32_LAYERS](images)
+            return first
 
     def stem_layers(self) -> nn.Module:
         """Return the layers up to the first stage, at stride 8.
@@ -119,8 +121,9 @@ class MobileNetV2(Tower):
         """
         return self.features[:_STEM_LAYERS] if self.output == "stages" else super().stem_layers()
 
-    def _stages(self, x: Tensor) -> Iterator[Tensor]:
+    def _stages(self, images: Tensor) -> Iterator[Tensor]:
         """Yield the outputs of the stages."""
+        x = self._first(images)
         for number, layer in enumerate(list(self.features)[_FLOAT32_LAYERS:], start=_FLOAT32_LAYERS):
             x = layer(x)
             if number in _STAGE_OUTPUTS:

@@ -53,21 +53,21 @@ class SmallTower(Tower):
         self.feature_count = {"classes": 1000, "pooled": 2 * inputs, "stages": 3 * sum(_WIDTHS)}[output]
 
     def _encode(self, images: Tensor) -> Tensor:
-        with without_autocast(images):
-            first = self.stages[:_FLOAT32_LAYERS](images)
+        maps = list(self._maps(images))
         if self.output == "stages":
-            return stage_statistics([first, *self._maps(first)])
-        x = self.stages[_FLOAT32_LAYERS:](first).flatten(2)
-        x = torch.cat([x.mean(2), x.amax(2)], dim=1)
+            return stage_statistics(maps)
+        x = torch.cat([maps[-1].mean((2, 3)), maps[-1].amax((2, 3))], dim=1)
         return x if self.fc is None else self.fc(x)
 
     def _encode_with_map(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        with without_autocast(images):
-            first = self.stages[:_FLOAT32_LAYERS](images)
-        maps = [first, *self._maps(first)]
+        maps = list(self._maps(images))
         return stage_statistics(maps), maps[-1]
 
-    def _maps(self, x: Tensor) -> Iterator[Tensor]:
+    def _maps(self, images: Tensor) -> Iterator[Tensor]:
+        """Yield the map of each stage."""
+        with without_autocast(images):
+            x = self.stages[:_FLOAT32_LAYERS](images)
+        yield x
         for layer in list(self.stages)[_FLOAT32_LAYERS:]:
             x = layer(x)
             if isinstance(layer, nn.ReLU):

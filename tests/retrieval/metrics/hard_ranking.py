@@ -16,6 +16,7 @@ from retrieval.metrics.ranking import (
     recall_at,
 )
 from retrieval.metrics.table import ScoreTable
+from retrieval.model.config import MatcherConfig
 from retrieval.model.fusion import FusionHead
 from retrieval.training.selection import ranking_auc
 from tests.hard_case import HardCase, error_of
@@ -42,7 +43,7 @@ def hard_cases() -> Iterator[HardCase]:
 
 def _adding_head(hidden: int) -> FusionHead:
     """Return a head whose logit is the sum over units of relu(touch partial + photo partial)."""
-    head = FusionHead(1, 1, hidden, 0.0)
+    head = FusionHead(1, 1, MatcherConfig(hidden=hidden))
     with torch.no_grad():
         nn.init.eye_(head.second.weight)
         nn.init.ones_(head.out.weight)

@@ -54,13 +54,13 @@ def test_an_embedding_at_the_end_of_partial_activations_has_its_own_scale():
     deviation = ((0 - 1000) ** 2 + (2000 - 1000) ** 2) ** 0.5 / 2
     torch.testing.assert_close(spread.scale, torch.tensor([deviation, deviation, 0.1]))
     torch.testing.assert_close(spread(partials)[:, 2], torch.tensor([-1.0, 1.0]))
-    assert PartialStatistics.of(partials)(partials)[:, 2].abs().max() < 1e-3
+    assert PartialStatistics.of(partials, 0)(partials)[:, 2].abs().max() < 1e-3
 
 
 def test_constant_partial_activations_stay_finite_where_a_plain_division_gives_nan():
     partials = torch.full((3, 2), 5.0)
     assert (partials - partials.mean(0)).div(partials.std(correction=0)).isnan().all()
-    assert PartialStatistics.of(partials)(partials).tolist() == [[0.0, 0.0]] * 3
+    assert PartialStatistics.of(partials, 0)(partials).tolist() == [[0.0, 0.0]] * 3
 
 
 def test_index_entries_have_the_candidate_encoders_embedding_and_without_one_the_contrastive_one():

@@ -218,7 +218,7 @@ def test_a_weight_that_is_not_finite_is_refused(saved, value):
         ({"config": [1]}, "it must be a table"),
         ({"split": {"train": ["a"]}}, "split must have .*; validation is missing"),
         ({"posterior": {"slope": 1.0}}, "posterior must have .*; formula is missing"),
-        ({"posterior": POSTERIOR.to_dict() | {"formula": "another"}}, "posterior.formula"),
+        ({"posterior": dataclasses.asdict(POSTERIOR) | {"formula": "another"}}, "posterior.formula"),
         ({"gel_check": dataclasses.asdict(GEL_CHECK) | {"level_above": "1"}}, "gel_check.level_above must be a number"),
     ],
 )

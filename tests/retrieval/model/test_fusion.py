@@ -86,7 +86,7 @@ def test_the_paper_configuration_has_the_papers_layers():
 
 def test_the_partial_activation_layers_start_like_one_layer_over_the_concatenation():
     torch.manual_seed(0)
-    head = FusionHead(2000, 1000, 1024, 0.5)
+    head = FusionHead(2000, 1000, MatcherConfig())
     bound = 1 / math.sqrt(3000)
     for weight in (head.touch_partial.weight, head.photo_partial.weight):
         assert bound * 0.99 < float(weight.detach().abs().max()) <= bound
@@ -94,7 +94,7 @@ def test_the_partial_activation_layers_start_like_one_layer_over_the_concatenati
 
 def small_head(hidden=32, seed=0):
     torch.manual_seed(seed)
-    return FusionHead(10, 10, hidden, 0.5)
+    return FusionHead(10, 10, MatcherConfig(hidden=hidden))
 
 
 @pytest.mark.parametrize("block", [5, 37])

@@ -1,6 +1,7 @@
 """The posterior: probabilities by hand, naive formulas that fail, and a fit that recovers planted parameters."""
 
 import math
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -159,4 +160,4 @@ def test_a_logit_that_is_not_finite_and_an_invalid_prior_are_refused():
 )
 def test_forged_numbers_are_refused(change):
     with pytest.raises(BadInput, match=r"posterior(\.\w+ (must be|must fit|is not)| has no setting)"):
-        typed(ADDING.to_dict() | change, Posterior, "posterior", complete=True, error=BadInput)
+        typed(asdict(ADDING) | change, Posterior, "posterior", complete=True, error=BadInput)

@@ -21,7 +21,7 @@ from retrieval.search.searcher import Searcher
 from tests.pages import HtmlPage
 
 SCRIPT = "<script>alert(1)</script>"
-POSTERIOR = Posterior(slope=0.75, offset=-1.25, dependence=0.5, tests=9).to_dict() | {
+POSTERIOR = dataclasses.asdict(Posterior(slope=0.75, offset=-1.25, dependence=0.5, tests=9)) | {
     "none_prior": 0.5,
     "grasps": 2,
     "objects": 500,
