@@ -208,11 +208,6 @@ def _model_card(name: str, checkpoint: Checkpoint) -> str:
             f"* Probabilities: fitted on {posterior.tests} sets of validation touches; slope {posterior.slope:.3f}, "
             f"offset {posterior.offset:.3f}, dependence of grasps {posterior.dependence:.3f}"
         )
-    if references := checkpoint.references:
-        lines.append(
-            f"* Reference touches: fitted on {references.touches} touches of {references.objects} objects that were "
-            "left out"
-        )
     if checkpoint.verification:
         rate = checkpoint.verification.bounds(CARD_FAR).false_rejects
         lines.append(

@@ -69,11 +69,6 @@ class PosteriorProbabilities:
     unscored: float
     objects_if_present: Floats
 
-    @property
-    def is_match(self) -> bool:
-        """Whether the best object is more likely than "none of these": the rule of the verdict."""
-        return bool(self.objects.max() > self.none)
-
 
 @dataclass(frozen=True)
 class EvidenceMass:

@@ -299,7 +299,7 @@ class Searcher:
         if found is not None and found.mass is not None and posterior is not None:
             logits = [one.logit for one in found.best]
             probabilities = posterior.probabilities_given(logits, found.mass, count, none_prior)
-            verdict = MATCH if probabilities.is_match else NONE_OF_THESE
+            verdict = MATCH if probabilities.objects.max() > probabilities.none else NONE_OF_THESE
             if verdict == NONE_OF_THESE and is_clear(float(probabilities.objects_if_present[0])):
                 more_grasps = posterior.more_grasps(logits[0], found.mass.objects, count, none_prior)
             formula = {

@@ -45,10 +45,7 @@ class DocumentResponse(JSONResponse):
 
     def render(self, content: Any) -> bytes:
         """Return the document as bytes (Starlette callback)."""
-        try:
-            return super().render(content)
-        except UnicodeEncodeError:
-            return super().render(replace_surrogates(content))
+        return super().render(replace_surrogates(content))
 
 
 class HttpProblem(HTTPException):
@@ -60,10 +57,9 @@ class HttpProblem(HTTPException):
 
     def response(self) -> JSONResponse:
         """Return the problem document as a response."""
-        status, title = KINDS[self.kind]
-        detail = (
-            self.detail if len(self.detail) <= MAX_DETAIL_CHARACTERS else self.detail[:MAX_DETAIL_CHARACTERS] + " ..."
-        )
+        (status, title), detail = KINDS[self.kind], self.detail
+        if len(detail) > MAX_DETAIL_CHARACTERS:
+            detail = detail[:MAX_DETAIL_CHARACTERS] + " ..."
         document = {"type": PREFIX + self.kind, "title": title, "status": status, "detail": detail}
         return DocumentResponse(document, status, {"cache-control": "no-store", **(self.headers or {})}, MEDIA_TYPE)
 

@@ -22,7 +22,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from retrieval.data.images import decode, encode_image
+from retrieval.data.images import decode_rgb, encode_image
 from retrieval.data.text import replace_surrogates
 from retrieval.errors import BadInput, RetrievalError
 from retrieval.model.gel_check import CONTACT
@@ -294,17 +294,15 @@ class HistoryWriter:
         """Record each grasp with contact; the first one last, because `is_recorded` checks only that one."""
         object_id, photo, gel_checks = self.store.feedback(query_id)
         pictures = self.store.pictures(query_id)
-        before = {finger: data for (grasp, finger), data in pictures.items() if grasp == BACKGROUND}
         contact_grasps = [number for number, gel_check in enumerate(gel_checks, start=1) if gel_check == CONTACT]
         for place, number in reversed(list(enumerate(contact_grasps))):
             grasp_id = f"{query_id}-{place:02}"
             if grasp_id in self._recorder.grasp_ids:
                 continue
-            images = {"photo": as_png_or_jpeg(photo)}
-            images |= {
-                f"touch_{finger}": as_png_or_jpeg(data) for (grasp, finger), data in pictures.items() if grasp == number
-            }
-            images |= {f"touch_{finger}_before": as_png_or_jpeg(data) for finger, data in before.items()}
+            endings, images = {number: "", BACKGROUND: "_before"}, {"photo": as_png_or_jpeg(photo)}
+            for (grasp, finger), data in pictures.items():
+                if grasp in endings:
+                    images[f"touch_{finger}{endings[grasp]}"] = as_png_or_jpeg(data)
             self._recorder.append(grasp_id, object_id, images, grasped=True, sequence_id=query_id)
 
 
@@ -312,6 +310,4 @@ def as_png_or_jpeg(data: bytes) -> bytes:
     """Return an image file as PNG or JPEG; other formats become PNG. Raises ImageError if it cannot be decoded."""
     if data.startswith(tuple(IMAGE_TYPES)):
         return data
-    samples = decode(data, "a picture")
-    pixels = samples if samples.dtype == np.uint8 else np.rint(255 * samples)
-    return encode_image(pixels.astype(np.uint8, copy=False))
+    return encode_image(np.rint(255 * decode_rgb(data, "a picture")).astype(np.uint8))
