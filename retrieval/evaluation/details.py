@@ -41,13 +41,7 @@ class SeedDetails:
 
 
 def describe(method: Method, scores: MethodScores, features: Features) -> SeedDetails:
-    """Return the details of one method and seed; only late fusion is verified.
-
-    Args:
-        method: The fitted method.
-        scores: Its scores.
-        features: Features of all grasps, as the method takes them.
-    """
+    """Return the details of a fitted method, from its scores and all features; only late fusion is verified."""
     seed, objects, test, posterior = scores.seed, scores.queries.objects, scores.touches("test"), scores.posterior
     accuracies = {"test_candidates": k_way(test, 5, seed=seed), "all_candidates": k_way(scores.touches(), 5, seed=seed)}
     details = Details(
@@ -104,12 +98,7 @@ def draw_k_way_tests(table: ScoreTable, k: int, seed: int) -> NDArray[np.float64
 
 
 def reliability(posterior: Posterior, test: ScoreTable, *, seed: int = 0) -> dict[str, Any]:
-    """Return the reliability bins of calibrated probabilities on test objects.
-
-    Args:
-        posterior: The fitted posterior.
-        test: Scores of touches of test objects.
-        seed: Seed of the drawn pairs and tests.
+    """Return the reliability bins of calibrated probabilities on test objects; `seed` draws pairs and tests.
 
     Returns:
         "pairs": bins of match probabilities at even prior odds; and by name of `K_WAY_TESTS`: probability of the top-1
@@ -130,9 +119,7 @@ def reliability(posterior: Posterior, test: ScoreTable, *, seed: int = 0) -> dic
 def combine(by_seed: Sequence[SeedDetails], seed: int) -> Details:
     """Return the details of all training seeds: means; threshold, calibration and curves are those of the first seed.
 
-    Args:
-        by_seed: The details of each seed.
-        seed: Seed of the resamples.
+    `seed` is that of the resamples.
     """
     first = by_seed[0].details
     fractions: dict[tuple[str, str], float] = defaultdict(float)

@@ -193,13 +193,8 @@ def run_touch_to_touch(
 ) -> ProtocolResult:
     """Return the results of the protocol.
 
-    Args:
-        protocol: The protocol.
-        facts: The recording.
-        towers_of: Towers by name of their row; the others are compared with the first.
-        seeds: Seeds of the permutations of the objects.
-        folder: Folder of images on the common frame.
-        quiet: No progress on stderr.
+    The towers of a row are compared with those of the first row. `seeds` are those of the permutations of the objects;
+    `folder` gets the images on the common frame.
 
     Raises:
         DatasetError: No-contact frames or second sequences are missing.

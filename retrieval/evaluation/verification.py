@@ -37,18 +37,10 @@ ErrorsByImpostors = dict[str, dict[str, Errors]]
 
 
 def verification_errors(scores: MethodScores, features: Features, checkpoint: Checkpoint) -> ErrorsByImpostors | None:
-    """Return the errors of late fusion on test objects.
+    """Return the errors of late fusion on test objects, from its scores and the tower features of all grasps.
 
-    A head that was trained on features has no posterior; one is fitted on validation objects, as in training.
-
-    Args:
-        scores: The scores of late fusion.
-        features: Tower features of all grasps.
-        checkpoint: The model.
-
-    Returns:
-        The errors; None for fewer than three test objects, or for a model without posterior and fewer than three
-        validation objects.
+    A head that was trained on features has no posterior; one is fitted on validation objects, as in training. None for
+    fewer than three test objects, or for a model without posterior and fewer than three validation objects.
     """
     queries, posterior, test = scores.queries, checkpoint.posterior, scored_touches(scores.touches("test"))
     if posterior is None:
@@ -99,12 +91,9 @@ def _rates(kind: str, by_seed: Sequence[Errors]) -> VerificationRates:
 
 
 def false_rejects(far: float, genuine: Floats, impostors: Floats) -> float:
-    """Return the false-reject rate at the lowest threshold that accepts at most a fraction `far` of the impostors.
+    """Return the false-reject rate at the lowest threshold that accepts at most a fraction `far` < 1 of the impostors.
 
-    Args:
-        far: False-accept rate, less than 1.
-        genuine: (S,) scores of the right object.
-        impostors: (T,) scores of other objects.
+    `genuine` (S,) are scores of the right object, `impostors` (T,) of other objects.
     """
     accepted = math.floor(far * len(impostors) + 1e-9)  # 0.29 * 100 is less than 29
     return float((genuine <= np.sort(impostors)[-1 - accepted]).mean())

@@ -94,11 +94,7 @@ def reliability_bins(probability: ArrayLike, outcomes: ArrayLike) -> dict[str, A
     """Return {"ece", "bins": [{"probability", "frequency", "count"}]} of 15 equal bins, empty ones left out.
 
     Each prediction has the error |probability - frequency| of its bin. The expected calibration error is the mean over
-    all predictions.
-
-    Args:
-        probability: (P,) predicted probabilities.
-        outcomes: (P,) 1 if the prediction is true, 0 if not; 1/n if n answers tie and one of them is right.
+    all predictions (P,). An outcome is 1 if the prediction is true, 0 if not; 1/n if n answers tie and one is right.
     """
     p, y = np.asarray(probability, dtype=np.float64), np.asarray(outcomes, dtype=np.float64)
     which = np.minimum((p * BINS).astype(int), BINS - 1)

@@ -32,10 +32,6 @@ def pair_accuracy(table: ScoreTable, threshold: float) -> Measure:
     A row is correct on a photo of its object if the score is above the threshold, and on another object's photo if it
     is below; exactly the threshold counts half. The value is the mean of two fractions: over its object's photos, and
     over other photos (a uniform object, then a uniform photo of it). Chance is 1/2.
-
-    Args:
-        table: The scores.
-        threshold: The threshold, from validation objects.
     """
     queries = table.with_targets
     above = (np.sign(queries.scores.astype(float) - threshold) + 1) / 2

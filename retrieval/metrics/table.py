@@ -95,12 +95,6 @@ def object_scores(table: ScoreTable, photos: int, draws: int, seed: int) -> NDAr
     Each object is represented by photos that are drawn without replacement, never a row's own; an object with fewer
     photos uses all of them. The draws depend on the seed and on the owners, never on scores, so all methods get the
     same queries.
-
-    Args:
-        table: The scores.
-        photos: Photos of each object.
-        draws: Repetitions.
-        seed: Seed of the draws.
     """
     rng = np.random.default_rng([seed, photos])
     found = np.empty((draws, len(table.touch_owner), len(table.objects)))

@@ -34,13 +34,7 @@ UNSEEN_OBJECTS = Protocol(
 def with_split(
     facts: RecordingFacts, settings: TrainingConfig, model: Checkpoint | None, requested: Split | None
 ) -> Protocol:
-    """Return the protocol with the requested split, else the model's own, else a new one.
-
-    Args:
-        facts: The recording.
-        settings: Seed and fractions of a new split.
-        model: The evaluated model.
-        requested: The requested split.
+    """Return the protocol with the requested split, else the model's own, else a new one as `settings` state.
 
     Raises:
         DatasetError: The requested split does not fit the recording, or the recording has some, but not all training
