@@ -119,18 +119,16 @@ loaded = load(source, PairSampler(load_grasps(Path(sys.argv[1])), seed=0).batch(
 
 def loss(kind, loaded):
     batch = loaded.batch
-    touch_objects, photo_objects = batch.touch_objects, batch.photo_objects
     if kind == "local":  # the naive way: every rank's loss uses its own images only
         touches, photos = (distributed.rank_rows(len(rows)) for rows in (batch.grasps, batch.photos))
-        touch, photo = matcher.touch_features(loaded.touches), matcher.photo_features(loaded.photos)
-        touch_objects, photo_objects = touch_objects[touches], photo_objects[photos]
+        features = matcher.touch_features(loaded.touches), matcher.photo_features(loaded.photos)
     else:
-        touch, photo = source.train_features(matcher, loaded)
+        touches, photos, features = slice(None), slice(None), source.train_features(matcher, loaded)
     if kind == "all":
-        return batch_loss(matcher, losses, batch, touch, photo)
-    touch, photo = matcher.touch_encoding(touch).embedding, matcher.photo_encoding(photo).embedding
-    objects = torch.from_numpy(touch_objects), torch.from_numpy(photo_objects)
-    return contrastive_loss(touch, photo, *objects, matcher.log_scale)
+        return batch_loss(matcher, losses, batch, *features)
+    embeddings = matcher.touch_encoding(features[0]).embedding, matcher.photo_encoding(features[1]).embedding
+    objects = torch.from_numpy(batch.touch_objects[touches]), torch.from_numpy(batch.photo_objects[photos])
+    return contrastive_loss(*embeddings, *objects, matcher.log_scale)
 
 
 for kind in ("all", "contrast", "local"):

@@ -4,8 +4,8 @@ import dataclasses
 import os
 import signal
 from copy import deepcopy
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 
 import numpy as np
 import pytest
@@ -267,24 +267,25 @@ def test_a_candidate_encoder_is_distilled_after_the_last_step_and_changes_no_oth
 @pytest.mark.parametrize(
     ("where", "stop"),
     [
-        ("distil.distillation_loss", interrupt),
-        ("train.calibrate_checkpoint", lambda: 1 / 0),
-        ("the deletion of the state", interrupt),
+        ("retrieval.training.distil.distillation_loss", interrupt),
+        ("retrieval.training.train.calibrate_checkpoint", lambda: 1 / 0),
+        ("pathlib.Path.unlink", interrupt),
     ],
 )
 def test_a_stop_after_the_last_step_leaves_a_usable_checkpoint_that_resuming_completes(
     where, stop, whole, recording, tmp_path, monkeypatch
 ):
     """A power cut or Ctrl-C comes before the complete checkpoint is written, or while its state still exists."""
-    broken, is_complete = trainer_for(recording, tmp_path / "b.safetensors", WITH_ENCODER), where.startswith("the ")
+    broken, real = trainer_for(recording, tmp_path / "b.safetensors", WITH_ENCODER), resolve_name(where)
+    is_complete = real is Path.unlink
+
+    def stopping(*given, **named):
+        if not is_complete or given[0] == state_path(broken.out):
+            stop()
+        return real(*given, **named)
+
     with monkeypatch.context() as cut:
-        if is_complete:
-            state, unlink = state_path(broken.out), Path.unlink
-            cut.setattr(Path, "unlink", lambda file, **named: (file == state and stop(), unlink(file, **named))[1])
-        else:
-            module, name = where.split(".")
-            real = getattr(import_module(f"retrieval.training.{module}"), name)
-            cut.setattr(f"retrieval.training.{where}", lambda *given, **named: (stop(), real(*given, **named))[1])
+        cut.setattr(where, stopping)
         with pytest.raises((ZeroDivisionError, JobInterrupted)) as stopped:
             broken.run(quiet=True)
     if stop is interrupt:
