@@ -544,10 +544,7 @@ class WSG50(Gripper):
                 break
             self._check_updates(now)
             system, grasping = (link.updates[command][0] for command in _UPDATED)
-            try:
-                is_moving = GripperReading(codec.system_state(system), codec.grasping_state(grasping)).is_moving
-            except WireError:
-                is_moving = True  # unknown: read again
+            is_moving = GripperReading(codec.system_state(system), codec.grasping_state(grasping)).is_moving
             if is_moving or status is Status.CMD_PENDING:
                 still_since = now
             if now - still_since > link.timeout_s:
@@ -623,11 +620,9 @@ class WSG50(Gripper):
         """Stop the jaws if they move or may move; else STOP would drop a held object."""
         try:
             is_moving = self._read().is_moving
-        except LinkLost:
-            if not self._may_be_moving:
+        except DeviceError as error:
+            if isinstance(error, LinkLost) and not self._may_be_moving:
                 raise
-            is_moving = True
-        except DeviceError:
             is_moving = True  # unknown
         if is_moving:
             self._stop()

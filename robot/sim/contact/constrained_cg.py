@@ -117,7 +117,7 @@ class _Descent:
             self.conjugate = False
             pressure = self._safe_step()
             state = self._measure(pressure, self.problem.operator(pressure))
-        self.change = _relative_change(before, state[0])
+        self.change = float(np.abs(state[0] - before).sum()) / (float(state[0].sum()) or 1.0)
         self._accept(*state)
 
     def _conjugate_step(self) -> tuple[Floats, Floats]:
@@ -254,14 +254,3 @@ def _project_step(before, direction, distance, length, pressure):  # type: ignor
             pressure[row, i] = p
             total += p
     return leaving > 0, entering > 0, total
-
-
-@jit_reassociated
-def _relative_change(before, pressure):  # type: ignore[no-untyped-def]
-    """Return the relative change of the pressure."""
-    change, total = 0.0, 0.0
-    for row in range(before.shape[0]):
-        for i in range(before.shape[1]):
-            change += abs(pressure[row, i] - before[row, i])
-            total += pressure[row, i]
-    return change / (total if total != 0.0 else 1.0)
