@@ -17,7 +17,6 @@ from retrieval.frontier import APPROXIMATIONS
 from retrieval.methods import METHODS
 from retrieval.model.shipped import shipped_model
 from tests import synthetic
-from tests.meshes import box, sphere, stl
 
 
 @pytest.fixture
@@ -360,14 +359,14 @@ def test_ctrl_c_while_collecting_prints_how_to_continue(workplace, capsys, monke
 
 
 def test_meshes_that_cannot_be_grasped_are_listed_and_the_others_are_collected(tmp_path, monkeypatch, capsys):
-    pytest.importorskip("trimesh", reason="needs touch-retrieval[mesh]")
-    pytest.importorskip("embreex", reason="needs touch-retrieval[mesh]")
+    from tests import meshes  # skips this test if the extra is missing
+
     monkeypatch.chdir(tmp_path)
     Path("meshes").mkdir()
     Path("rig.toml").write_text('rig = "sim"\nmeshes = "meshes"\n')
-    (globe, faces), collect = sphere(20), ["collect", "--rig", "rig.toml", "--grasps", "1", "--seed", "1"]
-    stl(Path("meshes/a_globe.stl"), 80 * globe, faces)
-    stl(Path("meshes/b_box.stl"), *box(60, 90, 120))
+    collect = ["collect", "--rig", "rig.toml", "--grasps", "1", "--seed", "1"]
+    meshes.saved(Path("meshes/a_globe.stl"), meshes.ball(80))
+    meshes.saved(Path("meshes/b_box.stl"), meshes.box(60, 90, 120))
     assert main([*collect, "--objects", "2", "--out", "rec"]) == 0
     lines = capsys.readouterr().err.splitlines()
     skipped = [line for line in lines if "skipped: wider than the gripper opens: 15" in line]

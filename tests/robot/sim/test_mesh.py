@@ -11,38 +11,38 @@ from robot.collection import CollectSettings, collect
 from robot.errors import RecordingError, RobotConfigError, SceneError
 from robot.rig import load_rig
 from robot.sim.objects.mesh import Mesh
-from tests.meshes import CORNERS, CUBE, load_mesh_object, obj, ply, sphere, stl
+from tests.meshes import ball, box, load_mesh_object, saved, solid
 
-pytest.importorskip("trimesh", reason="needs touch-retrieval[mesh]")
-pytest.importorskip("embreex", reason="needs touch-retrieval[mesh]")
+CUBE = box(40, 40, 40)
 
 
 @pytest.fixture
-def ball(tmp_path):
-    vertices, faces = sphere()
-    return load_mesh_object(stl(tmp_path / "ball.stl", 30 * vertices, faces), 0, relief="smooth")
+def globe(tmp_path):
+    return load_mesh_object(saved(tmp_path / "ball.stl", ball(30)), 0, relief="smooth")
 
 
 # Reading ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("write", "name"), [(stl, "cube.stl"), (obj, "cube.obj"), (ply, "cube.PLY")])
-def test_a_cube_stands_on_the_table_in_every_format(tmp_path, write, name):
-    item = load_mesh_object(write(tmp_path / name, 20 * CORNERS + [100, 5, -3], CUBE), 0, relief="smooth")
+@pytest.mark.parametrize("name", ["cube.stl", "cube.obj", "cube.PLY"])
+def test_a_cube_stands_on_the_table_in_every_format(tmp_path, name):
+    moved = solid(CUBE.vertices + np.array([100, 5, -3]), CUBE.faces)
+    item = load_mesh_object(saved(tmp_path / name, moved), 0, relief="smooth")
     np.testing.assert_allclose([item.body.lower, item.body.upper], [[-20, -20, 0], [20, 20, 40]], atol=1e-4)
     assert item.body.mesh.solid.volume == pytest.approx(64000)
     assert item.object_id == "mesh.cube-smooth-0000"
     assert len(item.body.mesh.vertices) == 8
 
 
-@pytest.mark.parametrize(("scale", "faces"), [(0.02, CUBE), (20, CUBE[:, ::-1])])
+@pytest.mark.parametrize(("scale", "faces"), [(0.001, CUBE.faces), (1, CUBE.faces[:, ::-1])])
 def test_small_numbers_are_metres_and_inward_faces_are_turned(tmp_path, scale, faces):
-    path = obj(tmp_path / "cube.obj", scale * CORNERS, faces)
+    path = saved(tmp_path / "cube.obj", solid(scale * CUBE.vertices, faces))
     assert load_mesh_object(path, 0).body.mesh.solid.volume == pytest.approx(64000)
 
 
 def test_only_geometry_is_read(tmp_path, monkeypatch):
-    path = obj(tmp_path / "cube.obj", 20 * CORNERS, CUBE, head="mtllib cube.mtl\nusemtl paint\n")
+    path = saved(tmp_path / "cube.obj", CUBE)
+    path.write_text("mtllib cube.mtl\nusemtl paint\n" + path.read_text())
     (tmp_path / "cube.mtl").write_text("newmtl paint\nmap_Kd secret.png\n")
     opened, real = [], builtins.open
     monkeypatch.setattr(builtins, "open", lambda *a, **k: opened.append(str(a[0])) or real(*a, **k))
@@ -53,34 +53,31 @@ def test_only_geometry_is_read(tmp_path, monkeypatch):
 # Refusals --------------------------------------------------------------------------------------------------
 
 
-def with_nan():
-    vertices = 20 * CORNERS.copy()
-    vertices[3, 1] = np.nan
-    return vertices
+FIRST = np.arange(12)[:, None] == 0
 
 
 @pytest.mark.parametrize(
     ("vertices", "faces", "message"),
     [
-        (20 * CORNERS, CUBE[:-1], "3 edges border a hole.*fill_holes"),
-        (with_nan(), CUBE, "NaN or infinite"),
-        (20 * CORNERS, CUBE[:0], "has no triangles"),
-        (CORNERS * [20, 20, 0], CUBE, "at least 2 mm thick"),
-        (20 * CORNERS, np.where(np.arange(12)[:, None] == 0, CUBE[:, ::-1], CUBE), "turned outwards.*fix_normals"),
-        (20 * CORNERS[:4], np.array([[0, 1, 2], [0, 2, 1]]), "at least 2 mm thick"),
+        (CUBE.vertices, CUBE.faces[:-1], "3 edges border a hole.*fill_holes"),
+        (np.where(np.arange(8)[:, None] == 3, np.nan, CUBE.vertices), CUBE.faces, "NaN or infinite"),
+        (CUBE.vertices, CUBE.faces[:0], "has no triangles"),
+        (CUBE.vertices * [1, 1, 0], CUBE.faces, "at least 2 mm thick"),
+        (CUBE.vertices, np.where(FIRST, CUBE.faces[:, ::-1], CUBE.faces), "turned outwards.*fix_normals"),
+        (CUBE.vertices[:4], [[0, 1, 2], [0, 2, 1]], "at least 2 mm thick"),
+        (CUBE.vertices, [[0, 0, 1]], "no triangles with an area"),
     ],
 )
 def test_a_surface_that_is_not_a_closed_solid_is_refused(tmp_path, vertices, faces, message):
     with pytest.raises(SceneError, match=message):
-        load_mesh_object(ply(tmp_path / "bad.ply", vertices, faces), 0)
+        load_mesh_object(saved(tmp_path / "bad.ply", solid(vertices, faces)), 0)
 
 
 @pytest.mark.parametrize("name", ["bad.stl", "bad.obj", "bad.ply"])
 def test_broken_and_truncated_files_are_one_clear_error(tmp_path, name):
-    vertices, faces = sphere(8)
-    whole = stl(tmp_path / "ball.stl", 30 * vertices, faces).read_bytes()
+    whole = saved(tmp_path / "ball.stl", ball(30, 2)).read_bytes()
     broken = [b"", b"\x00" * 84, b"nonsense", b"ply\nformat ascii 1.0\nelement vertex 9", b"v 1 2 x\n"]
-    for content in [*broken, *(whole[:length] for length in range(0, len(whole) - 1, 1371))]:
+    for content in [*broken, *(whole[:length] for length in range(0, len(whole) - 1, 1971))]:
         (tmp_path / name).write_bytes(content)
         with pytest.raises(SceneError, match=name):
             load_mesh_object(tmp_path / name, 0)
@@ -88,7 +85,7 @@ def test_broken_and_truncated_files_are_one_clear_error(tmp_path, name):
 
 @pytest.mark.parametrize("package", ["trimesh", "embreex"])
 def test_the_message_for_a_missing_package_names_the_extra(tmp_path, monkeypatch, package):
-    path = obj(tmp_path / "cube.obj", 20 * CORNERS, CUBE)
+    path = saved(tmp_path / "cube.obj", CUBE)
     monkeypatch.setitem(sys.modules, package, None)
     monkeypatch.delitem(sys.modules, "trimesh.ray.ray_pyembree", raising=False)
     with pytest.raises(SceneError, match=rf"{package}.*pip install 'touch-retrieval\[mesh\]'"):
@@ -105,23 +102,23 @@ def rays_at(body, count, seed=0):
     return rng.uniform(body.lower, body.upper, (count, 3)) - 200 * directions, directions
 
 
-def test_rays_meet_a_ball_at_the_root_of_the_quadratic(ball):
-    origins, directions = rays_at(ball.body, 2000)
+def test_rays_meet_a_ball_at_the_root_of_the_quadratic(globe):
+    origins, directions = rays_at(globe.body, 2000)
     offset = origins - [0, 0, 30]
     half = np.einsum("ij,ij->i", offset, directions)
     root = half**2 - np.einsum("ij,ij->i", offset, offset) + 900
-    found = ball.body.cast(origins, directions)
-    # Facets of 3 degrees lie up to 30 (1 - cos 1.5 deg) = 0.01 mm inside the ball, deeper across their diagonals.
+    found = globe.body.cast(origins, directions)
+    # Facets of 4 degrees lie up to 30 (1 - cos 2 deg) = 0.02 mm inside the ball, deeper across their diagonals.
     clear = root > 50
     np.testing.assert_allclose(found[clear], (-half - np.sqrt(np.maximum(root, 0)))[clear], atol=0.15)
     assert np.isinf(found[root < -1]).all()
     points = (origins + np.where(np.isfinite(found), found, 0)[:, None] * directions)[np.isfinite(found)]
     radial = (points - [0, 0, 30]) / 30
-    np.testing.assert_allclose(ball.body.normals(points), radial, atol=0.03)
+    np.testing.assert_allclose(globe.body.normals(points), radial, atol=0.03)
 
 
 def test_a_cube_keeps_its_edges_and_faces(tmp_path):
-    body = load_mesh_object(obj(tmp_path / "cube.obj", 20 * CORNERS, CUBE), 0, relief="smooth").body
+    body = load_mesh_object(saved(tmp_path / "cube.obj", CUBE), 0, relief="smooth").body
     x = np.array([-19.9, -3.0, 19.9, 20.1])
     origins = np.stack([x, np.full(4, -50.0), np.full(4, 20.0)], axis=1)
     found = body.cast(origins, np.tile([0.0, 1, 0], (4, 1)))
@@ -133,8 +130,7 @@ def test_a_cube_keeps_its_edges_and_faces(tmp_path):
 
 
 def test_relief_moves_hits_by_its_height_and_tilts_normals(tmp_path):
-    vertices, faces = sphere()
-    path = stl(tmp_path / "ball.stl", 30 * vertices, faces)
+    path = saved(tmp_path / "ball.stl", ball(30))
     textured = load_mesh_object(path, 1, relief="ribs").body
     smooth = load_mesh_object(path, 1, relief="smooth").body
     z = np.linspace(24, 36, 300)
@@ -151,27 +147,23 @@ def test_relief_moves_hits_by_its_height_and_tilts_normals(tmp_path):
     assert np.abs(textured.normals(points) - smooth.normals(points)).max() > 0.1
 
 
-def test_the_mass_is_that_of_the_volume_or_of_a_shell(ball):
-    solid = 4 / 3 * np.pi * 0.03**3 * ball.material.density_kg_m3
-    shell = 4 * np.pi * 0.03**2 * 0.003 * ball.material.density_kg_m3
-    assert ball.mass_kg == pytest.approx(solid if solid <= 0.6 else shell, rel=0.01)
+def test_the_mass_is_that_of_the_volume_or_of_a_shell(globe):
+    whole, shell = (volume * globe.material.density_kg_m3 for volume in (4 / 3 * np.pi * 0.03**3, 4 * np.pi * 2.7e-6))
+    assert globe.mass_kg == pytest.approx(whole if whole <= 0.6 else shell, rel=0.01)
 
 
 def test_corner_normals_are_smooth_on_a_ball_and_sharp_on_a_cube():
-    vertices, faces = sphere(20)
-    round_mesh = Mesh(vertices, faces)
-    np.testing.assert_allclose(round_mesh.corner_normals, vertices[faces], atol=0.03)
-    cube = Mesh(CORNERS, CUBE)
+    round_mesh, cube = (Mesh(np.array(each.vertices), np.array(each.faces)) for each in (ball(1, 3), CUBE))
+    np.testing.assert_allclose(round_mesh.corner_normals, round_mesh.vertices[round_mesh.faces], atol=0.03)
     np.testing.assert_allclose(cube.corner_normals, np.repeat(cube.face_normals[:, None], 3, axis=1), atol=1e-12)
-    assert cube.solid.volume == pytest.approx(8)
 
 
 def test_hidden_files_are_not_meshes_and_two_meshes_of_one_name_are_refused(tmp_path):
-    stl(tmp_path / "cube.stl", 20 * CORNERS, CUBE)
+    saved(tmp_path / "cube.stl", CUBE)
     (tmp_path / "._cube.stl").write_bytes(b"Mac OS X")
     names = load_rig("sim", seed=0, meshes=str(tmp_path)).object_ids(1)
     assert [name.split("-")[0] for name in names] == ["mesh.cube"]
-    stl(tmp_path / "cube.STL", 25 * CORNERS, CUBE)
+    saved(tmp_path / "cube.STL", box(50, 50, 50))
     with pytest.raises(
         RobotConfigError, match=r"must not contain two meshes of one name, got 'mesh\.cube-.*\. Rename one"
     ):
@@ -181,14 +173,14 @@ def test_hidden_files_are_not_meshes_and_two_meshes_of_one_name_are_refused(tmp_
 def test_a_rig_of_meshes_grasps_them_and_continues_only_with_the_same_files(tmp_path):
     folder, make_rig = tmp_path / "meshes", functools.partial(load_rig, "sim", seed=0, meshes=str(tmp_path / "meshes"))
     folder.mkdir()
-    for name, size in (("cube", 20), ("larger", 25)):
-        stl(folder / f"{name}.stl", size * CORNERS, CUBE)
+    for name, size in (("cube", 40), ("larger", 50)):
+        saved(folder / f"{name}.stl", box(size, size, size))
     settings = CollectSettings(grasps=1)
     tallies = collect(make_rig, tmp_path / "recording", objects=2, seed=0, settings=settings)
     assert [tally.object_id.split("-")[0] for tally in tallies] == ["mesh.cube", "mesh.larger"]
     assert sum(tally.attempts for tally in tallies) > 0
     with pytest.raises(RobotConfigError, match="must contain at least 3 STL, OBJ or PLY"):
         make_rig().object_ids(3)
-    stl(folder / "larger.stl", 30 * CORNERS, CUBE)
+    saved(folder / "larger.stl", box(60, 60, 60))
     with pytest.raises(RecordingError, match="meshes sha256"):
         collect(make_rig, tmp_path / "recording", objects=2, seed=0, settings=settings)
