@@ -336,7 +336,7 @@ def test_recovery_raises_after_its_last_try_and_waits_seconds_at_most(monkeypatc
     waits = []
     monkeypatch.setattr(wsg50, "time", SimpleNamespace(sleep=waits.append, monotonic=time.monotonic))
     gripper = WSG50(port="/nowhere/tty", reconnect_tries=20, reconnect_s=0.2)
-    gripper._connected = True  # as if the cable were unplugged
+    gripper.is_connected = True  # as if the cable were unplugged
     with pytest.raises(DeviceError, match="after 20 tries"):
         gripper.recover()
     assert (len(waits), waits[0], max(waits)) == (19, 0.2, 5.0)
