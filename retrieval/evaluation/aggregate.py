@@ -32,8 +32,8 @@ CONTROL_NAMES = {
 }
 """Control of a verdict -> its name."""
 
-MeasuresBySeed = Sequence[Mapping[str, Measure]]
-"""Measures by name, of each training seed or of each choice of test objects."""
+MeasuresByName = Mapping[str, Sequence[Measure]]
+"""Name -> the measure of each training seed, or of each choice of test objects."""
 
 
 @dataclass(frozen=True)
@@ -49,26 +49,22 @@ class Aggregation:
     seed: int
     ratio: float | None = None
 
-    def summaries(self, by_seed: MeasuresBySeed) -> Summaries:
-        """Return values with intervals, for measures that all seeds have."""
-        found = {name: [one[name] for one in by_seed] for name in _shared(by_seed)}
+    def summaries(self, measures: MeasuresByName) -> Summaries:
+        """Return values with intervals, by name."""
         return {
             name: summarise(each, seed=self.seed) if self.ratio is None else summarise_splits(each, self.ratio)
-            for name, each in found.items()
+            for name, each in measures.items()
         }
 
-    def differences(self, a: MeasuresBySeed, b: MeasuresBySeed) -> dict[str, Difference]:
+    def differences(self, a: MeasuresByName, b: MeasuresByName) -> dict[str, Difference]:
         """Return paired differences `a` - `b`, by name."""
-        names = [name for name in _shared(a) if name in _shared(b)]
-        pairs = {name: ([one[name] for one in a], [one[name] for one in b]) for name in names}
         return {
-            name: compare(*pair, seed=self.seed) if self.ratio is None else compare_splits(*pair, self.ratio)
-            for name, pair in pairs.items()
+            name: compare(each, b[name], seed=self.seed)
+            if self.ratio is None
+            else compare_splits(each, b[name], self.ratio)
+            for name, each in a.items()
+            if name in b
         }
-
-
-def _shared(by_seed: MeasuresBySeed) -> list[str]:
-    return [name for name in by_seed[0] if all(name in one for one in by_seed)]
 
 
 def protocol_result(
@@ -76,7 +72,7 @@ def protocol_result(
     facts: RecordingFacts,
     folds: Iterable[Sequence[Split]],
     rows: Mapping[str, RowResult],
-    measures: Mapping[tuple[str, str], MeasuresBySeed],
+    measures: Mapping[tuple[str, str], MeasuresByName],
     compared: Iterable[tuple[str, str]],
     aggregation: Aggregation,
     reasons: Mapping[str, str] = MappingProxyType({}),
@@ -134,7 +130,7 @@ def _measured(
     protocol: Protocol,
     name: str,
     row: RowResult,
-    measures: Mapping[tuple[str, str], MeasuresBySeed],
+    measures: Mapping[tuple[str, str], MeasuresByName],
     aggregation: Aggregation,
 ) -> RowResult:
     """Return a row with its measures, and if it has a low-pass control, with differences and verdict."""

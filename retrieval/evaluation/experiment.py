@@ -2,7 +2,7 @@
 
 import shutil
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from retrieval.console.output import say
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Split
 from retrieval.errors import BadInput
-from retrieval.evaluation.aggregate import Aggregation, MeasuresBySeed, protocol_result
+from retrieval.evaluation.aggregate import Aggregation, MeasuresByName, protocol_result
 from retrieval.evaluation.details import SeedDetails, combine, describe
 from retrieval.evaluation.inputs import Row, TowerEncoder, thin_grasps
 from retrieval.evaluation.protocol import Protocol, RecordingFacts
@@ -298,7 +298,7 @@ class ProtocolRun:
             self.facts,
             self.folds.values(),
             rows,
-            {job: self._by_seed(found) for job, found in outcomes.items()},
+            {job: self._by_name(found) for job, found in outcomes.items()},
             [(self.rows[0].name, other.name) for other in self.rows[1:]],
             Aggregation(self.seeds[0], ratio if protocol.choices else None),
             reasons,
@@ -328,17 +328,15 @@ class ProtocolRun:
             for seed, draw in seeds.items()
         ]
 
-    def _by_seed(self, outcomes: Iterable[Sequence[Outcome]]) -> MeasuresBySeed:
+    def _by_name(self, outcomes: Sequence[Sequence[Outcome]]) -> MeasuresByName:
         """Return the measures of each seed, over the queries of all folds; with `choices`, those of each fold."""
         groups = [[one] for folds in outcomes for one in folds] if self.protocol.choices else outcomes
-        return [
-            {
-                name: pooled([one.measures[name] for one in folds])
-                for name in folds[0].measures
-                if all(name in one.measures for one in folds)
-            }
-            for folds in groups
-        ]
+        every = [one.measures for folds in groups for one in folds]
+        return {
+            name: [pooled([one.measures[name] for one in folds]) for folds in groups]
+            for name in every[0]
+            if all(name in measures for measures in every)
+        }
 
 
 def _method_times(outcomes: Sequence[Sequence[Outcome]]) -> MethodTimes:

@@ -11,6 +11,7 @@ sequences is the cosine of their first principal components; scaling and compone
 """
 
 import dataclasses
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +25,7 @@ from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, Split
 from retrieval.data.images import encode_image, read_rgb
 from retrieval.errors import DatasetError
-from retrieval.evaluation.aggregate import Aggregation, protocol_result
+from retrieval.evaluation.aggregate import Aggregation, MeasuresByName, protocol_result
 from retrieval.evaluation.inputs import TowerEncoder, clock_features, missing_no_contact_reason
 from retrieval.evaluation.protocol import Protocol, RecordingFacts
 from retrieval.evaluation.results import ProtocolResult, RowResult
@@ -135,18 +136,20 @@ class Sequences:
         return np.stack([features[rows].mean(0, dtype=np.float64) for rows in self.rows])
 
     def measures(
-        self, protocol: Protocol, scores: NDArray[np.float32], owner: NDArray[np.int64] | None = None
-    ) -> dict[str, Measure]:
+        self, protocol: Protocol, scores: NDArray[np.float32], owners: Sequence[NDArray[np.int64]] = ()
+    ) -> MeasuresByName:
         """Return the measures of scores (S, S): each sequence is a query, and is not compared with itself.
 
-        `owner` replaces the objects of the sequences.
+        There is one measure for each of `owners`, which replace the objects of the sequences; else one for these.
         """
-        owner = self.owner if owner is None else owner
-        own = np.eye(len(owner), dtype=np.bool_)
-        table = ScoreTable(scores, owner, owner, own, "sequences")
-        tables = MethodScoreTables(table, table, {}, None, 0)
-        found = {name: metric.compute(tables) for name, metric in protocol.measures.items()}
-        return {name: pooled([one]) for name, one in found.items() if one}
+        measures: dict[str, list[Measure]] = defaultdict(list)
+        for owner in owners or [self.owner]:
+            table = ScoreTable(scores, owner, owner, np.eye(len(owner), dtype=np.bool_), "sequences")
+            tables = MethodScoreTables(table, table, {}, None, 0)
+            for name, metric in protocol.measures.items():
+                if measure := metric.compute(tables):
+                    measures[name].append(pooled([measure]))
+        return measures
 
 
 def with_common_frame(grasps: Sequence[Grasp], folder: Path, *, quiet: bool = True) -> list[Grasp]:
@@ -204,22 +207,22 @@ def run_touch_to_touch(
         raise DatasetError(f"Touch to touch needs the no-contact frame of each sequence: {reason}.")
     common = with_common_frame(facts.grasps, folder / facts.digest[:32], quiet=quiet)
     order = leave_one_out_scores(clock_features(len(sequences.names)).astype(np.float64))
-    measures = {("", "order"): [sequences.measures(protocol, order)]}
+    measures = {("", "order"): sequences.measures(protocol, order)}
     rows: dict[str, RowResult] = {}
     for label, towers in towers_of.items():
         digest = towers.checkpoint.digest if towers.checkpoint else None
         touch, low_pass = (_vectors(sequences, towers, common, variant) for variant in ("touch", "low_pass"))
-        no_contact = [sequences.measures(protocol, leave_one_out_scores(touch["no_contact"]))]
+        no_contact = sequences.measures(protocol, leave_one_out_scores(touch["no_contact"]))
         measures.setdefault(("", "no_contact"), no_contact)
         for each in REPRESENTATIONS:
             row, scores = f"{label}-{each}", leave_one_out_scores(touch[each])
             rows[row] = RowResult(METHOD, digest, best_params=[])
-            measures[row, "touch"] = [sequences.measures(protocol, scores)]
-            measures[row, "low_pass"] = [sequences.measures(protocol, leave_one_out_scores(low_pass[each]))]
+            measures[row, "touch"] = sequences.measures(protocol, scores)
+            measures[row, "low_pass"] = sequences.measures(protocol, leave_one_out_scores(low_pass[each]))
             measures[row, "no_contact"] = no_contact
             if ("", "permuted") not in measures:
                 owners = [np.random.default_rng([seed, 41]).permutation(sequences.owner) for seed in seeds]
-                measures["", "permuted"] = [sequences.measures(protocol, scores, owner) for owner in owners]
+                measures["", "permuted"] = sequences.measures(protocol, scores, owners)
     first, *others = towers_of
     return protocol_result(
         protocol,

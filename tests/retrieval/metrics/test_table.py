@@ -15,12 +15,9 @@ from tests.retrieval.metrics.test_registry import table_of, uneven
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_a_score_that_is_not_finite_is_refused_although_sorting_would_rank_a_nan_first(bad):
+def test_a_score_that_is_not_finite_is_refused(bad):
     scores = np.zeros((3, 3))
     scores[1, 2] = bad
-    if math.isnan(bad):
-        assert np.argsort(-scores[1])[0] != 2
-        assert np.argsort(scores[1])[::-1][0] == 2
     with pytest.raises(NumericalError, match="row 1, column 2"):
         table_of(scores, [0, 0, 1])
 
