@@ -56,7 +56,8 @@ class SmallTower(Tower):
         maps = list(self._maps(images))
         if self.output == "stages":
             return stage_statistics(maps)
-        x = torch.cat([maps[-1].mean((2, 3)), maps[-1].amax((2, 3))], dim=1)
+        x = maps[-1].flatten(2)
+        x = torch.cat([x.mean(2), x.amax(2)], dim=1)
         return x if self.fc is None else self.fc(x)
 
     def _encode_with_map(self, images: Tensor) -> tuple[Tensor, Tensor]:
