@@ -3,9 +3,10 @@
 import queue
 import re
 import signal
+import socket
 import sys
 import threading
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from fastapi.testclient import TestClient
 
@@ -72,6 +73,23 @@ def command(*options, **popen):
         found = re.search(r"listening on (\S+)", "".join(output))
         assert found, "".join(output)
         yield process, found[1], output
+
+
+def connect(url, sent=b""):
+    """Return a connection to the service at this address, on which `sent` is sent."""
+    host, port = url.removeprefix("http://").split(":")
+    line = socket.create_connection((host, int(port)), timeout=30)
+    line.sendall(sent)
+    return line
+
+
+def received(line):
+    """Return all bytes that arrive until the connection ends."""
+    data = b""
+    with suppress(ConnectionResetError):
+        while more := line.recv(65536):
+            data += more
+    return data
 
 
 def problem(response, status, kind):

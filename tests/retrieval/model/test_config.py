@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-import re
 from pathlib import Path
 
 import numpy as np
@@ -32,14 +31,8 @@ def test_every_preset_loads_and_names_a_tower_that_exists(name):
 
 def test_the_preset_paper_contains_the_papers_numbers():
     tables = load_config("paper").to_dict()
-    papers = {
-        "matcher": {
-            "tower": "resnet50",
-            "tower_output": "classes",  # the 1000 outputs of each network are concatenated
-            "fingers": 2,
-            "hidden": 1024,
-            "standardise": False,
-        },
+    papers = {  # the 1000 outputs of each network are concatenated
+        "matcher": {"tower": "resnet50", "tower_output": "classes", "fingers": 2, "hidden": 1024, "standardise": False},
         "training": {
             "init": "imagenet",
             "iterations": 26_000,
@@ -147,14 +140,6 @@ def test_a_refused_value_is_named(table, name, value):
     with pytest.raises(ConfigError, match=name) as caught:
         Config.from_dict({table: {name: value}})
     assert str(value) in str(caught.value)
-    if not name.endswith("_weight"):
-        with pytest.raises(ConfigError, match=re.escape(str(caught.value))):
-            type(getattr(Config(), table))(**{name: value})
-
-
-def test_the_message_of_a_wrong_choice_lists_the_choices():
-    with pytest.raises(ConfigError, match=r"training\.precision must be one of 'auto', 'float32', 'bfloat16'"):
-        Config.from_dict({"training": {"precision": "other"}})
 
 
 def test_settings_from_python_are_checked_and_converted_like_those_of_a_file():
@@ -165,6 +150,8 @@ def test_settings_from_python_are_checked_and_converted_like_those_of_a_file():
         TrainingConfig(seed="3")
     with pytest.raises(ConfigError, match=r"training\.listwise_weight must be a number, got '1'"):
         TrainingConfig(weights={"listwise": "1"})
+    with pytest.raises(ConfigError, match=r"training\.precision must be one of 'auto', 'float32', 'bfloat16'"):
+        TrainingConfig(precision="other")
 
 
 def test_a_weight_of_an_unknown_loss_is_refused(tmp_path):

@@ -89,12 +89,13 @@ def test_a_tower_in_training_mode_is_not_folded_because_its_normalisation_depend
     assert not torch.allclose(together, alone, rtol=0.01)  # folding would give `alone`
 
 
-def test_the_encoding_does_not_depend_on_the_batch():
-    matcher = matcher_with_statistics("small", "pooled")
-    photos = images(19)  # more than one batch
+@pytest.mark.parametrize("tower", ["resnet18", "mobilenet_v2", "small"])
+def test_the_encoding_does_not_depend_on_the_batch(tower):
+    matcher, photos = matcher_with_statistics(tower, "pooled"), images(19)  # more than one batch
     alone = [encode_photos(matcher, [photo]) for photo in photos]
     for together, each in zip(encode_photos(matcher, photos), zip(*alone, strict=True), strict=True):
-        torch.testing.assert_close(together, torch.cat(each), rtol=1e-5, atol=1e-5)
+        # Another batch size may sum in another order: float32 rounding of the largest outputs.
+        torch.testing.assert_close(together, torch.cat(each), rtol=0, atol=1e-4 * float(together.abs().max()))
 
 
 def test_a_pixel_that_is_not_finite_is_refused_by_a_folded_tower_too():

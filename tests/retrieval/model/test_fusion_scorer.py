@@ -86,15 +86,3 @@ def test_stored_cells_are_wrong_by_at_most_half_a_step_of_1_127():
     assert np.abs(stored[:][:, 6:] - partials[:, 6:]).max() <= 0.5 / 127 + 1e-6  # float32 rounding of the product
     np.testing.assert_array_equal(stored[:][:, :6], partials[:, :6].astype(np.float16).astype(np.float32))
     np.testing.assert_array_equal(stored[np.array([7, 2])], stored[:][[7, 2]])
-
-
-def test_a_logit_from_stored_cells_is_wrong_by_at_most_the_rounding_of_its_cells():
-    scorer, partials = random_scorer(6), unit_partials(40, 6, 4, 8)
-    scorer = FusionScorer(scorer.second, scorer.second_bias, scorer.out, scorer.out_bias, cell_dim=8)
-    exact = partials.copy()
-    exact[:, :6] = partials[:, :6].astype(np.float16)
-    touches = unit_partials(2, 6, 3, 8)
-    # A product of a unit vector with an error of at most 1/254 in each of 8 components.
-    bound = 2 * 3 * np.sqrt(8) * 0.5 / 127 + 1e-4
-    stored = StoredPartials(to_stored(partials, 6))
-    assert np.abs(scorer.logits(touches, stored) - scorer.logits(touches, exact)).max() <= bound

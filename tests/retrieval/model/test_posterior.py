@@ -5,12 +5,12 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import given
 from hypothesis import strategies as st
 
 from _touch_retrieval.documents import typed
 from retrieval.errors import BadInput, NumericalError
-from retrieval.model.posterior import MAX_GRASPS, EvidenceMass, Posterior, require_prior
+from retrieval.model.posterior import EvidenceMass, Posterior, require_prior
 
 ADDING = Posterior(slope=1.0, offset=0.0, dependence=0.0)
 
@@ -110,20 +110,6 @@ def test_where_none_rounds_to_one_the_probability_if_present_is_exact_and_the_qu
 )
 def test_the_further_grasps_to_a_match_equal_those_calculated_by_hand(dependence, logit, grasps, prior, more):
     assert Posterior(1.0, 0.0, dependence).more_grasps(logit, 4, grasps, prior) == more
-
-
-@given(st.floats(-5, 5), st.floats(-3, 3), st.floats(0, 1), st.integers(1, 4), st.floats(0.05, 0.95))
-def test_after_the_further_grasps_and_no_fewer_the_best_object_is_more_likely_than_none(
-    logit, offset, dependence, grasps, prior
-):
-    """The further grasps resemble the previous ones."""
-    posterior = Posterior(1.0, offset, dependence)
-    totals = range(grasps, MAX_GRASPS + 1)
-    answers = [probabilities(posterior, [logit * n / grasps, -1e6, -1e6], n, none_prior=prior) for n in totals]
-    gaps = [answer.objects[0] - answer.none for answer in answers]
-    assume(gaps[0] <= 0 and min(map(abs, gaps)) > 1e-9)  # otherwise rounding decides
-    matches = [more for more, gap in enumerate(gaps) if gap > 0]
-    assert posterior.more_grasps(logit, 3, grasps, prior) == (matches[0] if matches else None)
 
 
 def test_an_objects_logit_averages_the_likelihoods_of_its_photos():

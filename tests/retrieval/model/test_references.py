@@ -12,14 +12,6 @@ from retrieval.model.references import SHARPNESS, ReferenceCalibration, referenc
 from tests.reference_model import REFERENCE_CALIBRATION
 
 
-def test_one_reference_gives_its_cosine_and_a_copy_of_it_changes_nothing():
-    cosines = np.float32([[0.3, -0.2], [0.9, 0.1]])
-    one = reference_similarity(cosines, np.array([0, 1]))
-    np.testing.assert_allclose(one, cosines, atol=1e-7)
-    copied = reference_similarity(cosines[:, [0, 0, 0, 1]], np.array([0, 3]))
-    np.testing.assert_allclose(copied, cosines, atol=1e-7)
-
-
 def test_several_references_are_averaged_as_likelihoods():
     """Compare with two plain loops, over objects with one, three and two references."""
     cosines = np.random.default_rng(0).uniform(-1, 1, (4, 6)).astype(np.float32)

@@ -25,19 +25,14 @@ def picture(tmp_path):
     return tmp_path / "noise.png"
 
 
-# Nesting -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("touches", "fingers", "named"),
     [
         (["a.png", Path("b.png")], 2, [["a.png", "b.png"]]),
         ([["a.png", "b.png"], ("c.png", "d.png")], 2, [["a.png", "b.png"], ["c.png", "d.png"]]),
         ("a.png", 1, [["a.png"]]),
-        (["a.png"], 1, [["a.png"]]),
         ([["a.png"], ["b.png"]], 1, [["a.png"], ["b.png"]]),
         ([b"12345", bytearray(b"678")], 2, [["grasp 1, finger a", "grasp 1, finger b"]]),
-        (np.stack([GREY, GREY]), 2, [["grasp 1, finger a", "grasp 1, finger b"]]),
         (np.stack([[GREY], [GREY]]), 1, [["grasp 1, finger a"], ["grasp 2, finger a"]]),
         (GREY, 1, [["grasp 1, finger a"]]),
         (
@@ -56,13 +51,11 @@ def test_the_nesting_of_images_gives_the_grasps_and_files_keep_their_names(touch
     [
         ([], "give at least one touch"),
         ([[]], r"got 0: "),
-        ("a.png", r"got 1: a\.png"),
         (["a.png", "b.png", "c.png"], "got 3"),
         ([["a.png", "b.png"], ["c.png"]], r"got 1: c\.png"),
         (["a.png", ["b.png", "c.png"]], "a list mixes images with lists of images"),
         ([[["a.png", "b.png"]]], "query several objects with query_many"),
         (None, "got NoneType"),
-        ({"a": "a.png"}, "got dict"),
         ((image for image in ("a.png", "b.png")), "got generator"),
     ],
 )
@@ -84,21 +77,16 @@ def test_a_file_gives_the_same_numbers_in_every_form(picture):
         assert np.array_equal(read[0], other)
 
 
-@pytest.mark.parametrize("mode", ["P", "LA", "CMYK"])
-def test_a_pillow_image_is_read_like_its_file(mode, picture):
-    image, buffer = Image.open(picture).convert(mode), io.BytesIO()
-    image.save(buffer, "TIFF" if mode == "CMYK" else "PNG")
-    assert np.array_equal(read_image(image, "it"), read_image(buffer.getvalue(), "it"))
-
-
-def test_a_pillow_image_is_turned_upright_like_its_file(picture):
+@pytest.mark.parametrize("mode", ["P", "LA", "CMYK", "turned"])
+def test_a_pillow_image_is_read_upright_like_its_file(mode, picture):
     image, buffer = Image.open(picture), io.BytesIO()
     exif = image.getexif()
-    exif[274] = 6
-    image.save(buffer, "JPEG", exif=exif)
-    opened = Image.open(io.BytesIO(buffer.getvalue()))
-    assert read_image(opened, "it").shape == (32, 24, 3)
-    assert np.array_equal(read_image(opened, "it"), read_image(buffer.getvalue(), "it"))
+    exif[274] = 6 if mode == "turned" else 1
+    image = image if mode == "turned" else image.convert(mode)
+    image.save(buffer, "TIFF" if mode == "CMYK" else "PNG", exif=exif)
+    opened, by_file = Image.open(io.BytesIO(buffer.getvalue())), read_image(buffer.getvalue(), "it")
+    assert by_file.shape == ((32, 24, 3) if mode == "turned" else (24, 32, 3))
+    assert np.array_equal(read_image(opened, "it"), by_file)
 
 
 def test_an_array_need_not_be_contiguous():
@@ -112,8 +100,6 @@ def test_an_array_need_not_be_contiguous():
     ("array", "message"),
     [
         (GREY / 255, r"must contain uint8 samples in 0\.\.255, got float64; convert samples in 0\.\.1 with np\.rint"),
-        (GREY > 0, "got bool"),
-        (np.array(["a.png", "b.png"]), "got <U5"),
         (GREY[..., 0], r"must be \(height, width, 3\) in RGB order, got \(4, 6\); repeat a grey image"),
         (np.concatenate([GREY, GREY[..., :1]], axis=2), r"got \(4, 6, 4\)"),
         (GREY.transpose(2, 0, 1), r"got \(3, 4, 6\).*put channels last"),

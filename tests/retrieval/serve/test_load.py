@@ -2,7 +2,6 @@
 
 import shutil
 import signal
-import socket
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +16,7 @@ from retrieval.model.checkpoint import load_checkpoint
 from retrieval.serve.service import LiveRig
 from retrieval.serve.settings import ServiceSettings
 from tests import synthetic
-from tests.serving import command, listening, problem, service
+from tests.serving import command, connect, listening, problem, received, service
 from tests.waiting import wait_until
 
 
@@ -83,12 +82,9 @@ def test_requests_of_disconnected_clients_are_dropped(index, body):
 
 def connection_that_asks(url, body):
     """Return a connection on which a query is sent."""
-    host, port = url.removeprefix("http://").split(":")
     request = httpx.Request("POST", f"{url}/v1/query", json=body)
     head = "".join(f"{name}: {value}\r\n" for name, value in request.headers.items())
-    line = socket.create_connection((host, int(port)))
-    line.sendall(f"POST /v1/query HTTP/1.1\r\n{head}connection: close\r\n\r\n".encode() + request.content)
-    return line
+    return connect(url, f"POST /v1/query HTTP/1.1\r\n{head}connection: close\r\n\r\n".encode() + request.content)
 
 
 def test_late_requests_are_dropped(index, body):
@@ -191,19 +187,16 @@ def test_requests_in_flight_at_the_end_signal_are_answered(index, body, sign, tm
         def ask():
             with connection_that_asks(url, body) as line:
                 connected.release()
-                data = b""
-                while more := line.recv(65536):
-                    data += more
-                return data
+                return received(line)
 
         answers = [client_threads.submit(ask) for _ in range(8)]
         for _ in answers:
             connected.acquire(timeout=30)
         process.send_signal(sign)
-        received = [one.result(timeout=60) for one in answers]
+        responses = [one.result(timeout=60) for one in answers]
         assert process.wait(60) == 0
-        assert [data.split(b" ", 2)[1] for data in received] == [b"200"] * 8
-        assert all(data.endswith(b"}") for data in received)
+        assert [data.split(b" ", 2)[1] for data in responses] == [b"200"] * 8
+        assert all(data.endswith(b"}") for data in responses)
 
 
 def test_the_newest_picture_of_a_sensor_is_served(index):

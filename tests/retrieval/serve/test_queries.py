@@ -31,21 +31,17 @@ def form(grasps, **fields):
     return {"files": images, "data": fields}
 
 
-def equal_but_times(document, result):
-    """Return whether a document equals a result, apart from the times."""
-    expected = result.to_dict()
-    return {**document, "timing_ms": 0} == {**expected, "timing_ms": 0} and set(document["timing_ms"]) == set(
-        expected["timing_ms"]
-    )
+def without_times(document):
+    """Return a document with only the names of the timed stages."""
+    return document | {"timing_ms": set(document["timing_ms"])}
 
 
 def test_json_and_multipart_give_the_document_of_the_searcher(client, searcher, grasps):
     for touches in (grasps[:1], grasps):
-        expected = searcher.query(touches, top=3, none_prior=0.2)
+        expected = without_times(searcher.query(touches, top=3, none_prior=0.2).to_dict())
         by_json = client.post("/v1/query", json={"touches": encoded(touches), "top": 3, "none_prior": 0.2})
         by_form = client.post("/v1/query", **form(touches, top="3", none_prior="0.2"))
-        assert equal_but_times(by_json.json(), expected), by_json.text
-        assert equal_but_times(by_form.json(), expected), by_form.text
+        assert without_times(by_json.json()) == without_times(by_form.json()) == expected
 
 
 def test_verification_returns_the_document_of_the_searcher(grasps, model, catalogue, tmp_path):
