@@ -44,11 +44,10 @@ _CODEC = {"crf": "10", "g": "1", "bf": "0", "preset": "fast"}
 _STEP_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index", "moment")
 _FIELDS = {
     **dict.fromkeys(("grasp_id", "object_id", "sequence_id", "outcome"), "string"),
-    "grasped": "bool",
-    **dict.fromkeys(("force_n", "opening_mm", "touch_skew_s", "time_s"), "double"),
-    "pose": "list",
+    "grasped": "bool_",
+    **dict.fromkeys(("force_n", "opening_mm", "touch_skew_s", "time_s", "pose"), "float64"),
 }
-"""Recorded fields of an episode, with their types in Parquet."""
+"""Recorded fields of an episode, with the name of their type in pyarrow; a pose is a list."""
 _FACTS = ("source", "sensor", "rig", "licence", "terms", "citation", "background")
 """Keys of recording.json that info.json repeats."""
 _WHAT = "LeRobot's format"
@@ -109,8 +108,8 @@ def export_lerobot(recording: Recording, out: Path, progress: Progress | None = 
                 episodes.append(_episode(episode, grasp, len(moments), cameras))
                 if progress is not None:
                     progress(episode + 1, len(grasps))
-        kinds = {"string": pa.string(), "bool": pa.bool_(), "double": pa.float64(), "list": pa.list_(pa.float64())}
-        types = {key: kinds[kind] for key, kind in _FIELDS.items()}
+        types = {key: getattr(pa, kind)() for key, kind in _FIELDS.items()}
+        types["pose"] = pa.list_(types["pose"])
         tables = {
             DATA_PATH.format(**_NUMBERS): _table(pa, steps, {"timestamp": pa.float32()}),
             EPISODES_PATH.format(**_NUMBERS): _table(pa, episodes, types),

@@ -10,13 +10,21 @@ import numpy as np
 
 from robot.devices import Arm, Camera, Gripper, TactileSensor
 from robot.errors import DeviceError
-from robot.readings import Frame, GripperState, Intrinsics, Pose, Region
+from robot.readings import RGBD, Frame, GripperState, Intrinsics, Pose, Region
 from robot.rig import Rig
 from tests import views
 
 WORKSPACE = Region((-150.0, -150.0, 8.0), (150.0, 150.0, 500.0))
 LENS, PX = Intrinsics(120.0, 120.0, 63.5, 53.5), (108, 128)
 STROKE_MM, FORCE_N = 110.0, (5.0, 80.0)
+
+
+def chord(pose, solid):
+    """Return the width of a standing cylinder between the fingers, 0 for a miss."""
+    across = -math.sin(pose.yaw_rad) * (solid.x - pose.x_mm) + math.cos(pose.yaw_rad) * (solid.y - pose.y_mm)
+    if pose.z_mm > solid.height or abs(across) >= solid.radius:
+        return 0.0
+    return 2 * math.sqrt(solid.radius**2 - across**2)
 
 
 class FakeRigState:
@@ -40,18 +48,10 @@ class FakeRigState:
         if self.calls.count(name) in self.faults.get(name, ()):
             raise DeviceError(f"the fake {name} fails on purpose")
 
-    def chord(self):
-        """Return the width of the cylinder between the fingers, 0 for a miss."""
-        pose, solid = self.grip_at, self.solid
-        across = -math.sin(pose.yaw_rad) * (solid.x - pose.x_mm) + math.cos(pose.yaw_rad) * (solid.y - pose.y_mm)
-        if pose.z_mm > solid.height or abs(across) >= solid.radius:
-            return 0.0
-        return 2 * math.sqrt(solid.radius**2 - across**2)
-
     def status(self):
         if self.force is None:
             return "idle"
-        if self.chord() == 0.0:
+        if chord(self.grip_at, self.solid) == 0.0:
             return "no_part"
         return "part_lost" if self.slips and self.pose.z_mm > self.grip_at.z_mm + 1 else "holding"
 
@@ -88,19 +88,26 @@ class FakeRig(Rig):
         shared.force, shared.now_s = None, 100.0 * number
 
 
-class FakeArm(Arm):
+class FakeDevice:
+    """Records the calls that all devices have."""
+
+    def _record(self, what):
+        self.shared.record_call(f"{self.name.removeprefix('fake ')}.{what}")
+
+    def _connect(self):
+        self._record("connect")
+
+    def _close(self):
+        self._record("close")
+
+    def _stop(self):
+        self._record("stop")
+
+
+class FakeArm(FakeDevice, Arm):
     def __init__(self, shared):
         super().__init__("fake arm", WORKSPACE, clock=shared.clock)
         self.shared = shared
-
-    def _connect(self):
-        self.shared.record_call("arm.connect")
-
-    def _close(self):
-        self.shared.record_call("arm.close")
-
-    def _stop(self):
-        self.shared.record_call("arm.stop")
 
     def _move_to(self, pose, speed_mm_s):
         self.shared.record_call("arm")
@@ -112,20 +119,11 @@ class FakeArm(Arm):
         return self.shared.pose
 
 
-class FakeGripper(Gripper):
+class FakeGripper(FakeDevice, Gripper):
     def __init__(self, shared):
         low, high = FORCE_N
         super().__init__("fake gripper", stroke_mm=STROKE_MM, min_force_n=low, max_force_n=high, clock=shared.clock)
         self.shared = shared
-
-    def _connect(self):
-        self.shared.record_call("gripper.connect")
-
-    def _close(self):
-        self.shared.record_call("gripper.close")
-
-    def _stop(self):
-        self.shared.record_call("gripper.stop")
 
     def _settings(self):
         return {"stroke_mm": self.stroke_mm}
@@ -133,7 +131,7 @@ class FakeGripper(Gripper):
     def _state(self):
         shared = self.shared
         status = shared.status()
-        opening = shared.opening if status == "idle" else shared.chord()
+        opening = shared.opening if status == "idle" else chord(shared.grip_at, shared.solid)
         return GripperState(opening, shared.force or 0.0, status)
 
     def _open(self, opening_mm):
@@ -148,16 +146,10 @@ class FakeGripper(Gripper):
         return self._state()
 
 
-class FakeSensor(TactileSensor):
+class FakeSensor(FakeDevice, TactileSensor):
     def __init__(self, shared, finger):
         super().__init__(f"fake gel {finger}", finger, clock=shared.clock)
         self.shared = shared
-
-    def _connect(self):
-        self.shared.record_call(f"gel {self.finger}.connect")
-
-    def _close(self):
-        self.shared.record_call(f"gel {self.finger}.close")
 
     def _read(self):
         shared = self.shared
@@ -171,19 +163,13 @@ class FakeSensor(TactileSensor):
         return Frame(np.clip(image, 0, 255).astype(np.uint8), shared.now_s)
 
 
-class FakeCamera(Camera):
+class FakeCamera(FakeDevice, Camera):
     def __init__(self, shared):
         super().__init__("fake camera", views.camera_pose(), clock=shared.clock)
         self.shared = shared
-
-    def _connect(self):
-        self.shared.record_call("camera.connect")
-
-    def _close(self):
-        self.shared.record_call("camera.close")
 
     def _read(self, depth):
         shared = self.shared
         shared.record_call("depth" if depth else "camera")
         image = views.view(shared.solid, seed=shared.noise, lens=LENS, px=PX)
-        return type(image)(image.colour, image.depth_m if depth else None, LENS, shared.now_s)
+        return RGBD(image.colour, image.depth_m if depth else None, LENS, shared.now_s)

@@ -17,7 +17,7 @@ import numpy as np
 
 from robot.collection import CollectSettings, collect
 from robot.devices import Camera, TactileSensor, VirtualDevice
-from robot.readings import RGBD, Frame, Intrinsics
+from robot.readings import RGBD, Frame
 from robot.recording.folder import read_recording
 from robot.rig import load_rig
 from robot.sight import hand_eye
@@ -30,40 +30,27 @@ FILE = """
 rig = "real"
 source = "replayed"
 sensor = "fake gel"
-
+attempt = {{settle_s = 0.1, hold_s = 0.1}}
 [limits]
 workspace_lower_mm = [-150, -150, 8]
 workspace_upper_mm = [150, 150, 500]
 arm_speed_mm_s = 1000
 jaw_speed_mm_s = 400
-
 [arm]
 driver = "manual"
-
 [gripper]
 driver = "wsg50"
 port = "{port}"
-
 [sensors.a]
 driver = "tests.replay_rig:FolderSensor"
 path = "{folder}/a"
-
 [sensors.b]
 driver = "tests.replay_rig:FolderSensor"
 path = "{folder}/b"
-
 [camera]
 driver = "tests.replay_rig:RecordedCamera"
 path = "{folder}/recording"
 hand_eye = "{folder}/hand_eye.json"
-fx = {lens.fx}
-fy = {lens.fy}
-cx = {lens.cx}
-cy = {lens.cy}
-
-[attempt]
-settle_s = 0.1
-hold_s = 0.1
 """
 
 
@@ -85,9 +72,9 @@ class FolderSensor(VirtualDevice, TactileSensor):
 class RecordedCamera(VirtualDevice, Camera):
     """Shows the next photo of a recording, with its depth, at each read."""
 
-    def __init__(self, *, path: str, extrinsics, fx: float, fy: float, cx: float, cy: float, clock=time.monotonic):
+    def __init__(self, *, path: str, extrinsics, clock=time.monotonic):
         super().__init__("recorded camera", extrinsics, clock=clock)
-        self.path, self.lens = Path(path), Intrinsics(fx, fy, cx, cy)
+        self.path = Path(path)
 
     def _connect(self):
         self.grasps, self.next = read_recording(self.path).grasps, 0
@@ -98,7 +85,7 @@ class RecordedCamera(VirtualDevice, Camera):
         colour = cv2.imread(str(self.path / grasp.photo))[..., ::-1].copy()
         depth_mm = cv2.imread(str(self.path / grasp.depth), cv2.IMREAD_UNCHANGED)
         depth_m = np.where(depth_mm > 0, depth_mm * np.float32(1e-3), np.float32(np.nan))
-        return RGBD(colour, depth_m if depth else None, self.lens, self.clock())
+        return RGBD(colour, depth_m if depth else None, LENS, self.clock())
 
 
 @contextlib.contextmanager
@@ -119,7 +106,7 @@ def replay_file(emulator=None):
     ):
         folder = Path(name)
         record(folder)
-        (folder / "rig.toml").write_text(FILE.format(port=url, folder=folder, lens=LENS))
+        (folder / "rig.toml").write_text(FILE.format(port=url, folder=folder))
         yield folder / "rig.toml"
 
 

@@ -137,13 +137,7 @@ def import_items(
     with RecordingWriter(out, data_set.info()) as writer:
         names: set[str] = set()
         for done, item in enumerate(_readable(items), start=1):
-            skip = item if isinstance(item, Skip) else None
-            if isinstance(item, Item):
-                if item.grasp_id in names:
-                    skip = Skip("another grasp has the same name", item.grasp_id)
-                elif item.grasp_id not in writer.grasp_ids:
-                    skip = _append(writer, item)
-                names.add(item.grasp_id)
+            skip = item if isinstance(item, Skip) else _append(writer, item, names)
             if skip is not None:
                 skipped.setdefault(skip.reason, []).append(skip.name)
             if progress is not None:
@@ -166,8 +160,13 @@ def _readable(items: Iterable[Item | Skip]) -> Iterator[Item | Skip]:
         raise ImporterError(f"{error.filename or 'the source'} cannot be read: {error.strerror or error}") from error
 
 
-def _append(writer: RecordingWriter, item: Item) -> Skip | None:
-    """Append one grasp, or return why it was skipped."""
+def _append(writer: RecordingWriter, item: Item, names: set[str]) -> Skip | None:
+    """Append one grasp unless it is stored, or return why it was skipped; `names` are those of the grasps before."""
+    if item.grasp_id in names:
+        return Skip("another grasp has the same name", item.grasp_id)
+    names.add(item.grasp_id)
+    if item.grasp_id in writer.grasp_ids:
+        return None
     images: dict[str, ImageSource | SharedImage] = {}
     try:
         for column, source in item.images.items():

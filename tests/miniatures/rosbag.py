@@ -19,14 +19,8 @@ GRASPS = 6
 PEAKS = (27, 58)
 CONTACTS = ((20, 30), (50, 66))
 FRAMES, INTERVAL_NS, START_NS = 80, 50_000_000, 1_700_000_000 * 10**9
-GEL_A, GEL_B, CAMERA, GRIPPER, GRASP, OBJECT = (
-    "/gel/a",
-    "/gel/b",
-    "/camera/color",
-    "/gripper/state",
-    "/grasp",
-    "/object",
-)
+GEL_A, GEL_B, CAMERA = "/gel/a", "/gel/b", "/camera/color"
+GRIPPER, GRASP, OBJECT = "/gripper/state", "/grasp", "/object"
 
 Message = tuple[int, str, str, dict[str, Any]]
 """Time of recording in ns, topic, short type such as "std_msgs/Bool", fields besides the header."""
@@ -53,7 +47,8 @@ def messages() -> Iterator[Message]:
     for number in range(FRAMES):
         time_ns = START_NS + number * INTERVAL_NS
         yield time_ns, GEL_A, "sensor_msgs/Image", image_fields(gel("a", number)[..., ::-1], "bgr8")
-        joints = {"name": ["left", "right"], "position": [0.001 * number] * 2, "velocity": [], "effort": [-4.0, 6.0]}
+        joints = {"name": ["left", "right"], "position": np.full(2, 0.001 * number)}
+        joints |= {"velocity": np.array([]), "effort": np.array([-4.0, 6.0])}
         yield time_ns, GRIPPER, "sensor_msgs/JointState", joints
         yield time_ns + 10_000_000, GEL_B, "sensor_msgs/Image", image_fields(gel("b", number)[..., :1], "mono8")
         if number % 2 == 0:
@@ -76,7 +71,8 @@ def write_bag(path: Path, content: Iterable[Message], chunk_bytes: int = 20_000)
     """Write a bag: ROS 1 if the name ends in .bag, else a folder with an .mcap (if the name begins so) or .db3 file."""
     is_ros1 = path.suffix == ".bag"
     types = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
-    writer: Any = Rosbag1Writer(path) if is_ros1 else _rosbag2_writer(path)
+    plugin = StoragePlugin.MCAP if path.name.startswith("mcap") else StoragePlugin.SQLITE3
+    writer: Any = Rosbag1Writer(path) if is_ros1 else Rosbag2Writer(path, version=9, storage_plugin=plugin)
     if is_ros1:
         writer.chunk_threshold = chunk_bytes
     serialize = types.serialize_ros1 if is_ros1 else types.serialize_cdr
@@ -93,21 +89,11 @@ def write_bag(path: Path, content: Iterable[Message], chunk_bytes: int = 20_000)
     return path
 
 
-def _rosbag2_writer(path: Path) -> Rosbag2Writer:
-    plugin = StoragePlugin.MCAP if path.name.startswith("mcap") else StoragePlugin.SQLITE3
-    return Rosbag2Writer(path, version=9, storage_plugin=plugin)
-
-
 def _with_header(types: Any, kind: str, time_ns: int, fields: dict[str, Any]) -> dict[str, Any]:
-    """Add a header to the types that have one; `stamp_ns` of the fields replaces its time stamp."""
-    stamp_ns = fields.get("stamp_ns", time_ns)
-    fields = {
-        key: np.array(value) if isinstance(value, list) and key != "name" else value for key, value in fields.items()
-    }
-    fields.pop("stamp_ns", None)
+    """Add a header to the types that have one."""
     if kind.startswith("std_msgs"):
         return fields
-    stamp = types.types["builtin_interfaces/msg/Time"](stamp_ns // 10**9, stamp_ns % 10**9)
+    stamp = types.types["builtin_interfaces/msg/Time"](time_ns // 10**9, time_ns % 10**9)
     header = types.types["std_msgs/msg/Header"]
     of_ros1 = {"seq": 0} if "seq" in header.__dataclass_fields__ else {}
     return {"header": header(**of_ros1, stamp=stamp, frame_id=""), **fields}

@@ -105,7 +105,8 @@ def test_a_collection_continues_after_a_failure_at_any_step_of_an_attempt(tmp_pa
     run(tmp_path / "whole", names=names)
     for step in range(10, 39, 4):  # earlier calls make and read the folder
         out = tmp_path / f"r{step}"
-        with pytest.raises((StorageError, KeyboardInterrupt)), Failing(monkeypatch, error, step):
+        expected = "No space left on device; earlier grasps are complete" if isinstance(error, OSError) else "^$"
+        with pytest.raises((StorageError, KeyboardInterrupt), match=expected), Failing(monkeypatch, error, step):
             run(out, names=names)
         run(out, names=names)
         assert files(out) == files(tmp_path / "whole")

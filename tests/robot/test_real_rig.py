@@ -2,6 +2,7 @@
 
 import datetime
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,30 +29,29 @@ TABLES = {
 }
 
 
-def written(tmp_path, **changed):
-    """Write a rig file with some tables replaced (None: left out) and return its path."""
-    tables = {**TABLES, **changed}
-    path = tmp_path / "rig.toml"
-    heads = {name: f"[{name}]\n" if name else "" for name in tables}
-    path.write_text("\n".join(heads[name] + text for name, text in tables.items() if text is not None))
-    return str(path)
-
-
-@pytest.fixture(autouse=True)
-def working_folder(tmp_path, monkeypatch):
+@pytest.fixture
+def load(tmp_path, monkeypatch):
+    """Return the rig of a file with some tables replaced (None: left out)."""
     monkeypatch.chdir(tmp_path)
 
+    def load_changed(**changed):
+        tables = {name: text for name, text in {**TABLES, **changed}.items() if text is not None}
+        Path("rig.toml").write_text("\n".join(f"[{name}]\n{text}" if name else text for name, text in tables.items()))
+        return load_rig("rig.toml", seed=0)
 
-def points(tmp_path, days=0):
+    return load_changed
+
+
+def points(days=0):
     """Write a calibration file `days` old, of a camera 800 mm above the table that points down."""
     camera = np.array([[0, 0, 800], [100, 0, 800], [0, 100, 800], [0, 0, 700], [90, 80, 650]], float)
     rig = camera * [1, -1, -1] + [0, 0, 800]
     when = datetime.datetime.now(datetime.UTC) - datetime.timedelta(days=days)
-    hand_eye.fit_hand_eye(camera, rig, written=when).save(tmp_path / "hand_eye.json")
+    hand_eye.fit_hand_eye(camera, rig, written=when).save(Path("hand_eye.json"))
 
 
-def test_a_file_becomes_a_rig_with_its_devices_under_its_limits(tmp_path):
-    rig = load_rig(written(tmp_path), seed=0)
+def test_a_file_becomes_a_rig_with_its_devices_under_its_limits(load):
+    rig = load()
     assert isinstance(rig.arm, ManualArm)
     assert isinstance(rig.gripper, WSG50)
     assert isinstance(rig.sensors["a"], OpencvTactile)
@@ -68,25 +68,24 @@ def test_a_file_becomes_a_rig_with_its_devices_under_its_limits(tmp_path):
     assert (rig.attempt.travel_mm_s, rig.attempt.approach_mm_s, rig.attempt.closing_mm_s) == (90, 50, 40)
 
 
-def test_known_values_of_the_gels_are_recorded_and_the_others_are_unknown(tmp_path):
+def test_known_values_of_the_gels_are_recorded_and_the_others_are_unknown(load):
     unknown = {"thickness_mm": "unknown", "modulus_mpa": "unknown", "poisson": "unknown"}
-    assert load_rig(written(tmp_path), seed=0).info["gels"] == [{"a": unknown}]
-    rig = load_rig(written(tmp_path, **{"gel.a": "thickness_mm = 4"}), seed=0)
+    assert load().info["gels"] == [{"a": unknown}]
+    rig = load(**{"gel.a": "thickness_mm = 4"})
     assert rig.info["gels"] == [{"a": {**unknown, "thickness_mm": 4.0}}]
 
 
-def test_a_given_object_replaces_the_fit_for_a_camera_without_depth(tmp_path):
-    fit = load_rig(written(tmp_path), seed=0).object_fit
+def test_a_given_object_replaces_the_fit_for_a_camera_without_depth(load):
+    fit = load().object_fit
     assert (fit.x_mm, fit.y_mm, fit.height_mm, fit.radius_mm, fit.method) == (0, 5, 100, 30, "given")
     assert fit.width_mm(1.0, 25.0) == 60
     with pytest.raises(RobotConfigError, match="has no depth: give the position and size of every object"):
-        load_rig(written(tmp_path, object=None), seed=0)
+        load(object=None)
 
 
-def test_a_file_chooses_the_grasp_planner_and_its_settings(tmp_path):
-    assert load_rig(written(tmp_path), seed=0).planner.search_margin_mm == 150
-    assert load_rig(written(tmp_path, planner="search_margin_mm = 20"), seed=0).planner.search_margin_mm == 20
-    named = load_rig(written(tmp_path, planner='name = "cylinder"\nsearch_margin_mm = 30'), seed=0)
+def test_a_file_chooses_the_grasp_planner_and_its_settings(load):
+    assert load(planner="search_margin_mm = 20").planner.search_margin_mm == 20
+    named = load(planner='name = "cylinder"\nsearch_margin_mm = 30')
     assert (type(named.planner), named.planner.search_margin_mm) == (CylinderPlanner, 30)
     assert named.info["rig_settings"]["planner"] == {"name": "cylinder", "search_margin_mm": 30}
 
@@ -105,25 +104,25 @@ class Blind(GraspPlanner):
 BLIND = 'name = "tests.robot.test_real_rig:Blind"\nheight_mm = 40'
 
 
-def test_a_planner_of_a_users_module_plans_without_depth_if_it_needs_none(tmp_path):
-    rig = load_rig(written(tmp_path, planner=BLIND, object=None), seed=0)
+def test_a_planner_of_a_users_module_plans_without_depth_if_it_needs_none(load):
+    rig = load(planner=BLIND, object=None)
     plan = rig.planner.plan(rig, None, rig.attempt.grasp, np.random.default_rng(0))
     assert plan.pose == Pose(1.0, 2.0, 40, 0.5)
 
 
-def test_a_camera_with_depth_requires_a_recent_calibration(tmp_path):
+def test_a_camera_with_depth_requires_a_recent_calibration(load):
     depth = 'driver = "realsense"\n'
     with pytest.raises(RobotConfigError, match="a camera with depth requires hand_eye = FILE"):
-        load_rig(written(tmp_path, camera=depth), seed=0)
-    points(tmp_path)
-    found = load_rig(written(tmp_path, camera=depth + 'hand_eye = "hand_eye.json"', object=None), seed=0)
+        load(camera=depth)
+    points()
+    found = load(camera=depth + 'hand_eye = "hand_eye.json"', object=None)
     assert found.camera.extrinsics[:3, 3] == pytest.approx([0, 0, 800], abs=1e-6)
     assert found.object_fit is None
-    points(tmp_path, days=40)
+    points(days=40)
     with pytest.raises(RobotConfigError, match="must be at most 30 days old, got 40"):
-        load_rig(written(tmp_path, camera=depth + 'hand_eye = "hand_eye.json"'), seed=0)
+        load(camera=depth + 'hand_eye = "hand_eye.json"')
     longer = depth + 'hand_eye = "hand_eye.json"\nhand_eye_days = 60'
-    assert load_rig(written(tmp_path, camera=longer), seed=0).camera.has_depth
+    assert load(camera=longer).camera.has_depth
 
 
 BAD = {
@@ -136,15 +135,11 @@ BAD = {
     "a force above the limit": ({"grasp": "force_n = [5, 16]"}, "force_n must be at most 15"),
     "a speed above the limit": ({"attempt": "travel_mm_s = 91"}, r"travel_mm_s must be at most 90"),
     "an unknown attempt setting": ({"attempt": "speed = 3"}, r"\[attempt\] has no setting 'speed'"),
-    "an infinite speed": ({"attempt": "travel_mm_s = inf"}, r"attempt\.travel_mm_s must be a finite number"),
     "a gel of no finger": ({"gel.b": "thickness_mm = 4"}, r"a finger with a sensor: \[gel\.a\]; got 'b'"),
     "a gel of no thickness": ({"gel.a": "thickness_mm = 0"}, r"\[gel\.a\]: thickness_mm must be a number >= 0\.01"),
     "an unknown planner": ({"planner": 'name = "sphere"'}, r"\[planner\]: name must be one of cylinder, mesh; .*Class"),
     "a planner without its setting": ({"planner": BLIND.split("\n")[0]}, r"\[planner\] requires 'height_mm'"),
-    "a planner with a negative margin": (
-        {"planner": "search_margin_mm = -1"},
-        r"\[planner\]: search_margin_mm",
-    ),
+    "a planner with a negative margin": ({"planner": "search_margin_mm = -1"}, r"\[planner\]: search_margin_mm"),
     "a planner that is another object": ({"planner": 'name = "json:dumps"'}, "'json:dumps' must be a GraspPlanner"),
     "meshes of a real rig": ({"planner": 'name = "mesh"'}, "plans for meshes of the simulated rig only"),
     "no time to settle": ({"attempt": "settle_s = 0"}, r"\[attempt\]: settle_s must be at least 0\.1 s"),
@@ -153,10 +148,10 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", sorted(BAD))
-def test_a_wrong_file_is_refused_with_the_place_and_the_remedy(case, tmp_path):
+def test_a_wrong_file_is_refused_with_the_place_and_the_remedy(case, load):
     changed, message = BAD[case]
     with pytest.raises((RobotConfigError, UnknownName), match=message):
-        load_rig(written(tmp_path, **changed), seed=0)
+        load(**changed)
 
 
 @pytest.mark.parametrize(("role", "name"), [(role, name) for role, known in DRIVERS.items() for name in known])

@@ -30,25 +30,16 @@ def planned(earlier_mm, *drawn_mm):
     return planner.plan(None, None, None, np.random.default_rng(0)).pose.z_mm
 
 
-def test_the_first_grasp_is_the_first_draw():
-    assert planned([], 40.0, 90.0) == 40.0
-
-
 def test_a_further_grasp_is_the_draw_that_is_farthest_from_its_nearest_earlier_grasp():
+    assert planned([], 40.0, 90.0) == 40.0  # the first grasp is the first draw
     assert planned([40.0], 50.0, 90.0, 30.0) == 90.0
     assert planned([40.0, 90.0], 50.0, 88.0, 62.0, 20.0) == 62.0  # 22 mm from 40; 20 mm is 20 mm away
 
 
-def test_an_impossible_draw_is_left_out():
+def test_an_impossible_draw_is_left_out_and_the_last_reason_or_an_ungraspable_object_is_an_error():
     assert planned([40.0], PlanError("too wide"), 42.0) == 42.0
-
-
-def test_if_all_draws_are_impossible_the_last_reason_is_raised():
     with pytest.raises(PlanError, match="too high"):
         planned([40.0], PlanError("too wide"), PlanError("too high"))
-
-
-def test_an_object_that_cannot_be_grasped_ends_the_draws():
     with pytest.raises(UngraspableError):
         planned([40.0], UngraspableError("larger than the jaws"), 42.0)
 

@@ -6,15 +6,7 @@ import pytest
 
 from robot.errors import ImporterError
 from robot.importers.folder import import_folder
-from tests.miniatures import folder, picture
-
-pytestmark = pytest.mark.usefixtures("no_fsync")
-
-
-@pytest.fixture
-def source(tmp_path):
-    folder.write(tmp_path / "src")
-    return tmp_path / "src"
+from tests.miniatures import picture
 
 
 def ids_of(recording):

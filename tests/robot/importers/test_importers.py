@@ -17,14 +17,13 @@ from robot.importers import IMPORTERS, data_set_of, load_importer, options_of, r
 from robot.importers.importing import SPLITS_FOLDER, DataSet, Item, Skip, import_items, numbered_files
 from robot.recording.folder import RecordingWriter, SharedImage, read_recording, safe_name
 from robot.storage import parse_object
+from tests.data import touch_data
 from tests.documents import text_of
 from tests.miniatures import encoded, picture, pixels
 
 PICTURES = {".png", ".jpg"}
 SOURCE_FACTS = ("folder", "lerobot", "open-x-tactile", "rosbag")
 """Importers whose facts, such as the sensor, depend on the source."""
-
-pytestmark = pytest.mark.usefixtures("no_fsync")
 
 
 @pytest.fixture(scope="module", params=IMPORTERS)
@@ -149,6 +148,21 @@ def test_broken_files_cost_their_own_grasps_and_no_traceback(name, tmp_path):
         path.write_bytes(whole)
 
 
+@pytest.mark.parametrize(
+    ("real", "grasps", "objects", "sequences", "skipped"),
+    [
+        ("billets", 9 * 16, 9 * 16, 9, 0),
+        pytest.param("physiclear", 241 * 5, 44, 241, 0, marks=pytest.mark.slow),
+        pytest.param("vt60", 4991, 40, 36, 4, marks=pytest.mark.slow),
+    ],
+)
+def test_the_real_data_are_imported_completely(real, grasps, objects, sequences, skipped, tmp_path):
+    recording = load_importer(real)(touch_data(real), tmp_path / "out")
+    ids = [{getattr(grasp, key) for grasp in recording.grasps} for key in ("grasp_id", "object_id", "sequence_id")]
+    assert list(map(len, ids)) == [grasps, objects, sequences]
+    assert sum(recording.info["skipped"].values()) == skipped
+
+
 def test_the_page_of_data_sets_is_generated_from_the_importers():
     assert text_of(DATA_SETS) == data_sets(), "run `python -m benchmarks.reference`"
 
@@ -181,16 +195,13 @@ def with_options(
     """An importer."""
 
 
-def test_options_are_parsed_by_the_type_that_the_importer_declares():
+def test_options_are_parsed_by_the_type_that_the_importer_declares_and_others_are_refused():
     assert options_of(with_options)["every"] == (int, 1)
     words = ["sensor=GelSight = Mini", "every=3", "ratio=0.25", "all=false"]
     assert read_options(with_options, words) == {"sensor": "GelSight = Mini", "every": 3, "ratio": 0.25, "all": False}
-
-
-@pytest.mark.parametrize("word", ["every=many", "every=", "every=all=no", "nonsense=1", "every", "=3", ""])
-def test_other_options_are_refused(word):
-    with pytest.raises(ImporterError, match="every"):
-        read_options(with_options, [word])
+    for word in ("every=many", "every=", "nonsense=1", "every", ""):
+        with pytest.raises(ImporterError, match="every"):
+            read_options(with_options, [word])
 
 
 FACTS = DataSet("here", "none", "nobody", "gel", "by hand", "nothing", caveats=("beware",), unverified=("its size",))
@@ -208,73 +219,47 @@ def run(items, out, **more):
 
 def test_skips_are_counted_by_reason_with_the_first_names(tmp_path):
     items = [item(0), *(Skip("it is dark", f"n{n}") for n in range(5)), item(1, touch_a=tmp_path / "gone.png")]
-    recording = run(items, tmp_path / "out")
+    recording = run([*items, item(0, photo=encoded(".jpg", 50))], tmp_path / "out")
+    assert len(recording.grasps) == 1
     assert recording.notes == (
         "skipped 5: it is dark, such as n0",
         "skipped 1: its touch a is missing, such as g1",
+        "skipped 1: another grasp has the same name, such as g0",
         "beware",
         "not verified on the data itself: its size",
     )
-    assert read_recording(tmp_path / "out").info["skipped"] == {"it is dark": 5, "its touch a is missing": 1}
+    assert read_recording(tmp_path / "out").info["skipped"]["it is dark"] == 5
 
 
-@pytest.mark.parametrize(
-    ("photo", "reason"),
-    [
-        ("a" * 5000, "its photo is missing"),
-        (encoded(".jpg", 1)[:-9], "its photo is cut off"),
-        (encoded(".png", 1)[:-9], "its photo is cut off"),
-    ],
-    ids=["a path too long for the disk", "jpg", "png"],
-)
-def test_an_unusable_picture_costs_its_own_grasp(tmp_path, photo, reason):
-    assert run([item(0), item(1, photo=photo)], tmp_path / "out").info["skipped"] == {reason: 1}
+def test_an_unusable_picture_costs_its_own_grasp(tmp_path):
+    photos = ["a" * 5000, encoded(".jpg", 1)[:-9], encoded(".png", 1)[:-9]]  # a path too long for the disk, cut files
+    items = [item(0), *(item(number, photo=photo) for number, photo in enumerate(photos, start=1))]
+    skipped = {"its photo is missing": 1, "its photo is cut off": 2}
+    assert run(items, tmp_path / "out").info["skipped"] == skipped
 
 
-def test_a_function_that_returns_a_picture_is_called_late_and_not_for_stored_grasps(tmp_path):
+def test_a_picture_is_read_late_and_not_for_stored_grasps_and_a_shared_one_once(tmp_path):
     calls = []
 
-    def make_picture(number):
+    def read(number):
         calls.append(number)
         return pixels(number)
 
-    items = [item(n, touch_a=lambda n=n: make_picture(n)) for n in range(3)]
+    rest = SharedImage("rest", lambda: read(4))
+    items = [item(n, touch_a=lambda n=n: read(n), touch_a_before=rest) for n in range(3)]
     run(items[:2], tmp_path / "out")
-    assert calls == [0, 1]
-    run(items, tmp_path / "out")
-    assert calls == [0, 1, 2]
-
-
-def test_a_frame_of_many_grasps_is_read_and_stored_once(tmp_path):
-    calls = []
-
-    def frame():
-        calls.append(1)
-        return pixels(7)
-
-    recording = run([item(n, touch_a_before=SharedImage("rest", frame)) for n in range(3)], tmp_path / "out")
-    assert calls == [1]
+    assert calls == [0, 4, 1]
+    recording = run(items, tmp_path / "out")
+    assert calls == [0, 4, 1, 2]
     assert {grasp.touches_before["a"] for grasp in recording.grasps} == {"images/rest_shared.png"}
 
 
-def test_two_grasps_with_the_same_name_are_not_mixed(tmp_path):
-    recording = run([item(0), item(0, photo=encoded(".jpg", 50))], tmp_path / "out")
-    assert len(recording.grasps) == 1
-    assert recording.info["skipped"] == {"another grasp has the same name": 1}
-
-
-def test_an_error_states_why_nothing_can_be_imported(tmp_path):
+def test_an_error_states_why_nothing_can_be_imported_or_names_the_file(tmp_path):
     with pytest.raises(ImporterError, match=r"no grasp could be imported: skipped 1: it is dark, such as n"):
         run([Skip("it is dark", "n")], tmp_path / "out")
-
-
-def test_a_read_error_names_the_file(tmp_path):
-    def broken():
-        yield item(0)
-        (tmp_path / "gone").read_bytes()
-
+    gone = (path.read_bytes() for path in [tmp_path / "gone"])
     with pytest.raises(ImporterError, match=r"gone cannot be read: No such file or directory"):
-        import_items(FACTS, broken(), tmp_path / "out", total=1)
+        import_items(FACTS, gone, tmp_path / "out", total=1)
 
 
 def test_a_published_split_is_stored_unless_its_parts_have_objects_in_common(tmp_path):
@@ -290,17 +275,9 @@ def test_a_published_split_is_stored_unless_its_parts_have_objects_in_common(tmp
 
 def test_any_parts_become_a_valid_grasp_id():
     assert safe_name("mug", "01") == "mug-01"
-    strange = [
-        safe_name("my mug", "1"),
-        safe_name("my/mug", "1"),
-        safe_name("..", "1"),
-        safe_name("é" * 300),
-        safe_name("", ""),
-    ]
-    strange += [
-        safe_name("caf\udce9"),
-        safe_name("caf\ud800"),
-    ]  # a file name that is not UTF-8; a surrogate that JSON can escape
+    # The last two: a file name that is not UTF-8, and a surrogate that JSON can escape.
+    parts = [("my mug", "1"), ("my/mug", "1"), ("..", "1"), ("é" * 300,), ("", ""), ("caf\udce9",), ("caf\ud800",)]
+    strange = [safe_name(*each) for each in parts]
     assert len(set(strange)) == len(strange)
     assert all(name[0].isalnum() and len(name) <= 128 for name in strange)
 

@@ -18,8 +18,6 @@ from robot.importers.lerobot import import_lerobot
 from tests.miniatures import encoded, lerobot, pixels
 from tests.miniatures.lerobot import RIGHT
 
-pytestmark = pytest.mark.usefixtures("no_fsync")
-
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
@@ -60,19 +58,19 @@ def test_an_episode_is_a_sequence_with_its_own_pictures_its_task_the_object_and_
     assert recording.info["sensor"] == "observation.images.left_tactile, observation.images.right_tactile"
     for episode, grasp in enumerate(recording.grasps):
         first, pressed = (lerobot.pictures(episode, step) for step in (0, lerobot.PRESSED))
-        for path, seed in (
-            (grasp.photo, first[lerobot.WRIST]),
-            (grasp.touches["a"], pressed[lerobot.LEFT]),
-            (grasp.touches_before["a"], first[lerobot.LEFT]),
-        ):
-            assert rms(picture(recording, path), pixels(seed, lerobot.SIZE).astype(float)) < 4
-        for path, seed in ((grasp.touches["b"], pressed), (grasp.touches_before["b"], first)):
-            assert rms(picture(recording, path), pixels(seed[lerobot.RIGHT], lerobot.SIZE).astype(float)) == 0
+        expected = {
+            grasp.photo: (first[lerobot.WRIST], 4),  # a video is not lossless
+            grasp.touches["a"]: (pressed[lerobot.LEFT], 4),
+            grasp.touches_before["a"]: (first[lerobot.LEFT], 4),
+            grasp.touches["b"]: (pressed[RIGHT], 0),
+            grasp.touches_before["b"]: (first[RIGHT], 0),
+        }
+        for path, (seed, tolerance) in expected.items():
+            assert rms(picture(recording, path), pixels(seed, lerobot.SIZE).astype(float)) <= tolerance
 
 
 def test_cameras_are_chosen_by_name_and_unknown_ones_list_the_known(whole, tmp_path):
-    recording = import_lerobot(whole, tmp_path / "one", touch=lerobot.LEFT, photo=lerobot.WRIST)
-    assert recording.info["fingers"] == 1
+    assert import_lerobot(whole, tmp_path / "one", touch=lerobot.LEFT, photo=lerobot.WRIST).info["fingers"] == 1
     for options in ({"touch": "left"}, {"photo": "front"}):
         with pytest.raises(ImporterError, match=r"from: observation\.images\.wrist, observation"):
             import_lerobot(whole, tmp_path / "out", **options)
@@ -83,9 +81,7 @@ def test_cameras_are_chosen_by_name_and_unknown_ones_list_the_known(whole, tmp_p
     [
         ({"codebase_version": "v2.1"}, "must have LeRobot version 3, got v2.1; convert it with lerobot"),
         ({"video_path": "/etc/{video_key:999999999}"}, "must have the paths data/"),
-        ({"fps": None}, r"\$\.fps"),
         ({"fps": 0}, r"\$\.fps"),
-        ({"features": []}, r"\$\.features"),
         ({"features": {}}, "from: none"),
         ({"features": {"../touch": {"dtype": "video"}, "photo": {"dtype": "video"}}}, "no camera name that is a path"),
     ],

@@ -10,31 +10,23 @@ from robot.importers.objectfolder import import_objectfolder
 from robot.storage import parse_object
 from tests.miniatures import objectfolder
 
-pytestmark = pytest.mark.usefixtures("no_fsync")
 
-
-@pytest.fixture
-def pack(tmp_path):
-    objectfolder.write(tmp_path / "pack")
-    return tmp_path / "pack"
-
-
-def test_a_touch_of_a_pack_has_the_photo_of_its_own_number_and_the_split_is_stored_by_objects(pack, tmp_path):
-    recording = import_objectfolder(pack, tmp_path / "out")
+def test_a_touch_of_a_pack_has_the_photo_of_its_own_number_and_the_split_is_stored_by_objects(source, tmp_path):
+    recording = import_objectfolder(source, tmp_path / "out")
     assert [grasp.grasp_id for grasp in recording.grasps][:4] == ["2-1", "2-2", "2-10", "10-1"]
     for grasp in recording.grasps:
         instance = grasp.grasp_id.split("-")[1]
-        photo = pack / "vision" / grasp.object_id / f"{instance}.png"
+        photo = source / "vision" / grasp.object_id / f"{instance}.png"
         assert (tmp_path / "out" / grasp.photo).read_bytes() == photo.read_bytes()
     split = parse_object((tmp_path / "out" / SPLITS_FOLDER / "published.json").read_bytes(), RecordingError)
     assert split == {"seed": 0, "train": ["2", "31"], "validation": ["10"], "test": ["100"]}
 
 
-def test_a_split_by_pictures_gets_a_note_and_touches_without_their_photo_get_another(pack, tmp_path):
+def test_a_split_by_pictures_gets_a_note_and_touches_without_their_photo_get_another(source, tmp_path):
     rows = {"train": [["2", 1], ["10", 1]], "val": [], "test": [["2", 2], ["100", 1]]}
-    (pack / "split.json").write_text(json.dumps(rows))
-    (pack / "vision/31/2.png").unlink()
-    recording = import_objectfolder(pack, tmp_path / "out")
+    (source / "split.json").write_text(json.dumps(rows))
+    (source / "vision/31/2.png").unlink()
+    recording = import_objectfolder(source, tmp_path / "out")
     assert any("has objects in two parts" in note for note in recording.notes)
     assert not (tmp_path / "out" / SPLITS_FOLDER).exists()
     photos = {grasp.grasp_id: grasp.photo for grasp in recording.grasps}
@@ -42,10 +34,10 @@ def test_a_split_by_pictures_gets_a_note_and_touches_without_their_photo_get_ano
 
 
 @pytest.mark.parametrize("content", ["[1]", "{", '{"train": 3}'])
-def test_an_invalid_split_is_refused(pack, tmp_path, content):
-    (pack / "split.json").write_text(content)
+def test_an_invalid_split_is_refused(source, tmp_path, content):
+    (source / "split.json").write_text(content)
     with pytest.raises(ImporterError, match=r"split\.json"):
-        import_objectfolder(pack, tmp_path / "out")
+        import_objectfolder(source, tmp_path / "out")
 
 
 def test_each_sample_of_real_is_an_object(tmp_path):

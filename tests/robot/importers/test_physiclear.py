@@ -6,16 +6,7 @@ import pytest
 
 from robot.errors import ImporterError
 from robot.importers.physiclear import import_physiclear, strongest_frames
-from tests.data import touch_data
 from tests.miniatures import physiclear
-
-pytestmark = pytest.mark.usefixtures("no_fsync")
-
-
-@pytest.fixture
-def source(tmp_path):
-    physiclear.write(tmp_path / "src")
-    return tmp_path / "src"
 
 
 def test_a_video_is_a_sequence_of_five_frames_of_its_part_and_the_gel_image_replaces_the_photo(source, tmp_path):
@@ -62,10 +53,3 @@ def test_a_video_too_short_or_without_change_costs_its_own_grasps(source, tmp_pa
     assert recording.info["skipped"] == {
         "its video must have at least 5 frames that differ from the first one": 10,
     }
-
-
-@pytest.mark.slow
-def test_the_real_videos_are_imported_completely(tmp_path):
-    recording = import_physiclear(touch_data("physiclear"), tmp_path / "out")
-    assert len(recording.grasps) == 241 * 5
-    assert len({grasp.object_id for grasp in recording.grasps}) == 44

@@ -6,14 +6,6 @@ from robot.errors import ImporterError
 from robot.importers.rct import import_rct
 from tests.miniatures import rct
 
-pytestmark = pytest.mark.usefixtures("no_fsync")
-
-
-@pytest.fixture
-def source(tmp_path):
-    rct.write(tmp_path / "src")
-    return tmp_path / "src"
-
 
 def test_a_material_is_an_object_a_press_a_sequence_and_a_row_with_a_picture_a_grasp_with_its_force(source, tmp_path):
     recording = import_rct(source, tmp_path / "out")

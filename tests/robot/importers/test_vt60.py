@@ -6,16 +6,7 @@ import pytest
 
 from retrieval.data.dataset import load_grasps, make_split
 from robot.importers.vt60 import import_vt60
-from tests.data import touch_data
 from tests.miniatures import vt60
-
-pytestmark = pytest.mark.usefixtures("no_fsync")
-
-
-@pytest.fixture
-def source(tmp_path):
-    vt60.write(tmp_path / "src")
-    return tmp_path / "src"
 
 
 @pytest.fixture(scope="module")
@@ -71,15 +62,3 @@ def test_a_data_set_without_its_no_contact_frame_is_imported_without(source, tmp
     recording = import_vt60(source, tmp_path / "out")
     assert not any(grasp.touches_before for grasp in recording.grasps)
     assert recording.info["background"] == "none"
-
-
-@pytest.mark.slow
-def test_the_real_data_are_imported_completely(tmp_path):
-    recording = import_vt60(touch_data("vt60"), tmp_path / "out")
-    assert len(recording.grasps) == 4991
-    assert len({grasp.object_id for grasp in recording.grasps}) == 40
-    assert len({grasp.sequence_id for grasp in recording.grasps}) == 36
-    assert recording.info["skipped"] == {
-        "photos of an object without touches": 3,
-        "its touch is the no-contact frame itself": 1,
-    }

@@ -2,7 +2,7 @@
 
 import json
 import os
-import resource
+import re
 import shutil
 import subprocess
 import sys
@@ -11,11 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from robot.errors import RecordingError, StorageError
-from robot.recording import folder as module
 from robot.recording.folder import RecordingWriter, SharedImage, read_recording
 from robot.recording.grasp import RecordedGrasp
 
@@ -90,32 +87,23 @@ def test_appended_grasps_are_read_back_and_a_line_has_the_documented_columns_wit
     with RecordingWriter(tmp_path / "s", INFO) as writer:
         writer.append("1", "mug", {"photo": pixels(), "touch_a": pixels(), "touch_a_before": pixels()}, force_n=2)
     (line,) = (tmp_path / "s/metadata.jsonl").read_text().splitlines()
-    assert json.loads(line) == {
-        "grasp_id": "1",
-        "object_id": "mug",
-        "force_n": 2.0,
-        "photo_file_name": "images/1_photo.png",
-        "touch_a_file_name": "images/1_touch_a.png",
-        "touch_a_before_file_name": "images/1_touch_a_before.png",
-    }
+    images = {f"{column}_file_name": f"images/1_{column}.png" for column in ("photo", "touch_a", "touch_a_before")}
+    assert json.loads(line) == {"grasp_id": "1", "object_id": "mug", "force_n": 2.0, **images}
 
 
 def test_datasets_opens_a_recording(tmp_path):
     datasets = pytest.importorskip("datasets")
     two_grasps(tmp_path / "r")
-    rows = datasets.load_dataset("imagefolder", data_dir=str(tmp_path / "r"), cache_dir=str(tmp_path / "cache"))[
-        "train"
-    ]
+    folders = {"data_dir": str(tmp_path / "r"), "cache_dir": str(tmp_path / "cache")}
+    rows = datasets.load_dataset("imagefolder", split="train", **folders)
     assert rows["force_n"] == [5.0, None]
     np.testing.assert_array_equal(np.asarray(rows[1]["touch_b"]), pixels(4))
 
 
 def test_pixels_are_read_back_and_files_and_bytes_are_copied_unchanged(tmp_path):
     """Pixels are RGB, depth has 16 bits."""
-    depth, (jpeg, png) = (
-        np.array([[0, 256, 65535]], np.uint16),
-        (cv2.imencode(k, pixels())[1] for k in (".jpg", ".png")),
-    )
+    depth = np.array([[0, 256, 65535]], np.uint16)
+    jpeg, png = (cv2.imencode(kind, pixels())[1] for kind in (".jpg", ".png"))
     (tmp_path / "x.data").write_bytes(jpeg.tobytes())
     with RecordingWriter(tmp_path / "r", INFO) as writer:
         writer.append("1", "mug", {"photo": pixels(1), "touch_a": pixels(2)[:, ::-1], "depth": depth})
@@ -129,34 +117,19 @@ def test_pixels_are_read_back_and_files_and_bytes_are_copied_unchanged(tmp_path)
     assert (tmp_path / "r" / grasp.touches["a"]).read_bytes() == png.tobytes()
 
 
-def test_recording_json_has_defaults_and_other_keys(tmp_path):
-    RecordingWriter(tmp_path, {**INFO, "licence": "MIT"}).close()
-    info = json.loads((tmp_path / "recording.json").read_text())
-    assert info["schema_version"] == 1
-    assert info["seed"] == 3
-    assert info["background"] == "none"
-    assert info["licence"] == "MIT"
-    assert info["units"]["force_n"] == "newton"
+def test_recording_json_has_defaults_and_other_keys_that_a_writer_updates(tmp_path):
+    with RecordingWriter(tmp_path, {**INFO, "licence": "MIT"}) as writer:
+        writer.update_info(skipped={"it is dark": 2})
+        with pytest.raises(RecordingError, match="must contain plain JSON"):
+            writer.update_info(skipped={1j})
+    info = read_recording(tmp_path).info
+    assert (info["schema_version"], info["seed"], info["background"], info["licence"]) == (1, 3, "none", "MIT")
+    assert (info["units"]["force_n"], info["skipped"]) == ("newton", {"it is dark": 2})
     assert {"source", "sensor", "rig", "software_version"} <= set(info)
-    assert read_recording(tmp_path).grasps == ()
 
 
-@settings(max_examples=40)
-@given(
-    st.text(st.characters(categories=["L", "N", "P"]), min_size=1),
-    st.floats(allow_nan=False, allow_infinity=False),
-    st.none() | st.booleans(),
-    st.none() | st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=7),
-)
-def test_any_grasp_survives_its_line(object_id, number, grasped, pose):
-    grasp = RecordedGrasp(
-        "1", object_id, "p.png", {"b": "b.png"}, force_n=number, grasped=grasped, pose=pose and tuple(pose)
-    )
-    assert RecordedGrasp.from_row(json.loads(json.dumps(grasp.to_row()))) == grasp
-
-
-def test_a_line_of_another_program_may_leave_keys_null_and_end_without_a_newline(tmp_path):
-    write(tmp_path, {**ROW, "force_n": None, "touch_b_file_name": None}, "", "  ")
+def test_a_line_of_another_program_may_have_null_and_other_keys_and_end_without_a_newline(tmp_path):
+    write(tmp_path, {**ROW, "force_n": None, "touch_b_file_name": None, "text": "a red mug"}, "", "  ")
     with open(tmp_path / "metadata.jsonl", "a") as file:
         file.write(json.dumps({**ROW, "grasp_id": "2"}))
     recording = read_recording(tmp_path)
@@ -178,7 +151,6 @@ BAD_LINES = {
     json.dumps(ROW)[:-1] + ', "time_s": 1e999}': "Number out of range",
     json.dumps({**ROW, "outcome": "lost"}): "outcome must be one of",
     json.dumps({**ROW, "pose": [1, "2"]}): "pose[1] must be a number, got '2'",
-    json.dumps({**ROW, "photo_file_name": 5}): "photo must be a text in quotes",
     json.dumps({**ROW, "photo_file_name": "/etc/passwd"}): "must be a path inside",
     json.dumps({**ROW, "photo_file_name": "a/../../b.png"}): "must be a path inside",
     json.dumps({**ROW, "photo_file_name": "C:/x.png"}): "must be a path inside",
@@ -190,12 +162,8 @@ BAD_LINES = {
 @pytest.mark.parametrize("line", BAD_LINES, ids=range(len(BAD_LINES)))
 def test_a_bad_line_is_named_by_its_number(tmp_path, line):
     write(tmp_path, {**ROW, "grasp_id": "0"}, line, {**ROW, "grasp_id": "2"})
-    with pytest.raises(RecordingError) as caught:
+    with pytest.raises(RecordingError, match=rf"metadata\.jsonl, line 2: .*{re.escape(BAD_LINES[line])}"):
         read_recording(tmp_path)
-    message = str(caught.value)
-    assert message.startswith(f"{tmp_path}/metadata.jsonl, line 2: ")
-    assert BAD_LINES[line] in message
-    assert caught.value.exit_code == 2
 
 
 def test_an_incomplete_last_line_of_any_length_is_dropped_with_a_note(tmp_path):
@@ -220,20 +188,18 @@ def test_a_bad_recording_json_is_an_error_that_names_it(tmp_path, text):
 
 
 def test_the_error_for_another_folder_names_the_import_command(tmp_path):
-    for folder in (tmp_path, tmp_path / "none"):
-        with pytest.raises(RecordingError, match="`retrieve import` writes recordings"):
-            read_recording(folder)
+    with pytest.raises(RecordingError, match="`retrieve import` writes recordings"):
+        read_recording(tmp_path)
     (write(tmp_path / "r", ROW) / "metadata.jsonl").unlink()
     with pytest.raises(RecordingError, match=r"metadata\.jsonl cannot be read: No such file"):
         read_recording(tmp_path / "r")
 
 
 def test_reading_opens_no_image_and_imports_no_opencv(tmp_path):
-    write(tmp_path, ROW)  # its images do not exist
-    code = f"import sys; from robot.recording.folder import read_recording; read_recording({str(tmp_path)!r}); "
+    code = "import sys; from robot.recording.folder import read_recording; read_recording(sys.argv[1]); "
     code += "assert not {'cv2', 'torch', 'scipy', 'retrieval'} & set(sys.modules)"
-    root = Path(module.__file__).parents[1]
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=root)
+    recording = write(tmp_path, ROW)  # its images do not exist
+    subprocess.run([sys.executable, "-c", code, str(recording)], check=True, cwd=Path(__file__).parents[3])
 
 
 @pytest.mark.parametrize("cut", [-1, -30])
@@ -247,24 +213,25 @@ def test_a_writer_removes_an_incomplete_last_line_and_adds_a_newline_that_lacks(
     assert path.read_bytes().count(b"\n") == len(ids(tmp_path))
 
 
-@pytest.mark.parametrize("key", ["source", "sensor", "units", "background"])
-def test_a_recording_with_another_fixed_value_is_not_continued(tmp_path, key):
+def test_a_recording_with_another_fixed_value_is_not_continued(tmp_path):
     two_grasps(tmp_path)
-    other = {"x": "y"} if key == "units" else "other"
-    with pytest.raises(RecordingError, match=f"was recorded with {key} .* give another folder"):
-        RecordingWriter(tmp_path, {**INFO, key: other})
+    for key, other in {"source": "other", "sensor": "other", "units": {"x": "y"}, "background": "other"}.items():
+        with pytest.raises(RecordingError, match=f"was recorded with {key} .* give another folder"):
+            RecordingWriter(tmp_path, {**INFO, key: other})
     assert ids(tmp_path) == ["1", "2"]
 
 
-def test_a_second_writer_of_a_recording_is_refused(tmp_path):
-    with (
-        RecordingWriter(tmp_path, INFO) as first,
-        pytest.raises(StorageError, match="being written by another process") as caught,
-    ):
+def test_a_second_writer_of_a_recording_and_a_second_grasp_of_one_id_are_refused(tmp_path):
+    with RecordingWriter(tmp_path, INFO) as first, pytest.raises(StorageError, match="being written by another"):
         RecordingWriter(tmp_path, INFO)
-    assert caught.value.exit_code == 1
     first.close()
-    RecordingWriter(tmp_path, INFO).close()
+    with RecordingWriter(tmp_path, INFO) as writer:
+        writer.append("1", "mug", pictures())
+        with pytest.raises(RecordingError, match="already contains grasp 1"):
+            writer.append("1", "mug", pictures())
+        with pytest.raises(RecordingError, match="force_n must be a finite number, got nan"):
+            writer.append("2", "mug", pictures(), force_n=float("nan"))
+    assert ids(tmp_path) == ["1"]
 
 
 def test_a_folder_of_other_files_is_not_written_to(tmp_path):
@@ -298,14 +265,12 @@ def test_bad_info_is_refused_before_a_folder_is_made(tmp_path, info, reason):
 
 BAD_IMAGES = {
     "missing photo": ({"touch_a": pixels()}, "photo_file_name is missing"),
-    "missing touch": ({"photo": pixels()}, "at least one touch"),
     "float": ({"photo": pixels() / 255, "touch_a": pixels()}, "photo must be H x W x 3 uint8 RGB"),
     "grey": ({"photo": pixels()[..., 0], "touch_a": pixels()}, "photo must be H x W x 3 uint8 RGB"),
     "no pixels": ({"photo": pixels(), "touch_a": np.zeros((0, 2, 3), np.uint8)}, "touch_a must be H x W"),
     "colour depth": ({**pictures(), "depth": pixels()}, "depth must be H x W uint16"),
     "gif": ({"photo": b"GIF89a", "touch_a": pixels()}, "its first bytes are b'GIF8'"),
     "no file": ({"photo": "/nowhere/x.png", "touch_a": pixels()}, "/nowhere/x.png cannot be read"),
-    "four channels": ({"photo": np.zeros((2, 2, 4), np.uint8), "touch_a": pixels()}, "photo must be H x W x 3"),
     "unknown column": ({**pictures(), "foto": pixels()}, "unknown key 'foto_file_name'"),
 }
 
@@ -313,9 +278,8 @@ BAD_IMAGES = {
 @pytest.mark.parametrize("name", BAD_IMAGES)
 def test_bad_images_are_refused_before_anything_is_written(tmp_path, name):
     images, reason = BAD_IMAGES[name]
-    with RecordingWriter(tmp_path, INFO) as writer, pytest.raises(RecordingError) as caught:
+    with RecordingWriter(tmp_path, INFO) as writer, pytest.raises(RecordingError, match=reason):
         writer.append("1", "mug", images)
-    assert reason in str(caught.value)
     assert list((tmp_path / "images").iterdir()) == []
     assert ids(tmp_path) == []
 
@@ -323,47 +287,21 @@ def test_bad_images_are_refused_before_anything_is_written(tmp_path, name):
 def test_a_shared_image_is_stored_once_and_later_ones_of_its_name_are_ignored(tmp_path):
     for number in (1, 2):  # the second writer continues the recording
         with RecordingWriter(tmp_path / "recording", INFO) as writer:
-            writer.append(
-                str(number), "mug", {**pictures(), "touch_a_before": SharedImage("rest", pixels(10 * number))}
-            )
+            rest = SharedImage("rest", pixels(10 * number))
+            writer.append(str(number), "mug", {**pictures(), "touch_a_before": rest})
     grasps = read_recording(tmp_path / "recording").grasps
     assert {grasp.touches_before["a"] for grasp in grasps} == {"images/rest_shared.png"}
     stored = cv2.imread(str(tmp_path / "recording/images/rest_shared.png"))[..., ::-1]
     np.testing.assert_array_equal(stored, pixels(10))
 
 
-def test_a_writer_updates_recording_json(tmp_path):
-    with RecordingWriter(tmp_path / "recording", INFO) as writer:
-        writer.update_info(skipped={"it is dark": 2})
-        with pytest.raises(RecordingError, match="must contain plain JSON"):
-            writer.update_info(skipped={1j})
-    info = read_recording(tmp_path / "recording").info
-    assert (info["skipped"], info["sensor"], info["seed"]) == ({"it is dark": 2}, "GelSight", 3)
-
-
-@pytest.mark.parametrize("name", ["", "../x", "a/b", ".hidden", "x" * 129, 5, None])
+@pytest.mark.parametrize("name", ["", "../x", ".hidden", "x" * 129, 5])
 def test_a_grasp_id_and_the_name_of_a_shared_image_must_be_safe_in_a_file_name(tmp_path, name):
     with RecordingWriter(tmp_path, INFO) as writer:
         with pytest.raises(RecordingError, match="grasp_id must have"):
             writer.append(name, "mug", pictures())
         with pytest.raises(RecordingError, match="shared image"):
             writer.append("1", "mug", {**pictures(), "touch_a_before": SharedImage(name, pixels())})
-
-
-def test_a_grasp_is_not_appended_twice(tmp_path):
-    with RecordingWriter(tmp_path, INFO) as writer:
-        writer.append("1", "mug", pictures())
-        with pytest.raises(RecordingError, match="already contains grasp 1"):
-            writer.append("1", "mug", pictures())
-        with pytest.raises(RecordingError, match="force_n must be a finite number, got nan"):
-            writer.append("2", "mug", pictures(), force_n=float("nan"))
-    assert ids(tmp_path) == ["1"]
-
-
-def test_keys_of_other_tools_are_ignored(tmp_path: Path) -> None:
-    (tmp_path / "recording.json").write_text(json.dumps({"schema_version": 1, "source": "x", "sensor": "y"}))
-    (tmp_path / "metadata.jsonl").write_text(json.dumps({**ROW, "text": "a red mug"}) + "\n")
-    assert len(read_recording(tmp_path).grasps) == 1
 
 
 @pytest.mark.parametrize("name", ["recording.json", "metadata.jsonl"])
@@ -378,14 +316,3 @@ def test_a_path_that_is_not_a_file_is_refused_without_being_read_or_written(tmp_
         with pytest.raises((RecordingError, StorageError)):
             RecordingWriter(tmp_path, INFO)
         path.rmdir() if path.is_dir() else path.unlink()
-
-
-def test_a_full_disk_error_names_the_file(tmp_path):
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    with RecordingWriter(tmp_path, INFO) as writer:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
-        try:
-            with pytest.raises(StorageError, match=r"1_photo\.png could not be written: File too large"):
-                writer.append("1", "mug", {**pictures(), "photo": pixels(height=40)})
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

@@ -8,17 +8,17 @@ import numpy.typing as npt
 
 from robot.grasping.attempt import depth_in_mm
 from robot.grasping.gates import ContactAreaGate, GraspFrames
-from robot.readings import RGBD, Intrinsics
+from robot.readings import RGBD
 from robot.sight.cloud import Rays, find_table
 from robot.sight.cylinder import fit_cylinder
 from robot.sight.solids import fit_circle
+from tests import views
 from tests.hard_case import HardCase, error_of
 
 Array = npt.NDArray[np.float64]
 _CYLINDER, _DEPTH = "cylinder fit", "depth"
 _RADIUS, _HEIGHT = 33.0, 120.0
-_LENS = Intrinsics(365.0, 365.0, 127.5, 105.5)
-_ROWS, _COLUMNS = 212, 256
+POSE = views.camera_pose()
 
 
 def hard_cases() -> Iterator[HardCase]:
@@ -33,50 +33,21 @@ def hard_cases() -> Iterator[HardCase]:
     yield _gel_of_another_shade()
 
 
-# Pictures ----------------------------------------------------------------------------------------------------
-
-
-def _pose() -> Array:
-    """Return the (4, 4) pose of a camera 600 mm up and 600 mm in front of the origin, towards which it points."""
-    forward = np.array([0.0, 1.0, -1.0]) / math.sqrt(2.0)
-    right = np.array([1.0, 0.0, 0.0])
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-    pose[:3, 3] = (0.0, -600.0, 600.0)
-    return pose
-
-
-def _directions() -> Array:
-    """Return the (rows, columns, 3) rays in the rig's frame, at depth 1."""
-    v, u = np.indices((_ROWS, _COLUMNS), dtype=np.float64)
-    local = np.stack([(u - _LENS.cx) / _LENS.fx, (v - _LENS.cy) / _LENS.fy, np.ones_like(u)], axis=-1)
-    return np.asarray(local @ _pose()[:3, :3].T)
-
-
-def _exact_depth() -> Array:
-    """Return the (rows, columns) depth in mm of a can on a table, in closed form."""
-    start, ray = _pose()[:3, 3], _directions()
-    square = (ray[..., :2] ** 2).sum(-1)
-    middle = (ray[..., :2] @ start[:2]) / square
-    root = middle**2 - (start[:2] @ start[:2] - _RADIUS**2) / square
-    side = -middle - np.sqrt(np.where(root > 0, root, np.nan))
-    z = start[2] + side * ray[..., 2]
-    side[~((z >= 0) & (z <= _HEIGHT))] = np.inf
-    top = (_HEIGHT - start[2]) / ray[..., 2]
-    top[~(np.hypot(*np.moveaxis(start + top[..., None] * ray, -1, 0)[:2]) <= _RADIUS)] = np.inf
-    return np.asarray(np.minimum(np.minimum(side, top), -start[2] / ray[..., 2]))
+def _can(noise_mm: float = 0.0, outliers: float = 0.0) -> RGBD:
+    """Return the picture of a can at the origin, from the side and above."""
+    return views.view(views.UprightCylinder(_RADIUS, _HEIGHT), noise_mm=noise_mm, outliers=outliers)
 
 
 def _picture(depth_mm: Array) -> RGBD:
-    grey = np.full((_ROWS, _COLUMNS, 3), 128, np.uint8)
-    return RGBD(grey, (depth_mm / 1000.0).astype(np.float32), _LENS, 0.0)
+    grey = np.full((*views.KINECT_PX, 3), 128, np.uint8)
+    return RGBD(grey, (depth_mm / 1000.0).astype(np.float32), views.KINECT, 0.0)
 
 
-def _points(image: RGBD) -> Array:
-    """Return the (N, 3) points of all pixels with finite depth above the table."""
+def _points(image: RGBD, pose: Array) -> Array:
+    """Return the (N, 3) points of all pixels with finite depth."""
     assert image.depth_m is not None
-    points = _pose()[:3, 3] + image.depth_m[..., None] * 1000.0 * _directions()
-    return np.asarray(points[np.isfinite(image.depth_m) & (points[..., 2] > 20.0)])
+    rows, columns = np.nonzero(np.isfinite(image.depth_m))
+    return Rays.from_image(image, pose).points(image.depth_m * np.float32(1000), rows, columns)
 
 
 def naive_circle(plan: Array) -> tuple[float, float, float]:
@@ -87,17 +58,12 @@ def naive_circle(plan: Array) -> tuple[float, float, float]:
     return float(a), float(b), float(np.sqrt(c + a**2 + b**2))
 
 
-# Cylinders -------------------------------------------------------------------------------------------------
-
-
 def _outliers() -> HardCase:
     """Noise of 3 mm, and 10 % of the pixels with errors of up to 200 mm."""
-    rng = np.random.default_rng([31])
-    depth = _exact_depth() + rng.normal(0, 3, (_ROWS, _COLUMNS))
-    depth += np.where(rng.random(depth.shape) < 0.1, rng.uniform(-200, 200, depth.shape), 0)
-    image = _picture(depth)
-    x, y, _ = naive_circle(_points(image)[:, :2])
-    fit = fit_cylinder(image, _pose())
+    image = _can(noise_mm=3.0, outliers=0.1)
+    points = _points(image, POSE)
+    x, y, _ = naive_circle(points[points[:, 2] > 20.0, :2])
+    fit = fit_cylinder(image, POSE)
     off = [math.hypot(x, y), math.hypot(fit.x_mm, fit.y_mm)]
     naive, ours = (f"centre off by {error:.1f} mm" for error in off)
     return HardCase(_CYLINDER, "10 % outliers", "centre within 3 mm", naive, ours, off[1] < 3, off[0] < 3)
@@ -129,10 +95,10 @@ def _straight_line() -> HardCase:
 
 def _unknown_depth() -> HardCase:
     """Unknown depth written as 0, as sensors do, for one pixel in ten: the position of the camera."""
-    depth = _exact_depth()
-    depth[np.random.default_rng([33]).random(depth.shape) < 0.1] = 0.0
-    image = _picture(depth)
-    naive, ours = float(_points(image)[:, 2].max()), fit_cylinder(image, _pose()).height_mm
+    image = _can()
+    assert image.depth_m is not None
+    image.depth_m[np.random.default_rng([33]).random(image.depth_m.shape) < 0.1] = 0.0
+    naive, ours = float(_points(image, POSE)[:, 2].max()), fit_cylinder(image, POSE).height_mm
     right = [abs(height - _HEIGHT) < 2 for height in (naive, ours)]
     naive_text, text = (f"{height:.0f} mm high" for height in (naive, ours))
     required = f"{_HEIGHT:.0f} mm high"
@@ -140,9 +106,9 @@ def _unknown_depth() -> HardCase:
 
 
 def _nothing_but_nan() -> HardCase:
-    image = _picture(np.full((_ROWS, _COLUMNS), np.nan))
+    image = _picture(np.full(views.KINECT_PX, np.nan))
     naive = float(np.median(image.depth_m if image.depth_m is not None else math.nan))
-    ours, holds = error_of(lambda: fit_cylinder(image, _pose()))
+    ours, holds = error_of(lambda: fit_cylinder(image, POSE))
     return HardCase(_CYLINDER, "no depth at all", "refused", f"median depth {naive}", ours, holds, math.isfinite(naive))
 
 
@@ -150,21 +116,16 @@ def _crowded_table() -> HardCase:
     """A plate 30 mm high covers two fifths of the picture, on one side of a level table."""
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[2, 3] = 900.0
-    depth = np.full((_ROWS, _COLUMNS), 900.0) + np.random.default_rng([34]).normal(0, 1, (_ROWS, _COLUMNS))
-    depth[:, : 2 * _COLUMNS // 5] -= 30.0
+    depth = 900.0 + np.random.default_rng([34]).normal(0, 1, views.KINECT_PX)
+    depth[:, : 2 * depth.shape[1] // 5] -= 30.0
     image = _picture(depth)
-    rays = Rays.from_image(image, pose)
-    rows, columns = (one.ravel() for one in np.indices(depth.shape))
-    points = rays.points(depth.astype(np.float32), rows, columns)
+    points = _points(image, pose)
     naive = np.linalg.lstsq(np.c_[points[:, :2], np.ones(len(points))], points[:, 2], rcond=None)[0]
-    table = find_table(depth.astype(np.float32), rays)
+    table = find_table(depth.astype(np.float32), Rays.from_image(image, pose))
     slopes = [math.degrees(math.hypot(*plane)) for plane in (naive[:2], (table.a, table.b))]
     naive_text, text = (f"{slope:.2f} degrees steep" for slope in slopes)
     case, required = "a plate over 2/5 of the table", "level to 0.1 degrees"
     return HardCase("table fit", case, required, naive_text, text, slopes[1] < 0.1, slopes[0] < 0.1)
-
-
-# Integers --------------------------------------------------------------------------------------------------
 
 
 def _depth_as_millimetres() -> HardCase:

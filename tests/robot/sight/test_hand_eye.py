@@ -32,8 +32,8 @@ def measured(camera, noise_mm=3.0):
 
 
 def test_a_quarter_turn_about_z():
-    camera = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], dtype=float) * 100
-    rig = np.array([[5, 0, 0], [5, 100, 0], [-95, 0, 0], [5, 0, 100], [-95, 100, 100]], dtype=float)
+    camera = np.array([[0, 0, 0], [100, 0, 0], [0, 100, 0], [0, 0, 100], [100, 100, 100]])
+    rig = [[5, 0, 0], [5, 100, 0], [-95, 0, 0], [5, 0, 100], [-95, 100, 100]]
     expected = [[0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     np.testing.assert_allclose(fit_hand_eye(camera, rig).rigid, expected, rtol=0, atol=1e-12)  # rounding near 100
 
@@ -74,11 +74,10 @@ def test_residuals_are_those_of_two_plain_loops_and_points_of_one_plane_are_enou
 
 
 @pytest.mark.parametrize(("camera", "rig", "name"), [(1e-3, 1, "camera"), (1, 1e-3, "rig"), (1e-3, 1e-3, "camera")])
-def test_metres_are_refused_for_any_number_of_points(camera, rig, name):
-    for count in (4, 9):
-        points = 3 * cube()[np.linspace(0, 8, count).astype(int)]
-        with pytest.raises(RobotConfigError, match=f"the {name} points must be in mm.*multiply them by 1000"):
-            fit_hand_eye(camera * points, rig * measured(points))
+def test_metres_are_refused(camera, rig, name):
+    points = 3 * cube()[[0, 2, 5, 8]]
+    with pytest.raises(RobotConfigError, match=f"the {name} points must be in mm.*multiply them by 1000"):
+        fit_hand_eye(camera * points, rig * measured(points))
 
 
 LINE = [[t, 2 * t, 3 * t] for t in (0.0, 10.0, 20.0, 30.0, 40.0)]
@@ -87,7 +86,7 @@ LINE = [[t, 2 * t, 3 * t] for t in (0.0, 10.0, 20.0, 30.0, 40.0)]
 @pytest.mark.parametrize(
     ("camera", "rig", "message"),
     [
-        (np.repeat(cube()[:3], 4, axis=0), cube(), "got .12, 3. and .9, 3."),
+        (cube()[:8], cube(), "got .8, 3. and .9, 3."),
         (np.repeat(cube()[:3], 3, axis=0), cube(), "at least 4 different points, got 3"),
         (LINE, cube()[:5], "the camera points must not lie on one line"),
         (cube()[:5], LINE, "the rig points must not lie on one line"),
