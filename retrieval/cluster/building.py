@@ -18,8 +18,8 @@ import torch
 from indexes.errors import IndexesError, LockedIndex
 from retrieval.cluster.session import ray_session
 from retrieval.console.output import say
-from retrieval.errors import RetrievalError
-from retrieval.indexing.sharded import ShardBuild, ShardJob, ShardRunner, build_shard
+from retrieval.errors import NoReadablePhoto, RetrievalError
+from retrieval.indexing.sharded import ShardBuild, ShardJob, build_shard
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import default_device
 
@@ -53,39 +53,29 @@ class ShardBuildWorker:
                 return error
 
 
-def ray_runner(cpus: int | None = None, workers: int | None = None) -> ShardRunner:
-    """Return a function that builds shards on a Ray cluster (`retrieval.cluster.session`).
-
-    Args:
-        cpus: CPUs of a Ray that is started here; None for all.
-        workers: Largest number of concurrent processes. Default: one for each GPU of the cluster, or for each CPU if
-            it has no GPU.
-    """
-
-    def run(jobs: Sequence[ShardJob], checkpoint: Checkpoint) -> Iterator[ShardBuild]:
-        with ray_session(cpus) as ray:
-            ray.data.DataContext.get_current().enable_progress_bars = False
-            processes, pool = ray_worker_pool(ray)
-            try:
-                built = ray.data.from_items([{"job": job} for job in jobs], override_num_blocks=len(jobs)).map_batches(
-                    ShardBuildWorker,
-                    batch_size=1,
-                    compute=ray.data.ActorPoolStrategy(min_size=1, max_size=min(len(jobs), workers or processes)),
-                    fn_constructor_args=(checkpoint.path.resolve(), bool(pool["num_gpus"])),
-                    **pool,
-                )
-                for row in built.iter_rows():
-                    if isinstance(row["built"], Exception):
-                        raise row["built"]
-                    yield row["built"]
-            except (RetrievalError, IndexesError):
-                raise
-            except Exception as error:  # the exceptions of Ray have no common base
-                raise RetrievalError(
-                    f"Ray lost the build ({type(error).__name__}: {error}); run the same command again to continue"
-                ) from error
-
-    return run
+def build_on_ray(jobs: Sequence[ShardJob], checkpoint: Checkpoint) -> Iterator[ShardBuild]:
+    """Build shards on a Ray cluster (`retrieval.cluster.session`): a `ShardRunner`."""
+    with ray_session() as ray:
+        ray.data.DataContext.get_current().enable_progress_bars = False
+        processes, pool = ray_worker_pool(ray)
+        try:
+            built = ray.data.from_items([{"job": job} for job in jobs], override_num_blocks=len(jobs)).map_batches(
+                ShardBuildWorker,
+                batch_size=1,
+                compute=ray.data.ActorPoolStrategy(min_size=1, max_size=min(len(jobs), processes)),
+                fn_constructor_args=(checkpoint.path.resolve(), bool(pool["num_gpus"])),
+                **pool,
+            )
+            for row in built.iter_rows():
+                if isinstance(row["built"], Exception) and not isinstance(row["built"], NoReadablePhoto):
+                    raise row["built"]
+                yield row["built"]
+        except (RetrievalError, IndexesError):
+            raise
+        except Exception as error:  # the exceptions of Ray have no common base
+            raise RetrievalError(
+                f"Ray lost the build ({type(error).__name__}: {error}); run the same command again to continue"
+            ) from error
 
 
 def ray_worker_pool(ray: Any) -> tuple[int, dict[str, int]]:

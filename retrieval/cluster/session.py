@@ -35,14 +35,11 @@ def _without_ray_warnings() -> Iterator[None]:
 
 
 @contextmanager
-def ray_session(cpus: int | None = None) -> Iterator[Any]:
+def ray_session() -> Iterator[Any]:
     """Connect to a Ray cluster, and yield the module `ray` with `ray.data` and `ray.serve`.
 
     The environment variable RAY_ADDRESS names the cluster ("auto": one on this machine). Without it, Ray is started
     here, on 127.0.0.1 only, and ends with the block. An existing connection of this process is reused and stays open.
-
-    Args:
-        cpus: CPUs of a Ray that is started here; None for all.
 
     Raises:
         BadInput: Ray is not installed.
@@ -62,7 +59,6 @@ def ray_session(cpus: int | None = None) -> Iterator[Any]:
     options: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False, "ignore_reinit_error": True}
     if not joined:
         options |= {
-            "num_cpus": cpus,
             "object_store_memory": OBJECT_STORE_BYTES,
             "include_dashboard": False,
             "runtime_env": {"worker_process_setup_hook": "retrieval.cluster.session.on_loopback"},

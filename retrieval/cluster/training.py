@@ -21,13 +21,7 @@ MAX_RESTARTS = 3
 
 
 def train_on_ray(
-    recording: Path,
-    out: Path,
-    config: Config,
-    *,
-    split: Split | None = None,
-    workers: int = 2,
-    cpus: int | None = None,
+    recording: Path, out: Path, config: Config, *, split: Split | None = None, workers: int = 2
 ) -> Checkpoint:
     """Train on several ranks, each with a GPU if the cluster has enough; as `retrieval.training.train.train`.
 
@@ -37,7 +31,6 @@ def train_on_ray(
         config: As for `train`.
         split: As for `train`.
         workers: Number of ranks.
-        cpus: CPUs of a Ray that is started here; None for all.
 
     Raises:
         BadInput: Ray is not installed.
@@ -46,7 +39,7 @@ def train_on_ray(
     """
     require_writable(out)
     settings = {"recording": recording.resolve(), "out": out.resolve(), "config": config, "split": split}
-    with ray_session(cpus) as ray, tempfile.TemporaryDirectory() as notes:
+    with ray_session() as ray, tempfile.TemporaryDirectory() as notes:
         from ray.train import FailureConfig, RunConfig, ScalingConfig, TrainingFailedError
         from ray.train.torch import TorchTrainer
 

@@ -1,5 +1,6 @@
 """`retrieve build-index`: make a folder of photos searchable."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -88,9 +89,9 @@ def build_index(
     options: dict[str, Any] = {"objects_from": objects_from, "kind": kind, "cells": cells}
     run = None
     if cluster:
-        from retrieval.cluster.building import ray_runner
+        from retrieval.cluster.building import build_on_ray
 
-        run = ray_runner()
+        run = build_on_ray
     with resumable(out):
         if shards is None:
             report = build.build_index(catalogue, checkpoint, out, **options)
@@ -103,7 +104,7 @@ def build_index(
     if preview:
         _write_views(catalogue, out, report, checkpoint)
     if json:
-        print_json(report.to_dict())
+        print_json(asdict(report))
     if report.without_photo:
         count = len(report.without_photo)
         raise RetrievalError(f"the index is written, but {count} object(s) have no readable photo; see above")

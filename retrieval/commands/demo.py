@@ -96,7 +96,7 @@ def _accuracy_summary(index: Path, queries: "dict[str, list[Grasp]]") -> str:
     from retrieval.search.searcher import Searcher
 
     with Searcher.open(index) as searcher:
-        gallery = searcher.objects.count
+        gallery = searcher.manifest.objects
         touches = [[grasp.touches for grasp in grasps] for grasps in queries.values()]
         answers = searcher.query_many(touches, top=gallery)
     ranked = [[match.object_id for match in answer.results] for answer in answers]

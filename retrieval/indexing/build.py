@@ -234,23 +234,20 @@ def _report(
     why: str,
     is_written: bool,
 ) -> BuildReport:
-    rows, references, inside = contents.rows, contents.references, out.resolve()
+    rows, inside = contents.rows, out.resolve()
     objects, candidates = Counter(row.object_id for row in rows), manifest.about["candidates"]
     names, first_photo = sorted(objects), {row.object_id: row.path for row in reversed(rows)}
     shown = dict.fromkeys((names[0], names[len(names) // 2], names[-1]))
-    encoded = {"touch_only": len(references.pictures), "encoded": references.encoded}
     return BuildReport(
         index=str(out),
         generation=manifest.generation,
         written=is_written,
-        model=str(checkpoint.path),
         photos=len(rows),
         objects=len(names),
         objects_from=options.naming.text,
         examples=[(name, first_photo[name]) for name in shown],
         warnings=naming_warnings(objects, options.naming),
         embedded=contents.encoded,
-        reused=len(rows) - contents.encoded,
         skipped=contents.skipped,
         ignored=[name for name in catalogue.ignored if not (catalogue.folder / name).resolve().is_relative_to(inside)],
         without_photo=sorted(set(catalogue.object_ids) - objects.keys()),
@@ -261,6 +258,5 @@ def _report(
         candidates=candidates,
         partial_error=manifest.about["partial_error"],
         cells=options.cells,
-        seconds=contents.seconds,
-        references={**references.counts, **encoded} if references.rows else None,
+        references=contents.references.report,
     )

@@ -105,17 +105,12 @@ def kept_measurement(before: Mapping[str, Any] | None, photos: int, encoded: int
 
 def candidate_steps(photos: int) -> list[int]:
     """Return the numbers of candidates to try: `EXHAUSTIVE_LIMIT`, its doubles below `photos`, and `photos`."""
-    doubled = takewhile(lambda k: k < photos, (EXHAUSTIVE_LIMIT << power for power in range(40)))
-    return [*doubled, photos]
+    return [*takewhile(lambda k: k < photos, (EXHAUSTIVE_LIMIT << power for power in range(40))), photos]
 
 
 @torch.inference_mode()
-def query_codes(checkpoint: Checkpoint, count: int | None = None) -> tuple[Floats, Floats] | None:
-    """Return the touches that a checkpoint stores to measure with.
-
-    Args:
-        checkpoint: The model.
-        count: Largest number of touches; None for all.
+def query_codes(checkpoint: Checkpoint, count: int) -> tuple[Floats, Floats] | None:
+    """Return the touches that a checkpoint stores to measure with, at most `count`.
 
     Returns:
         Partial activations (Q, partial_width) and unit embeddings (Q, d), float32. None if the checkpoint stores no

@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from threading import Lock
 from typing import Any, NamedTuple
 
 import msgspec
@@ -39,7 +38,7 @@ Paths = tuple[str, ...]
 """Files of one photo (one) or of one touch (one for each finger), relative to the catalogue."""
 
 BATCH = 16
-"""Photos that are encoded together."""
+"""Photos or touches that are encoded together."""
 MIN_PHOTOS_FOR_ONNX = 256
 """Smallest number of new photos that ONNX Runtime encodes: exporting the towers takes about a second."""
 MIN_AGE_NS = 2 * 10**9
@@ -83,8 +82,7 @@ class CatalogueFiles:
 
     def digest(self, path: str) -> str:
         """Return the digest of a known file, or an empty string."""
-        record = self.known.get(path)
-        return "" if record is None else record.digest
+        return self.known[path].digest if path in self.known else ""
 
     def read(self, path: str) -> tuple[FileRecord, bytes]:
         """Read a file, which becomes known. Raises ImageError."""
@@ -114,7 +112,6 @@ class Encoder(NamedTuple):
         what: Plural of the items.
         layout: Type of a code.
         model: Group of the codes in the cache: a digest of model, preprocessing and layout.
-        batch: Number of items that are encoded together.
         decode: Returns the model's input from the bytes of an item's files and their paths; raises ImageError.
         start: Returns, for a number of items to encode, the function that returns the codes (B,) of inputs with these
             paths; several threads call it at once.
@@ -123,7 +120,6 @@ class Encoder(NamedTuple):
     what: str
     layout: np.dtype[Any]
     model: str
-    batch: int
     decode: Callable[[Sequence[bytes], Paths], Any]
     start: Callable[[int], Callable[[Sequence[Any], Sequence[Paths]], NDArray[Any]]]
 
@@ -141,8 +137,9 @@ def photo_encoder(checkpoint: Checkpoint) -> Encoder:
     )
 
     def start(count: int) -> Callable[[Sequence[Any], Sequence[Paths]], NDArray[Any]]:
-        is_long = count >= MIN_PHOTOS_FOR_ONNX
-        run = choose_photo_encoder(checkpoint) if is_long else torch_photo_encoder(checkpoint.matcher)
+        run = (
+            torch_photo_encoder(checkpoint.matcher) if count < MIN_PHOTOS_FOR_ONNX else choose_photo_encoder(checkpoint)
+        )
 
         def encode(images: Sequence[Any], paths: Sequence[Paths]) -> NDArray[Any]:
             encoded, records = run(images), np.empty(len(images), layout)
@@ -159,10 +156,13 @@ def photo_encoder(checkpoint: Checkpoint) -> Encoder:
 
         return encode
 
-    def decode(data: Sequence[bytes], paths: Paths) -> Any:
-        return photo_from_bytes(data[0], paths[0])
-
-    return Encoder("photos", layout, _model(checkpoint, layout), BATCH, decode, start)
+    return Encoder(
+        "photos",
+        layout,
+        _model(checkpoint, layout),
+        lambda data, paths: photo_from_bytes(data[0], paths[0]),
+        start,
+    )
 
 
 def touch_encoder(checkpoint: Checkpoint) -> Encoder:
@@ -187,7 +187,7 @@ def touch_encoder(checkpoint: Checkpoint) -> Encoder:
             records["shows"] = [SHOWS.index(shows) for shows in check.classify(readings.cpu().numpy())]
         return records
 
-    return Encoder("touches", layout, _model(checkpoint, layout), 32, decode, lambda count: encode)
+    return Encoder("touches", layout, _model(checkpoint, layout), decode, lambda count: encode)
 
 
 def _model(checkpoint: Checkpoint, layout: np.dtype[Any]) -> str:
@@ -215,9 +215,9 @@ def find_codes(items: Sequence[Paths], encoder: Encoder, files: CatalogueFiles, 
     Raises:
         NumericalError: A partial activation exceeds float16.
     """
-    stored, claim, found = cache.keys(encoder.model), Lock(), Codes()
+    found, taken = Codes(), dict[str, Paths | None].fromkeys(cache.keys(encoder.model))
     known = {paths: encoder.key(map(files.digest, paths)) for paths in items}
-    found.keys = {paths: key for paths, key in known.items() if key in stored}
+    found.keys = {paths: key for paths, key in known.items() if key in taken}
     unread = [paths for paths in items if paths not in found.keys]
     if not unread:
         return found
@@ -233,10 +233,7 @@ def find_codes(items: Sequence[Paths], encoder: Encoder, files: CatalogueFiles, 
                 found.skipped.append(SkippedPhoto(paths[0], error.reason))
                 continue
             found.keys[paths] = key = encoder.key(record.digest for record in records)
-            with claim:
-                is_new = key not in stored
-                stored.add(key)
-            if is_new:
+            if taken.setdefault(key, paths) is paths:  # no other thread encodes this content
                 try:
                     inputs.append(encoder.decode(contents, paths))
                     new[key] = paths
@@ -251,10 +248,10 @@ def find_codes(items: Sequence[Paths], encoder: Encoder, files: CatalogueFiles, 
         one_thread(),
     ):
         try:
-            for codes in map_in_order(pool, process, batches(unread, encoder.batch), 2 * threads):
+            for codes in map_in_order(pool, process, batches(unread, BATCH), 2 * threads):
                 cache.add(codes)
                 found.encoded += len(codes)
-                bar.advance(min(encoder.batch, len(unread) - bar.done))
+                bar.advance(min(BATCH, len(unread) - bar.done))
         finally:
             pool.shutdown(cancel_futures=True)
     for paths in [paths for paths, key in found.keys.items() if key in unusable]:

@@ -2,12 +2,10 @@
 
 import hashlib
 import json
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from _touch_retrieval.cache import Cache
@@ -24,7 +22,6 @@ from retrieval.indexing.codes import (
     touch_encoder,
 )
 from retrieval.model.checkpoint import Checkpoint
-from retrieval.model.encode import batches
 from retrieval.model.gel_check import CONTACT
 from retrieval.model.references import REFERENCE_PARTIALS, REFERENCE_ROWS
 
@@ -34,43 +31,24 @@ BLOCK = 1024
 
 @dataclass(frozen=True, eq=False)
 class ReferenceTouches:
-    """The reference touches of a catalogue (R of them).
+    """The reference touches of a catalogue.
 
     Attributes:
-        rows: Object, paths of the gel images and their digests, of each touch.
-        partials: Their partial activations (R, touch_partial_width).
+        documents: Documents of the generation: object, paths of the gel images and their digests of each touch, and
+            the partial activations (touches, touch_partial_width); empty without references.
+        about: Entries of the manifest; empty without references.
+        report: Numbers for the report; None without references.
         pictures: A gel image of each object without photos, in place of its photo.
         keys: Keys of the codes of all touches in the cache.
-        encoded: Number of touches that were encoded now.
         skipped: Touches that could not be used.
     """
 
-    rows: list[dict[str, Any]] = field(default_factory=list)
-    partials: NDArray[np.float16] = field(default_factory=lambda: np.empty((0, 0), np.float16))
+    documents: dict[str, Any] = field(default_factory=dict)
+    about: dict[str, Any] = field(default_factory=dict)
+    report: dict[str, int] | None = None
     pictures: list[CataloguePhoto] = field(default_factory=list)
     keys: list[str] = field(default_factory=list)
-    encoded: int = 0
     skipped: list[SkippedPhoto] = field(default_factory=list)
-
-    @property
-    def documents(self) -> dict[str, Any]:
-        """Documents of the generation; empty without references."""
-        touch_only = sorted(picture.object_id for picture in self.pictures)
-        listed = {"touches": self.rows, "touch_only": touch_only}
-        return {REFERENCE_ROWS: listed, REFERENCE_PARTIALS: self.partials} if self.rows else {}
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Number of touches and of their objects."""
-        return {"touches": len(self.rows), "objects": len({row["object_id"] for row in self.rows})}
-
-    @property
-    def about(self) -> dict[str, Any]:
-        """Entries of the manifest; empty without references."""
-        if not self.rows:
-            return {}
-        digest = hashlib.sha256(json.dumps(self.documents[REFERENCE_ROWS]).encode()).hexdigest()
-        return {REFERENCE_ROWS: {**self.counts, "sha256": digest}}
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +62,6 @@ class IndexContents:
         references: The reference touches.
         encoded: Number of photos that were encoded now.
         skipped: Photos and touches that could not be used.
-        seconds: Time of decoding and encoding photos.
     """
 
     rows: list[Row]
@@ -93,12 +70,11 @@ class IndexContents:
     references: ReferenceTouches
     encoded: int
     skipped: list[SkippedPhoto]
-    seconds: float
 
     def blocks(self, cache: Cache) -> Iterator[dict[str, NDArray[Any]]]:
         """Yield the codes of the rows in blocks: arrays by name, such as "embeddings" (n, d)."""
-        for some in batches(self.keys, BLOCK):
-            records = read_codes(cache, self.encoder, some)
+        for start in range(0, len(self.keys), BLOCK):
+            records = read_codes(cache, self.encoder, self.keys[start : start + BLOCK])
             yield {name: records[name] for name in self.encoder.layout.names or ()}
 
 
@@ -112,9 +88,8 @@ def read_contents(catalogue: Catalogue, checkpoint: Checkpoint, cache: Cache, qu
     files = CatalogueFiles(catalogue, cache)
     references = _find_references(catalogue, checkpoint, files, cache, quiet)
     photos = sorted([*catalogue.photos, *references.pictures], key=lambda photo: photo.path)
-    start, encoder = time.perf_counter(), photo_encoder(checkpoint)
+    encoder = photo_encoder(checkpoint)
     codes = find_codes([(photo.path,) for photo in photos], encoder, files, cache, quiet)
-    seconds = time.perf_counter() - start
     files.save()
     if not codes.keys:
         raise no_photo(catalogue, [*catalogue.skipped, *codes.skipped])
@@ -126,7 +101,6 @@ def read_contents(catalogue: Catalogue, checkpoint: Checkpoint, cache: Cache, qu
         references,
         codes.encoded,
         [*catalogue.skipped, *codes.skipped, *references.skipped],
-        seconds,
     )
 
 
@@ -160,8 +134,19 @@ def _find_references(
         if touch.object_id not in photographed:
             picture = CataloguePhoto(touch.paths[0], touch.object_id, touch.metadata)
             pictures.setdefault(touch.object_id, picture)
-    partials = records["partial"][[shows == CONTACT for shows in shown]]
-    return ReferenceTouches(rows, partials, list(pictures.values()), list(codes.keys.values()), codes.encoded, skipped)
+    if not rows:
+        return ReferenceTouches(keys=list(codes.keys.values()), skipped=skipped)
+    listed = {"touches": rows, "touch_only": sorted(pictures)}
+    counts = {"touches": len(rows), "objects": len({row["object_id"] for row in rows})}
+    digest = hashlib.sha256(json.dumps(listed).encode()).hexdigest()
+    return ReferenceTouches(
+        {REFERENCE_ROWS: listed, REFERENCE_PARTIALS: records["partial"][[shows == CONTACT for shows in shown]]},
+        {REFERENCE_ROWS: {**counts, "sha256": digest}},
+        {**counts, "touch_only": len(pictures), "encoded": codes.encoded},
+        list(pictures.values()),
+        list(codes.keys.values()),
+        skipped,
+    )
 
 
 def require_reference_calibration(checkpoint: Checkpoint) -> None:

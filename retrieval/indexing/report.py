@@ -1,7 +1,7 @@
 """The report of `build-index`, for people and as JSON."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from retrieval.data.catalogue import SkippedPhoto
@@ -18,14 +18,12 @@ class BuildReport:
         index: Folder of the index.
         generation: Name of the current generation.
         written: Whether a new generation was written; False if nothing changed.
-        model: Path of the checkpoint.
         photos: Number of photos in the index.
         objects: Number of objects in the index.
         objects_from: Rule that names objects (`retrieval.data.naming`).
         examples: Some objects, each with one of its photos.
         warnings: Sentences about suspicious object names.
         embedded: Number of photos that were encoded now.
-        reused: Number of photos that were not.
         skipped: Images that could not be read.
         ignored: Files that are not images, by their names.
         without_photo: Objects without a readable image.
@@ -36,7 +34,6 @@ class BuildReport:
         candidates: Measured number of candidates; None if the checkpoint stores no touches to measure with.
         partial_error: Largest possible rounding error of a stored partial activation.
         cells: Whether the index stores the cells of photos, for late interaction; None for a model without cells.
-        seconds: Time of decoding and encoding.
         shards: Shards of a sharded index, as in its manifest (`indexes.store.sharded`); None for an index folder.
         references: Numbers of reference touches (`touches`), their objects (`objects`), objects without photos
             (`touch_only`) and touches that were encoded now (`encoded`); None without references.
@@ -50,14 +47,12 @@ class BuildReport:
     index: str
     generation: str
     written: bool
-    model: str
     photos: int
     objects: int
     objects_from: str
     examples: list[tuple[str, str]]
     warnings: list[str]
     embedded: int
-    reused: int
     skipped: list[SkippedPhoto]
     ignored: list[str]
     without_photo: list[str]
@@ -68,21 +63,12 @@ class BuildReport:
     candidates: dict[str, Any] | None
     partial_error: float
     cells: bool | None
-    seconds: float
     shards: list[dict[str, Any]] | None = None
     references: dict[str, Any] | None = None
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return a plain dictionary for JSON."""
-        document = asdict(self)
-        if self.references is None:
-            del document["references"]
-        return document
-
     def lines(self) -> Iterator[str]:
         """Yield the lines of the printed report."""
-        rate = f", {self.embedded / self.seconds:.1f} photos per second" if self.embedded else ""
-        counts = f"{self.embedded} embedded, {self.reused} unchanged{rate}"
+        counts = f"{self.embedded} embedded, {self.photos - self.embedded} unchanged"
         yield f"{self.index} ({self.generation}): {self.photos} photos of {self.objects} objects; {counts}"
         if not self.written:
             yield "nothing changed: the index stays as it is"

@@ -26,7 +26,7 @@ from indexes.store.sharded import (
     shard_number,
     write_sharded_manifest,
 )
-from retrieval.data.catalogue import Catalogue, SkippedPhoto, list_catalogue
+from retrieval.data.catalogue import Catalogue, list_catalogue
 from retrieval.data.naming import naming_warnings
 from retrieval.errors import BadInput, NoReadablePhoto
 from retrieval.indexing.build import BuildOptions, build_listed, build_options
@@ -48,21 +48,8 @@ class ShardJob:
     options: BuildOptions
 
 
-@dataclass(frozen=True)
-class ShardBuild:
-    """Result of a `ShardJob`.
-
-    Attributes:
-        folder: Name of the shard's folder.
-        report: Its report; None if none of its photos can be read.
-        skipped: Photos that could not be read.
-    """
-
-    folder: str
-    report: BuildReport | None
-    skipped: list[SkippedPhoto]
-
-
+ShardBuild = BuildReport | NoReadablePhoto
+"""Result of a `ShardJob`: an error if none of its photos can be read."""
 ShardRunner = Callable[[Sequence[ShardJob], Checkpoint], Iterable[ShardBuild]]
 """Builds shards, in any order."""
 
@@ -119,9 +106,11 @@ def build_sharded(
             require_reference_calibration(checkpoint.without_cells() if options.cells is False else checkpoint)
         _delete_old_shards(own, before, shards)
         jobs = [ShardJob(own / name, part, options) for name, part in _split_catalogue(catalogue, shards)]
-        built = sorted((run or build_in_process)(jobs, checkpoint), key=lambda one: one.folder)
-        report = _report(own, catalogue, options, built)
-        manifest = _manifest(own, before, shards, checkpoint, catalogue, report, built)
+        built = list(run(jobs, checkpoint)) if run else [build_shard(job, checkpoint) for job in jobs]
+        reports = sorted((one for one in built if isinstance(one, BuildReport)), key=lambda one: one.index)
+        unreadable = [one for one in built if isinstance(one, NoReadablePhoto)]
+        report = _report(own, catalogue, options, reports, unreadable)
+        manifest = _manifest(own, before, shards, checkpoint, catalogue, report, reports)
         if written := before is None or manifest.generation != before.generation:
             write_sharded_manifest(own, manifest)
         for entry in manifest.shards:
@@ -135,18 +124,12 @@ def build_sharded(
     )
 
 
-def build_in_process(jobs: Sequence[ShardJob], checkpoint: Checkpoint) -> Iterable[ShardBuild]:
-    """Build shards in this process, one after another."""
-    return [build_shard(job, checkpoint) for job in jobs]
-
-
 def build_shard(job: ShardJob, checkpoint: Checkpoint) -> ShardBuild:
-    """Build one shard; it may have no readable photo. Raises the errors of `build_index`."""
+    """Build one shard. Raises the errors of `build_index`, except for a shard without a readable photo."""
     try:
-        report = build_listed(job.catalogue, checkpoint, job.folder, job.options)
+        return build_listed(job.catalogue, checkpoint, job.folder, job.options)
     except NoReadablePhoto as error:
-        return ShardBuild(job.folder.name, None, error.skipped)
-    return ShardBuild(job.folder.name, report, report.skipped)
+        return error
 
 
 def _delete_old_shards(out: Path, before: ShardedManifest | None, shards: int) -> None:
@@ -170,23 +153,26 @@ def _split_catalogue(catalogue: Catalogue, shards: int) -> Iterable[tuple[str, C
         yield f"shard-{number:02d}-of-{shards:02d}", part
 
 
-def _report(out: Path, catalogue: Catalogue, options: BuildOptions, built: Sequence[ShardBuild]) -> BuildReport:
+def _report(
+    out: Path,
+    catalogue: Catalogue,
+    options: BuildOptions,
+    reports: Sequence[BuildReport],
+    unreadable: Sequence[NoReadablePhoto],
+) -> BuildReport:
     """Merge the reports of all shards. Raises NoReadablePhoto if no shard has a photo."""
-    reports = [one.report for one in built if one.report is not None]
-    skipped = [*catalogue.skipped, *(item for one in built for item in one.skipped)]
+    bad = [item for error in unreadable for item in error.skipped]
+    skipped = [*catalogue.skipped, *(item for report in reports for item in report.skipped), *bad]
     if not reports:
         raise no_photo(catalogue, skipped)
-    bad = {item.path for one in built if one.report is None for item in one.skipped}
-    lost = {photo.object_id for photo in catalogue.photos if photo.path in bad}
+    paths = {item.path for item in bad}
+    lost = {photo.object_id for photo in catalogue.photos if photo.path in paths}
     reason, same = Counter(report.reason for report in reports).most_common(1)[0]
     references = [report.references for report in reports if report.references]
     sums = {key: sum(one[key] for one in references) for key in ("touches", "objects", "touch_only", "encoded")}
     return replace(
         reports[0],
-        **{
-            name: sum(getattr(report, name) for report in reports)
-            for name in ("photos", "objects", "embedded", "reused", "seconds")
-        },
+        **{name: sum(getattr(report, name) for report in reports) for name in ("photos", "objects", "embedded")},
         index=str(out),
         warnings=naming_warnings(Counter(photo.object_id for photo in catalogue.photos), options.naming),
         skipped=skipped,
@@ -208,7 +194,7 @@ def _manifest(
     checkpoint: Checkpoint,
     catalogue: Catalogue,
     report: BuildReport,
-    built: Sequence[ShardBuild],
+    reports: Sequence[BuildReport],
 ) -> ShardedManifest:
     """Return the new manifest, or the current one if they would be equal."""
     about: dict[str, Any] = {
@@ -230,14 +216,13 @@ def _manifest(
         of=shards,
         shards=[
             ShardEntry(
-                folder=one.folder,
-                generation=one.report.generation,
-                sha256=file_digest(own / one.folder / one.report.generation / MANIFEST),
-                photos=one.report.photos,
-                objects=one.report.objects,
+                folder=Path(one.index).name,
+                generation=one.generation,
+                sha256=file_digest(Path(one.index, one.generation, MANIFEST)),
+                photos=one.photos,
+                objects=one.objects,
             )
-            for one in built
-            if one.report is not None
+            for one in reports
         ],
     )
     if before is None:

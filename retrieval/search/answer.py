@@ -5,12 +5,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from retrieval.errors import BadInput
-from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck
-from retrieval.model.touch_reader import TouchEncodings
+from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
 from retrieval.model.verification import ACCEPT, ANOTHER_GRASP, REJECT, DecisionBounds
 
 MATCH, NONE_OF_THESE, UNCALIBRATED = "match", "none of these", "uncalibrated"
@@ -111,9 +107,9 @@ class QueryResult:
         none_probability: Probability that the object is out of catalogue.
         posterior: Formula of the probabilities and its numbers (`retrieval.model.posterior`).
         results: The ranking.
-        more_grasps: If the verdict is "none of these" and the ranking is clear (`is_clear`): number of further grasps
-            like these after which "match" is expected (`Posterior.more_grasps`). None otherwise, and if too many are
-            needed.
+        more_grasps: If the verdict is "none of these" and the ranking is clear (`CLEAR_PROBABILITY`): number of further
+            grasps like these after which "match" is expected (`Posterior.more_grasps`). None otherwise, and if too many
+            are needed.
 
     >>> with retrieval.open("index") as searcher:
     ...     answer = searcher.query(["a.png", "b.png"])
@@ -145,7 +141,7 @@ class QueryResult:
         if self.verdict != NONE_OF_THESE or best is None or best.probability_if_present is None:
             return None
         references = "Reference touches" if best.reference is None else "More reference touches"
-        if not is_clear(best.probability_if_present):
+        if best.probability_if_present <= CLEAR_PROBABILITY:
             return f"The ranking is not clear. {references} of its first objects would help."
         if self.more_grasps is None:
             return (
@@ -197,11 +193,6 @@ def _match(document: dict[str, Any], catalogue: Path) -> Match:
     return Match(**own, photo_path=catalogue / document["photo"], reference=reference)
 
 
-def is_clear(probability_if_present: float) -> bool:
-    """Whether a ranking whose first object has this probability is clear."""
-    return probability_if_present > CLEAR_PROBABILITY
-
-
 def verdict_sentence(result: QueryResult) -> str:
     """Return the verdict as a sentence, with the grasps that were left out."""
 
@@ -240,9 +231,8 @@ class Verification:
             grasp with contact, the first two, and so on.
         bounds: The bounds of the decision, and their error rates on validation objects.
 
-    >>> import retrieval
-    >>> retrieval.Verification("mug", "reject", [["a.png"]], ["contact"], [-3.2], None).is_accepted
-    False
+    >>> retrieval.Verification("mug", "no contact", [["a.png"]], ["no contact"], [], None).sentence
+    'no contact: the gels show no contact; close the jaws on the object, or press harder'
     """
 
     expected: str
@@ -251,11 +241,6 @@ class Verification:
     grasps: list[str]
     log_ratios: list[float]
     bounds: DecisionBounds | None
-
-    @property
-    def is_accepted(self) -> bool:
-        """Whether the object is accepted as the expected one."""
-        return self.decision == ACCEPT
 
     def to_dict(self) -> dict[str, Any]:
         """Return the document of `retrieve verify --json`."""
@@ -283,10 +268,3 @@ class Verification:
             f"reject: not {self.expected}, log likelihood ratio {ratio:.1f}; "
             f"false-reject rate {rate.value:.2g} [{rate.low:.2g}, {rate.high:.2g}]"
         )
-
-
-def gel_classes(check: GelCheck | None, codes: TouchEncodings) -> NDArray[np.str_]:
-    """Return the gel check (G,) of each encoded grasp; without a check or readings, every grasp has contact."""
-    if check is None or codes.readings is None:
-        return np.full(len(codes.partials), CONTACT)
-    return np.array(check.classify(codes.readings, codes.levels))

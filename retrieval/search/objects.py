@@ -113,8 +113,7 @@ class Objects:
         rows, documents = generation.rows, generation.documents
         self.posterior = stored.posterior or Posterior()  # without calibration objects are ranked, too
         self._of_row, self.count = rows.objects, rows.object_count
-        self._original = None if (rows.originals == np.arange(len(rows))).all() else rows.originals
-        """For each photo the first one with the same bytes; None if all photos differ."""
+        self._originals = rows.originals
         self._photos = np.bincount(self._of_row)
         self._columns, self._calibration = columns, stored.references
         try:
@@ -166,12 +165,10 @@ class Objects:
             similarities: Similarities of the grasps with the reference touches.
             grasps: Number of grasps.
         """
-        if (
-            self._original is not None
-        ):  # equal photos get equal logits: a matrix product may round its last rows differently
-            original, of_original = self._original[rows], np.empty(len(self._original), dtype=np.float32)
-            of_original[original[::-1]] = logits[::-1]  # the last assignment remains: that of the first equal photo
-            logits = of_original[original]
+        # Equal photos get equal logits, of the first one: a matrix product may round its last rows differently.
+        originals, of_original = self._originals[rows], np.empty(len(self._originals), dtype=np.float32)
+        of_original[originals[::-1]] = logits[::-1]  # the last assignment remains
+        logits = of_original[originals]
         numbers, owner = np.unique(self._of_row[rows], return_inverse=True)
         order = np.lexsort((rows, -logits, owner))
         first = order[np.searchsorted(owner[order], np.arange(len(numbers)))]

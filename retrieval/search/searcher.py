@@ -22,16 +22,14 @@ from retrieval.model.touch_reader import EncodedTouches, Stopwatch, TouchEncoder
 from retrieval.model.touches import AnyImage, AnyTouches, InputImage, parse_grasps
 from retrieval.model.verification import MAX_GRASPS, DecisionBounds
 from retrieval.search.answer import (
+    CLEAR_PROBABILITY,
     MATCH,
     NONE_OF_THESE,
     UNCALIBRATED,
     Match,
     QueryResult,
     Verification,
-    gel_classes,
-    is_clear,
 )
-from retrieval.search.objects import Objects
 from retrieval.search.opening import OpenShards, open_index
 from retrieval.search.shard import FolderShard, ShardResult, Shards
 
@@ -106,11 +104,6 @@ class Searcher:
     def generation(self) -> Generation:
         """The opened generation of an index folder. Raises BadInput for a sharded index."""
         return self.folder_shard.generation
-
-    @property
-    def objects(self) -> Objects:
-        """The objects of the opened generation of an index folder. Raises BadInput for a sharded index."""
-        return self.folder_shard.objects
 
     @property
     def folder_shard(self) -> FolderShard:
@@ -218,7 +211,7 @@ class Searcher:
         """
         opened = self._snapshot()
         grasps = parse_grasps(touches, opened.reader.fingers)
-        codes = opened.reader.encode(grasps, opened.reader.no_contact_frames(background), Stopwatch())
+        codes, _ = opened._encoded(grasps, background, Stopwatch())
         return EncodedTouches(codes.embeddings, codes.partials)
 
     def verify(
@@ -282,7 +275,10 @@ class Searcher:
     ) -> tuple[TouchEncodings, NDArray[np.str_]]:
         """Return the codes of grasps and the gel check (G,) of each."""
         codes = self.reader.encode(grasps, self.reader.no_contact_frames(background), clock)
-        return codes, gel_classes(self.checkpoint.gel_check, codes)
+        check = self.checkpoint.gel_check
+        if check is None or codes.readings is None:  # then every grasp has contact
+            return codes, np.full(len(grasps), CONTACT)
+        return codes, np.array(check.classify(codes.readings, codes.levels))
 
     def _result(
         self,
@@ -296,11 +292,11 @@ class Searcher:
         manifest, posterior, count = self.manifest, self.posterior, classes.count(CONTACT)
         probabilities, formula, more_grasps = None, None, None
         verdict = _fault(classes) or UNCALIBRATED
-        if found is not None and found.mass is not None and posterior is not None:
+        if found is not None and posterior is not None:
             logits = [one.logit for one in found.best]
             probabilities = posterior.probabilities_given(logits, found.mass, count, none_prior)
             verdict = MATCH if probabilities.objects.max() > probabilities.none else NONE_OF_THESE
-            if verdict == NONE_OF_THESE and is_clear(float(probabilities.objects_if_present[0])):
+            if verdict == NONE_OF_THESE and probabilities.objects_if_present[0] > CLEAR_PROBABILITY:
                 more_grasps = posterior.more_grasps(logits[0], found.mass.objects, count, none_prior)
             formula = {
                 **asdict(posterior),

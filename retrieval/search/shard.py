@@ -49,14 +49,14 @@ class ShardResult:
         photos: Number of scored photos.
         objects: Number of scored objects.
         best: The best objects, ordered by (-logit, name), at most the requested number.
-        mass: Evidence mass of all objects; None if the model is not calibrated.
+        mass: Evidence mass of all objects.
         timing_ms: Milliseconds by stage; of several shards, those of the slowest.
     """
 
     photos: int
     objects: int
     best: list[RankedObject]
-    mass: EvidenceMass | None
+    mass: EvidenceMass
     timing_ms: Mapping[str, float]
 
 
@@ -85,7 +85,7 @@ class FolderShard:
         check_fingerprint(generation.folder.parent, generation.manifest.fingerprint, fingerprint(stored))
         self.generation, self.manifest, self.scorer = generation, generation.manifest, read_scorer(stored)
         self.objects = Objects(generation, stored, self.scorer.cosine_columns)
-        self._has_embeddings, self._is_calibrated = stored.config.has_embeddings, stored.posterior is not None
+        self._has_embeddings = stored.config.has_embeddings
 
     def search(self, query: EncodedTouches, top: int, candidates: int | None) -> ShardResult:
         """Return the best objects for the grasps of a query, and the evidence mass of all objects.
@@ -190,10 +190,8 @@ class FolderShard:
 
     def _mass(
         self, partials: Floats, scored: Rows, logits: NDArray[np.float64], similarities: Similarities
-    ) -> EvidenceMass | None:
+    ) -> EvidenceMass:
         """Return the evidence mass of all objects, of which those in `scored` have these logits."""
-        if not self._is_calibrated:
-            return None
         # A sample of unscored objects estimates their mass. Without a sample, use the lowest logit of the scored ones,
         # an upper estimate: unscored objects are expected to be worse than candidates.
         sample = logits.min(keepdims=True)
@@ -235,12 +233,11 @@ class Shards:
         """As `FolderShard.search`; each shard reranks `candidates` photos."""
         results: list[ShardResult] = self.call(self.shards, "search", query, top, candidates)
         best = [one for result in results for one in result.best]
-        masses = [result.mass for result in results if result.mass is not None]
         return ShardResult(
             sum(result.photos for result in results),
             sum(result.objects for result in results),
             sorted(best, key=lambda one: (-one.logit, one.photo.object_id))[:top],
-            EvidenceMass.merged(masses) if masses else None,
+            EvidenceMass.merged([result.mass for result in results]),
             {stage: max(result.timing_ms[stage] for result in results) for stage in results[0].timing_ms},
         )
 

@@ -6,7 +6,6 @@ import os
 import re
 import subprocess
 import sys
-import time
 from contextlib import suppress
 
 import numpy as np
@@ -79,55 +78,14 @@ print(json.dumps(states))
 """
 
 
-def run(program: str, *arguments: str) -> str:
-    done = subprocess.run(
-        [sys.executable, "-c", program, *arguments],
-        check=True,
-        timeout=120,
-        capture_output=True,
-        text=True,
-        env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
-    )
-    return done.stdout
-
-
 def test_a_kill_at_any_filesystem_step_leaves_the_old_or_the_new_index_complete(tmp_path):
-    found = json.loads(run(KILLED_AT_EVERY_STEP, str(tmp_path), json.dumps(STEPS)))
+    command = [sys.executable, "-c", KILLED_AT_EVERY_STEP, str(tmp_path), json.dumps(STEPS)]
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(command, check=True, timeout=120, capture_output=True, text=True, env=environment)
+    found = json.loads(done.stdout)
     assert set(found) == {"old", "new"}
     assert found == sorted(found, reverse=True)  # the switch happens once: old before it, new after it
     assert len(found) > 15
-
-
-WRITING_FOREVER = """
-import sys
-import numpy as np
-from indexes.store.folder import IndexStore
-from indexes.store.rows import Row
-turn = 0
-while True:
-    turn += 1
-    rows = [Row(f"{number:03}", str(turn), str(number)) for number in range(200)]
-    vectors = np.random.default_rng(turn).normal(size=(200, 16))
-    vectors = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
-    IndexStore(sys.argv[1]).write(rows, [{"embeddings": vectors, "partials": vectors}], kind=sys.argv[2])
-    print(turn, flush=True)
-"""
-
-
-@pytest.mark.parametrize("kind", ["flat", pytest.param("HNSW8", marks=pytest.mark.slow)])
-def test_kills_at_random_moments_leave_a_complete_index(tmp_path, kind):
-    store, rng = IndexStore(tmp_path), np.random.default_rng(0)
-    for _ in range(3):
-        with run_process([sys.executable, "-c", WRITING_FOREVER, str(tmp_path), kind]) as writer:
-            first_line(writer)
-            time.sleep(float(rng.uniform(0, 0.05)))
-            found = store.open()  # reading while it writes
-            writer.kill()
-        for one in (found, store.open()):
-            assert len({row.object_id for row in one.rows}) == 1
-            assert one.count == 200
-            own = np.ascontiguousarray(one.embeddings)
-            assert one.index.search(own, 1)[1][:, 0].tolist() == list(range(200))
 
 
 class Steps:
@@ -214,12 +172,6 @@ def test_a_writer_killed_before_the_first_switch_does_not_block_the_next(tmp_pat
     assert filled(tmp_path).count == 20
 
 
-def test_two_writers_in_one_process_exclude_each_other(tmp_path):
-    with IndexStore(tmp_path).lock(), pytest.raises(LockedIndex, match="another writer"):
-        filled(tmp_path)
-    assert filled(tmp_path).count == 20
-
-
 HOLDING = """
 import sys, time
 from indexes.store.folder import IndexStore
@@ -240,20 +192,12 @@ def test_a_writer_in_another_process_is_reported_and_its_death_releases_the_lock
     assert filled(tmp_path, 5).count == 5
 
 
-def test_a_lock_file_that_cannot_be_opened_raises_one_error(tmp_path):
-    (tmp_path / "index").write_text("a file")
-    with pytest.raises(WriteFailed, match="lock file cannot be opened"):
-        filled(tmp_path / "index")
-
-
 def test_a_disk_without_locks_is_not_reported_as_locked(tmp_path, monkeypatch):
     def refused(descriptor, how):
         raise OSError(errno.EOPNOTSUPP, "Operation not supported")
 
     monkeypatch.setattr(locking.fcntl, "flock", refused)
-    with pytest.raises(
-        WriteFailed, match=r"this disk does not support locks \(Operation not supported\); build the index on"
-    ):
+    with pytest.raises(WriteFailed, match="does not support locks"):
         filled(tmp_path)
 
 

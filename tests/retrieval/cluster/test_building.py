@@ -117,7 +117,7 @@ def test_each_process_of_the_pool_requests_its_own_gpu(catalogue, model, tmp_pat
         assert "PyTorch cannot use them there" in capsys.readouterr().err
         monkeypatch.setattr(building, "_has_gpu", lambda: True)
         monkeypatch.setattr(building, "ShardBuildWorker", ReportingWorker)
-        report = build_sharded(catalogue, checkpoint, tmp_path / "c", 4, quiet=True, run=building.ray_runner())
+        report = build_sharded(catalogue, checkpoint, tmp_path / "c", 4, quiet=True, run=building.build_on_ray)
     assert (report.photos, report.embedded) == (24, 24)
     names = [entry.folder for entry in read_sharded_manifest(tmp_path / "c").shards]
     assert {(reports / name).read_text() for name in names} <= {"['0'] 0 2", "['1'] 1 2"}

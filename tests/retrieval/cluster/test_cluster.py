@@ -43,7 +43,7 @@ SHARD, WORKER = r"ray::ServeReplica:shard-", r"ray::MapWorker"
 def ray():
     from retrieval.cluster.session import ray_session
 
-    with ray_session(2) as module:
+    with ray_session() as module:
         yield module
         for opened in OPENED:
             opened.close()
@@ -220,7 +220,7 @@ from concurrent.futures import ThreadPoolExecutor
 from retrieval.cluster.serving import Deployments, ReplicaSettings
 from retrieval.cluster.session import ray_session
 from retrieval.search.searcher import Searcher
-with ray_session(2) as ray:
+with ray_session() as ray:
     served = Deployments(ray, ReplicaSettings(cpus=0.1, wait_s=240.0))
     with Searcher.open(sys.argv[1], shards=served.open) as searcher, ThreadPoolExecutor(12) as threads:
         print(set(threads.map(lambda _: str(searcher.shard.photos(["nothing"])), range(12))), flush=True)
@@ -254,9 +254,9 @@ def partials_of(cluster):
 
 
 def test_shards_built_by_ray_equal_those_built_in_process(ray, catalogue, cluster, model, tmp_path):
-    from retrieval.cluster.building import ray_runner
+    from retrieval.cluster.building import build_on_ray
 
-    report = build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=ray_runner())
+    report = build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=build_on_ray)
     assert (report.photos, report.embedded, len(report.shards)) == (24, 24, 4)
     assert ray.is_initialized()  # an existing session stays open
     ours, theirs = partials_of(tmp_path / "c"), partials_of(cluster)
@@ -284,14 +284,12 @@ def many(tmp_path):
 
 def test_a_killed_worker_loses_nothing_and_repeats_little(ray, many, model, tmp_path):
     """Codes are stored immediately: only photos in work of the killed process are embedded twice."""
-    from retrieval.cluster.building import ray_runner
+    from retrieval.cluster.building import build_on_ray
 
     done = {}
 
     def build():
-        done["report"] = build_sharded(
-            many, load_checkpoint(model), tmp_path / "c", 3, quiet=True, run=ray_runner(workers=1)
-        )
+        done["report"] = build_sharded(many, load_checkpoint(model), tmp_path / "c", 3, quiet=True, run=build_on_ray)
 
     thread = threading.Thread(target=build)
     thread.start()

@@ -27,7 +27,7 @@ RANK = r"ray::RayTrainWorker|ray::_RayTrainWorker|ray::RayTrainWorker__execute"
 def train_on_ray(*words, **how):
     from retrieval.cluster.training import train_on_ray as train_on_cluster
 
-    return train_on_cluster(*words, cpus=2, **how)
+    return train_on_cluster(*words, **how)
 
 
 @pytest.mark.slow

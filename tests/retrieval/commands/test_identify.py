@@ -3,15 +3,14 @@
 import itertools
 import json
 
-import numpy as np
 import pytest
 
 from retrieval.commands.main import main
 from retrieval.data.dataset import load_grasps
 from retrieval.indexing.build import build_index
 from retrieval.model.checkpoint import load_checkpoint
+from retrieval.model.gel_check import GelCheck
 from retrieval.model.shipped import shipped_model
-from retrieval.search import answer, searcher
 from robot.collection import CollectSettings, collect
 from robot.recording.folder import read_recording
 from robot.rig import load_rig
@@ -93,8 +92,7 @@ def test_without_an_accepted_grasp_the_error_states_why_the_last_attempt_failed(
 
 
 def test_an_image_that_is_no_gel_image_ends_the_run_since_no_further_grasp_changes_it(identify, monkeypatch):
-    monkeypatch.setattr(answer, "gel_classes", lambda check, codes: np.full(len(codes.partials), "not a gel image"))
-    monkeypatch.setattr(searcher, "gel_classes", answer.gel_classes)
+    monkeypatch.setattr(GelCheck, "classify", lambda check, readings, levels: ["not a gel image"] * len(readings))
     assert identify("--confidence", "1", "--grasps", "3") == 5
 
 

@@ -74,7 +74,6 @@ def give_posterior(monkeypatch, searcher, posterior):
     """Give an opened index another posterior; None for a model without one."""
     monkeypatch.setattr(searcher, "posterior", posterior)
     for shard in getattr(searcher.shard, "shards", [searcher.shard]):
-        monkeypatch.setattr(shard, "_is_calibrated", posterior is not None)
         monkeypatch.setattr(shard.objects, "posterior", posterior or Posterior())
 
 
@@ -461,7 +460,8 @@ def test_a_model_that_uses_a_background_needs_one_for_each_finger(subtracting, s
 
 def test_another_model_than_the_indexs_raises(index, model, tmp_path):
     other = variant(model, tmp_path / "other.safetensors", training__seed=5)
-    with pytest.raises(MismatchedIndex, match="made with checkpoint"):
+    must = f"made with checkpoint '{load_checkpoint(model).digest[:12]}', but '{other.digest[:12]}' is required"
+    with pytest.raises(MismatchedIndex, match=must):
         Searcher.open(index, model=other.path)
 
 
@@ -502,9 +502,9 @@ def by_plain_loops(owners, rows, logits, scale):
 def made_up_objects(searcher, rng):
     """500 photos of 40 objects."""
     owners = np.concatenate([np.arange(40), rng.integers(0, 40, 460)])
-    made_up = copy.copy(searcher.objects)
+    made_up = copy.copy(searcher.shard.objects)
     made_up._of_row, made_up._photos, made_up.posterior = owners, np.bincount(owners), STEEP
-    made_up._touch_only = np.zeros(40, dtype=bool)
+    made_up._touch_only, made_up._originals = np.zeros(40, dtype=bool), np.arange(500)
     return made_up
 
 
@@ -525,9 +525,9 @@ def test_the_logit_and_the_best_photo_of_each_object_equal_plain_loops(levels, g
 @pytest.mark.parametrize("photos", [1, 2, 3, 7, 24, 29])
 def test_equal_photos_give_the_same_logit_for_any_number_of_them(photos, searcher):
     """Their mean equals each of them; rounding in the last bit would put the later of two names first."""
-    made_up = copy.copy(searcher.objects)
+    made_up = copy.copy(searcher.shard.objects)
     made_up._of_row = np.array([0] * photos + [1])
-    made_up._photos = np.bincount(made_up._of_row)
+    made_up._photos, made_up._originals = np.bincount(made_up._of_row), np.arange(photos + 1)
     logits = np.full(photos + 1, 1.3, dtype=np.float32)
     made_up.posterior = Posterior(slope=0.9)
     many, one = made_up.score(np.arange(photos + 1), logits, np.full(8, np.nan), 1).logits
@@ -547,8 +547,8 @@ def test_the_best_objects_equal_a_plain_sort(top, levels):
 
 
 def test_equal_photos_get_the_logit_of_the_first_scored_one(searcher):
-    made_up = copy.copy(searcher.objects)
-    made_up._of_row, made_up._original = np.arange(24), np.array([0, 1, 0, 1, 4, 0, *range(6, 24)])
+    made_up = copy.copy(searcher.shard.objects)
+    made_up._of_row, made_up._originals = np.arange(24), np.array([0, 1, 0, 1, 4, 0, *range(6, 24)])
     made_up._photos, made_up._touch_only = np.ones(24, dtype=int), np.zeros(24, dtype=bool)
     rows, logits = np.array([2, 3, 4, 5]), np.array([0.25, 0.5, 0.75, 0.26], dtype=np.float32)
     assert made_up.score(rows, logits, np.full(24, np.nan), 1).logits.tolist() == [0.25, 0.5, 0.75, 0.25]

@@ -104,8 +104,9 @@ def test_a_result_has_the_number_of_shards_and_folder_attributes_raise(divided, 
 # Merging by hand ------------------------------------------------------------------------------------------------------
 
 
-def scored(*objects, mass=None, photos=10):
+def scored(*objects, photos=10):
     best = [RankedObject(logit, ListedPhoto(name, f"{name}/1.jpg", {})) for name, logit in objects]
+    mass = STEEP.mass([logit for _, logit in objects])
     return ShardResult(photos, len(best), best, mass, {"candidates": 1.0, "rerank": photos / 10})
 
 
@@ -170,7 +171,7 @@ def test_a_rebuild_of_the_same_photos_embeds_nothing_and_switches_only_changed_s
     build_sharded(catalog, load_checkpoint(model), cluster, 4, quiet=True)  # the catalogue has another path now
     before = read_sharded_manifest(cluster)
     again = build_sharded(catalog, load_checkpoint(model), cluster, 4, quiet=True)
-    assert (again.written, again.embedded, again.reused) == (False, 0, 24)
+    assert (again.written, again.embedded) == (False, 0)
     assert read_sharded_manifest(cluster) == before
     name = min(path.name for path in catalog.iterdir())
     shutil.copy(next(catalog.glob("*/2.jpg")), catalog / name / "new.jpg")
@@ -227,7 +228,7 @@ def test_killed_between_shards_the_index_is_unchanged_and_the_next_build_embeds_
     assert not (tmp_path / "c" / "SHARDS.json").exists()
     (tmp_path / "c" / ".SHARDS.json.1.tmp").touch()  # of a build that was killed in its last step
     monkeypatch.setattr(module, "build_shard", build)
-    done = sum(one.report.photos for one in finished)
+    done = sum(report.photos for report in finished)
     embedded.clear()
     report = build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True)
     assert (report.photos, sum(embedded)) == (24, 24 - done)
@@ -302,10 +303,10 @@ def test_a_failure_of_ray_ends_the_build_with_a_clear_error(catalogue, model, tm
 
     context = SimpleNamespace(get_current=SimpleNamespace)
     parts = SimpleNamespace(data=SimpleNamespace(DataContext=context, from_items=failing, ActorPoolStrategy=dict))
-    monkeypatch.setattr(building, "ray_session", lambda cpus: nullcontext(parts))
+    monkeypatch.setattr(building, "ray_session", lambda: nullcontext(parts))
     monkeypatch.setattr(building, "ray_worker_pool", lambda ray: (1, {"num_gpus": 0}))
     with pytest.raises(RetrievalError, match=r"KeyError: .*same command again to continue"):
-        build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=building.ray_runner(1, 1))
+        build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=building.build_on_ray)
 
 
 # Damage ---------------------------------------------------------------------------------------------------------------

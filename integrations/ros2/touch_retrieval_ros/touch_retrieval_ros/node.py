@@ -125,7 +125,7 @@ class RecogniserNode:
         except _ERRORS as error:
             response.error = self._warn("Verify", error)
             return response
-        response.decision, response.accepted = result.decision, result.is_accepted
+        response.decision, response.accepted = result.decision, result.decision == "accept"
         response.sentence, response.log_ratios = result.sentence, result.log_ratios
         return response
 
