@@ -136,8 +136,7 @@ class Objects:
         self._codes = unit_embeddings(partials[order], columns)
         self._owners = numbers[order]
         self._touched, self._starts = np.unique(self._owners, return_index=True)
-        self._touch_only = np.zeros(self.count, np.bool_)
-        self._touch_only[[number_of[name] for name in listed.touch_only if number_of[name] >= 0]] = True
+        self._touch_only = np.isin(np.arange(self.count), [number_of[name] for name in listed.touch_only])
 
     @cached_property
     def gel_images(self) -> dict[str, ListedPhoto]:

@@ -30,6 +30,7 @@ from retrieval.search.answer import (
     QueryResult,
     Verification,
 )
+from retrieval.search.objects import Objects
 from retrieval.search.opening import OpenShards, open_index
 from retrieval.search.shard import FolderShard, ShardResult, Shards
 
@@ -104,6 +105,11 @@ class Searcher:
     def generation(self) -> Generation:
         """The opened generation of an index folder. Raises BadInput for a sharded index."""
         return self.folder_shard.generation
+
+    @property
+    def objects(self) -> Objects:
+        """The objects of the opened generation of an index folder. Raises BadInput for a sharded index."""
+        return self.folder_shard.objects
 
     @property
     def folder_shard(self) -> FolderShard:

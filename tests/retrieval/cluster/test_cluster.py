@@ -25,7 +25,7 @@ from retrieval.errors import IncompleteSearch
 from retrieval.indexing.sharded import build_sharded
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.searcher import Searcher
-from tests import ray_processes, serving, synthetic
+from tests import ray_processes, serving
 from tests.waiting import first_line, run_process
 
 pytestmark = [
@@ -63,12 +63,9 @@ def served(ray, cluster):
         yield searcher
 
 
-def parts(match):
-    return match.logit, match.probability, match.probability_if_present
-
-
 def numbers(answer):
-    return [answer.none_probability, *(part for match in answer.results for part in parts(match))]
+    parts = [(match.logit, match.probability, match.probability_if_present) for match in answer.results]
+    return [answer.none_probability, *np.ravel(parts)]
 
 
 def names(answer):
@@ -93,28 +90,6 @@ def test_everything_listens_only_on_this_machine(served, touch):
     found = ray_processes.listening_addresses()
     assert found
     assert found <= LOOPBACK
-
-
-REPLICA = """
-import sys
-from pathlib import Path
-from indexes.store.sharded import read_sharded_manifest
-from retrieval.cluster.serving import ShardReplica
-from threadpoolctl import threadpool_info
-manifest = read_sharded_manifest(Path(sys.argv[1]))
-replica = ShardReplica(sys.argv[1], manifest.shards[0], sys.argv[2])
-print(*(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"))
-"""
-
-
-def test_a_shard_uses_one_blas_thread(cluster):
-    """Idle threads of OpenBLAS spin for a while: with them, a query over Ray took 40 ms instead of 6."""
-    model = read_sharded_manifest(cluster).about["checkpoint"]
-    environment = os.environ | {"OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
-    command = [sys.executable, "-c", REPLICA, str(cluster), str(model)]
-    output = subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout.split()
-    assert output
-    assert set(output) == {"1"}
 
 
 HOLDING = """
@@ -268,18 +243,14 @@ def test_shards_built_by_ray_equal_those_built_in_process(ray, catalogue, cluste
 
 
 @pytest.fixture
-def many(tmp_path):
-    """A catalogue of 240 different photos."""
-    folder = tmp_path / "many"
-    base = next(
-        path for path in sorted(synthetic.write_catalogue(tmp_path / "few", synthetic.make_objects(1)).rglob("*.jpg"))
-    )
-    data = base.read_bytes()
+def many(catalogue, tmp_path):
+    """A catalogue of 240 different photos of 40 objects."""
+    data = min(catalogue.rglob("*.jpg")).read_bytes()
     for number in range(240):
-        place = folder / f"object-{number % 40:02d}" / f"{number}.jpg"
+        place = tmp_path / "many" / f"object-{number % 40:02d}" / f"{number}.jpg"
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_bytes(data + b"\0" + str(number).encode())  # different content; decoders stop at the end marker
-    return folder
+    return tmp_path / "many"
 
 
 def test_a_killed_worker_loses_nothing_and_repeats_little(ray, many, model, tmp_path):
@@ -329,10 +300,3 @@ def test_the_service_on_a_cluster_gives_the_results_of_the_folder_and_restarts_a
         while (remaining := set(below) & set(ray_processes.parents())) and time.monotonic() < deadline:
             time.sleep(0.2)
         assert not remaining
-
-
-def test_without_a_cluster_the_service_says_what_to_do(index, capsys):
-    from retrieval.commands.main import main
-
-    assert main(["serve", "--index", str(index), "--cluster", "--no-history"]) == 2
-    assert "has no shards; build a sharded index with `retrieve build-index --shards`" in capsys.readouterr().err

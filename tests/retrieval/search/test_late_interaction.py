@@ -60,28 +60,6 @@ def test_a_photo_takes_two_bytes_for_each_pooled_number_and_one_for_each_number_
         assert 0 < searcher.generation.manifest.about["partial_error"] < 0.02
 
 
-def test_logits_of_an_index_equal_those_of_the_network_but_for_the_rounding(index, checkpoint, catalogue, touches):
-    files = next(iter(touches.values()))[0]
-    load = checkpoint.config.preprocessing
-    with Searcher.open(index) as searcher, torch.inference_mode():
-        result = searcher.query(files, top=8)
-        gels = torch.from_numpy(np.stack([load.load_touch(file) for file in files])).permute(0, 3, 1, 2)[None]
-        matcher = checkpoint.matcher
-        touch = matcher.touch_encoding(matcher.touch_features(gels)).partial
-        for match in result.results:
-            photo = torch.from_numpy(load.load_photo(catalogue / match.photo)).permute(2, 0, 1)[None]
-            partial = matcher.photo_encoding(matcher.photo_features(photo)).partial
-            exact = float(matcher.head(touch, partial))
-            row = [at for at, row in enumerate(searcher.generation.rows) if row.path == match.photo]
-            found = searcher.shard._logits(searcher.encode(files).partials, np.array(row))
-            assert float(found[0]) == pytest.approx(exact, abs=0.02)
-
-
-def test_a_second_build_embeds_no_photo_again(index, catalogue, checkpoint):
-    report = build_index(catalogue, checkpoint, index, quiet=True)
-    assert report.embedded == 0
-
-
 # Cells left out -------------------------------------------------------------------------------------------------------
 
 
@@ -95,27 +73,29 @@ def arrays_of(index):
     return IndexStore(index).open().arrays
 
 
-def test_an_index_without_cells_gives_the_pooled_logits_and_their_posterior(
-    pooled_index, checkpoint, catalogue, touches
+@pytest.mark.parametrize("cells", [True, False])
+def test_logits_of_an_index_equal_those_of_the_network_but_for_the_rounding(
+    cells, index, pooled_index, checkpoint, catalogue, touches
 ):
-    assert list(arrays_of(pooled_index)) == ["partials"]
+    """Without cells, the pooled part of a photo's partial activation, and the posterior of pooled logits."""
     files, load, matcher = next(iter(touches.values()))[0], checkpoint.config.preprocessing, checkpoint.matcher
-    with Searcher.open(pooled_index) as searcher, torch.inference_mode():
-        assert searcher.posterior == POOLED_POSTERIOR
-        assert searcher.scorer.cell_dim == 0
-        partials = searcher.encode(files).partials
-        for match in searcher.query(files, top=8).results:
-            photo = torch.from_numpy(load.load_photo(catalogue / match.photo)).permute(2, 0, 1)[None]
-            pooled = matcher.photo_encoding(matcher.photo_features(photo)).partial[:, : CELLS.pooled_width]
-            row = [at for at, row in enumerate(searcher.generation.rows) if row.path == match.photo]
-            found = searcher.shard._logits(partials, np.array(row))
-            assert float(found[0]) == pytest.approx(float(matcher.head(torch.from_numpy(partials), pooled)), abs=0.01)
+    gels = torch.from_numpy(np.stack([load.load_touch(file) for file in files])).permute(0, 3, 1, 2)[None]
+    width = None if cells else CELLS.pooled_width
+    with Searcher.open(index if cells else pooled_index) as searcher, torch.inference_mode():
+        assert set(searcher.generation.arrays) == ({"partials", "cells"} if cells else {"partials"})
+        assert searcher.posterior == (POSTERIOR if cells else POOLED_POSTERIOR)
+        touch = matcher.touch_encoding(matcher.touch_features(gels)).partial[:, :width]
+        found = searcher.shard._logits(searcher.encode(files).partials, np.arange(searcher.generation.count))
+        for row, logit in zip(searcher.generation.rows, found, strict=True):
+            photo = torch.from_numpy(load.load_photo(catalogue / row.path)).permute(2, 0, 1)[None]
+            partial = matcher.photo_encoding(matcher.photo_features(photo)).partial[:, :width]
+            assert float(logit) == pytest.approx(float(matcher.head(touch, partial)), abs=0.02)
 
 
 def test_a_later_build_keeps_the_setting(pooled_index, index, catalogue, checkpoint):
     assert not build_index(catalogue, checkpoint, pooled_index, quiet=True).written
     report = build_index(catalogue, checkpoint, index, quiet=True)
-    assert (report.written, report.cells) == (False, True)
+    assert (report.written, report.cells, report.embedded) == (False, True, 0)
 
 
 def test_cells_can_be_dropped_and_added_again(index, pooled_index, catalogue, checkpoint):

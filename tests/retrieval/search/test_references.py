@@ -21,6 +21,7 @@ from retrieval.search.objects import Objects
 from retrieval.search.searcher import Searcher
 from tests import synthetic
 from tests.documents import ROOT, text_of
+from tests.indexes.test_damage import forge
 from tests.reference_model import NAMES, POSTERIOR, REFERENCE_CALIBRATION, write_reference_model
 
 EMBEDDING = slice(32, 48)
@@ -90,17 +91,6 @@ def test_photos_and_references_of_an_object_combine_as_computed_by_hand(
     assert match.reference.adds == pytest.approx(match.logit - bare, abs=1e-4)
 
 
-def test_logits_of_objects_without_references_do_not_change(
-    catalogue_copy, catalogue_with_touches, calibrated_model, tmp_path, touches
-):
-    with_them = query_new_index(catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[0]][2])
-    for path in catalogue_with_touches.rglob("touch_*"):
-        path.unlink()
-    without = query_new_index(catalogue_with_touches, calibrated_model, tmp_path / "bare", touches[NAMES[0]][2])
-    before, after = ({match.object_id: match.logit for match in one.results} for one in (without, with_them))
-    assert [after[name] for name in NAMES[4:]] == pytest.approx([before[name] for name in NAMES[4:]], abs=1e-5)
-
-
 def test_photos_of_the_nearest_reference_are_always_scored(
     catalogue_with_touches, calibrated_model, tmp_path, touches, monkeypatch
 ):
@@ -118,30 +108,21 @@ def test_photos_of_the_nearest_reference_are_always_scored(
             assert len(rows) <= len(photos) + 1
 
 
-def test_the_result_has_the_reference_calibration_and_reads_back(
-    catalogue_with_touches, calibrated_model, tmp_path, touches
-):
-    result = query_new_index(catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[0]][2])
-    references = result.posterior["references"]
-    assert (references["touches"], references["objects"]) == (8, 4)
-    assert typed(references["calibration"], ReferenceCalibration, complete=True) == REFERENCE_CALIBRATION
-    document = json.loads(json.dumps(result.to_dict()))
-    assert QueryResult.from_dict(document).to_dict() == result.to_dict()
-
-
-def test_the_documented_keys_of_references_are_those_written(
+def test_the_documented_keys_of_references_are_those_written_and_the_result_reads_back(
     catalogue_with_touches, calibrated_model, tmp_path, touches
 ):
     documented = text_of(ROOT / "docs" / "formats.md").split("| with reference touches |")[1].split("\n\n")[0]
-    result = query_new_index(
-        catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[0]][2]
-    ).to_dict()
+    result = query_new_index(catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[0]][2])
+    document = json.loads(json.dumps(result.to_dict()))
+    assert QueryResult.from_dict(document).to_dict() == result.to_dict()
     generation = IndexStore(tmp_path / "index").open()
     keys = {f"about.references.{key}" for key in generation.manifest.about["references"]}
-    keys |= {f"reference.{key}" for key in result["results"][0]["reference"]}
+    keys |= {f"reference.{key}" for key in document["results"][0]["reference"]}
     assert keys | {"posterior.references"} == set(re.findall(r"`([a-z_0-9]+\.[\w.]+)`", documented))
-    about = {key.rsplit(".")[-1] for key in keys if key.startswith("about")}
-    assert set(result["posterior"]["references"]) == about | {"calibration"}
+    references = result.posterior["references"]
+    assert set(references) == {*generation.manifest.about["references"], "calibration"}
+    assert (references["touches"], references["objects"]) == (8, 4)
+    assert typed(references["calibration"], ReferenceCalibration, complete=True) == REFERENCE_CALIBRATION
     assert {"references.json", "touches.npy"} <= {path.name for path in generation.folder.iterdir()}
 
 
@@ -187,14 +168,20 @@ def test_only_new_touches_are_encoded_again(catalogue_with_touches, calibrated_m
     assert (more.written, more.embedded, more.references["touches"], more.references["encoded"]) == (True, 0, 9, 1)
 
 
-def test_removing_the_touches_restores_the_results(catalogue_copy, calibrated_model, tmp_path, touches):
-    index = tmp_path / "index"
-    before = query_new_index(catalogue_copy, calibrated_model, index, touches[NAMES[0]][2])
+def test_touches_change_only_the_logits_of_their_object_until_they_are_removed(
+    catalogue_copy, calibrated_model, tmp_path, touches
+):
+    def query():
+        return query_new_index(catalogue_copy, calibrated_model, tmp_path / "index", touches[NAMES[0]][2]).results
+
+    before = query()
     synthetic.put_touch(catalogue_copy, NAMES[0], 0, touches[NAMES[0]][0])
-    assert query_new_index(catalogue_copy, calibrated_model, index, touches[NAMES[0]][2]).results != before.results
-    (catalogue_copy / NAMES[0] / "touch_0_a.png").unlink()
-    (catalogue_copy / NAMES[0] / "touch_0_b.png").unlink()
-    assert query_new_index(catalogue_copy, calibrated_model, index, touches[NAMES[0]][2]).results == before.results
+    bare, touched = ({match.object_id: match.logit for match in results} for results in (before, query()))
+    assert touched.pop(NAMES[0]) != pytest.approx(bare.pop(NAMES[0]), abs=1e-3)
+    assert touched == pytest.approx(bare, abs=1e-5)
+    for path in (catalogue_copy / NAMES[0]).glob("touch_*"):
+        path.unlink()
+    assert query() == before
 
 
 def test_unusable_touches_are_left_out_with_a_reason(catalogue_with_touches, calibrated_model, tmp_path):
@@ -210,16 +197,10 @@ def test_unusable_touches_are_left_out_with_a_reason(catalogue_with_touches, cal
     assert report.without_photo == [NAMES[2]]  # no photo or touch of it is usable
 
 
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"posterior": None}, "no calibration of reference touches"),
-        ({}, "no calibration of reference touches"),
-    ],
-)
-def test_a_model_without_reference_calibration_builds_nothing(catalogue_with_touches, tmp_path, changed, message):
-    model = write_reference_model(tmp_path / "other.safetensors", references=None, **changed)
-    with pytest.raises(BadInput, match=message):
+@pytest.mark.parametrize("posterior", [POSTERIOR, None])
+def test_a_model_without_reference_calibration_builds_nothing(catalogue_with_touches, tmp_path, posterior):
+    model = write_reference_model(tmp_path / "other.safetensors", references=None, posterior=posterior)
+    with pytest.raises(BadInput, match="no calibration of reference touches"):
         build_index(catalogue_with_touches, model, tmp_path / "index", quiet=True)
     with pytest.raises(BadInput, match="no calibration of reference touches"):
         build_sharded(catalogue_with_touches, model, tmp_path / "sharded", 2, quiet=True)
@@ -243,36 +224,22 @@ def test_a_sharded_index_gives_the_results_of_one_folder(catalogue_with_touches,
     assert divided.posterior["references"]["touches"] == 8
 
 
-def forged(index, **changed):
-    """Rewrite the index with other reference touches."""
-    store = IndexStore(index)
-    current = store.open()
-    rows = list(current.rows)
-    documents = {name: changed.get(name, content) for name, content in current.documents.items()}
-    store.write(
-        rows,
-        [{"embeddings": current.embeddings, **current.arrays}],
-        documents=documents,
-        fingerprint=current.manifest.fingerprint,
-        about=current.manifest.about,
-    )
-
-
 TOUCH = {"object_id": NAMES[0], "touch": ["a.png"], "digests": ["0"]}
 
 
 @pytest.mark.parametrize(
-    "changed",
+    "references",
     [
-        {"references": []},
-        {"references": {"touches": [TOUCH | {"touch": ["../../etc/passwd"]}] * 8, "touch_only": []}},
-        {"references": {"touches": [TOUCH | {"object_id": 3}] * 8, "touch_only": []}},
-        {"references": {"touches": [TOUCH | {"digests": []}] * 8, "touch_only": []}},
+        [],
+        {"touches": [TOUCH | {"touch": ["../../etc/passwd"]}] * 8, "touch_only": []},
+        {"touches": [TOUCH | {"object_id": 3}] * 8, "touch_only": []},
+        {"touches": [TOUCH | {"digests": []}] * 8, "touch_only": []},
     ],
 )
-def test_forged_references_raise_a_clear_error(catalogue_with_touches, calibrated_model, tmp_path, changed):
-    index = tmp_path / "index"
-    build_index(catalogue_with_touches, calibrated_model, index, quiet=True)
-    forged(index, **changed)
+def test_forged_references_raise_a_clear_error(catalogue_with_touches, calibrated_model, tmp_path, references):
+    build_index(catalogue_with_touches, calibrated_model, tmp_path / "index", quiet=True)
+    folder = IndexStore(tmp_path / "index").open().folder
+    (folder / "references.json").write_text(json.dumps(references))
+    forge(folder)
     with pytest.raises(CorruptIndex, match="retrieve build-index"):
-        Searcher.open(index)
+        Searcher.open(tmp_path / "index")

@@ -1,11 +1,11 @@
 """From gel images to ranked objects, compared with two plain loops over the whole network."""
 
-import copy
 import dataclasses
 import math
 import shutil
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from retrieval.indexing.build import build_index
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
 from retrieval.model.encode import to_batch, touch_batch
 from retrieval.model.posterior import Posterior
-from retrieval.search.objects import ScoredObjects
+from retrieval.search.objects import Objects, ScoredObjects
 from retrieval.search.searcher import Searcher
 from retrieval.search.shard import combined_embedding
 from tests import synthetic
@@ -208,17 +208,6 @@ def test_equal_photos_of_several_objects_are_all_found_in_the_order_of_their_ids
         assert [match.rank for match in results] == [1, 2, 3]
 
 
-def test_a_reader_continues_with_the_generation_it_opened(catalogue, model, touch, tmp_path):
-    own, index = shutil.copytree(catalogue, tmp_path / "catalog"), tmp_path / "index"
-    build_index(own, load_checkpoint(model), index, quiet=True)
-    reader = Searcher.open(index)
-    before = reader.query([touch]).results
-    for path in sorted(own.iterdir())[:4]:
-        shutil.rmtree(path)
-        build_index(own, load_checkpoint(model), index, quiet=True)
-    assert reader.query([touch]).results == before
-
-
 @pytest.mark.parametrize("top", [1, 3, 8, 50])
 def test_top_limits_the_ranking(top, searcher, touch):
     whole = searcher.query([touch], top=8).results
@@ -240,24 +229,37 @@ def test_the_ranking_does_not_depend_on_the_number_of_threads(searcher, grasps):
 
 
 @pytest.mark.parametrize("candidates", [None, 24, 1000])
-def test_no_candidate_stage_runs_if_it_covers_all_photos(
-    candidates, searcher, catalogue, model, touch, tmp_path, searches
-):
+def test_no_candidate_stage_runs_if_it_covers_all_photos(candidates, searcher, touch, searches):
     assert searcher.query([touch], candidates=candidates).index["scored"] == 24
-    if candidates is None:  # nor without trained embeddings
-        checkpoint = variant(model, tmp_path / "paper.safetensors", training__weights={})
-        build_index(catalogue, checkpoint, tmp_path / "index", quiet=True)
-        assert Searcher.open(tmp_path / "index").query([touch], candidates=2, top=1).index["scored"] == 24
     assert searches == []
 
 
-@pytest.mark.parametrize(("candidates", "top", "stage"), [(1, 1, 1), (9, 1, 9), (23, 1, 23), (2, 5, 5)])
-def test_one_candidate_stage_with_the_requested_number_runs_if_it_omits_photos(
-    candidates, top, stage, searcher, grasps, searches
+def test_no_candidate_stage_runs_without_trained_embeddings(catalogue, model, touch, tmp_path, searches):
+    checkpoint = variant(model, tmp_path / "paper.safetensors", training__weights={})
+    build_index(catalogue, checkpoint, tmp_path / "index", quiet=True)
+    assert Searcher.open(tmp_path / "index").query([touch], candidates=2, top=1).index["scored"] == 24
+    assert searches == []
+
+
+@pytest.mark.parametrize(
+    ("measured", "numbers", "expected"),
+    [
+        ({"k": 5}, {"top": 2}, [5]),
+        ({"k": 5}, {"top": 7}, [7]),
+        ({"k": 5}, {"top": 2, "candidates": 9}, [9]),
+        ({"k": 5}, {"top": 2, "candidates": 1}, [2]),
+        (None, {"top": 1, "candidates": 23}, [23]),
+        (None, {"top": 2}, []),
+        ({"k": 24}, {"top": 2}, []),
+    ],
+)
+def test_the_index_sets_the_number_of_candidates_unless_the_query_does(
+    measured, numbers, expected, searcher, grasps, searches, monkeypatch
 ):
-    result = searcher.query(grasps, candidates=candidates, top=top)
-    assert searches == [stage]
-    assert stage <= result.index["scored"] <= 24
+    monkeypatch.setitem(searcher.generation.manifest.about, "candidates", measured)
+    scored = searcher.query(grasps, **numbers).index["scored"]
+    assert searches == expected
+    assert sum(expected) <= scored <= 24
 
 
 @pytest.mark.parametrize(("candidates", "completed"), [(5, 1), (2, 1), (2, 20)])
@@ -285,17 +287,10 @@ def test_the_candidates_are_the_photos_nearest_to_all_grasps_together(
     assert [(match.object_id, match.photo) for match in result.results] == [item[:2] for item in expected[:2]]
 
 
-def test_the_combined_embedding_orders_by_sums_of_cosines_and_is_the_first_if_they_cancel():
-    """A photo between two grasps is nearer to both together than the photos nearest to one of them."""
-    grasps = np.array([[1, 0, 0], [0, 1, 0]], dtype=np.float32)
-    between = np.sqrt(0.5) * grasps.sum(0)
-    np.testing.assert_allclose(combined_embedding(grasps), [between], atol=1e-7)
-    np.testing.assert_allclose(combined_embedding(grasps[[0, 0, 1]]), np.array([[2, 1, 0]]) / np.sqrt(5), atol=1e-7)
-    photos = np.array([[0.9, np.sqrt(0.19), 0], [np.sqrt(0.19), 0.9, 0], between], dtype=np.float32)
-    assert (grasps @ photos.T).argmax(1).tolist() == [0, 1]
-    assert (combined_embedding(grasps) @ photos.T).argmax() == (grasps @ photos.T).sum(0).argmax() == 2
+def test_the_combined_embedding_is_that_of_the_first_grasp_if_they_cancel():
+    """The direction of the sum would be that of its rounding, or 0 / 0."""
     grasp = np.array([[0.6, 0.8]], dtype=np.float32)
-    for off in (0, 1e-6):  # the direction of the sum would be that of its rounding, or 0 / 0
+    for off in (0, 1e-6):
         np.testing.assert_array_equal(combined_embedding(np.concatenate([grasp, off - grasp])), grasp)
 
 
@@ -321,38 +316,27 @@ def test_probabilities_equal_normalised_likelihoods_with_none_of_these_and_follo
     assert if_present == pytest.approx([term / math.fsum(terms) for term in terms], abs=1e-12)
 
 
-def test_the_probability_if_present_is_unchanged_if_none_of_these_is_certain(searcher, touch, monkeypatch):
-    without_none = searcher.query([touch], none_prior=0)
-    give_posterior(monkeypatch, searcher, dataclasses.replace(searcher.posterior, offset=-1000.0))
-    result = searcher.query([touch])
-    assert (result.none_probability, result.top.probability) == (1.0, 0.0)
-    shown = [match.probability_if_present for match in result.results]
-    assert shown == pytest.approx([match.probability for match in without_none.results], abs=1e-12)
-
-
 @pytest.mark.parametrize(
     ("missing", "scale", "more"),
     [
         (110, 10_000, 1),  # with dependence 0.5 and logit 100, two grasps weigh 133, three 150, five 167
-        (140, 10_000, 2),
         (200, 10_000, None),
         (110, 0.01, None),  # one more would suffice, but the ranking is not clear
     ],
 )
-def test_more_grasps_is_the_number_needed_if_the_ranking_is_clear_and_few_suffice(
+def test_more_grasps_are_advised_if_the_ranking_is_clear_and_few_suffice(
     missing, scale, more, searcher, touch, monkeypatch
 ):
     """The best object has logit 100, and a match needs the evidence `missing`."""
     head = searcher.scorer
-    scaled = dataclasses.replace(head, out=scale * head.out, out_bias=scale * head.out_bias)
-    monkeypatch.setattr(searcher.shard, "scorer", scaled)
     give_posterior(monkeypatch, searcher, Posterior(1.0, math.log(8) - missing, dependence=0.5))
-    lift = 100 - searcher.query([touch]).top.logit
-    monkeypatch.setattr(searcher.shard, "scorer", dataclasses.replace(scaled, out_bias=scaled.out_bias + lift))
-    result = searcher.query([touch])
+    scaled = dataclasses.replace(head, out=scale * head.out, out_bias=0.0)
+    for _ in range(2):
+        monkeypatch.setattr(searcher.shard, "scorer", scaled)
+        result = searcher.query([touch])
+        scaled = dataclasses.replace(scaled, out_bias=scaled.out_bias + 100 - result.top.logit)
     assert result.top.logit == pytest.approx(100, rel=1e-4)
     assert (result.verdict, result.more_grasps) == ("none of these", more)
-    assert result.to_dict()["more_grasps"] == more
 
 
 def test_objects_with_equal_probabilities_are_still_ranked_by_logit(searcher, touch, monkeypatch):
@@ -485,53 +469,51 @@ def test_a_moved_model_must_be_given(moved, touch):
 # The best of each object -----------------------------------------------------------------------------------------
 
 
-def by_plain_loops(owners, rows, logits, scale):
-    """{object number: (row of its best photo, log mean exp over all its photos)}; ties take the first photo."""
-    best, terms = {}, {}
-    for row, logit in zip(rows.tolist(), logits.tolist(), strict=True):
-        owner = owners[row]
-        terms.setdefault(owner, []).append(math.exp(scale * logit))
-        if owner not in best or logit > best[owner][1]:
-            best[owner] = (row, logit)
-    return {
-        owner: (row, math.log(math.fsum(terms[owner]) / owners.count(owner)) / scale)
-        for owner, (row, _) in best.items()
-    }
+def objects_of(owners, originals=None, posterior=STEEP):
+    """Objects whose photos have these numbers of objects, and perhaps equal photos; without reference touches."""
+    originals = np.arange(len(owners)) if originals is None else np.array(originals)
+    rows = SimpleNamespace(objects=np.array(owners), object_count=max(owners) + 1, originals=originals)
+    header = SimpleNamespace(posterior=posterior, references=None)
+    return Objects(SimpleNamespace(rows=rows, documents={}), header, slice(0, 4))
 
 
-def made_up_objects(searcher, rng):
-    """500 photos of 40 objects."""
-    owners = np.concatenate([np.arange(40), rng.integers(0, 40, 460)])
-    made_up = copy.copy(searcher.shard.objects)
-    made_up._of_row, made_up._photos, made_up.posterior = owners, np.bincount(owners), STEEP
-    made_up._touch_only, made_up._originals = np.zeros(40, dtype=bool), np.arange(500)
-    return made_up
+def scored(objects, rows, logits, grasps=1):
+    logits = np.array(logits, dtype=np.float32)
+    return objects.score(np.array(rows), logits, np.full(objects.count, np.nan), grasps)
 
 
 @pytest.mark.parametrize("grasps", [1, 3])
 @pytest.mark.parametrize("levels", [1, 3, 10_000])
-def test_the_logit_and_the_best_photo_of_each_object_equal_plain_loops(levels, grasps, searcher):
-    rng = np.random.default_rng(levels)
-    made_up = made_up_objects(searcher, rng)
-    rows = np.sort(rng.choice(500, 300, replace=False))
-    logits = rng.integers(0, levels, 300).astype(np.float32) / levels
-    found = made_up.score(rows, logits, np.full(40, np.nan), grasps)
-    expected = by_plain_loops(made_up._of_row.tolist(), rows, logits, weight(STEEP, grasps))
-    assert found.numbers.tolist() == sorted(expected)
-    assert found.rows.tolist() == [expected[number][0] for number in sorted(expected)]
-    np.testing.assert_allclose(found.logits, [expected[number][1] for number in sorted(expected)], atol=1e-9)
+def test_the_logit_and_the_best_photo_of_each_object_equal_plain_loops(levels, grasps):
+    """300 scored photos of 500, of 40 objects; ties take the first photo."""
+    rng, scale = np.random.default_rng(levels), weight(STEEP, grasps)
+    owners = [*range(40), *rng.integers(0, 40, 460).tolist()]
+    rows = np.sort(rng.choice(500, 300, replace=False)).tolist()
+    logits = (rng.integers(0, levels, 300).astype(np.float32) / levels).tolist()
+    best, terms = {}, {}
+    for row, logit in zip(rows, logits, strict=True):
+        owner = owners[row]
+        terms.setdefault(owner, []).append(math.exp(scale * logit))
+        if owner not in best or logit > best[owner][1]:
+            best[owner] = (row, logit)
+    found = scored(objects_of(owners), rows, logits, grasps)
+    assert found.numbers.tolist() == sorted(best)
+    assert found.rows.tolist() == [best[number][0] for number in sorted(best)]
+    expected = [math.log(math.fsum(terms[number]) / owners.count(number)) / scale for number in sorted(best)]
+    np.testing.assert_allclose(found.logits, expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("photos", [1, 2, 3, 7, 24, 29])
-def test_equal_photos_give_the_same_logit_for_any_number_of_them(photos, searcher):
+def test_equal_photos_give_the_same_logit_for_any_number_of_them(photos):
     """Their mean equals each of them; rounding in the last bit would put the later of two names first."""
-    made_up = copy.copy(searcher.shard.objects)
-    made_up._of_row = np.array([0] * photos + [1])
-    made_up._photos, made_up._originals = np.bincount(made_up._of_row), np.arange(photos + 1)
-    logits = np.full(photos + 1, 1.3, dtype=np.float32)
-    made_up.posterior = Posterior(slope=0.9)
-    many, one = made_up.score(np.arange(photos + 1), logits, np.full(8, np.nan), 1).logits
+    objects = objects_of([0] * photos + [1], posterior=Posterior(slope=0.9))
+    many, one = scored(objects, range(photos + 1), [1.3] * (photos + 1)).logits
     assert many == one
+
+
+def test_equal_photos_get_the_logit_of_the_first_scored_one():
+    objects = objects_of(range(6), originals=[0, 1, 0, 1, 4, 0])
+    assert scored(objects, [2, 3, 4, 5], [0.25, 0.5, 0.75, 0.26]).logits.tolist() == [0.25, 0.5, 0.75, 0.25]
 
 
 @pytest.mark.parametrize("levels", [1, 3, 10_000])
@@ -544,28 +526,6 @@ def test_the_best_objects_equal_a_plain_sort(top, levels):
     scored = ScoredObjects(numbers, logits, numbers, logits)
     expected = sorted(range(30), key=lambda place: (-logits[place], numbers[place]))
     assert scored.best(top).tolist() == expected[:top]
-
-
-def test_equal_photos_get_the_logit_of_the_first_scored_one(searcher):
-    made_up = copy.copy(searcher.shard.objects)
-    made_up._of_row, made_up._originals = np.arange(24), np.array([0, 1, 0, 1, 4, 0, *range(6, 24)])
-    made_up._photos, made_up._touch_only = np.ones(24, dtype=int), np.zeros(24, dtype=bool)
-    rows, logits = np.array([2, 3, 4, 5]), np.array([0.25, 0.5, 0.75, 0.26], dtype=np.float32)
-    assert made_up.score(rows, logits, np.full(24, np.nan), 1).logits.tolist() == [0.25, 0.5, 0.75, 0.25]
-
-
-@pytest.mark.parametrize(
-    ("measured", "expected"), [({"k": 5, "top1_agreement": 0.99}, [5]), (None, []), ({"k": 24}, [])]
-)
-def test_the_index_sets_the_number_of_candidates_unless_the_query_does(
-    measured, expected, searcher, touch, searches, monkeypatch
-):
-    about = searcher.generation.manifest.about
-    monkeypatch.setitem(about, "candidates", measured)
-    searcher.query([touch], top=2)
-    assert searches == expected
-    searcher.query([touch], top=2, candidates=9)
-    assert searches == [*expected, 9]
 
 
 def test_a_damaged_model_is_distinguished_from_another_one(moved):

@@ -1,7 +1,7 @@
 """Sharded indexes: a catalogue in several index folders gives the results of one folder."""
 
 import dataclasses
-import math
+import json
 import shutil
 from contextlib import nullcontext
 from types import SimpleNamespace
@@ -10,11 +10,12 @@ import pytest
 
 from indexes.errors import CorruptIndex, MismatchedIndex
 from indexes.store.folder import IndexStore
+from indexes.store.manifest import content_digest
 from indexes.store.sharded import read_sharded_manifest, shard_number, write_sharded_manifest
 from retrieval.errors import BadInput, RetrievalError
 from retrieval.indexing.sharded import build_sharded
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.model.posterior import EvidenceMass, Posterior
+from retrieval.model.posterior import Posterior
 from retrieval.search.objects import ListedPhoto
 from retrieval.search.searcher import Searcher
 from retrieval.search.shard import RankedObject, ShardResult, Shards
@@ -64,26 +65,11 @@ def test_with_all_photos_scored_answers_equal_those_of_one_folder(
         for one in (divided, searcher):
             give_posterior(monkeypatch, one, posterior)
     for own in grasps:
-        same_answers(
-            divided.query(own[:count], none_prior=0.3),
-            searcher.query(own[:count], none_prior=0.3),
-        )
+        same_answers(divided.query(own[:count], none_prior=0.3), searcher.query(own[:count], none_prior=0.3))
 
 
 def test_the_best_of_all_shards_are_the_best_of_the_catalogue(divided, searcher, grasps):
     same_answers(divided.query(grasps[0], top=2), searcher.query(grasps[0], top=2))
-
-
-def test_with_as_many_candidates_in_each_shard_the_exhaustive_top1_is_found_at_least_as_often(
-    divided, searcher, grasps
-):
-    for own in grasps:
-        for candidates in (1, 2, 5):
-            best = searcher.query(own, top=1).top
-            found = divided.query(own, top=1, candidates=candidates)
-            whole = searcher.query(own, top=1, candidates=candidates)
-            assert (found.top.photo == best.photo) >= (whole.top.photo == best.photo)
-            assert found.top.logit >= whole.top.logit - 1e-5
 
 
 def test_rows_are_found_in_every_shard(divided, searcher):
@@ -117,16 +103,6 @@ def test_merged_objects_are_ordered_by_logit_then_by_name():
     assert [one.photo.object_id for one in found.best] == ["mug", "tin", "cup"]
     assert (found.photos, found.objects) == (40, 4)
     assert found.timing_ms == {"candidates": 1.0, "rerank": 3.0}
-
-
-def test_masses_of_parts_give_the_probabilities_of_the_whole():
-    """By hand: two parts of two objects each; the second part has one unscored object."""
-    logits = [math.log(4), 0.0, math.log(2)]
-    parts = [STEEP.mass(logits[:2]), STEEP.mass(logits[2:], unscored=1, sample=[math.log(3)])]
-    probabilities = STEEP.probabilities_given(logits, EvidenceMass.merged(parts), none_prior=0.4)
-    terms = [0.4, *(0.6 / 4 * math.exp(2 * logit - 1.5) for logit in [*logits, math.log(3)])]
-    expected = [term / math.fsum(terms) for term in terms]
-    assert [probabilities.none, *probabilities.objects, probabilities.unscored] == pytest.approx(expected, abs=1e-12)
 
 
 # Building -------------------------------------------------------------------------------------------------------------
@@ -257,31 +233,18 @@ def test_killed_before_every_switch_the_old_generations_answer(catalogue_copy, m
             assert searcher.manifest.photos == 24
 
 
-def test_bad_photos_are_left_out_and_listed(catalogue_copy, model):
+def test_bad_photos_and_a_shard_without_a_readable_one_are_left_out_and_listed(catalogue_copy, model):
     catalog, cluster = catalogue_copy
-    bad = next(catalog.glob("*/2.jpg"))
-    bad.write_bytes(b"not an image")
+    names = sorted(path.name for path in catalog.iterdir())
+    gone = [name for name in names if shard_number(name, 4) == shard_number(names[0], 4)]
+    bad = [*(photo for name in gone for photo in (catalog / name).iterdir())]
+    bad.append(next((catalog / next(name for name in names if name not in gone)).iterdir()))
+    for photo in bad:
+        photo.write_bytes(b"not an image")
     report = build_sharded(catalog, load_checkpoint(model), cluster, 4, quiet=True)
-    assert [item.path for item in report.skipped] == [str(bad.relative_to(catalog))]
-    assert report.photos == 23
-
-
-def test_a_shard_without_a_readable_photo_is_left_out(catalogue_copy, model):
-    catalog, cluster = catalogue_copy
-    affected = [path.name for path in catalog.iterdir() if shard_number(path.name, 4) == shard_number("spare", 4)]
-    affected = affected or [next(catalog.iterdir()).name]
-    gone = {
-        name
-        for name in (path.name for path in catalog.iterdir())
-        if shard_number(name, 4) == shard_number(affected[0], 4)
-    }
-    for name in gone:
-        for photo in (catalog / name).iterdir():
-            photo.write_bytes(b"not an image")
-    report = build_sharded(catalog, load_checkpoint(model), cluster, 4, quiet=True)
-    assert report.without_photo == sorted(gone)
-    assert report.photos == 24 - 3 * len(gone)
-    assert read_sharded_manifest(cluster).photos == report.photos
+    assert {item.path for item in report.skipped} == {photo.relative_to(catalog).as_posix() for photo in bad}
+    assert report.without_photo == gone
+    assert report.photos == read_sharded_manifest(cluster).photos == 24 - len(bad)
 
 
 def test_an_invalid_number_of_shards_or_an_index_folder_raises(catalogue, model, index, tmp_path):
@@ -351,11 +314,9 @@ ENTRY = {"folder": "shard-00-of-01", "generation": "gen-000001", "sha256": "0" *
 )
 def test_a_forged_manifest_is_corrupt(field, value, catalogue_copy):
     """Software that alters the manifest can also write the right digest."""
-    _, cluster = catalogue_copy
-    manifest = read_sharded_manifest(cluster)
-    made_up = object.__new__(type(manifest))
-    for one in dataclasses.fields(manifest):
-        object.__setattr__(made_up, one.name, value if one.name == field else getattr(manifest, one.name))
-    write_sharded_manifest(cluster, made_up)
+    path = catalogue_copy[1] / "SHARDS.json"
+    content = json.loads(path.read_text()) | {field: value}
+    del content["sha256"]
+    path.write_text(json.dumps(content | {"sha256": content_digest(content)}))
     with pytest.raises(CorruptIndex, match=rf"SHARDS\.{field}.* must be"):
-        Searcher.open(cluster)
+        Searcher.open(catalogue_copy[1])
