@@ -10,7 +10,10 @@ from indexes.store.sharded import read_sharded_manifest
 from retrieval.commands.main import main
 from retrieval.errors import BadInput, IncompleteSearch
 
-pytestmark = pytest.mark.skipif(find_spec("ray") is None, reason="needs the extra `cluster`")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore"),  # Ray's own warnings
+    pytest.mark.skipif(find_spec("ray") is None, reason="needs the extra `cluster`"),
+]
 
 
 def shards_of(manifest, **answers):

@@ -330,7 +330,7 @@ def test_more_grasps_are_advised_if_the_ranking_is_clear_and_few_suffice(
     """The best object has logit 100, and a match needs the evidence `missing`."""
     head = searcher.scorer
     give_posterior(monkeypatch, searcher, Posterior(1.0, math.log(8) - missing, dependence=0.5))
-    scaled = dataclasses.replace(head, out=scale * head.out, out_bias=0.0)
+    scaled = dataclasses.replace(head, out=scale * head.out, out_bias=scale * head.out_bias)
     for _ in range(2):
         monkeypatch.setattr(searcher.shard, "scorer", scaled)
         result = searcher.query([touch])
