@@ -31,7 +31,7 @@ def shards_of(manifest, **answers):
         return SimpleNamespace(call=SimpleNamespace(remote=lambda method, *arguments: response))
 
     handles = {entry.folder: handle(iter(answers[f"s{place}"])) for place, entry in enumerate(manifest.shards)}
-    return RayShards(manifest, handles, ReplicaSettings(wait_s=1.0))
+    return RayShards(manifest, handles, ReplicaSettings(wait_s=60.0))
 
 
 def test_a_lost_replica_is_asked_again_and_results_are_in_the_order_of_shards(cluster):
@@ -45,7 +45,7 @@ def test_a_lost_replica_is_asked_again_and_results_are_in_the_order_of_shards(cl
 def test_no_result_lacks_a_part_of_the_catalogue(cluster):
     manifest = read_sharded_manifest(cluster)
     silent = shards_of(manifest, s0=["a"], s1=[TimeoutError], s2=["c"], s3=[TimeoutError])
-    with pytest.raises(IncompleteSearch, match="within 1 s from shard-01-of-04, shard-03-of-04"):
+    with pytest.raises(IncompleteSearch, match="within 60 s from shard-01-of-04, shard-03-of-04"):
         silent.call(manifest.shards, "page")
     failing = shards_of(manifest, s0=["a"], s1=[BadInput("a wrong query")], s2=["c"], s3=["d"])
     with pytest.raises(BadInput, match="a wrong query"):
