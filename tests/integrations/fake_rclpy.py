@@ -240,12 +240,7 @@ def _modules(overrides, nodes):
         )
     }
     return {
-        "rclpy": {
-            "init": lambda: None,
-            "ok": lambda: True,
-            "try_shutdown": lambda: None,
-            "create_node": create_node,
-        },
+        "rclpy": {"init": lambda: None, "ok": lambda: True, "try_shutdown": lambda: None, "create_node": create_node},
         "rclpy.action": {
             "ActionServer": FakeActionServer,
             "CancelResponse": SimpleNamespace(ACCEPT="accept", REJECT="reject"),

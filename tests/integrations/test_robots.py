@@ -6,6 +6,8 @@ import socketserver
 import sys
 import threading
 import types
+from contextlib import contextmanager
+from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -36,9 +38,13 @@ def examples(monkeypatch):
 class FakeUR:
     """The parts of rtde_control and rtde_receive that the example uses; a motion takes three polls."""
 
-    def __init__(self, host=""):
+    def __init__(self):
         self.pose, self.goal, self.polls, self.finished = [0.5, 0.1, 0.4, math.pi, 0.0, 0.0], None, 0, -1
-        self.calls, self.reachable, self.is_stopped = [], True, False
+        self.calls, self.is_stopped = [], False
+        self.isPoseWithinSafetyLimits = lambda target: True
+        self.isProtectiveStopped, self.isEmergencyStopped = lambda: self.is_stopped, lambda: False
+        self.getActualTCPPose = lambda: self.pose
+        self.stopL, self.stopScript = lambda _: self.calls.append("stopL"), lambda: self.calls.append("stopScript")
 
     def moveL(self, target, speed, acceleration, asynchronous):
         self.calls.append(("moveL", speed))
@@ -56,24 +62,6 @@ class FakeUR:
             return 0
         self.pose, self.goal, self.finished = self.goal, None, -3 - self.finished
         return self.finished
-
-    def isPoseWithinSafetyLimits(self, target):
-        return self.reachable
-
-    def isProtectiveStopped(self):
-        return self.is_stopped
-
-    def isEmergencyStopped(self):
-        return False
-
-    def getActualTCPPose(self):
-        return self.pose
-
-    def stopL(self, acceleration):
-        self.calls.append("stopL")
-
-    def stopScript(self):
-        self.calls.append("stopScript")
 
     def disconnect(self): ...
 
@@ -95,10 +83,11 @@ def ur(fake_ur):
 class FakeFranka:
     """The parts of franky that the example uses."""
 
-    def __init__(self, host=""):
+    def __init__(self):
         self.tip = types.SimpleNamespace(translation=[0.5, 0.1, 0.4], quaternion=[1.0, 0.0, 0.0, 0.0])
         self.calls, self.relative_dynamics_factor, self.joins = [], None, 0
         self.translation_velocity_limit = types.SimpleNamespace(set=lambda speed: self.calls.append(("speed", speed)))
+        self.stop, self.recover_from_errors = (partial(self.calls.append, call) for call in ("stop", "recover"))
 
     @property
     def current_cartesian_state(self):
@@ -112,18 +101,13 @@ class FakeFranka:
         self.joins -= 1
         return self.joins <= 0
 
-    def stop(self):
-        self.calls.append("stop")
-
-    def recover_from_errors(self):
-        self.calls.append("recover")
-
 
 class FakeHand:
     max_width = 0.08
 
-    def __init__(self, host="", object_m=0.03):
-        self.width, self.is_grasped, self.object_m, self.calls = 0.08, False, object_m, []
+    def __init__(self):
+        self.width, self.is_grasped, self.object_m, self.calls = 0.08, False, 0.03, []
+        self.stop = partial(self.calls.append, "stop")
 
     def move(self, width, speed):
         self.width, self.is_grasped = width, False
@@ -132,9 +116,6 @@ class FakeHand:
     def grasp(self, width, speed, force, epsilon_inner, epsilon_outer):
         self.calls.append(("grasp", speed, force))
         self.width, self.is_grasped = self.object_m, self.object_m > 0
-
-    def stop(self):
-        self.calls.append("stop")
 
 
 @pytest.fixture
@@ -149,6 +130,18 @@ def franka(monkeypatch):
     )
     monkeypatch.setitem(sys.modules, "franky", module)
     return robot, hand
+
+
+@contextmanager
+def serving(kind, handler):
+    """Answer on a free port in a thread."""
+    with kind(("127.0.0.1", 0), handler) as server:
+        server.daemon_threads = True
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        yield server
+        server.shutdown()
+        thread.join(10)
 
 
 class URCap(socketserver.StreamRequestHandler):
@@ -176,15 +169,10 @@ class URCap(socketserver.StreamRequestHandler):
 
 @pytest.fixture
 def urcap():
-    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), URCap) as server:
-        server.daemon_threads = True
+    with serving(socketserver.ThreadingTCPServer, URCap) as server:
         server.values, server.calls = {"POS": 0, "PRE": 0, "OBJ": 3, "STA": 3}, []
         server.object_at = round(255 * (1 - 40 / 85))
-        thread = threading.Thread(target=server.serve_forever, daemon=True)
-        thread.start()
         yield server
-        server.shutdown()
-        thread.join(10)
 
 
 @pytest.fixture
@@ -197,18 +185,19 @@ def robotiq(urcap):
         yield urcap, gripper
 
 
-def moves_and_reports(arm: Arm, goal: Pose, speed_mm_s: float) -> None:
-    reached = arm.move_to(goal, speed_mm_s)
+def moves_and_reports(arm: Arm, yaw_rad: float = 0.5) -> None:
+    goal = Pose(30.0, -40.0, 100.0, yaw_rad)
+    reached = arm.move_to(goal, 150.0)
     assert reached.as_tuple() == pytest.approx(goal.as_tuple(), abs=1e-6)
     assert arm.pose() == reached
 
 
-@pytest.mark.parametrize("yaw_rad", [-3.0, 0.7])
-def test_a_ur_arm_moves_at_the_requested_speed_and_reports_the_pose_of_the_rigs_frame(ur, yaw_rad):
+def test_a_ur_arm_moves_at_the_requested_speed_and_reports_the_pose_of_the_rigs_frame(ur):
     fake, arm = ur
-    moves_and_reports(arm, Pose(30.0, -40.0, 100.0, yaw_rad), 150.0)
-    assert fake.calls == [("moveL", 0.15)]
-    assert fake.pose[:3] == pytest.approx([0.53, 0.06, 0.2])  # origin + pose, and the tool above the fingertips
+    for yaw_rad in (-3.0, 0.7):
+        moves_and_reports(arm, yaw_rad)
+        assert fake.pose[:3] == pytest.approx([0.53, 0.06, 0.2])  # origin + pose, and the tool above the fingertips
+    assert fake.calls == [("moveL", 0.15)] * 2
 
 
 def test_a_ur_arm_is_stopped_after_a_protective_stop(ur):
@@ -223,7 +212,7 @@ def test_a_ur_arm_is_stopped_after_a_protective_stop(ur):
 def test_a_franka_arm_moves_at_the_requested_speed_and_reports_the_pose_of_the_rigs_frame(franka, yaw_rad):
     robot, _ = franka
     with OwnArm(workspace=WORKSPACE, robot="franka:FrankaArm", settings={"host": "fr3", **ORIGIN}) as arm:
-        moves_and_reports(arm, Pose(30.0, -40.0, 100.0, yaw_rad), 150.0)
+        moves_and_reports(arm, yaw_rad)
         assert robot.calls == [("speed", 0.15), "move"]
         arm.recover()
         arm.stop()
@@ -291,19 +280,15 @@ class Endpoint(BaseHTTPRequestHandler):
 
 
 def test_a_robot_on_another_computer_moves_stops_and_its_errors_keep_their_text():
-    with ThreadingHTTPServer(("127.0.0.1", 0), Endpoint) as server:
+    with serving(ThreadingHTTPServer, Endpoint) as server:
         server.at, server.calls = {"x_mm": 0.0, "y_mm": 0.0, "z_mm": 100.0, "yaw_rad": 0.0}, []
-        thread = threading.Thread(target=server.serve_forever, daemon=True)
-        thread.start()
         url = f"http://127.0.0.1:{server.server_address[1]}/arm"
         with OwnArm(workspace=WORKSPACE, robot="remote:RemoteRobot", settings={"url": url}) as arm:
             assert server.calls == ["/arm/pose"]
-            moves_and_reports(arm, Pose(30.0, -40.0, 100.0, 0.5), 150.0)
+            moves_and_reports(arm)
             with pytest.raises(DeviceError, match=r"/arm/move_to answered 409: protective stop"):
                 arm.move_to(Pose(0.0, 0.0, 20.0, 0.0), 150.0)
         assert server.calls[-1] == "/arm/stop"
-        server.shutdown()
-        thread.join(10)
 
 
 def test_collect_records_grasps_with_the_examples_in_a_rig_file(fake_ur, urcap, tmp_path):

@@ -30,14 +30,7 @@ TINY = {
         "preset": "tiny",
         "iterations": 4,
     },
-    "one_query": {
-        "demo": "../demo",
-        "out": "../build/one-query",
-        "which": 0,
-        "grasps": 2,
-        "candidates": 4,
-        "top": 2,
-    },
+    "one_query": {"demo": "../demo", "out": "../build/one-query", "which": 0, "grasps": 2, "candidates": 4, "top": 2},
     "simulated_data": {
         "out": "../build/simulated-data",
         "seed": 0,

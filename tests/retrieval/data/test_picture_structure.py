@@ -10,14 +10,7 @@ from retrieval.data import images
 from retrieval.data.images import decode
 from retrieval.data.picture_structure import MAX_SCANS, MAX_SEGMENTS, MAX_STRAY_BYTES, MAX_TIFF_NUMBERS
 from retrieval.errors import ImageError
-from tests.hostile_pictures import (
-    jpeg_of_scans,
-    jpeg_of_segments,
-    png_chunk,
-    png_file,
-    png_of_zeros,
-    tiff_of_numbers,
-)
+from tests.hostile_pictures import jpeg_of_scans, jpeg_of_segments, png_chunk, png_file, png_of_zeros, tiff_of_numbers
 
 MB = 100_000
 PIXELS = bytes(25 * 8)  # of a PNG file of 8 x 8
