@@ -2,14 +2,14 @@
 
 import socket
 import time
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 
 import httpx
 import pytest
 
 from retrieval.serve import server
 from retrieval.serve.server import MAX_CONNECTIONS, MAX_HEADER_BYTES
-from tests.serving import listening
+from tests.serving import connect, listening, received
 
 pytestmark = pytest.mark.slow
 
@@ -22,41 +22,17 @@ def service_at(index):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(server, "HEADERS_S", 1.0)
         with listening(index) as (url, parts):
-            host, port = url.removeprefix("http://").split(":")
-            yield url, (host, int(port)), parts
-
-
-@contextmanager
-def opened(address, count, sent=HALF_SENT):
-    """Open `count` connections and send `sent` on each."""
-    with ExitStack() as stack:
-        lines = []
-        for _ in range(count):
-            line = stack.enter_context(socket.create_connection(address, timeout=30))
-            line.sendall(sent)
-            lines.append(line)
-        yield lines
-
-
-def received(line):
-    """Return all bytes that the service sends until it closes the connection."""
-    data = b""
-    try:
-        while more := line.recv(65536):
-            data += more
-    except ConnectionResetError:
-        pass
-    return data
+            yield url, parts
 
 
 @pytest.mark.parametrize("sent", [HALF_SENT, b"", BEGIN + b"\r\n" + HALF_SENT], ids=["half", "silent", "second"])
 def test_half_sent_headers_and_silent_connections_end_at_a_deadline(service_at, sent):
-    with opened(service_at[1], 1, sent) as (line,):
+    with connect(service_at[0], sent) as line:
         assert received(line).count(b"HTTP/1.1 200 ") == sent.count(b"\r\n\r\n")
 
 
 def test_headers_that_come_byte_by_byte_do_not_outlive_the_deadline(service_at):
-    with opened(service_at[1], 1) as (line,):
+    with connect(service_at[0], HALF_SENT) as line:
         for _ in range(200):
             time.sleep(0.05)
             try:
@@ -68,7 +44,7 @@ def test_headers_that_come_byte_by_byte_do_not_outlive_the_deadline(service_at):
 
 
 def test_a_request_that_takes_longer_than_the_headers_may_is_answered(service_at, monkeypatch):
-    url, _, parts = service_at
+    url, parts = service_at
     shard = parts.generations.current.shard
     page = shard.page
     monkeypatch.setattr(shard, "page", lambda *args: time.sleep(2) or page(*args))
@@ -76,32 +52,31 @@ def test_a_request_that_takes_longer_than_the_headers_may_is_answered(service_at
 
 
 def test_the_longest_waiting_connections_are_closed_for_new_ones(index):
-    with listening(index) as (url, parts):
-        host, port = url.removeprefix("http://").split(":")
+    with listening(index) as (url, parts), ExitStack() as stack:
         shard = parts.generations.current.shard
         page = shard.page
         shard.page = lambda *args: time.sleep(3) or page(*args)
         whole = b"GET /v1/catalogue HTTP/1.1\r\nhost: 127.0.0.1\r\nconnection: close\r\n\r\n"
-        with opened((host, int(port)), 1, whole) as (busy,), opened((host, int(port)), MAX_CONNECTIONS) as lines:
-            for _ in range(3):
-                assert httpx.get(f"{url}/healthz", timeout=10).status_code == 200
-            assert received(lines[0]) == b""
-            lines[-1].sendall(b"b\r\nconnection: close\r\n\r\n")
-            assert received(lines[-1]).startswith(b"HTTP/1.1 200 ")
-            assert received(busy).startswith(b"HTTP/1.1 200 ")
+        busy, *lines = (stack.enter_context(connect(url, sent)) for sent in (whole, *[HALF_SENT] * MAX_CONNECTIONS))
+        for _ in range(3):
+            assert httpx.get(f"{url}/healthz", timeout=10).status_code == 200
+        assert received(lines[0]) == b""
+        lines[-1].sendall(b"b\r\nconnection: close\r\n\r\n")
+        assert received(lines[-1]).startswith(b"HTTP/1.1 200 ")
+        assert received(busy).startswith(b"HTTP/1.1 200 ")
 
 
 def test_headers_above_the_limit_and_invalid_http_are_refused_at_once(service_at):
     end = b"\r\nconnection: close\r\n\r\n"
-    with opened(service_at[1], 1, HALF_SENT + b"a" * (MAX_HEADER_BYTES - 100) + end) as (line,):
+    with connect(service_at[0], HALF_SENT + b"a" * (MAX_HEADER_BYTES - 100) + end) as line:
         assert received(line).startswith(b"HTTP/1.1 200 ")
     for flood in (HALF_SENT + b"a" * 10**6 + end, BEGIN + b"x-a: b\r\n" * 10**5 + end, b"\x16\x03\x01 hello\r\n\r\n"):
-        with opened(service_at[1], 1, flood[: 3 * MAX_HEADER_BYTES]) as (line,):
+        with connect(service_at[0], flood[: 3 * MAX_HEADER_BYTES]) as line:
             assert received(line).startswith(b"HTTP/1.1 400 ")
 
 
 def test_a_flood_of_pipelined_requests_is_answered_one_by_one(service_at):
-    with opened(service_at[1], 1, (BEGIN + b"\r\n") * 1_000) as (line,):
+    with connect(service_at[0], (BEGIN + b"\r\n") * 1_000) as line:
         assert received(line).count(b"HTTP/1.1 200 ") == 1_000
 
 

@@ -55,10 +55,13 @@ def test_simulated_grasps_include_their_no_contact_frames(browser, index, tmp_pa
         opened.get_by_role("button", name="Grasp something").click()
         opened.locator(".answer").wait_for()
         names = [path.name for path in (index.parent / "catalog").iterdir()]
-        assert opened.locator(".grasped-object strong").inner_text() in names
+        name = opened.locator(".grasped-object strong").inner_text()
+        assert name in names
         assert opened.get_by_alt_text("Gel image").count() == 2
         opened.get_by_role("button", name="Grasp it again").click()
         opened.locator("legend", has_text="Grasp 2").wait_for()
+        opened.get_by_text("Grasped object:").wait_for()
+        assert opened.locator(".grasped-object strong").inner_text() == name
         opened.get_by_role("navigation").get_by_role("link", name="History").click()
         opened.locator(".query").first.get_by_role("link").click()
         opened.locator(".answer").wait_for()
