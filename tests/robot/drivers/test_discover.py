@@ -2,6 +2,7 @@
 
 import sys
 import tomllib
+from types import SimpleNamespace
 
 import pytest
 
@@ -81,20 +82,12 @@ def test_a_camera_without_a_name_of_its_own_is_named_by_its_socket(roots):
     assert [(each.device, each.label) for each in discover.find_cameras(*roots)] == [(own, "Gel"), (socket, "Gel")]
 
 
-class Port:
-    def __init__(self, device, hwid="USB VID:PID=1:2"):
-        self.device, self.hwid, self.description = device, hwid, "a port"
-
-
 def test_serial_ports_with_hardware_are_found_by_their_stable_names(roots, monkeypatch):
     link = roots[0] / "serial" / "by-id" / "usb-FTDI_7"
     link.symlink_to(roots[0] / "ttyUSB0")
-    ports = [Port(str(roots[0] / "ttyUSB0")), Port("/dev/ttyACM7"), Port("/dev/ttyS0", hwid="n/a")]
-    lister = type(sys)("serial.tools.list_ports")
-    lister.comports = lambda: ports
-    tools = type(sys)("serial.tools")
-    tools.list_ports = lister
-    monkeypatch.setitem(sys.modules, "serial", type(sys)("serial"))
+    devices = {str(roots[0] / "ttyUSB0"): "USB VID:PID=1:2", "/dev/ttyACM7": "USB", "/dev/ttyS0": "n/a"}
+    ports = [SimpleNamespace(device=device, hwid=hwid, description="") for device, hwid in devices.items()]
+    tools = SimpleNamespace(list_ports=SimpleNamespace(comports=lambda: ports))
     monkeypatch.setitem(sys.modules, "serial.tools", tools)
     assert [each.device for each in discover.find_serial_ports(roots[0])] == [str(link), "/dev/ttyACM7"]
 

@@ -412,12 +412,3 @@ def test_a_silent_topic_and_an_unknown_tip_are_named():
         arm_at(url, timeout_s=0.2).connect()
     with connected(tip="left_hand") as (_, arm), pytest.raises(DeviceError, match="must report its tip 'left_hand'"):
         arm.pose()
-
-
-def test_it_connects_again_and_leaves_no_thread():
-    with serve(EmulatedSawyer()) as url:
-        arm = arm_at(url)
-        for _ in range(2):
-            with arm:
-                arm.pose()
-            assert not [thread for thread in threading.enumerate() if thread.name.startswith("rosbridge ")]

@@ -4,7 +4,7 @@ import os
 import socket
 import struct
 import threading
-from contextlib import closing
+from contextlib import contextmanager, suppress
 
 import pytest
 
@@ -18,49 +18,38 @@ FORCE = codec.query(CommandId.GET_FORCE_LIMIT)
 ONE, TWO = struct.pack("<f", 1), struct.pack("<f", 2)
 
 
-class Peer:
-    """The other end of a TCP link: answers each packet by a function packet -> bytes, or None to disconnect."""
+@contextmanager
+def linked_to(answer, timeout_s=0.2):
+    """Yield an open link and the ids that its peer receives; `answer(packet)` returns bytes, or None to disconnect."""
+    received = []
 
-    def __init__(self, answer):
-        self.answer, self.received = answer, []
-        self.server = socket.create_server(("127.0.0.1", 0))
-        self.url = f"socket://127.0.0.1:{self.server.getsockname()[1]}"
-        self.thread = threading.Thread(target=self.run)
-        self.thread.start()
+    def run():
+        with suppress(OSError):
+            while True:
+                with server.accept()[0] as client, suppress(OSError, TypeError):
+                    serve(client)
 
-    def run(self):
-        try:
-            client, _ = self.server.accept()
-        except OSError:
-            return
+    def serve(client):
         buffer = bytearray()
-        with client:
-            while data := self.receive(client):
-                buffer += data
-                while True:
-                    used, packet = decode(buffer)
-                    del buffer[:used]
-                    if packet is None:
-                        break
-                    self.received.append(packet.id)
-                    answer = self.answer(packet)
-                    if answer is None:
-                        return
-                    client.sendall(answer)
+        while data := client.recv(4096):
+            buffer += data
+            packet = True
+            while packet:
+                used, packet = decode(buffer)
+                del buffer[:used]
+                if packet:
+                    received.append(packet.id)
+                    client.sendall(answer(packet))  # TypeError for None
 
-    def receive(self, client):
-        try:
-            return client.recv(4096)
-        except OSError:
-            return b""
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.server.shutdown(socket.SHUT_RDWR)
-        self.server.close()
-        self.thread.join()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        link = Link(f"socket://127.0.0.1:{server.getsockname()[1]}", timeout_s=timeout_s)
+        thread = threading.Thread(target=run)
+        thread.start()
+        link.open()
+        yield link, received
+        link.close()
+        server.shutdown(socket.SHUT_RDWR)
+        thread.join()
 
 
 @pytest.fixture(autouse=True)
@@ -78,19 +67,13 @@ def echoing(packet):
     return reply(packet, packet.payload) if packet.id == CommandId.LOOP else b""
 
 
-def linked(peer, timeout_s=0.2):
-    link = Link(peer.url, timeout_s=timeout_s)
-    link.open()
-    return closing(link)
-
-
 def test_a_reply_is_found_among_updates_noise_and_the_pending_of_a_motion():
     def answer(packet):
         update = encode(Packet(CommandId.OPENING, OK + TWO))
         pending = reply(packet, status=Status.CMD_PENDING)
         return echoing(packet) or update + b"\xaa\xaa noise" + pending + update + reply(packet, ONE)
 
-    with Peer(answer) as peer, linked(peer) as link:
+    with linked_to(answer) as (link, _):
         assert link.query(FORCE, codec.number) == 1.0
         assert codec.number(link.updates[CommandId.OPENING][0]) == 2.0
         link.begin(codec.HOME)
@@ -99,10 +82,10 @@ def test_a_reply_is_found_among_updates_noise_and_the_pending_of_a_motion():
 
 
 def test_another_status_than_success_raises_and_is_not_repeated():
-    with Peer(lambda packet: echoing(packet) or reply(packet, status=16)) as peer, linked(peer) as link:
+    with linked_to(lambda packet: echoing(packet) or reply(packet, status=16)) as (link, received):
         with pytest.raises(CommandFailed, match=r"STOP.*ACCESS_DENIED"):
             link.send(Packet(CommandId.STOP))
-        assert peer.received.count(CommandId.STOP) == 1
+        assert received.count(CommandId.STOP) == 1
 
 
 @pytest.mark.parametrize(
@@ -112,20 +95,20 @@ def test_another_status_than_success_raises_and_is_not_repeated():
 )
 def test_an_answer_that_is_not_valid_is_requested_again(first):
     answers = [first, reply(FORCE, ONE)]
-    with Peer(lambda packet: echoing(packet) or answers.pop(0)) as peer, linked(peer, 0.1) as link:
+    with linked_to(lambda packet: echoing(packet) or answers.pop(0), 0.1) as (link, _):
         assert link.query(FORCE, codec.number) == 1.0
         assert answers == []
 
 
 def test_a_query_without_answer_is_tried_three_times_and_without_an_echo_it_is_not_sent():
-    with Peer(echoing) as peer, linked(peer, timeout_s=0.05) as link:
+    with linked_to(echoing, 0.05) as (link, received):
         with pytest.raises(NoReply, match=r"INFO.*0\.05 s"):
             link.query(codec.query(CommandId.INFO), codec.info)
-        assert peer.received.count(CommandId.INFO) == 3
-    with Peer(lambda packet: b"") as peer, linked(peer, timeout_s=0.05) as link:
+        assert received.count(CommandId.INFO) == 3
+    with linked_to(lambda packet: b"", 0.05) as (link, received):
         with pytest.raises(NoEcho, match="is it on and connected"):
             link.send(Packet(CommandId.STOP))
-        assert set(peer.received) == {CommandId.LOOP}
+        assert set(received) == {CommandId.LOOP}
 
 
 def test_every_wait_ends_although_the_peer_sends_without_end():
@@ -163,31 +146,24 @@ def test_a_late_reply_is_never_returned_for_the_next_query():
             return b""
         return reply(packet, TWO)
 
-    with Peer(answer) as peer, linked(peer, timeout_s=0.1) as link:
+    with linked_to(answer, 0.1) as (link, _):
         assert link.query(FORCE, codec.number) == 2.0
 
 
 def test_an_urgent_stop_does_not_synchronise_first():
-    with Peer(lambda packet: echoing(packet) or reply(packet)) as peer, linked(peer) as link:
+    with linked_to(lambda packet: echoing(packet) or reply(packet)) as (link, received):
         link.send_urgent(Packet(CommandId.STOP))
-        assert peer.received == [CommandId.STOP]
+        assert received == [CommandId.STOP]
 
 
 def test_a_link_closed_by_the_peer_raises_and_can_be_opened_again():
-    with Peer(lambda packet: None) as peer:
-        link = Link(peer.url, timeout_s=0.5)
-        link.open()
+    answers = [None]
+    with linked_to(lambda packet: answers.pop() if answers else echoing(packet)) as (link, _):
         for _ in range(2):
             with pytest.raises(LinkLost, match=r"was lost.*recover"):
                 link.sync()
-        link.close()
-    with Peer(echoing) as other:
-        link.name = other.url
-        link.open()
-        link.open()
-        link.sync()
-        link.close()
-        link.close()
+        for use in (link.open, link.open, link.sync, link.close, link.close):
+            use()
 
 
 @pytest.mark.parametrize("port", ["/nowhere/tty", "socket://127.0.0.1:1", "socket://127.0.0.1", "what://is this"])

@@ -69,7 +69,7 @@ def test_rays_meet_the_side_of_a_cylinder_and_the_face_of_a_box():
     np.testing.assert_allclose(box().cast(origins, directions), -20 - origins[:, 1], atol=ATOL)
 
 
-@pytest.mark.parametrize("relief", [Relief("smooth", 0.0, 5.0), Relief("ribs", 1.0, 5.0)])
+@pytest.mark.parametrize("relief", [SMOOTH, Relief("ribs", 1.0, 5.0)])
 def test_a_ray_hits_where_its_distance_is_finite_and_at_once_if_it_starts_inside(relief):
     body = can(relief)
     origins, directions = wall_rays(body, pitch=2.0)
@@ -108,16 +108,8 @@ def test_ribs_on_a_flat_wall_have_the_height_and_slope_of_a_cosine():
     # Bilinear pixels of 0.2 mm cut an arch of curvature 0.25 / mm by 0.2^2 / 8 * 0.25 = 0.001 mm.
     np.testing.assert_allclose(-20 - origins[:, 1] - depth, height, atol=5e-3)
     normals = body.normals(origins + depth[:, None] * directions)
-    slope = (
-        -0.8
-        * 0.4
-        / np.cosh(0.4 * wave) ** 2
-        / (2 * np.tanh(0.4))
-        * np.sin(2 * np.pi * origins[:, 2] / 8)
-        * 2
-        * np.pi
-        / 8
-    )
+    per_wave = 0.8 * 0.4 / np.cosh(0.4 * wave) ** 2 / (2 * np.tanh(0.4))
+    slope = -per_wave * np.sin(2 * np.pi * origins[:, 2] / 8) * 2 * np.pi / 8
     np.testing.assert_allclose(normals[:, 2] / -normals[:, 1], -slope, atol=0.03)
 
 

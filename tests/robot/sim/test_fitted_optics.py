@@ -21,25 +21,11 @@ def dome(depth_mm=1.0):
 def fitted(degree=2, places=3, reaches=(1.0,), seed=0, **limits):
     rng = np.random.default_rng(seed)
     count = (degree * (degree + 3) // 2 + 3 * len(reaches)) * places
-    free = {
-        "steepest": 1.0,
-        "left": -1,
-        "right": 1,
-        "top": -1,
-        "bottom": 1,
-        "lowest": (-9.0,) * 3,
-        "highest": (9.0,) * 3,
-    }
+    free = {"steepest": 1.0, "left": -1, "right": 1, "top": -1, "bottom": 1}
+    free |= {"lowest": (-9.0,) * 3, "highest": (9.0,) * 3}
     rows = tuple(map(tuple, rng.normal(0, 20, (count, 3)).tolist()))
-    return FittedOptics(
-        degree,
-        places,
-        reaches,
-        rows,
-        1,
-        ((100.0, 90.0, 80.0), (5.0, 0.0, 0.0), (0.0, 5.0, 0.0)),
-        FittedLimits(**{**free, **limits}),
-    )
+    flat = (100.0, 90.0, 80.0), (5.0, 0.0, 0.0), (0.0, 5.0, 0.0)
+    return FittedOptics(degree, places, reaches, rows, 1, flat, FittedLimits(**free | limits))
 
 
 def test_fitted_colours_are_the_documented_sum():

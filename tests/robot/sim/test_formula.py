@@ -68,16 +68,6 @@ def test_every_family_is_the_same_in_packets_and_in_numpy(family):
             np.testing.assert_allclose(ours, numpys, atol=5e-5)  # float32 sines and powers of about 100 mm
 
 
-def test_normals_in_packets_are_differences_of_the_field():
-    body, h = draw_object(3, 5, relief="knurl").body, 0.1
-    points = np.random.default_rng(1).uniform(body.lower, body.upper, (300, 3))
-    sides = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)])
-    values = [body.field(*(points + h / 2 * side).astype(np.float32).T, step_mm=h) for side in sides]
-    plain = np.sum([value[:, None] * side for value, side in zip(values, sides, strict=True)], axis=0)
-    plain /= np.linalg.norm(plain, axis=1, keepdims=True)
-    np.testing.assert_allclose(body.normals(points, h), plain, atol=2e-3)
-
-
 def test_hits_do_not_depend_on_the_order_of_rays():
     body = draw_object(0, 14).body
     width = np.linspace(*body.lower[[0]], *body.upper[[0]], 400)

@@ -6,7 +6,7 @@ import pytest
 from robot.errors import RobotConfigError, UnknownName
 from robot.sim.objects.appearance import Appearance
 from robot.sim.objects.body import SdfBody
-from robot.sim.objects.draw import STROKE_MM, SimObject, draw_object
+from robot.sim.objects.draw import SimObject, draw_object
 from robot.sim.objects.materials import MATERIALS
 from robot.sim.objects.relief import RELIEFS, Relief
 from robot.sim.objects.shapes import SHAPES
@@ -25,15 +25,10 @@ def solid(radius, height, material):
 def test_the_same_seed_and_index_give_the_same_object():
     for index in (0, 7, 1234):
         one, two = draw_object(5, index), draw_object(5, index)
-        assert (one.object_id, one.relief, one.material, one.appearance) == (
-            two.object_id,
-            two.relief,
-            two.material,
-            two.appearance,
-        )
+        for name in ("object_id", "relief", "material", "appearance", "mass_kg"):
+            assert getattr(one, name) == getattr(two, name)
         points = np.random.default_rng(0).uniform(one.body.lower, one.body.upper, (500, 3))
         np.testing.assert_array_equal(one.body.shape.distance(points), two.body.shape.distance(points))
-        assert one.mass_kg == two.mass_kg
 
 
 def test_98_objects_show_every_family_and_relief_several_times():
@@ -44,12 +39,6 @@ def test_98_objects_show_every_family_and_relief_several_times():
     assert min(families.count(name) for name in SHAPES) >= 3
     assert min(reliefs.count(name) for name in RELIEFS) >= 6
     assert len({(item.family, item.relief.name) for item in objects}) > 75
-
-
-def test_all_of_them_fit_between_the_fingers():
-    for index in range(400):
-        size = (draw_object(2, index).body.upper - draw_object(2, index).body.lower)[:2]
-        assert 8 <= size.min() <= 95 + 1e-9 < STROKE_MM
 
 
 @pytest.mark.parametrize(
@@ -71,33 +60,20 @@ def test_impossible_draws_are_refused(settings, error, message):
 
 def test_appearance_and_material_do_not_depend_on_shape_and_relief():
     for index in range(30):
-        drawn = [
-            draw_object(4, index, family=family, relief=relief)
-            for family, relief in (("box", "knurl"), ("ring", "smooth"), (None, None))
-        ]
+        kinds = ({"family": "box", "relief": "knurl"}, {"family": "ring", "relief": "smooth"}, {})
+        drawn = [draw_object(4, index, **kind) for kind in kinds]
         assert len({repr(item.appearance) for item in drawn}) == 1
         assert len({item.material for item in drawn}) == 1
 
 
 def test_colour_is_not_correlated_with_tactile_properties():
-    objects = [draw_object(6, index) for index in range(600)]
-    appearance = np.array(
-        [[*item.appearance.colour, item.appearance.paint is None, item.appearance.label is None] for item in objects]
-    )
-    tactile = np.array(
-        [
-            [
-                list(SHAPES).index(item.family),
-                list(RELIEFS).index(item.relief.name),
-                item.relief.amplitude_mm,
-                item.relief.pitch_mm,
-                np.log(item.material.modulus_mpa),
-                *(item.body.upper - item.body.lower),
-            ]
-            for item in objects
-        ]
-    )
-    correlation = np.corrcoef(appearance.T.astype(float), tactile.T)[: appearance.shape[1], appearance.shape[1] :]
+    appearance, tactile = [], []
+    for item in (draw_object(6, index) for index in range(600)):
+        look, relief, size = item.appearance, item.relief, item.body.upper - item.body.lower
+        appearance.append([*look.colour, look.paint is None, look.label is None])
+        names = list(SHAPES).index(item.family), list(RELIEFS).index(relief.name)
+        tactile.append([*names, relief.amplitude_mm, relief.pitch_mm, np.log(item.material.modulus_mpa), *size])
+    correlation = np.corrcoef(np.array(appearance, float).T, np.transpose(tactile))[:5, 5:]
     # Of 40 independent pairs of 600 samples, the largest exceeds 0.17 once in a thousand object sets.
     assert np.abs(correlation).max() < 0.17
 
