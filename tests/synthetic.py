@@ -17,7 +17,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from robot.recording.folder import RecordingWriter
 
@@ -44,7 +43,7 @@ class DrawnObject:
     pitch_mm: float
     depth_mm: float
     anisotropy: float  # 0 isotropic, 1 strongly elongated
-    regularity: float  # 0 scattered, 1 regular
+    regularity: float  # 0 distorted, 1 regular
     sharpness: float  # 0 rounded profile, 1 flat-topped
 
     colour: tuple[float, float, float]
@@ -123,38 +122,9 @@ def _profile(obj: DrawnObject, phase: FloatImage) -> FloatImage:
     return 0.5 + 0.5 * np.tanh(steep * np.cos(2 * np.pi * phase)) / np.tanh(steep)
 
 
-def _cells(obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Generator) -> tuple[FloatImage, FloatImage]:
-    """Return distances, in pitches, to the nearest and second nearest point of a (scattered) hexagonal lattice."""
-    stretch = 1.0 + 0.8 * obj.anisotropy
-    rows, columns = np.meshgrid(np.arange(-4, int(70 / obj.pitch_mm)), np.arange(-4, int(70 / obj.pitch_mm)))
-    points = np.stack([rows + 0.5 * (columns % 2), 0.87 * columns], -1).reshape(-1, 2).astype(np.float64)
-    points += rng.normal(0, 0.16 * (1 - obj.regularity), points.shape)
-    half = np.stack([cv2.resize(c, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for c in (x, y / stretch)], -1)
-    near = cKDTree(points).query(half.reshape(-1, 2) / obj.pitch_mm, k=2)[0].astype(np.float32)
-    size = (FIELD_PX, FIELD_PX)
-    first, second = (cv2.resize(d.reshape(half.shape[:2]), size, interpolation=cv2.INTER_CUBIC) for d in near.T)
-    return first, second
-
-
 def _waves(obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Generator) -> FloatImage:
     swing = (0.25 + 0.35 * obj.anisotropy) * np.sin(2 * np.pi * y / (3 * obj.pitch_mm))
     return _profile(obj, x / obj.pitch_mm + swing)
-
-
-def _bumps(obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Generator) -> FloatImage:
-    first, _ = _cells(obj, x, y, rng)
-    radius = 0.30 + 0.15 * obj.sharpness
-    return np.sqrt(np.maximum(1 - (first / radius) ** 2, 0))
-
-
-def _pebble(obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Generator) -> FloatImage:
-    first, second = _cells(obj, x, y, rng)
-    return np.sqrt(np.clip((second - first) / 0.8, 0, 1))
-
-
-def _honeycomb(obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Generator) -> FloatImage:
-    first, second = _cells(obj, x, y, rng)
-    return np.exp(-(((second - first) / (0.15 + 0.2 * obj.sharpness)) ** 2))
 
 
 def _knurl(obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Generator) -> FloatImage:
@@ -176,19 +146,6 @@ def _weave(obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Genera
     return np.maximum(warp, weft)
 
 
-def _lines(obj: DrawnObject, rng: np.random.Generator, per_pitch: float, width_mm: float) -> FloatImage:
-    """Return straight strokes, 0..1; their angles vary more for lower anisotropy."""
-    canvas = np.zeros((FIELD_PX, FIELD_PX), np.float32)
-    side = FIELD_PX / PX_PER_MM
-    for _ in range(int(per_pitch * side / obj.pitch_mm)):
-        angle = np.pi / 2 + rng.normal(0, 1.3 * (1 - obj.anisotropy) + 0.05)
-        start = rng.uniform(0, FIELD_PX, 2)
-        reach = rng.uniform(0.3, 0.9) * FIELD_PX * np.array([np.cos(angle), np.sin(angle)])
-        ends = [tuple(int(16 * value) for value in start + sign * reach / 2) for sign in (-1, 1)]
-        cv2.line(canvas, ends[0], ends[1], 1.0, max(1, round(width_mm * PX_PER_MM)), cv2.LINE_8, 4)
-    return cv2.GaussianBlur(canvas, (0, 0), 1.0 + 1.2 * (1 - obj.sharpness))
-
-
 def _grain(obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Generator) -> FloatImage:
     noise = _noise(rng, obj.pitch_mm, 1 + 2 * obj.anisotropy)
     return np.tanh((0.4 + 2 * obj.sharpness) * noise)
@@ -202,17 +159,12 @@ def _smooth(obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Gener
 Family = Callable[[DrawnObject, FloatImage, FloatImage, np.random.Generator], FloatImage]
 FAMILIES: Mapping[str, Family] = {
     "ribs": lambda obj, x, y, rng: _profile(obj, x / obj.pitch_mm),
-    "bumps": _bumps,
-    "scratches": lambda obj, x, y, rng: 1 - _lines(obj, rng, per_pitch=3.0, width_mm=0.5),
-    "weave": _weave,
-    "pebble": _pebble,
     "knurl": _knurl,
+    "weave": _weave,
     "grain": _grain,
-    "dimples": lambda obj, x, y, rng: 1 - _bumps(obj, x, y, rng),
     "waves": _waves,
     "tiles": _tiles,
-    "ridges": lambda obj, x, y, rng: _lines(obj, rng, per_pitch=1.6, width_mm=0.9),
-    "honeycomb": _honeycomb,
+    "pits": lambda obj, x, y, rng: 1 - _knurl(obj, x, y, rng),
     "smooth": _smooth,
 }
 

@@ -141,19 +141,19 @@ def test_details_and_measures_of_each_method(made):
     assert rows["late_fusion"].measures["pair_auc"].value[0] == pytest.approx(np.mean(repeats["late_fusion"]))
 
 
+@torch.inference_mode()
 def match_logits(matcher, grasps):
     """Return the logits of every touch with every photo, from the images, one by one."""
+
+    def pictures(images):
+        return torch.tensor(np.array(images)).permute(0, 3, 1, 2)
+
     load = CONFIG.preprocessing
-    table = np.empty((len(grasps), len(grasps)))
-    with torch.inference_mode():
-        fingers = [torch.tensor(np.array([load.load_touch(path) for path in grasp.touches])) for grasp in grasps]
-        touches = [matcher.touch_encoding(matcher.touch_features(touch.permute(0, 3, 1, 2)[None])) for touch in fingers]
-        pictures = [torch.tensor(load.load_photo(grasp.photo)).permute(2, 0, 1)[None] for grasp in grasps]
-        photos = [matcher.photo_encoding(matcher.photo_features(picture)) for picture in pictures]
-        for row, touch in enumerate(touches):
-            for column, photo in enumerate(photos):
-                table[row, column] = matcher.head(touch.partial, photo.partial).item()
-    return table
+    fingers = [pictures([load.load_touch(path) for path in grasp.touches])[None] for grasp in grasps]
+    touches = [matcher.touch_encoding(matcher.touch_features(touch)).partial for touch in fingers]
+    photos = [pictures([load.load_photo(grasp.photo)]) for grasp in grasps]
+    photos = [matcher.photo_encoding(matcher.photo_features(photo)).partial for photo in photos]
+    return [[matcher.head(touch, photo).item() for photo in photos] for touch in touches]
 
 
 def test_measures_equal_plain_loops_over_images_and_the_checkpoint_of_the_fit(made, grasped):
@@ -165,8 +165,8 @@ def test_measures_equal_plain_loops_over_images_and_the_checkpoint_of_the_fit(ma
     table = match_logits(matcher, test)
     first, areas = defaultdict(list), defaultdict(list)
     for row, grasp in enumerate(test):
-        mine = [table[row, c] for c, other in enumerate(test) if other.object_id == grasp.object_id and c != row]
-        theirs = [table[row, c] for c, other in enumerate(test) if other.object_id != grasp.object_id]
+        mine = [table[row][c] for c, other in enumerate(test) if other.object_id == grasp.object_id and c != row]
+        theirs = [table[row][c] for c, other in enumerate(test) if other.object_id != grasp.object_id]
         first[grasp.object_id].append(max(mine) > max(theirs))
         areas[grasp.object_id].append(np.mean([own > other for own in mine for other in theirs]))
     for name, by_object in (("recall_1", first), ("pair_auc", areas)):

@@ -8,6 +8,7 @@ import pytest
 
 from retrieval.data.dataset import Grasp, Split
 from retrieval.errors import DatasetError
+from retrieval.evaluation.inputs import thin_grasps
 from retrieval.evaluation.queries import (
     SETS_OF_AN_OBJECT,
     MethodScores,
@@ -64,6 +65,13 @@ def test_sets_have_different_grasps_of_one_object_and_leave_three_photos():
         names, counts = np.unique([QUERIES.objects[number] for number in owners[:, 0]], return_counts=True)
         assert set(names.tolist()) == {name for name, count in have.items() if count - size >= 3}
         assert set(counts.tolist()) == {SETS_OF_AN_OBJECT}
+
+
+def test_a_control_encodes_evenly_spaced_grasps_of_each_object():
+    thin = [grasp.grasp_id for grasp in thin_grasps(GRASPS, 3)]
+    assert thin[:6] == ["a-0", "a-9", "a-19", "b-0", "b-1", "b-2"]
+    assert [name for name in thin if name.startswith("f")] == ["f-0", "f-1"]  # it has no more
+    assert thin_grasps(GRASPS, None) == GRASPS
 
 
 def test_queries_depend_on_the_seed():

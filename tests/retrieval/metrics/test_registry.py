@@ -48,9 +48,8 @@ def perfect(objects=6, grasps=4):
 
 
 def others_of(table, row):
-    """Return {object: its columns} without the row's own object."""
-    mine = table.touch_owner[row]
-    return {name: np.flatnonzero(table.photo_owner == name) for name in np.unique(table.photo_owner) if name != mine}
+    """Return the columns of each other object."""
+    return [np.flatnonzero(table.photo_owner == name) for name in table.objects if name != table.touch_owner[row]]
 
 
 def mine_of(table, row):
@@ -65,7 +64,7 @@ def test_pair_accuracy_and_auc_equal_those_of_two_loops():
     accuracy, area = pair_accuracy(table, 1.0).values[:, 0], pair_auc(table).values[:, 0]
     for row in range(14):
         above = [0.5 if score == 1 else float(score > 1) for score in table.scores[row]]
-        mine, others = mine_of(table, row), others_of(table, row).values()
+        mine, others = mine_of(table, row), others_of(table, row)
         false = np.mean([np.mean([1 - above[column] for column in columns]) for columns in others])
         assert accuracy[row] == pytest.approx((np.mean([above[column] for column in mine]) + false) / 2, abs=1e-12)
         wins = []
@@ -90,7 +89,7 @@ def k_way_by_enumeration(table, row, k, photos):
     """Return the exact top-n curve of a row, over every choice of photos and rivals and every order of ties."""
     shown = [
         [np.mean(table.scores[row, list(chosen)]) for chosen in combinations(columns, min(photos, len(columns)))]
-        for columns in [mine_of(table, row), *others_of(table, row).values()]
+        for columns in [mine_of(table, row), *others_of(table, row)]
     ]
     curve, cases = np.zeros(k), 0
     for true, *others in product(*shown):
