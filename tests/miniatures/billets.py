@@ -6,8 +6,6 @@ from pathlib import Path
 from tests.miniatures import picture
 
 GRASPS = 3
-
-
 PLACES = (("welded1", "01"), ("welded1", "02"), ("ground1", "01"))
 
 

@@ -88,16 +88,6 @@ def test_a_killed_collection_continues_to_the_same_bytes(tmp_path, whole, syncs)
     assert files(tmp_path / "r") == whole
 
 
-@pytest.mark.slow
-def test_a_collection_that_is_killed_again_and_again_ends_in_the_same_bytes(tmp_path, whole):
-    kills = 0
-    while killed(tmp_path / "r", 41):
-        kills += 1
-        assert kills < 20
-    assert kills > 1
-    assert files(tmp_path / "r") == whole
-
-
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()], ids=["full", "stop"])
 def test_a_collection_continues_after_a_failure_at_any_step_of_an_attempt(tmp_path, monkeypatch, error):
     """The steps are all disk calls of the first attempt: two lines and eight images."""

@@ -362,18 +362,13 @@ class Blind(GraspPlanner):
         return GraspPlan(pose, above, rig.gripper.stroke_mm, 12.0, fit={"method": "none"})
 
 
-def test_no_depth_is_read_for_a_planner_that_needs_none():
+def test_no_depth_is_read_for_a_planner_that_needs_none_and_only_requested_outputs_are_recorded():
     rig = FakeRig(3)
     rig.planner = Blind()
     attempt, calls = attempted(rig, attempt=AttemptSettings(outputs=("before",)))
     assert "depth" not in calls
+    assert attempt.images.keys() == {"photo", "touch_a", "touch_b", "touch_a_before", "touch_b_before"}
     assert (attempt.fields["force_n"], attempt.fit) == (12.0, {"method": "none"})
-
-
-def test_a_recording_has_the_requested_outputs_only(tmp_path):
-    run(tmp_path / "r", ["round-0"], grasps=1, attempt=AttemptSettings(outputs=("before",)))
-    columns = {key.removesuffix("_file_name") for row in rows(tmp_path / "r") for key in row if "file_name" in key}
-    assert columns == {"photo", "touch_a", "touch_b", "touch_a_before", "touch_b_before"}
 
 
 def test_a_gate_without_its_frames_raises(tmp_path):
@@ -517,7 +512,6 @@ def test_settings_out_of_range_are_refused_before_a_folder_is_made(tmp_path, opt
     assert not (tmp_path / "r").exists()
 
 
-def test_a_real_rig_cannot_run_in_several_jobs(tmp_path, monkeypatch):
-    monkeypatch.setattr(FakeRig, "can_run_jobs", False)
-    with pytest.raises(RobotConfigError, match=r"FakeRig can run in one process only, so jobs must be 1, got 2"):
-        run(tmp_path / "r", jobs=2)
+def test_a_real_rig_cannot_run_in_several_jobs(tmp_path):
+    with pytest.raises(RobotConfigError, match=r"OneRig can run in one process only, so jobs must be 1, got 2"):
+        collect(OneRig, tmp_path / "r", objects=["round-0"], seed=3, jobs=2)

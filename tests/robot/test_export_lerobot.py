@@ -85,8 +85,8 @@ def test_an_error_names_a_damaged_picture_and_nothing_is_written(source, tmp_pat
 
 def test_grasps_with_different_fingers_are_refused(tmp_path):
     with RecordingWriter(tmp_path / "r", {"source": "synthetic", "sensor": "gel"}) as writer:
-        writer.append("1", "mug", {"photo": smooth(9, 9), "touch_a": smooth(9, 9)})
-        writer.append("2", "mug", {"photo": smooth(9, 9), "touch_a": smooth(9, 9), "touch_b": smooth(9, 9)})
+        writer.append("1", "mug", dict.fromkeys(("photo", "touch_a"), smooth(9, 9)))
+        writer.append("2", "mug", dict.fromkeys(("photo", "touch_a", "touch_b"), smooth(9, 9)))
     with pytest.raises(RecordingError, match="must have the same fingers; 1 has a, 2 has a, b"):
         export_lerobot(read_recording(tmp_path / "r"), tmp_path / "out")
 
@@ -155,6 +155,11 @@ def test_an_export_can_be_imported_again(source, exported, tmp_path):
         assert again.info[key] == source.info[key]
 
 
-def test_the_command_refuses_a_second_run(source, exported, capsys):
-    assert main(["export-recording", str(source.folder), "--out", str(exported)]) == 2
+def test_the_command_reports_and_refuses_a_second_run(source, tmp_path, capsys):
+    options = ["export-recording", str(source.folder), "--out", str(tmp_path / "out")]
+    assert main(options) == 0
+    output = capsys.readouterr().err
+    assert "frames after the touch are left out" in output
+    assert f"{tmp_path / 'out'}: 6 grasps" in output
+    assert main(options) == 2
     assert "must be a new or an empty folder" in capsys.readouterr().err
