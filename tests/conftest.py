@@ -109,10 +109,16 @@ def catalogue_with_touches(catalogue_copy: Path, touches: dict[str, list[tuple[P
 
 
 @pytest.fixture(scope="session")
-def touch(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ...]:
-    """The gel images (a, b) of one grasp of the catalogue's first object."""
+def two_grasps(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Path, ...]]:
+    """The gel images (a, b) of two grasps of the catalogue's first object."""
     objects = synthetic.make_objects(1, seed=9)
-    return synthetic.write_queries(tmp_path_factory.mktemp("touch"), objects)[objects[0].object_id][0]
+    return synthetic.write_queries(tmp_path_factory.mktemp("touch"), objects, 2)[objects[0].object_id]
+
+
+@pytest.fixture(scope="session")
+def touch(two_grasps: list[tuple[Path, ...]]) -> tuple[Path, ...]:
+    """The gel images (a, b) of one grasp of the catalogue's first object."""
+    return two_grasps[0]
 
 
 @pytest.fixture(scope="session")

@@ -116,7 +116,8 @@ class TorchEncoder:
         """Encode grasps, each a sequence of its fingers' images."""
         if self._threads is not None:
             torch.set_num_threads(self._threads)  # applies to the calling thread
-        return TouchEncodings(*(output.numpy() for output in self._fast.encode_touches(touch_batch(touches))))
+        partials, embeddings, *readings = self._fast.encode_touches(touch_batch(touches))
+        return TouchEncodings(partials.numpy(), embeddings.numpy(), readings[0].numpy() if readings else None)
 
 
 PhotoEncoder = Callable[[Sequence[Image]], EncodedTouches]

@@ -1,9 +1,11 @@
 """Read touches and encode them by the matcher: partial activations, embeddings and readings."""
 
+import hashlib
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from itertools import chain
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -31,12 +33,14 @@ class TouchEncodings(NamedTuple):
         embeddings: (G, embedding_dim) unit embeddings.
         readings: (G, fingers, 2) log-odds of the gel head, if the model has one (`retrieval.model.fusion_scorer`).
         levels: (G, fingers) differences in grey levels from the no-contact frames, if given.
+        pictures: A digest of the pixels of each finger's image, for each grasp.
     """
 
     partials: Floats
     embeddings: Floats
     readings: Floats | None = None
     levels: Floats | None = None
+    pictures: Sequence[Sequence[bytes]] = ()
 
 
 class TouchEncoder(Protocol):
@@ -124,13 +128,14 @@ class TouchReader:
         self, grasps: Sequence[Sequence[InputImage]], no_contact_frames: Sequence[RgbImage | None], clock: Stopwatch
     ) -> TouchEncodings:
         """Encode grasps in batches; `clock` times the stages "decode" and "encode"."""
-        parts, levels = [], []
+        parts, levels, pictures = [], [], []
         for start in range(0, len(grasps), BATCH):
             with clock("decode"):
                 views = self._preprocessed(grasps[start : start + BATCH], no_contact_frames)
-                levels += [[level for _, level in grasp] for grasp in views]
+                levels += [[level for _, level, _ in grasp] for grasp in views]
+                pictures += [[picture for *_, picture in grasp] for grasp in views]
             with clock("encode"), fork_guard.computing():
-                parts.append(self.encoder.encode([[view for view, _ in grasp] for grasp in views]))
+                parts.append(self.encoder.encode([[view for view, *_ in grasp] for grasp in views]))
         partials, embeddings = (np.concatenate([part[place] for part in parts]) for place in (0, 1))
         readings = [part.readings for part in parts if part.readings is not None]
         return TouchEncodings(
@@ -138,12 +143,13 @@ class TouchReader:
             _finite(embeddings, "embedding"),
             np.concatenate(readings) if readings else None,
             None if no_contact_frames[0] is None else np.array(levels, dtype=np.float32),
+            pictures,
         )
 
     def _preprocessed(
         self, grasps: Sequence[Sequence[InputImage]], no_contact_frames: Sequence[RgbImage | None]
-    ) -> list[list[tuple[RgbImage, float]]]:
-        """Return the preprocessed images of grasps, each with its difference from its no-contact frame (0 without one).
+    ) -> list[list[tuple[RgbImage, float, bytes]]]:
+        """Return the preprocessed images of grasps, their differences from the no-contact frames, and pixel digests.
 
         Of several bad images, the first is reported. The threads end with the call: a fork would not have them.
         """
@@ -153,11 +159,12 @@ class TouchReader:
                 with suppress(Exception):  # `read` reports it
                     source.image.load()
 
-        def view(source: InputImage, reference: RgbImage | None) -> tuple[RgbImage, float]:
+        def view(source: InputImage, reference: RgbImage | None) -> tuple[RgbImage, float, bytes]:
             with fork_guard.computing():
                 image = self._resized(source)
                 level = 0.0 if reference is None else contact_level(image, reference)
-                return self._preprocessing.touch(image, reference), level
+                picture = hashlib.blake2b(np.ascontiguousarray(image), digest_size=16).digest()
+                return self._preprocessing.touch(image, reference), level, picture
 
         with ThreadPoolExecutor(DECODERS, "decode") as threads:
             views = [threads.map(view, grasp, no_contact_frames) for grasp in grasps]
@@ -171,6 +178,16 @@ class TouchReader:
         if source.image.touch.shape != (px, px, 3):
             raise IncompleteSearch("an index of another model was opened in the meantime; repeat the query")
         return source.image.touch
+
+
+def require_distinct(grasps: Iterable[Sequence[InputImage]], pictures: Iterable[Sequence[bytes]]) -> None:
+    """Raise BadInput if two images of an object's grasps are the same picture, which would count as evidence twice."""
+    first: dict[bytes, str] = {}
+    for image, picture in zip(chain.from_iterable(grasps), chain.from_iterable(pictures), strict=True):
+        if picture in first:
+            same = "given twice" if first[picture] == image.name else f"the same picture as {first[picture]}"
+            raise BadInput(f"{image.name}: {same}; a picture counts once, so leave the repetition out")
+        first[picture] = image.name
 
 
 def _finite(values: Floats, name: str) -> Floats:

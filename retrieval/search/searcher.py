@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import asdict
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,14 @@ from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
 from retrieval.model.onnx_encoder import find_export
 from retrieval.model.posterior import NONE_PRIOR, Posterior, require_prior
 from retrieval.model.references import REFERENCE_ROWS
-from retrieval.model.touch_reader import EncodedTouches, Stopwatch, TouchEncoder, TouchEncodings, TouchReader
+from retrieval.model.touch_reader import (
+    EncodedTouches,
+    Stopwatch,
+    TouchEncoder,
+    TouchEncodings,
+    TouchReader,
+    require_distinct,
+)
 from retrieval.model.touches import AnyImage, AnyTouches, InputImage, parse_grasps
 from retrieval.model.verification import MAX_GRASPS, DecisionBounds
 from retrieval.search.answer import (
@@ -153,7 +161,7 @@ class Searcher:
             none_prior: Prior probability that the catalogue lacks the object.
 
         Raises:
-            BadInput: An argument is invalid.
+            BadInput: An argument is invalid, or a picture is given twice.
             ImageError: An image cannot be read.
             NumericalError: A logit is not finite.
         """
@@ -193,9 +201,9 @@ class Searcher:
             span = slice(start, start := start + len(grasps))
             classes, result = shown[span], None
             if _fault(classes) is None:
-                query = EncodedTouches(
-                    codes.embeddings[span][classes == CONTACT], codes.partials[span][classes == CONTACT]
-                )
+                used = classes == CONTACT
+                require_distinct(compress(grasps, used), compress(codes.pictures[span], used))
+                query = EncodedTouches(codes.embeddings[span][used], codes.partials[span][used])
                 result = opened.shard.search(query, top, candidates)
             clock.add({stage: result.timing_ms[stage] if result else 0.0 for stage in ("candidates", "rerank")})
             found.append((classes.tolist(), result))
@@ -242,7 +250,9 @@ class Searcher:
         codes, classes = opened._encoded(grasps, background, Stopwatch())
         if (fault := _fault(classes)) is not None:
             return Verification(expect, fault, names, classes.tolist(), [], None)
-        shard, partials = opened.folder_shard, codes.partials[classes == CONTACT][:MAX_GRASPS]
+        used = classes == CONTACT
+        require_distinct(compress(grasps, used), compress(codes.pictures, used))
+        shard, partials = opened.folder_shard, codes.partials[used][:MAX_GRASPS]
         ratios = [
             float(posterior.log_ratio(shard.object_logit(number, partials[:count]), count))
             for count in range(1, len(partials) + 1)

@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -20,10 +21,10 @@ from tests import synthetic
 
 
 @pytest.fixture
-def workplace(tmp_path, catalogue, touch, monkeypatch):
-    """The current folder, with `catalog/`, `a.png` and `b.png` as in the README."""
+def workplace(tmp_path, catalogue, two_grasps, monkeypatch):
+    """The current folder, with `catalog/`, `a.png` and `b.png` as in the README, and a second grasp."""
     shutil.copytree(catalogue, tmp_path / "catalog")
-    for name, path in zip(("a.png", "b.png"), touch, strict=True):
+    for name, path in zip(("a.png", "b.png", "a2.png", "b2.png"), chain(*two_grasps), strict=True):
         shutil.copy(path, tmp_path / name)
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -85,14 +86,14 @@ def test_json_is_the_only_thing_on_stdout_and_has_the_documented_keys(workplace,
     assert json.loads(capsys.readouterr().out)["photos"] == 24
     assert main(["build-index", "catalog/"]) == 0
     assert capsys.readouterr().err.startswith(f"model: {model} (the one that index was built with)\n")
-    query = [*QUERY, "--gelsight", "a.png", "b.png", "--top", "3", "--json"]
+    query = [*QUERY, "--gelsight", "a2.png", "b2.png", "--top", "3", "--json"]
     assert main([*query, *NO_UNKNOWN_OBJECTS]) == 0
     document = json.loads(capsys.readouterr().out)
     assert set(document) == {
         *("query", "index", "timing_ms", "verdict", "none_probability", "posterior", "results"),
         *("more_grasps", "advice", "unlisted_probability"),
     }
-    touches = [["a.png", "b.png"], ["a.png", "b.png"]]
+    touches = [["a.png", "b.png"], ["a2.png", "b2.png"]]
     assert document["query"] == {"touches": touches, "grasps": ["contact", "contact"]}
     assert set(document["posterior"]) == {
         *("formula", "slope", "offset", "dependence", "tests"),

@@ -71,14 +71,14 @@ ONE = ("mug", 1.5, 0.8, "mug/1.jpg", {})
 
 
 @pytest.fixture(scope="module")
-def answer(catalogue, model, touch, tmp_path_factory):
+def answer(catalogue, model, two_grasps, tmp_path_factory):
     """A real result over a catalogue with metadata, and that catalogue; one photo is missing, one is damaged."""
     folder = tmp_path_factory.mktemp("report")
     own = shutil.copytree(catalogue, folder / "catalog")
     lines = [json.dumps({"object_id": path.name, "shelf": "B4"}) for path in own.iterdir()]
     (own / "metadata.jsonl").write_text("\n".join(lines))
     build_index(own, load_checkpoint(model), folder / "index", quiet=True)
-    result = Searcher.open(folder / "index").query([touch, touch], top=5)
+    result = Searcher.open(folder / "index").query(two_grasps, top=5)
     (own / result.results[0].photo).unlink()
     broken = own / result.results[1].photo
     broken.write_bytes(broken.read_bytes()[:300])

@@ -34,12 +34,13 @@ def without_times(result):
     return {**result.to_dict(), "timing_ms": None}
 
 
-def test_the_client_answers_like_the_searcher_for_images_of_every_kind(client, searcher, touch):
+def test_the_client_answers_like_the_searcher_for_images_of_every_kind(client, searcher, two_grasps):
+    touch = two_grasps[0]
     images = [Image.open(path) for path in touch]
     inputs = [
         touch,
         [str(path) for path in touch],
-        [touch, touch],
+        two_grasps,
         [np.asarray(image) for image in images],
         [path.read_bytes() for path in touch],
         images,
