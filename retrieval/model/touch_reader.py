@@ -163,7 +163,7 @@ class TouchReader:
             with fork_guard.computing():
                 image = self._resized(source)
                 level = 0.0 if reference is None else contact_level(image, reference)
-                picture = hashlib.blake2b(np.ascontiguousarray(image), digest_size=16).digest()
+                picture = hashlib.blake2b(image.tobytes(), digest_size=16).digest()
                 return self._preprocessing.touch(image, reference), level, picture
 
         with ThreadPoolExecutor(DECODERS, "decode") as threads:
