@@ -4,6 +4,7 @@ Rows are sorted by path, and objects are numbered by name, so a photo or an obje
 """
 
 from bisect import bisect_left
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
 from itertools import pairwise
@@ -16,6 +17,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from _touch_retrieval.files import durable_file
+from _touch_retrieval.names import lookup_key
 from indexes.errors import AGAIN, CorruptIndex, RowError
 from indexes.kinds.vector_index import RowNumbers
 
@@ -82,9 +84,19 @@ class Rows:
         return number if number < len(self) and self[number].path == path else -1
 
     def find_object(self, name: str) -> int:
-        """Return the number of the object with this name; -1 if there is none."""
+        """Return the number of the object with this name, or of the only one with its `lookup_key`; else -1."""
         number = bisect_left(range(self.object_count), name, key=self.object_name)
-        return number if number < self.object_count and self.object_name(number) == name else -1
+        if number < self.object_count and self.object_name(number) == name:
+            return number
+        similar = self._numbers_by_key.get(lookup_key(name), [])
+        return similar[0] if len(similar) == 1 else -1
+
+    @cached_property
+    def _numbers_by_key(self) -> dict[str, list[int]]:
+        numbers: dict[str, list[int]] = defaultdict(list)
+        for number in range(self.object_count):
+            numbers[lookup_key(self.object_name(number))].append(number)
+        return dict(numbers)
 
     def object_name(self, number: int) -> str:
         """Return the name of an object."""

@@ -8,30 +8,39 @@
                                     catalogue) or `object_id` (all its photos) and any other keys; a photo's
                                     value of a key takes precedence over its object's
 
-Names that start with a dot are skipped. A photo's path in the catalogue, with forward slashes, is its stable id.
-Listing opens no photo.
+A picture is recognised by its extension, or by its content if it has no extension of a picture. Hidden files and those
+of systems and network drives are left out (`_touch_retrieval.names`). A photo's path in the catalogue, with forward
+slashes, is its stable id.
 """
 
 import os
 import re
 from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from pathlib import Path, PurePosixPath
+from string import ascii_lowercase
 from typing import Any
 
-from _touch_retrieval.files import parse_json, read_regular
-from retrieval.data.images import EXTENSIONS
-from retrieval.data.naming import STEM, Naming
+from _touch_retrieval.files import open_regular, parse_json, read_regular
+from _touch_retrieval.names import is_system_name, lookup_key
+from retrieval.console.output import abbreviate_list
+from retrieval.data.images import EXTENSIONS, is_picture
+from retrieval.data.naming import MAX_EXAMPLES, STEM, Naming
 from retrieval.data.text import is_utf8
 from retrieval.errors import BadInput, DatasetError
 
 METADATA_FILE = "metadata.jsonl"
 UNSUPPORTED_EXTENSIONS = frozenset(
-    {".arw", ".cr2", ".cr3", ".dng", ".gif", ".jfif", ".jp2", ".jxl", ".nef", ".orf", ".raf", ".rw2", ".svg", ".tga"}
+    {".arw", ".cr2", ".cr3", ".dng", ".gif", ".jp2", ".jxl", ".nef", ".orf", ".raf", ".rw2", ".svg", ".tga"}
 )
-"""Extensions of picture formats that are not read. An object with only such files has no photo."""
+"""Extensions of picture formats that are not read, some of which begin like TIFF."""
+_TABLES = frozenset({".csv", ".json", ".jsonl", ".ods", ".tsv", ".xls", ".xlsx"})
 _TOUCH = re.compile(r"(touch_.*?)(?:_([a-z]))?", re.DOTALL)
+_NEARLY_TOUCH = re.compile(r"touch_.*|touch[ -].*[ _-][a-z]", re.DOTALL | re.IGNORECASE)
+_NEARLY_FINGER = re.compile(r"touch_.+[ _-][a-z]([ (].*| ?- ?copy.*)?", re.DOTALL | re.IGNORECASE)
+_TOUCH_NAMES = "gel images of a touch are named touch_<name>_a, touch_<name>_b and so on, each once"
 _LAYOUT = "put photos in <object_id>/<photo> or <object_id>.<ext>"
 
 
@@ -120,8 +129,11 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
     if not root.is_dir():
         what = "is a file" if root.exists() else "does not exist"
         raise DatasetError(f"a catalogue must be a folder of photos, but {root} {what}: {_LAYOUT}")
-    names, skipped = _list_files(root)
+    names, skipped, system = _list_files(root)
     by_object, by_photo = _read_metadata(root / METADATA_FILE, naming)
+
+    def metadata_of(name: str, path: str) -> dict[str, Any]:
+        return {**by_object.get(lookup_key(name), {}), **by_photo.get(lookup_key(path), {})}
 
     photos: list[CataloguePhoto] = []
     gels: dict[tuple[str, str], list[tuple[str, str]]] = defaultdict(list)  # (touch, object) -> (finger, path)
@@ -129,39 +141,75 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
     unfit: list[SkippedPhoto] = []
     for path in sorted(names):
         extension = os.path.splitext(path)[1].lower()
-        if extension in UNSUPPORTED_EXTENSIONS:
-            skipped.append(SkippedPhoto(path, f"{extension} pictures are not read: save it as PNG or JPEG"))
-        elif extension not in EXTENSIONS:
-            ignored += [path] if path != METADATA_FILE else []
+        if extension not in EXTENSIONS and (path == METADATA_FILE or not _has_picture(root / path, extension)):
+            if extension in UNSUPPORTED_EXTENSIONS:
+                skipped.append(SkippedPhoto(path, f"{extension} pictures are not read: save it as PNG or JPEG"))
+            elif path != METADATA_FILE:
+                ignored.append(path)
         elif (name := naming.object_of(path)) is None:
             why = ": the name is only a number" if naming.text == STEM else ""
             unfit.append(SkippedPhoto(path, f"does not fit --objects-from {naming.text}{why}"))
-        elif (touch := _touch_name(path, naming)) is None:
-            photos.append(CataloguePhoto(path, name, {**by_object.get(name, {}), **by_photo.get(path, {})}))
+        elif not _is_nearly_touch(path, naming):
+            photos.append(CataloguePhoto(path, name, metadata_of(name, path)))
+        elif (touch := _touch_name(path)) is None:
+            skipped.append(SkippedPhoto(path, f"neither a photo nor a touch: {_TOUCH_NAMES}"))
         else:
             gels[touch[0], name].append((touch[1], path))
-    if not photos and not gels:
-        raise _no_photo_error(root, ignored, skipped, unfit, naming)
 
     touches = []
     for (_, name), fingers in sorted(gels.items()):
-        paths = tuple(path for _, path in sorted(fingers))
-        touches.append(CatalogueTouch(name, paths, {**by_object.get(name, {}), **by_photo.get(paths[0], {})}))
+        letters, paths = zip(*sorted(fingers), strict=True)
+        if letters not in (("",), tuple(ascii_lowercase[: len(letters)])):
+            reason = f"its touch has the images {', '.join(paths)}; {_TOUCH_NAMES}"
+            skipped += [SkippedPhoto(path, reason) for path in paths]
+        else:
+            touches.append(CatalogueTouch(name, paths, metadata_of(name, paths[0])))
+    if not photos and not touches:
+        raise _no_photo_error(root, ignored, skipped, unfit, naming)
     catalogue = Catalogue(root, tuple(photos), tuple(ignored), (*skipped, *unfit), touches=tuple(touches))
-    unknown = [*sorted(by_photo.keys() - catalogue.paths), *sorted(by_object.keys() - catalogue.object_ids)]
-    return replace(
-        catalogue, notes=tuple(f"{METADATA_FILE} names {name}, which is not in the catalogue" for name in unknown)
-    )
+    unknown = [
+        *sorted(by_photo.keys() - set(map(lookup_key, catalogue.paths))),
+        *sorted(by_object.keys() - set(map(lookup_key, catalogue.object_ids))),
+    ]
+    notes = [f"{METADATA_FILE} names {name}, which is not in the catalogue" for name in unknown]
+    return replace(catalogue, notes=(*notes, *_notes_on_files(catalogue, names, system)))
 
 
-def _list_files(folder: Path) -> tuple[list[str], list[SkippedPhoto]]:
-    """Return the files below a folder as posix paths relative to it, and what cannot be used.
+def _has_picture(path: Path, extension: str) -> bool:
+    """Whether a file without the extension of a picture contains one; a raw photo of a camera only looks like TIFF."""
+    try:
+        with open_regular(path) as file:
+            head = file.read(64)
+    except OSError:
+        return False
+    return is_picture(head) and (extension not in UNSUPPORTED_EXTENSIONS or head[:2] not in (b"II", b"MM"))
+
+
+def _notes_on_files(catalogue: Catalogue, names: Sequence[str], system: Sequence[str]) -> Iterator[str]:
+    """Yield remarks on what a user may have expected to be in the catalogue."""
+    if system:
+        yield f"{len(system)} file(s) or folder(s) of the system left out: {abbreviate_list(system, MAX_EXAMPLES)}"
+    used = {str(folder) for path in catalogue.paths for folder in PurePosixPath(path).parents}
+    folders = {str(folder) for name in names for folder in PurePosixPath(name).parents}
+    indexes = {name.rpartition("/")[0] for name in names if name.endswith(("/CURRENT", "/SHARDS.json"))}
+    if empty := sorted(folder for folder in folders - used - indexes if str(PurePosixPath(folder).parent) in used):
+        yield f"no picture in {len(empty)} folder(s) that contain files: {abbreviate_list(empty, MAX_EXAMPLES)}"
+    if tables := [name for name in catalogue.ignored if PurePosixPath(name).suffix.lower() in _TABLES]:
+        yield (
+            f"{abbreviate_list(tables, MAX_EXAMPLES)}: not read; titles and other facts of objects can be given in "
+            f'{METADATA_FILE}, a line such as {{"object_id": "mug", "title": "Blue mug"}} for each'
+        )
+
+
+def _list_files(folder: Path) -> tuple[list[str], list[SkippedPhoto], list[str]]:
+    """Return the files below a folder as posix paths relative to it, what cannot be used, and names of the system.
 
     A link to a folder is followed if it leads out of `folder`, and each target once: no loop is endless.
     """
     root = Path(os.path.realpath(folder))
     names: list[str] = []
     skipped: list[SkippedPhoto] = []
+    system: list[str] = []
     targets: set[Path] = set()
 
     def walk(place: str, prefix: str) -> None:
@@ -171,9 +219,10 @@ def _list_files(folder: Path) -> tuple[list[str], list[SkippedPhoto]]:
             raise DatasetError(f"cannot list the catalogue folder {place}: {error.strerror}") from error
         for entry in entries:
             path = prefix + entry.name
-            if entry.name.startswith("."):
-                continue
-            if not path.isascii() and not is_utf8(path):
+            if is_system_name(entry.name):
+                if not entry.name.startswith("."):
+                    system.append(path)
+            elif not path.isascii() and not is_utf8(path):
                 printable = path.encode(errors="surrogateescape").decode(errors="backslashreplace")
                 skipped.append(SkippedPhoto(printable, "the name is not valid UTF-8; rename it"))
             elif not os.path.isdir(entry):  # False for a link that leads to itself
@@ -189,19 +238,24 @@ def _list_files(folder: Path) -> tuple[list[str], list[SkippedPhoto]]:
                 walk(entry.path, f"{path}/")
 
     walk(str(folder), "")
-    return names, skipped
+    return names, skipped, system
 
 
-def _touch_name(path: str, naming: Naming) -> tuple[str, str] | None:
-    """Return a gel image's touch name (with its folder) and finger ("" for one finger), or None for a photo.
+def _is_nearly_touch(path: str, naming: Naming) -> bool:
+    """Whether a picture is named like a gel image, perhaps not exactly.
 
     A picture outside every folder is a photo, and so is every picture if the file stem names the object.
     """
-    if "/touch_" not in path or naming.text == STEM:
-        return None
+    return "/" in path and naming.text != STEM and bool(_NEARLY_TOUCH.fullmatch(PurePosixPath(path).stem))
+
+
+def _touch_name(path: str) -> tuple[str, str] | None:
+    """Return a gel image's touch name (with its folder) and finger ("" for one finger); None if it is not exact."""
     place = PurePosixPath(path)
     found = _TOUCH.fullmatch(place.stem)
-    return None if found is None else (f"{place.parent}/{found[1]}", found[2] or "")
+    if found is None or (found[2] is None and _NEARLY_FINGER.fullmatch(found[1])):
+        return None
+    return f"{place.parent}/{found[1]}", found[2] or ""
 
 
 def _no_photo_error(
@@ -231,7 +285,7 @@ def _read_metadata(file: Path, naming: Naming) -> tuple[dict[str, dict[str, Any]
             continue
         try:
             name, is_photo, metadata = _parse_line(line, naming)
-            table = by_photo if is_photo else by_object
+            name, table = lookup_key(name), by_photo if is_photo else by_object
             if name in table:
                 raise ValueError(f"{name} has two lines; merge them")
         except ValueError as error:
@@ -255,6 +309,6 @@ def _parse_line(line: bytes, naming: Naming) -> tuple[str, bool, dict[str, Any]]
         return row["object_id"], False, metadata
     path = PurePosixPath(row["file_name"]).as_posix()
     name = naming.object_of(path)
-    if row.get("object_id", name) != name:
+    if name is None or lookup_key(row.get("object_id", name)) != lookup_key(name):
         raise ValueError(f"{path} belongs to object {name}, but the line names {row['object_id']}")
     return path, True, metadata

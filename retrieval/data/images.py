@@ -141,13 +141,23 @@ def _reason(error: BaseException) -> str:
     return f"{' '.join(text.split())} ({type(error).__name__})"
 
 
-def _decoders(data: bytes, name: str | Path) -> tuple[str, ...]:
-    """Return the names of Pillow's decoders for a file. Raises ImageError if the decoder is not installed.
+def is_picture(head: bytes) -> bool:
+    """Return whether a file that begins with these bytes, 64 or more, is of a picture format that is read."""
+    is_bitmap = head.startswith(b"BM") and head[6:10] == b"\0\0\0\0"
+    is_webp = head.startswith(b"RIFF") and head[8:12] == b"WEBP"
+    starts = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*")
+    return head.startswith(starts) or is_bitmap or is_webp or bool(_brands(head) & (_AVIF_BRANDS | _HEIC_BRANDS))
 
-    HEIC and AVIF files begin with a box of type "ftyp" that lists their brands; so do videos.
-    """
+
+def _brands(data: bytes) -> set[bytes]:
+    """Return the brands in the box "ftyp" at the begin of a HEIC, AVIF or video file; else nothing."""
     box = data[: min(int.from_bytes(data[:4], "big"), 256)] if data[4:8] == b"ftyp" else b""
-    brands = {box[at : at + 4] for at in range(8, len(box), 4)}
+    return {box[at : at + 4] for at in range(8, len(box), 4)}
+
+
+def _decoders(data: bytes, name: str | Path) -> tuple[str, ...]:
+    """Return the names of Pillow's decoders for a file. Raises ImageError if the decoder is not installed."""
+    brands = _brands(data)
     if brands & _AVIF_BRANDS:
         if not features.check("avif"):
             raise ImageError(name, "an AVIF picture, and this Pillow was built without AVIF: pip install -U pillow")

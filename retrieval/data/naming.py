@@ -6,18 +6,19 @@
     PATTERN    a path in which {object} stands for the name, and any other word in braces for an ignored part:
                {split}/{object}/{photo}, or {object}_{view}.jpg
 
-A pattern must match the photo's whole path, first without its extension, then with it. A word in braces matches one
-character or more, but no "/"; {object} matches as many as possible, the others as few as possible. A second {object}
-matches the same text as the first.
+A pattern must match the photo's whole path, first without its extension, then with it (JPG or jpg). A word in braces
+matches one character or more, but no "/"; {object} matches as many as possible, the others as few as possible. A
+second {object} matches the same text as the first.
 """
 
 import re
-from collections import Counter
-from collections.abc import Mapping
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import PurePosixPath
 
+from _touch_retrieval.names import same_object_key
 from retrieval.console.output import abbreviate_list
 from retrieval.errors import BadInput
 
@@ -33,7 +34,8 @@ NOT_OBJECTS = frozenset(
 _FIELD = re.compile(r"\{(\w+)\}")
 _ESCAPED_FIELD = re.compile(r"\\\{(\w+)\\\}")  # as re.escape writes it
 _NUMBER = re.compile(r"[\s._#-]*\(?\d+\)?$")
-_MAX_EXAMPLES = 3
+_LAST_WORD = re.compile(r"(.*\w)[\s._-]+([^\W\d_]+)")
+MAX_EXAMPLES = 3
 
 
 @dataclass(frozen=True)
@@ -75,26 +77,79 @@ class Naming:
     @cached_property
     def _pattern(self) -> re.Pattern[str]:
         again = f"(?P={OBJECT})"
-        escaped = re.escape(self.text)
+        suffix = PurePosixPath(self.text).suffix
+        suffix = "" if "{" in suffix else suffix
+        escaped = re.escape(self.text.removesuffix(suffix)) + f"(?i:{re.escape(suffix)})"
         pattern = _ESCAPED_FIELD.sub(lambda field: again if field[1] == OBJECT else "[^/]+?", escaped)
         return re.compile(pattern.replace(again, f"(?P<{OBJECT}>[^/]+)", 1))
 
 
-def naming_warnings(photos: Mapping[str, int], naming: Naming) -> list[str]:
-    """Return a warning sentence for each suspicious property of the object names, given their numbers of photos."""
-    names, warnings = sorted(photos), []
+def naming_warnings(photos: Iterable[tuple[str, str]], naming: Naming) -> list[str]:
+    """Return a warning sentence for each suspicious property of the objects of photos, given as (object, path)."""
+    paths: dict[str, list[str]] = defaultdict(list)
+    for name, path in photos:
+        paths[name].append(path)
+    names, warnings = sorted(paths), []
     if generic := [name for name in names if name.casefold() in NOT_OBJECTS]:
+        remedy = f"check the rule {naming.text!r}"
+        if naming.text == FOLDER:
+            remedy = "if the objects' folders are below it, use --objects-from '{split}/{object}/{photo}'"
         warnings.append(
-            f"{abbreviate_list(generic, _MAX_EXAMPLES)} {'is' if len(generic) == 1 else 'are'} used as the name of an "
-            f"object, with {sum(photos[name] for name in generic)} photo(s): if the objects' folders are below it, use "
-            f"--objects-from '{{split}}/{{object}}/{{photo}}'"
+            f"{_some(generic)} {'is' if len(generic) == 1 else 'are'} used as the name of an object, with "
+            f"{sum(len(paths[name]) for name in generic)} photo(s): {remedy}"
         )
-    stem_of = {name: _NUMBER.sub("", name) for name in names}
-    stems = Counter(stem_of.values())
-    similar = [name for name, stem in stem_of.items() if stem and stems[stem] > 1]
-    if naming.text != STEM and similar:
+    keys = Counter(map(same_object_key, names))
+    if same := [name for name in names if keys[same_object_key(name)] > 1]:
         warnings.append(
-            f"the names of {len(similar)} of {len(names)} objects differ from another name only by a number: "
-            f"{abbreviate_list(similar, _MAX_EXAMPLES)}; if these show one object, use --objects-from stem or a pattern"
+            f"the names of {len(same)} objects differ only by case, spaces or the form of their characters: "
+            f"{_some(list(map(repr, same)))}; they are searched as different objects: rename those that are one"
         )
+    if naming.text == FOLDER and (inner := _object_folders(paths)):
+        warnings.append(
+            f"{_some([name for name in names if name in inner])}: photos in {sum(map(len, inner.values()))} folders "
+            f"below count as one object for each of these names; if those folders are the objects, use "
+            "--objects-from '{shop}/{object}/{photo}'"
+        )
+    if naming.text in (FOLDER, STEM) and (found := _views(names)):
+        views, similar = found
+        place = "{object}_{view}/{photo}" if any("/" in path for path in paths[similar[0]]) else "{object}_{view}"
+        warnings.append(
+            f"the names of {len(similar)} objects differ from another name only by {_some(views)}: {_some(similar)}; "
+            f"if these show one object, use --objects-from '{place}'"
+        )
+    elif naming.text == FOLDER:
+        stem_of = {name: _NUMBER.sub("", name) for name in names}
+        stems = Counter(stem_of.values())
+        if similar := [name for name, stem in stem_of.items() if stem and stems[stem] > 1]:
+            warnings.append(
+                f"the names of {len(similar)} of {len(names)} objects differ from another name only by a number: "
+                f"{_some(similar)}; if these show one object, use --objects-from stem or a pattern"
+            )
     return warnings
+
+
+def _some(names: Sequence[str]) -> str:
+    return abbreviate_list(names, MAX_EXAMPLES)
+
+
+def _object_folders(paths: Mapping[str, Sequence[str]]) -> dict[str, set[str]]:
+    """Return the folders with photos below each object's folder, where they may be the objects themselves.
+
+    That is so for two folders or more whose names the other objects do not have: views, such as front and back, recur.
+    """
+    inner = {name: {path.split("/")[1] for path in own if path.count("/") > 1} for name, own in paths.items()}
+    often = Counter(folder for folders in inner.values() for folder in folders)
+    return {name: folders for name, folders in inner.items() if sum(often[folder] == 1 for folder in folders) > 1}
+
+
+def _views(names: Sequence[str]) -> tuple[list[str], list[str]] | None:
+    """Return the last words that recur after two or more beginnings of names, and these names; None without such."""
+    words_of: dict[str, dict[str, str]] = defaultdict(dict)  # beginning -> last word -> name
+    for name in names:
+        if found := _LAST_WORD.fullmatch(_NUMBER.sub("", name)):
+            words_of[found[1]][found[2].casefold()] = name
+    groups = [words for words in words_of.values() if len(words) > 1]
+    often = Counter(word for words in groups for word in words)
+    views = sorted(word for word, count in often.items() if count > 1)
+    similar = sorted(name for words in groups for word, name in words.items() if word in views)
+    return (views, similar) if len(views) > 1 else None

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,10 @@ from indexes.kinds.vector_index import VectorIndex
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Arrays
 from indexes.store.manifest import Manifest, read_manifest
-from indexes.store.rows import TEXT, encode_rows
+from indexes.store.rows import TEXT, Row, encode_rows
+from retrieval.console.output import abbreviate_list
 from retrieval.data.catalogue import Catalogue, list_catalogue
-from retrieval.data.naming import FOLDER, Naming, naming_warnings
+from retrieval.data.naming import FOLDER, MAX_EXAMPLES, Naming, naming_warnings
 from retrieval.errors import BadInput
 from retrieval.indexing.candidates import candidates_sentence, kept_measurement, measure_candidates, query_codes
 from retrieval.indexing.contents import IndexContents, read_contents
@@ -83,9 +84,22 @@ def build_index(
     except IndexesError:
         before = {}
     options, note = build_options(checkpoint, before, objects_from=objects_from, kind=kind, cells=cells, quiet=quiet)
-    report = build_listed(list_catalogue(folder, options.naming), checkpoint, store.path, options)
+    catalogue = list_catalogue(folder, options.naming)
+    report = build_listed(catalogue, checkpoint, store.path, options)
     store.discard_before(report.generation)
-    return replace(report, reason=" ".join(filter(None, (note, report.reason))))
+    warnings = [*replaced_catalogue(before, catalogue), *report.warnings]
+    return replace(report, warnings=warnings, reason=" ".join(filter(None, (note, report.reason))))
+
+
+def replaced_catalogue(before: Mapping[str, Any], catalogue: Catalogue) -> list[str]:
+    """Return a warning if the existing index, with the entries `before`, is of another catalogue that still exists."""
+    old = str(before.get("catalogue", catalogue.where))
+    if old == catalogue.where or not Path(old).is_dir():
+        return []
+    return [
+        f"the index was of the catalogue {old} and is now of {catalogue.where}: objects of the first are no longer "
+        "found; to search both, put both below one folder, or give each its own --out"
+    ]
 
 
 @dataclass(frozen=True)
@@ -224,6 +238,21 @@ def _write(
     return manifest
 
 
+def _shared_photos(rows: Sequence[Row]) -> list[str]:
+    """Return a warning if objects share a photo, which cannot tell them apart."""
+    first = dict[str, Row]()
+    sharing = dict[str, dict[str, str]]()  # digest -> object -> path
+    for row in rows:
+        if first.setdefault(row.digest, row).object_id != row.object_id:
+            known = sharing.setdefault(row.digest, {first[row.digest].object_id: first[row.digest].path})
+            known.setdefault(row.object_id, row.path)
+    return [
+        f"one picture is the photo of {len(paths)} objects: {abbreviate_list(list(paths.values()), MAX_EXAMPLES)}; "
+        "remove it if it is a placeholder, or merge the objects"
+        for paths in sharing.values()
+    ]
+
+
 def _report(
     out: Path,
     catalogue: Catalogue,
@@ -246,7 +275,7 @@ def _report(
         objects=len(names),
         objects_from=options.naming.text,
         examples=[(name, first_photo[name]) for name in shown],
-        warnings=naming_warnings(objects, options.naming),
+        warnings=[*naming_warnings(((row.object_id, row.path) for row in rows), options.naming), *_shared_photos(rows)],
         embedded=contents.encoded,
         skipped=contents.skipped,
         ignored=[name for name in catalogue.ignored if not (catalogue.folder / name).resolve().is_relative_to(inside)],

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from _touch_retrieval.names import lookup_key
 from indexes.store.generation import Generation, check_fingerprint
 from indexes.store.sharded import ShardedManifest
 from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_scorer
@@ -159,15 +160,15 @@ class FolderShard:
         if object_id is not None:
             found = np.flatnonzero(rows.objects == rows.find_object(object_id))
         if words:
-            texts = self._texts
-            found = np.array([row for row in found if all(word in texts[row] for word in words)], dtype=np.int64)
+            texts, keys = self._texts, [lookup_key(word) for word in words]
+            found = np.array([row for row in found if all(key in texts[row] for key in keys)], dtype=np.int64)
         return Page(len(found), [listed_photo(rows[int(row)]) for row in found[offset : offset + limit]])
 
     @cached_property
     def _texts(self) -> list[str]:
         """Searched text of each row: object, path and metadata in lower case."""
         return [
-            " ".join(map(str, (row.object_id, row.path, *row.metadata.values()))).casefold()
+            lookup_key(" ".join(map(str, (row.object_id, row.path, *row.metadata.values()))).casefold())
             for row in self.generation.rows
         ]
 

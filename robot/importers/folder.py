@@ -24,6 +24,7 @@ from pathlib import Path
 from string import ascii_lowercase
 from typing import NoReturn
 
+from _touch_retrieval.names import is_system_name
 from robot.errors import ImporterError
 from robot.importers.importing import (
     NOT_STATED,
@@ -189,12 +190,12 @@ class _MatchingFiles:
 
 
 def _pictures(src: Path) -> list[str]:
-    """Return the pictures below a folder as relative paths, without hidden ones, in natural order."""
+    """Return the pictures below a folder as relative paths, without those of systems, in natural order."""
 
     def fail(error: OSError) -> NoReturn:  # else an object would be missing without a message
         raise ImporterError(f"{error.filename} cannot be listed: {error.strerror}") from error
 
     files = (Path(folder, name) for folder, _, names in os.walk(src, onerror=fail) for name in names)
     paths = (path.relative_to(src) for path in files if path.suffix.lower() in _ENDINGS)
-    shown = [path.as_posix() for path in paths if not any(part.startswith(".") for part in path.parts)]
+    shown = [path.as_posix() for path in paths if not any(map(is_system_name, path.parts))]
     return sorted(shown, key=natural_sort_key)

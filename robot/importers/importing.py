@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from _touch_retrieval.files import write_atomically
+from _touch_retrieval.names import is_system_name
 from robot.errors import ImporterError, RecordingError
 from robot.recording.folder import Recording, RecordingWriter, SharedImage, read_recording
 from robot.storage import ImageSource, file_content, storage_errors
@@ -223,9 +224,9 @@ def numbered_files(folder: Path, pattern: re.Pattern[str]) -> list[tuple[re.Matc
 
 
 def subfolders(parent: Path) -> list[Path]:
-    """Return the folders in `parent` except hidden ones, in natural order; none if it does not exist."""
+    """Return the folders in `parent` except those of systems, in natural order; none if it does not exist."""
     names = sorted(os.listdir(parent), key=natural_sort_key) if parent.is_dir() else []
-    return [parent / name for name in names if not name.startswith(".") and (parent / name).is_dir()]
+    return [parent / name for name in names if not is_system_name(name) and (parent / name).is_dir()]
 
 
 def natural_sort_key(name: str) -> tuple[list[str | int], str]:

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from retrieval.data.catalogue import SkippedPhoto, list_catalogue
-from retrieval.data.images import read_rgb
+from retrieval.data.images import EXTENSIONS, read_rgb
 from retrieval.data.naming import Naming
 from retrieval.errors import DatasetError, ImageError
 
@@ -20,10 +20,11 @@ def photo(colour=(255, 0, 0)):
 
 
 def fill(folder, *paths):
-    """Write a small picture at every path below `folder`."""
+    """Write a small picture, or other content if the extension is of another kind, at every path below `folder`."""
     for path in paths:
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
-        (folder / path).write_bytes(photo())
+        is_picture = (folder / path).suffix.lower() in EXTENSIONS
+        (folder / path).write_bytes(photo() if is_picture else b"other content")
     return folder
 
 
@@ -233,7 +234,6 @@ def test_broken_files_are_listed_and_reading_them_gives_the_reason(tmp_path):
     ("paths", "touches", "rule"),
     [
         (["mug/1.jpg", "mug/touch_0_b.png", "mug/touch_0_a.png"], ["mug: mug/touch_0_a.png mug/touch_0_b.png"], ""),
-        (["mug/touch_7.png", "mug/touch_7_b.png"], ["mug: mug/touch_7.png mug/touch_7_b.png"], ""),
         (["mug/second/touch_rim_left_a.jpg"], ["mug: mug/second/touch_rim_left_a.jpg"], ""),
         (["mug/touch_a.png", "mug/touch_b.png"], ["mug: mug/touch_a.png", "mug: mug/touch_b.png"], ""),  # no fingers
         (["touch_7.png", "mug/touched.png", "touch_1/view.png", "tin/touch.jpg"], [], ""),  # photos

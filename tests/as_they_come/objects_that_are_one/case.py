@@ -1,0 +1,37 @@
+"""Names are looked up in any Unicode form; objects that differ only so, by case or space, or share photos are named."""
+
+import json
+import shutil
+import unicodedata
+
+from retrieval.data.catalogue import list_catalogue
+from retrieval.data.naming import Naming, naming_warnings
+from retrieval.indexing.build import build_index
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.search.searcher import Searcher
+from tests.as_they_come import write_pictures
+
+NFC, NFD = "Caf\u00e9 cup", unicodedata.normalize("NFD", "Caf\u00e9 cup")
+
+
+def check(folder, get):
+    catalogue = shutil.copytree(get("catalogue"), folder / "catalog")
+    names = sorted(path.name for path in catalogue.iterdir())
+    (catalogue / names[0]).rename(catalogue / NFD)  # as macOS writes it
+    for name in names[1:3]:
+        shutil.copy(next((catalogue / names[3]).iterdir()), catalogue / name / "no-image-yet.jpg")
+    line = {"object_id": f" {NFC} ", "shelf": "B4"}  # as a person types it
+    (catalogue / "metadata.jsonl").write_text(json.dumps(line, ensure_ascii=False), "utf-8")
+    report = build_index(catalogue, load_checkpoint(get("model")), folder / "index", quiet=True)
+    assert report.notes == []
+    (warning,) = report.warnings
+    assert "one picture is the photo of 3 objects" in warning
+    assert all(name in warning for name in names[1:4])
+    with Searcher.open(folder / "index") as searcher:
+        for name in (NFC, NFD, f" {NFC}"):
+            assert [photo.metadata for photo in searcher.shard.page([], name, 0, 1).photos] == [{"shelf": "B4"}]
+
+    same = {"Mug": 1, "mug": 1, "blue  cup": 1, "blue cup": 1, NFC: 1, NFD: 1, "tin": 1}
+    (warning,) = naming_warnings([(name, f"{name}/1.jpg") for name in same], Naming())
+    assert "the names of 6 objects differ only by case, spaces" in warning
+    assert list_catalogue(write_pictures(folder / "other", "tin/1.jpg")).notes == ()
