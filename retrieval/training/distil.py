@@ -170,7 +170,7 @@ def exhaustive_top1_ranks(matcher: Matcher, touch_partials: Tensor, photo_partia
 def feature_partials(matcher: Matcher, features: Features) -> tuple[Tensor, Tensor]:
     """Return partial activations (G, P) of the touches and of the photos of features."""
     # One part after another, because the hidden layer of the cells takes more memory than the features.
-    touch, photo = (torch.from_numpy(part).split(ROWS) for part in (features.touch_rows, features.photo))
+    touch, photo = (torch.split(torch.from_numpy(part), ROWS) for part in (features.touch_rows, features.photo))
     touch_partials = torch.cat([matcher.touch_encoding(part).partial for part in touch])
     return touch_partials, torch.cat([matcher.photo_encoding(part).partial for part in photo])
 
