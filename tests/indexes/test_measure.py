@@ -5,7 +5,7 @@ import pytest
 
 import indexes
 from indexes.errors import ParameterError
-from indexes.kinds.measure import query_ms, recall_against_exact, sample_queries
+from indexes.kinds.measure import recall_against_exact, sample_queries
 from indexes.kinds.vector_index import VectorIndex
 from tests.indexes.test_search import unit
 
@@ -43,9 +43,3 @@ def test_sampled_queries_are_unit_vectors_near_the_data_and_always_the_same():
     nearest = (queries @ vectors.T).max(axis=1)
     assert 0.8 < nearest.min() < nearest.max() < 0.98
     assert np.array_equal(queries, sample_queries(vectors))
-
-
-def test_the_time_of_a_query_is_the_median_without_the_first(monkeypatch):
-    ticks = iter([0.0, 0.001, 1.0, 1.009, 2.0, 2.002])
-    monkeypatch.setattr("indexes.kinds.measure.time.perf_counter", lambda: next(ticks))
-    assert query_ms(indexes.build(AXES), AXES[:3]) == pytest.approx(2.0)

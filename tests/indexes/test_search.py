@@ -79,9 +79,8 @@ def test_rows_that_an_approximate_kind_misses_are_minus_one_and_no_candidates():
     scores, rows = index.search(QUERIES, N // 2)
     assert (rows == -1).any()
     assert (scores[rows == -1] == -np.inf).all()
-    assert [len(one) for one in index.candidates(QUERIES, N // 2)] == (rows >= 0).sum(axis=1).tolist()
     found = [set(one.tolist()) for one in index.candidates(QUERIES, N // 2)]
-    assert all(len(one) == count for one, count in zip(found, (rows >= 0).sum(axis=1), strict=True))
+    assert found == [set(row[row >= 0].tolist()) for row in rows]
 
 
 def test_a_search_setting_trades_time_for_recall():
@@ -123,14 +122,7 @@ def test_an_invalid_number_of_results_raises(built, k):
 
 @pytest.mark.parametrize(
     ("value", "words"),
-    [
-        (np.nan, "nan"),
-        (np.inf, "inf"),
-        (0.0, "got 0"),
-        (1e30, "got 4e"),
-        (0.26, "got 1.04"),
-        (1e-30, "got 4e-30"),
-    ],
+    [(np.nan, "nan"), (np.inf, "inf"), (0.0, "got 0"), (1e30, "got 4e"), (0.26, "got 1.04"), (1e-30, "got 4e-30")],
 )
 def test_a_vector_that_is_not_a_unit_vector_is_named(value, words):
     vectors = unit(3)

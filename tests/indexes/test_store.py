@@ -40,13 +40,9 @@ def blocks(embeddings, arrays=None):
 @pytest.mark.parametrize("kind", ["flat", "IVF4,SQ8;nprobe=2", "HNSW8"])
 def test_a_written_index_is_read_back(tmp_path, kind):
     count = 200
-    rows = sorted(
-        (
-            Row(f"фото/{n}\u2028.jpg", f"o{n % 7}", str(n % 150), {"price": 0.1 + n, "tags": [None, True, 2**70]})
-            for n in range(count)
-        ),
-        key=lambda row: row.path,
-    )
+    metadata = {"price": 0.1, "tags": [None, True, 2**70]}
+    paths = sorted(f"фото/{number}\u2028.jpg" for number in range(count))
+    rows = [Row(path, f"o{number % 7}", str(number % 150), metadata) for number, path in enumerate(paths)]
     partials = np.random.default_rng(0).normal(size=(count, 6)).astype(np.float16)
     store = IndexStore(tmp_path / "a" / "index")
     manifest = store.write(
@@ -110,14 +106,8 @@ def test_the_folder_has_the_documented_layout(tmp_path):
     tables = ["embeddings.npy", "rows.jsonl", "rows.npy"]
     assert found == sorted(["calibration.json", "manifest.json", "vectors.faiss", *tables])
     manifest = json.loads((folder / "manifest.json").read_text())
-    must = {
-        "format": FORMAT,
-        "generation": "gen-000001",
-        "fingerprint": FINGERPRINT,
-        "software": "1.2",
-        "kind": "HNSW8",
-    }
-    must |= {"about": {"catalogue": "mugs/"}, "dim": DIM, "photos": 20, "objects": 20}
+    must = {"format": FORMAT, "generation": "gen-000001", "fingerprint": FINGERPRINT, "software": "1.2"}
+    must |= {"kind": "HNSW8", "about": {"catalogue": "mugs/"}, "dim": DIM, "photos": 20, "objects": 20}
     assert {key: manifest[key] for key in must} == must
     assert set(manifest["recall"]) == {"value", "at", "queries", "how", "ms", "exact_ms"}
     assert sorted(manifest["files"]) == [name for name in found if name != "manifest.json"]

@@ -169,26 +169,6 @@ def test_with_exact_partials_the_order_equals_the_oracle(
     np.testing.assert_allclose([match.logit for match in result.results], logits, atol=1e-5)
 
 
-@pytest.mark.parametrize("given_posterior", [None, STEEP])
-def test_several_grasps_add_their_logits(given_posterior, catalogue, model, grasps, tmp_path, monkeypatch):
-    """With one photo for each object, the logits of several grasps are the sums of the single ones."""
-    for path in sorted(catalogue.rglob("1.jpg")):
-        (tmp_path / "catalog" / path.parent.name).mkdir(parents=True)
-        shutil.copy(path, tmp_path / "catalog" / path.parent.name)
-    build_index(tmp_path / "catalog", load_checkpoint(model), tmp_path / "index", quiet=True)
-    searcher = Searcher.open(tmp_path / "index")
-    give_posterior(monkeypatch, searcher, given_posterior)
-    single = [logits_by_object(searcher.query([grasp])) for grasp in grasps]
-    np.testing.assert_allclose(logits_by_object(searcher.query(grasps)), np.sum(single, axis=0), atol=1e-6)
-    assert np.ptp(single, axis=0).max() > 1e-4  # the grasps differ
-
-
-def logits_by_object(result):
-    """Logits of all 8 objects, in the order of their names."""
-    assert len(result.results) == 8
-    return [match.logit for match in sorted(result.results, key=lambda match: match.object_id)]
-
-
 def test_swapped_fingers_give_another_logit(searcher, touch):
     a, b = touch
     assert searcher.query([(a, b)]).results[0].logit != searcher.query([(b, a)]).results[0].logit
