@@ -26,6 +26,7 @@ from retrieval.indexing.sharded import build_sharded
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.searcher import Searcher
 from tests import ray_processes, serving
+from tests.retrieval.search.test_shards import names, same_answers
 from tests.waiting import first_line, run_process
 
 pytestmark = [
@@ -63,26 +64,13 @@ def served(ray, cluster):
         yield searcher
 
 
-def numbers(answer):
-    parts = [(match.logit, match.probability, match.probability_if_present) for match in answer.results]
-    return [answer.none_probability, *np.ravel(parts)]
-
-
-def names(answer):
-    return [(match.object_id, match.photo) for match in answer.results]
-
-
 # Results --------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_results_equal_those_of_the_folder(count, served, searcher, grasps):
     for own in grasps:
-        ours, theirs = served.query(own[:count]), searcher.query(own[:count])
-        assert names(ours) == names(theirs)
-        assert numbers(ours) == pytest.approx(numbers(theirs), abs=1e-5)
-        assert (ours.verdict, ours.posterior["scored_objects"]) == (theirs.verdict, 8)
-        assert ours.index["shards"] == 4
+        same_answers(served.query(own[:count]), searcher.query(own[:count]))
 
 
 def test_everything_listens_only_on_this_machine(served, touch):
@@ -286,8 +274,7 @@ def test_the_service_on_a_cluster_gives_the_results_of_the_folder_and_restarts_a
         with serving.command("--index", cluster, "--cluster", "--no-history", "--port", 0) as (process, address, _):
             client = retrieval.Client(address)
             answer = client.query(touch)
-            assert names(answer) == names(expected)
-            assert numbers(answer) == pytest.approx(numbers(expected), abs=1e-5)
+            same_answers(answer, expected)
             assert answer.index["shards"] == 4
             found = httpx.get(f"{address}/v1/catalogue", params={"limit": 500}).json()
             assert {item["id"] for item in found["items"]} == {row.path for row in searcher.generation.rows}
