@@ -299,6 +299,8 @@ def test_a_batch_depends_on_seed_and_step_and_not_on_earlier_calls_or_the_order_
     for step in (3, 0, 4, 1):
         sampler.evaluation_pairs()
         assert contents(sampler.batch(step, 6)) == batches[5 + step]
+    first = [item.grasp_id for step in range(12) for item in sampler.batch(step, 8).grasps if "-00-" in item.grasp_id]
+    assert first[:6] != first[6:]  # another order when all grasps of the object were used
 
 
 def test_positives_are_drawn_without_repeats_where_the_object_has_enough_photos():
