@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from retrieval.commands.options import COUNT, Json, Model
+from retrieval.commands.options import COUNT, Json, Model, resolve_model
 from retrieval.console.interruption import resumable
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput, RetrievalError
@@ -76,15 +76,13 @@ def build_index(
     from retrieval.model.checkpoint import load_checkpoint
     from retrieval.model.export import export_to_cache
     from retrieval.model.shipped import is_shipped
-    from retrieval.search.opening import find_model
 
     require_separate_folders(catalogue, out)
     if shards is None and is_sharded(out):
         shards = read_sharded_manifest(out).of
     if shards is None and cluster:
         raise BadInput("--cluster needs shards; give --shards too")
-    path, reason = find_model(model, out)
-    say(f"model: {path} ({reason})")
+    path = resolve_model(model, out)
     checkpoint = load_checkpoint(path)
     options: dict[str, Any] = {"objects_from": objects_from, "kind": kind, "cells": cells}
     run = None

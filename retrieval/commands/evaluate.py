@@ -1,6 +1,5 @@
 """`retrieve evaluate`: compare methods on unseen objects, of a recording or by protocols of real data sets."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -95,15 +94,13 @@ def evaluate(
     if model and (config or init):
         raise BadInput("--model already defines towers and settings; give either --model or --config and --init")
     preset = config or (DATA_SET_PRESET if protocol else DEFAULT_PRESET)
-    recordings: Mapping[str | None, Path] = {None: data}
-    skipped: dict[str, str] = {}
-    names: list[str] = []
-    if protocol:
-        names, recordings, skipped = _data_sets(protocol, data, out / "recordings")
+    protocols, recordings, skipped = (
+        _data_sets(protocol, data, out / "recordings") if protocol else ([], {None: data}, {})
+    )
     results = run(
         recordings,
         out,
-        protocols=names,
+        protocols=protocols,
         config=training_config(preset, iterations, init=init, seed=seed),
         preset=Path(preset).stem,
         methods=methods.split(",") if methods else METHODS_OF_PRESETS.get(preset, ()),

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from retrieval.commands.options import DEFAULT_MODEL
+from retrieval.commands.options import DEFAULT_MODEL, resolve_model
 from retrieval.console.output import say
 
 
@@ -19,8 +19,5 @@ def export(
     """Export a checkpoint's touch encoder to ONNX. With it, `query` runs without PyTorch."""
     from retrieval.model.checkpoint import load_checkpoint
     from retrieval.model.export import export as write_export
-    from retrieval.search.opening import find_model
 
-    path, reason = find_model(model)
-    say(f"model: {path} ({reason})")
-    say(f"written: {write_export(load_checkpoint(path), out)}")
+    say(f"written: {write_export(load_checkpoint(resolve_model(model)), out)}")

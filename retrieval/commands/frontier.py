@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from retrieval.commands.options import Json, Model, OptionValues
+from retrieval.commands.options import Json, Model, OptionValues, resolve_model
 from retrieval.console.interruption import resumable
 from retrieval.console.output import print_json, say
 from retrieval.frontier import APPROXIMATIONS
@@ -34,10 +34,8 @@ def frontier(
 ) -> None:
     """Plot the error of each approximation against its run time, on a page. Resumes a stopped run."""
     from retrieval.frontier.measure import measure_frontier
-    from retrieval.search.opening import find_model
 
-    path, reason = find_model(model)
-    say(f"model: {path} ({reason})")
+    path = resolve_model(model)
     with resumable(out):
         document = measure_frontier(out, path, partial(recording_of, recording, out), only=only or ())
     say(f"page: {out / 'frontier.html'}")

@@ -146,12 +146,35 @@ def refuse_options(reason: str, **options: object) -> None:
 
 
 def resolve_index(index: str | None) -> Path:
-    """Return the folder of the index, and print it if the user named none."""
-    from retrieval.search.opening import find_index
+    """Return the folder of the index; ./index, which is printed, if the user named none.
 
-    path, reason = find_index(index)
-    if index is None:
-        say(f"index: {path} ({reason})")
+    Raises:
+        BadInput: The user named none, and ./index is none.
+    """
+    from indexes.store.sharded import is_sharded
+    from retrieval.search.opening import INDEX
+
+    if index is not None:
+        return Path(index)
+    if not ((INDEX / "CURRENT").is_file() or is_sharded(INDEX)):
+        raise BadInput(
+            "there is no index in this folder; run `retrieve build-index CATALOGUE` first, or name one with --index"
+        )
+    say(f"index: {INDEX} (in this folder)")
+    return INDEX
+
+
+def resolve_model(model: str | None, index: Path = Path("index")) -> Path:
+    """Return the file of the checkpoint, and print it with the reason.
+
+    Args:
+        model: A path or one of `SHIPPED_NAMES`; None for the checkpoint of `index`, else the shipped one.
+        index: Index folder or sharded index.
+    """
+    from retrieval.search.opening import find_model
+
+    path, reason = find_model(model, index)
+    say(f"model: {path} ({reason})")
     return path
 
 

@@ -18,8 +18,7 @@ from retrieval.errors import RetrievalError
 
 def print_json(document: Any) -> None:
     """Print one JSON document to stdout, in ASCII."""
-    with checked_stdout():
-        print(json.dumps(document, allow_nan=False))
+    show(json.dumps(document, allow_nan=False))
 
 
 def show(text: str) -> None:

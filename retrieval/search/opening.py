@@ -1,4 +1,4 @@
-"""Find an index, the checkpoint that built it, and the default of both; open an index folder or a sharded index."""
+"""Find the checkpoint that built an index, and the default one; open an index folder or a sharded index."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -10,7 +10,7 @@ from indexes.store.folder import IndexStore
 from indexes.store.generation import check_fingerprint
 from indexes.store.manifest import Manifest, read_manifest
 from indexes.store.sharded import ShardedManifest, is_sharded, open_shard, read_sharded_manifest
-from retrieval.errors import BadInput, CheckpointError
+from retrieval.errors import CheckpointError
 from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_checkpoint_info
 from retrieval.model.fusion_scorer import CELLS
 from retrieval.model.shipped import SHIPPED_NAMES, shipped_model
@@ -18,24 +18,6 @@ from retrieval.search.shard import FolderShard, Shards
 
 INDEX = Path("index")
 """Default index folder of `build-index` and `query`."""
-
-
-def find_index(choice: str | None) -> tuple[Path, str]:
-    """Return the index folder to use, and the reason.
-
-    Args:
-        choice: A folder; None for ./index.
-
-    Raises:
-        BadInput: There is no index.
-    """
-    if choice is not None:
-        return Path(choice), "given"
-    if (INDEX / "CURRENT").is_file() or is_sharded(INDEX):
-        return INDEX, "in this folder"
-    raise BadInput(
-        "there is no index in this folder; run `retrieve build-index CATALOGUE` first, or name one with --index"
-    )
 
 
 def find_model(choice: str | None, index: str | Path = INDEX) -> tuple[Path, str]:

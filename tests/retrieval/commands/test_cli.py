@@ -102,7 +102,7 @@ def test_json_is_the_only_thing_on_stdout_and_has_the_documented_keys(workplace,
     assert set(document["timing_ms"]) == {"decode", "encode", "candidates", "rerank", "total"}
     assert [match["rank"] for match in document["results"]] == [1, 2, 3]
     probabilities = ("probability", "probability_if_present")
-    assert set(document["results"][0]) == {"rank", "object_id", "logit", *probabilities, "photo", "metadata"}
+    assert set(document["results"][0]) == {"rank", "object_id", "logit", *probabilities, "photo", "photo_digest", "metadata"}
 
 
 def test_html_is_written_in_addition_to_the_table_over_pages_only(built, capsys):
@@ -162,11 +162,11 @@ def test_wrong_use_is_one_line_on_stderr_and_exit_code_2(case, workplace, model,
 
 
 def test_an_unexpected_error_has_a_traceback_only_with_debug(workplace, monkeypatch, capsys):
-    monkeypatch.setattr("retrieval.search.opening.find_index", lambda path: 1 / 0)
-    assert main(["query", "--gelsight", "a.png"]) == 1
+    monkeypatch.setattr("retrieval.search.searcher.Searcher.open", lambda path, model: 1 / 0)
+    assert main([*QUERY, "--index", "index"]) == 1
     assert "unexpected ZeroDivisionError" in capsys.readouterr().err
     with pytest.raises(ZeroDivisionError):
-        main(["--debug", "query", "--gelsight", "a.png"])
+        main(["--debug", *QUERY, "--index", "index"])
 
 
 def numeric_options():

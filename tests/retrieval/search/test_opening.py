@@ -8,11 +8,12 @@ import pytest
 from _touch_retrieval.files import file_digest
 from indexes.store.folder import IndexStore
 from indexes.store.rows import Row
+from retrieval.commands.options import resolve_index
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.checkpoint_info import read_checkpoint_info
 from retrieval.model.shipped import shipped_model
 from retrieval.search import opening
-from retrieval.search.opening import find_index, find_model
+from retrieval.search.opening import find_model
 
 
 @pytest.fixture(autouse=True)
@@ -71,9 +72,10 @@ def test_a_damaged_index_does_not_determine_the_model(tmp_path, monkeypatch):
     assert find_model(None)[1].startswith("shipped")
 
 
-def test_the_index_in_this_folder_is_used(tmp_path):
+def test_the_index_in_this_folder_is_used(tmp_path, capsys):
     (tmp_path / "index").mkdir()
     with pytest.raises(BadInput, match=r"no index in this folder; run `retrieve build-index"):
-        find_index(None)
+        resolve_index(None)
     (tmp_path / "index" / "CURRENT").write_text("gen-000001")
-    assert find_index(None) == (Path("index"), "in this folder")
+    assert resolve_index(None) == Path("index")
+    assert capsys.readouterr().err == "index: index (in this folder)\n"
