@@ -40,18 +40,13 @@ class LineFaults:
             return self._damaged(kind, encode(packet))
 
     def _damaged(self, kind, data):
-        if kind == "dropped":
-            return []
-        if kind == "corrupted":
-            number = self._random.randrange(8 * len(data))
-            return [(0, bytes(byte ^ (at == number // 8) << number % 8 for at, byte in enumerate(data)))]
-        if kind == "delayed":
-            return [(DELAY_S, data)]
-        if kind == "split":
-            cut = self._random.randrange(1, len(data))
-            return [(0, data[:cut]), (DELAY_S, data[cut:])]
-        if kind == "disconnect":
-            return [(0, None)]
-        if kind == "long":  # claims 255 bytes, so the next packets are read as its payload
-            return [(0, data[:4] + b"\xff\x00" + data[6:])]
-        return [(0, data)]
+        bit, cut = self._random.randrange(8 * len(data)), self._random.randrange(1, len(data))
+        return {
+            None: [(0, data)],
+            "dropped": [],
+            "corrupted": [(0, (int.from_bytes(data) ^ 1 << bit).to_bytes(len(data)))],
+            "delayed": [(DELAY_S, data)],
+            "split": [(0, data[:cut]), (DELAY_S, data[cut:])],
+            "disconnect": [(0, None)],
+            "long": [(0, data[:4] + b"\xff\x00" + data[6:])],  # claims 255 bytes: the next packets are its payload
+        }[kind]

@@ -11,7 +11,6 @@ or in a program:
 
 import argparse
 import contextlib
-import logging
 import os
 import select
 import socket
@@ -25,7 +24,6 @@ from robot.drivers.wsg50.codec import decode, encode
 from tests.emulators.wsg50.faults import LineFaults
 from tests.emulators.wsg50.gripper import UPDATES, EmulatedWSG50
 
-_log = logging.getLogger(__name__)
 _TICK_S = 0.001
 _CHUNK = 4096
 
@@ -117,12 +115,8 @@ def _served(emulator, faults, wait_for_client):
     def work():
         while (line := wait_for_client(stop)) is not None:
             emulator.connected()
-            try:
+            with contextlib.suppress(OSError, _Cut):  # the client disconnected
                 _Session(emulator, faults, line).run(stop)
-            except (OSError, _Cut):
-                pass  # the client disconnected
-            except Exception:
-                _log.exception("the emulated gripper failed on what a client sent; the next client is served")
             line.close()
             if isinstance(line, _Socket):
                 emulator.disconnected()
@@ -180,13 +174,11 @@ class _Session:
 
 def _packets(buffer):
     """Remove the complete packets from a buffer, each with the noise before it; finally the noise behind them."""
-    while True:
+    packet = True
+    while packet:
         used, packet = decode(buffer)
-        noise = bytes(buffer[: used - len(encode(packet))] if packet else buffer[:used])
+        yield bytes(buffer[: used - len(encode(packet))] if packet else buffer[:used]), packet
         del buffer[:used]
-        yield noise, packet
-        if packet is None:
-            return
 
 
 def main():

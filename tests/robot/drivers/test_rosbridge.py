@@ -3,8 +3,6 @@
 import contextlib
 import json
 import math
-import signal
-import sys
 import threading
 import time
 
@@ -13,7 +11,7 @@ import pytest
 from robot.drivers.sawyer.codec import encode
 from robot.drivers.sawyer.driver import RosbridgeLink
 from robot.errors import DeviceError
-from tests.waiting import first_line, run_process, wait_until
+from tests.waiting import wait_until
 
 
 @contextlib.contextmanager
@@ -203,15 +201,3 @@ def test_a_silent_server_a_closed_port_and_an_invalid_name_are_device_errors():
     for url in (f"ws://127.0.0.1:{port}", "ws://no such host:9090", "ws://[::1:9090"):
         with pytest.raises(DeviceError, match="rosbridge must answer at"):
             RosbridgeLink(url, timeout_s=0.5).open()
-
-
-def test_the_emulator_runs_as_a_process_and_ends_with_ctrl_c():
-    with run_process([sys.executable, "-m", "tests.emulators.sawyer.server", "--port", "0"]) as process:
-        link = RosbridgeLink(first_line(process).strip(), timeout_s=60.0)
-        link.open()
-        link.subscribe("/robot/joint_states", "sensor_msgs/JointState")
-        link.wait_for("/robot/joint_states")
-        link.close()
-        process.send_signal(signal.SIGINT)
-        process.communicate(timeout=60)
-    assert process.returncode == 0

@@ -6,7 +6,6 @@ import logging
 import os
 import signal
 import socket
-import sys
 import threading
 import time
 from types import SimpleNamespace
@@ -20,7 +19,7 @@ from robot.drivers.wsg50.driver import WSG50, LinkLost
 from robot.errors import DeviceError, RobotConfigError
 from tests.emulators.wsg50.faults import LineFaults
 from tests.emulators.wsg50.gripper import EmulatedWSG50
-from tests.waiting import first_line, run_process, wait_until
+from tests.waiting import wait_until
 from tests.wsg50_bench import (
     ACK,
     FAST_STOP,
@@ -429,12 +428,3 @@ def test_a_grasp_that_was_refused_is_not_repeated():
             with pytest.raises(DeviceError, match=f"answered {status.name} to GRASP"):
                 gripper.grasp(10.0, 400.0)
         assert emulator.received.count(GRASP) == 3
-
-
-def test_the_emulator_runs_as_a_program_and_prints_its_port():
-    program = [sys.executable, "-m", "tests.emulators.wsg50.server", "--tcp", "0", "--object-mm", "40"]
-    with run_process(program) as process:
-        assert first_line(process).startswith("socket://127.0.0.1:")
-        process.send_signal(signal.SIGINT)
-        process.communicate(timeout=60)
-    assert process.returncode == 0
