@@ -1,7 +1,7 @@
 """Build an index from a folder of photos: list, read or find codes, and write a generation unless nothing changed."""
 
 import hashlib
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -240,16 +240,14 @@ def _write(
 
 def _shared_photos(rows: Sequence[Row]) -> list[str]:
     """Return a warning if objects share a photo, which cannot tell them apart."""
-    first = dict[str, Row]()
-    sharing = dict[str, dict[str, str]]()  # digest -> object -> path
+    owners = defaultdict[str, dict[str, str]](dict)  # digest -> object -> path
     for row in rows:
-        if first.setdefault(row.digest, row).object_id != row.object_id:
-            known = sharing.setdefault(row.digest, {first[row.digest].object_id: first[row.digest].path})
-            known.setdefault(row.object_id, row.path)
+        owners[row.digest].setdefault(row.object_id, row.path)
     return [
         f"one picture is the photo of {len(paths)} objects: {abbreviate_list(list(paths.values()), MAX_EXAMPLES)}; "
         "remove it if it is a placeholder, or merge the objects"
-        for paths in sharing.values()
+        for paths in owners.values()
+        if len(paths) > 1
     ]
 
 
