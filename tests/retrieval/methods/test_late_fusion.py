@@ -10,7 +10,7 @@ from retrieval.data.dataset import load_grasps, make_split
 from retrieval.errors import BadInput
 from retrieval.methods.late_fusion import LateFusion
 from retrieval.methods.method import MethodSettings
-from retrieval.methods.retrieve_rerank import RetrieveRerank
+from retrieval.methods.retrieve_rerank import RetrieveRerank, merge_scores
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.training.features import encode_recording
 from retrieval.training.initial_weights import build_matcher
@@ -122,6 +122,11 @@ def test_reranking_orders_candidates_by_logit_and_the_rest_after_them_by_embeddi
         assert ranked == expected_order(logits[members].sum(0, dtype=np.float64), nearness[members], count)
     if grasps == 1:
         np.testing.assert_allclose(method.score(*encodings(method, every))[:4], scores, rtol=1e-4, atol=1e-5)
+
+
+def test_photos_that_are_not_reranked_follow_below_the_smallest_logit_in_the_order_of_their_cosines():
+    nearness, logits = np.array([[1.0, 0.5, 0.0, -1.0]], np.float32), np.array([5.0, -7.0], np.float32)
+    assert merge_scores(nearness, np.array([2, 3]), logits).tolist() == [-8.0, -8.5, 5.0, -7.0]
 
 
 def test_a_model_without_trained_embeddings_scores_every_photo(parts, tmp_path):
