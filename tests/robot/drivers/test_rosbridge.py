@@ -147,14 +147,10 @@ def test_a_connection_that_breaks_ends_every_wait_at_once():
     with linked(lambda _: None, timeout_s=60.0) as link:
         with pytest.raises(DeviceError, match=r"the connection to rosbridge at .* is closed"):
             link.call("/s", {})
-        for use in (
-            link.check,
-            lambda: link.publish("/t", {}),
-            lambda: link.wait_for("/t"),
-            lambda: link.call("/s", {}),
-        ):
+        uses = (link.publish, "/t", {}), (link.wait_for, "/t"), (link.call, "/s", {}), (link.check,)
+        for use, *arguments in uses:
             with pytest.raises(DeviceError, match="is closed"):
-                use()
+                use(*arguments)
 
 
 def test_a_link_can_be_closed_twice_and_unopened_and_leaves_no_thread():

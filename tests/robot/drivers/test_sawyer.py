@@ -237,9 +237,7 @@ def test_a_momentary_collision_report_stops_the_arm():
         emulator.model.has_collided = True
         published = len(arm._link.history(LIMB + "collision_detection_state"))
         history = lambda: arm._link.history(LIMB + "collision_detection_state")  # noqa: E731
-        wait_until(
-            lambda: any(each.message["collision_state"] for each in history()) or len(history()) > published + 99
-        )
+        wait_until(lambda: arm._has_collided_since(0.0) or len(history()) > published + 99)
         emulator.model.has_collided = False
 
     with connected() as (emulator, arm):

@@ -109,15 +109,8 @@ def _press_without_information() -> HardCase:
     except np.linalg.LinAlgError as error:
         words, naive_holds = str(error), False
     moved = float(np.abs(aligned(presses, 0, start, weights, setting, 3) - start).max())
-    return HardCase(
-        _FIT,
-        "a press without information",
-        "the pose does not move",
-        words,
-        f"moved by {moved:g}",
-        moved == 0,
-        naive_holds,
-    )
+    case, expected = "a press without information", "the pose does not move"
+    return HardCase(_FIT, case, expected, words, f"moved by {moved:g}", moved == 0, naive_holds)
 
 
 # Pictures --------------------------------------------------------------------------------------------------

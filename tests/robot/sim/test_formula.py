@@ -62,9 +62,8 @@ def test_every_family_is_the_same_in_packets_and_in_numpy(family):
     points = rng.uniform(body.lower - 3, body.upper + 3, (2000, 3)).astype(np.float32).T
     for function in (body.shape.distance_xyz, body.chart_coordinates):
         exact = function(*points)
-        for ours, numpys in zip(
-            evaluate_formula(trace_formula(function, 3), *points), np.atleast_2d(exact), strict=True
-        ):
+        packets = evaluate_formula(trace_formula(function, 3), *points)
+        for ours, numpys in zip(packets, np.atleast_2d(exact), strict=True):
             np.testing.assert_allclose(ours, numpys, atol=5e-5)  # float32 sines and powers of about 100 mm
 
 
