@@ -4,7 +4,7 @@ import math
 import time
 from collections.abc import Callable
 
-from robot.devices import Arm, Clock
+from robot.devices import Arm, Clock, VirtualDevice
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import Pose, Region
 
@@ -12,7 +12,7 @@ NEAR_MM, NEAR_RAD = 1.0, math.radians(1.0)
 """A person is not asked again for a pose this close to the current one."""
 
 
-class ManualArm(Arm):
+class ManualArm(VirtualDevice, Arm):
     """Asks a person to move the hand to each pose and assumes it reached.
 
     `ask` shows a request and returns when it is done.
@@ -34,8 +34,6 @@ class ManualArm(Arm):
 
     def _connect(self) -> None:
         self._at = None
-
-    def _close(self) -> None: ...
 
     def _stop(self) -> None:
         """Forget the pose: after an interruption, the next pose is requested again."""

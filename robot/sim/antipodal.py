@@ -116,7 +116,7 @@ class _JawProfile:
             face, distance = body.first_faces(grid + far * direction, towards)
             hit = np.flatnonzero(face >= 0)
             reach[side, hit] = far - distance
-            normal = body.mesh.face_normals[face[hit]]
+            normal = body.mesh.solid.face_normals[face[hit]]
             tangents = (normal @ np.stack([sideways, [0.0, 0.0, 1.0]], 1)).T
             slopes[side][:, hit] = tangents / np.maximum(normal @ direction, 0.05)
         shape = len(across), len(up)

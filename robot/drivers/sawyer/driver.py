@@ -278,11 +278,6 @@ class Sawyer(Arm):
         yaw, tool_yaw = math.radians(options.base_yaw_deg), math.radians(options.tool_yaw_deg)
         self._mount = Mount(options.base_xyz_mm, yaw, options.tool_mm, tool_yaw)
         self._url = f"ws://{options.host}:{options.port}"
-        self._sees_collisions = False
-        self._link = self._new_link()
-
-    def _new_link(self) -> RosbridgeLink:
-        return RosbridgeLink(self._url, timeout_s=self._options.timeout_s, clock=self.clock)
 
     def _connect(self) -> None:
         self._sees_collisions = False
@@ -299,7 +294,7 @@ class Sawyer(Arm):
 
     def _open_link(self) -> None:
         """Open a new link and wait for each state once, also the collision state if it was available on connecting."""
-        self._link = self._new_link()
+        self._link = RosbridgeLink(self._url, timeout_s=self._options.timeout_s, clock=self.clock)
         self._link.open()
         for topic, kind in (*_STATE_TOPICS, codec.SPEED_RATIO, codec.COMMAND_TIMEOUT):
             self._link.subscribe(topic, kind)

@@ -286,12 +286,8 @@ def _draw_varied(rng: np.random.Generator) -> LedOptics:
 
 def _draw_any_backdrop(rng: np.random.Generator) -> GaussianBackdrop:
     """Draw a channel of the flat gel: dark to bright, its maximum anywhere, with a weak or strong vignette."""
-    x0, y0 = (float(value) for value in rng.uniform(-0.6, 0.6, 2))
-    width_x, width_y = (float(value) for value in np.exp(rng.uniform(-0.5, 1.2, 2)))
-    slant_x, slant_y = (float(value) for value in rng.uniform(-18, 18, 2))
-    return GaussianBackdrop(
-        float(rng.uniform(15, 90)), float(rng.uniform(15, 130)), x0, y0, width_x, width_y, slant_x, slant_y
-    )
+    numbers = [*rng.uniform(-0.6, 0.6, 2), *np.exp(rng.uniform(-0.5, 1.2, 2)), *rng.uniform(-18, 18, 2)]
+    return GaussianBackdrop(float(rng.uniform(15, 90)), float(rng.uniform(15, 130)), *map(float, numbers))
 
 
 def _draw_camera(sensor: GelSensor, rng: np.random.Generator) -> GelSensor:

@@ -44,20 +44,15 @@ class Mesh:
     faces: Faces
 
     @cached_property
-    def face_normals(self) -> Vectors:
-        """Unit normals of the faces, (F, 3)."""
-        return np.asarray(self.solid.face_normals)
-
-    @cached_property
     def corner_normals(self) -> Vectors:
         """A normal for each corner of each face, (F, 3, 3): the vertex's mean, or the face's own at a crease.
 
         trimesh weights faces by their angle at the vertex (Thuermer and Wuethrich 1998), so the triangulation of a flat
         side has no effect.
         """
-        shared, own = self.solid.vertex_normals[self.faces], self.face_normals[:, None, :]
+        shared, own = self.solid.vertex_normals[self.faces], self.solid.face_normals[:, None, :]
         is_smooth = np.sum(shared * own, axis=2, keepdims=True) > _CREASE_COSINE
-        return np.where(is_smooth, shared, own)
+        return np.asarray(np.where(is_smooth, shared, own))
 
     @cached_property
     def solid(self) -> Any:
@@ -113,7 +108,7 @@ class MeshBody(Body):
         face = np.minimum(np.searchsorted(ends, rng.uniform(0, ends[-1], count)), len(ends) - 1)
         weights = rng.dirichlet(np.ones(3), count)
         places = np.einsum("ij,ijk->ik", weights, self.mesh.vertices[self.mesh.faces[face]])
-        return cKDTree(places), places, self.mesh.face_normals[face]
+        return cKDTree(places), places, self.mesh.solid.face_normals[face]
 
     def volumes_mm3(self, shell_mm: float) -> tuple[float, float]:
         """Return the exact volume; the shell's volume is area times thickness, at most the whole."""
@@ -128,7 +123,7 @@ class MeshBody(Body):
         hit = np.flatnonzero(face >= 0)
         result = np.full(len(ahead), np.inf)
         result[hit] = start[hit] + distance
-        cosine = -np.einsum("ij,ij->i", directions[hit], self.mesh.face_normals[face[hit]])
+        cosine = -np.einsum("ij,ij->i", directions[hit], self.mesh.solid.face_normals[face[hit]])
         outside, inside = hit[cosine > 0], hit[(cosine <= 0) & (start[hit] == near[hit])]
         result[inside] = near[inside]
         result[outside] -= self._lift(face[outside], origins[outside], directions[outside], result[outside], step_mm)
@@ -140,7 +135,7 @@ class MeshBody(Body):
         """Return the first mesh face along each ray (-1 for a miss), and for each hit the distance to its plane."""
         face = np.asarray(self._caster.intersects_first(origins, directions), np.int64)
         hit = face >= 0
-        normal, corner = self.mesh.face_normals[face[hit]], self.mesh.vertices[self.mesh.faces[face[hit], 0]]
+        normal, corner = self.mesh.solid.face_normals[face[hit]], self.mesh.vertices[self.mesh.faces[face[hit], 0]]
         speed = np.einsum("ij,ij->i", directions[hit], normal)
         offset = np.einsum("ij,ij->i", corner - origins[hit], normal)
         return face, offset / np.where(np.abs(speed) < 1e-12, 1e-12, speed)

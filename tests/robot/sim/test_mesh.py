@@ -155,7 +155,7 @@ def test_the_mass_is_that_of_the_volume_or_of_a_shell(globe):
 def test_corner_normals_are_smooth_on_a_ball_and_sharp_on_a_cube():
     round_mesh, cube = (Mesh(np.array(each.vertices), np.array(each.faces)) for each in (ball(1, 3), CUBE))
     np.testing.assert_allclose(round_mesh.corner_normals, round_mesh.vertices[round_mesh.faces], atol=0.03)
-    np.testing.assert_allclose(cube.corner_normals, np.repeat(cube.face_normals[:, None], 3, axis=1), atol=1e-12)
+    np.testing.assert_allclose(cube.corner_normals, np.repeat(cube.solid.face_normals[:, None], 3, axis=1), atol=1e-12)
 
 
 def test_hidden_files_are_not_meshes_and_two_meshes_of_one_name_are_refused(tmp_path):
