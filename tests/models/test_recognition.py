@@ -3,7 +3,6 @@
 import json
 
 import numpy as np
-import pytest
 
 from models import recognition
 from retrieval.data.dataset import load_grasps
@@ -30,15 +29,9 @@ def test_top1_equals_the_accuracy_of_k_way_tests_also_with_ties():
         np.testing.assert_allclose(recognition.top1(scored, 5, 1).values[:, 0], expected, rtol=1e-9)
 
 
-@pytest.fixture
-def small(monkeypatch):
-    monkeypatch.setattr(recognition, "CANDIDATES", (5,))
-    monkeypatch.setattr(recognition, "CATALOGUE", 5)
-    monkeypatch.setattr(recognition, "QUERIES", ((1, 1), (2, 1)))
-
-
-@pytest.mark.usefixtures("small")
-def test_a_model_does_not_differ_from_itself(recording, model, tmp_path, capsys):
+def test_a_model_does_not_differ_from_itself(recording, model, tmp_path, monkeypatch, capsys):
+    for name, value in {"CANDIDATES": (5,), "CATALOGUE": 5, "QUERIES": ((1, 1), (2, 1))}.items():
+        monkeypatch.setattr(recognition, name, value)
     models = ("--model", f"one={model}", "--model", f"other={model}")
     assert recognition.main([str(recording), *models, "--out", str(tmp_path)]) == 0
     rows = json.loads((tmp_path / "recognition.json").read_text())

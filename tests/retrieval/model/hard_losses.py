@@ -1,5 +1,6 @@
 """Losses at logits whose exponentials overflow, and gradients where square roots have none."""
 
+import math
 from collections.abc import Callable, Iterator
 
 import torch
@@ -207,11 +208,7 @@ def _zero_embedding() -> HardCase:
     zero = torch.zeros(1, 2)
     naive = _with_slope(lambda x: (x / (x * x).sum().sqrt())[0, 0], zero)
     ours = _with_slope(lambda x: module(x, module.touch)[0, 0], zero)
-    finite = [all(map(_finite, (value, *slope))) for value, slope in (naive, ours)]
+    finite = [all(map(math.isfinite, (value, *slope))) for value, slope in (naive, ours)]
     expected = "0, and a finite gradient"
     holds = finite[1] and ours[0] == 0
     return HardCase("cosine", "an embedding of zeros", expected, _text(*naive), _text(*ours), holds, finite[0])
-
-
-def _finite(value: float) -> bool:
-    return abs(value) < float("inf")

@@ -8,14 +8,10 @@ from retrieval.model.config import MatcherConfig
 from retrieval.model.fusion import Matcher
 
 
-def random_candidate_encoder(hidden=6, width=8, dim=4, seed=0, linear=0):
-    torch.manual_seed(seed)
-    return CandidateEncoder(hidden, width, dim, linear), 3 + 5 * torch.randn(7, hidden), 2 * torch.randn(9, hidden) - 1
-
-
 @pytest.mark.parametrize("linear", [0, 3])
 def test_folded_statistics_give_raw_partial_activations_the_scores_of_standardised_ones(linear):
-    candidate_encoder, touches, photos = random_candidate_encoder(linear=linear)
+    torch.manual_seed(0)
+    candidate_encoder, touches, photos = CandidateEncoder(6, 8, 4, linear), 3 + 5 * torch.randn(7, 6), torch.randn(9, 6)
     spreads = PartialStatistics.of(touches, 4), PartialStatistics.of(photos, 4)
     candidate_encoder.initialise_linear(photos, *spreads)
     expected = candidate_encoder.scores(spreads[0](touches), spreads[1](photos))

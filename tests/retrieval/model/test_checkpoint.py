@@ -216,24 +216,21 @@ def test_a_weight_that_is_not_finite_is_refused(saved):
         ({"config": {"matcher": {"colour": 1}}}, "matcher has no setting 'colour'"),
         ({"config": {"matcher": {"tower": "vgg"}}}, "tower must be one of"),
         ({"config": [1]}, "it must be a table"),
+        (
+            {"config": dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, hidden=64)).to_dict()},
+            r"weights do not fit its configuration: .*head\..*torch\.Size\(\[1?.*64\]\)",
+        ),
         ({"split": {"train": ["a"]}}, "split must have .*; validation is missing"),
         ({"posterior": {"slope": 1.0}}, "posterior must have .*; formula is missing"),
         ({"posterior": dataclasses.asdict(POSTERIOR) | {"formula": "another"}}, "posterior.formula"),
         ({"gel_check": dataclasses.asdict(GEL_CHECK) | {"level_above": "1"}}, "gel_check.level_above must be a number"),
     ],
 )
-def test_a_header_of_another_version_is_refused_with_the_wrong_entry(saved, entry, message):
+def test_a_header_of_another_version_or_model_is_refused_with_the_wrong_entry(saved, entry, message):
     rewrite(saved, **entry)
     with pytest.raises(
         CheckpointError, match=rf"m\.safetensors is not a checkpoint that this version can use: .*{message}"
     ):
-        load_checkpoint(saved)
-
-
-def test_weights_that_do_not_fit_the_configuration_give_a_one_line_error(saved):
-    config = dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, hidden=64))
-    rewrite(saved, config=config.to_dict())
-    with pytest.raises(CheckpointError, match=r"do not fit its configuration: .*head\..*torch\.Size\(\[1?.*64\]\)"):
         load_checkpoint(saved)
 
 

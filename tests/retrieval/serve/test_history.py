@@ -16,10 +16,11 @@ from tests.serving import INFO, problem, service, with_history
 
 
 @pytest.fixture(scope="module")
-def touches(tmp_path_factory):
+def touches(touches):
     """The image files of two grasps of each of three catalogue objects, by object."""
-    files = synthetic.write_queries(tmp_path_factory.mktemp("touches"), synthetic.make_objects(3, seed=9), 2)
-    return {name: [[path.read_bytes() for path in grasp] for grasp in grasps] for name, grasps in files.items()}
+    return {
+        name: [[path.read_bytes() for path in grasp] for grasp in touches[name][:2]] for name in sorted(touches)[:3]
+    }
 
 
 @pytest.fixture
