@@ -128,13 +128,13 @@ def test_pytorch_encodes_if_the_export_is_damaged_or_onnx_runtime_missing(model_
 
 
 @pytest.mark.parametrize("part", ["partial activation", "embedding"])
-def test_an_encoder_that_gives_a_nan_is_refused_with_the_touch_named(part, model_copy, index, touches, monkeypatch):
+def test_an_encoder_that_gives_a_nan_is_refused_with_the_touch_named(part, model_copy, index, two_grasps, monkeypatch):
     searcher = Searcher.open(index)
     encodings = searcher.encoder.encode(touches_of(2, 2, 32))
     (encodings.embeddings if part == "embedding" else encodings.partials)[1, 3] = np.nan
     monkeypatch.setattr(searcher.encoder, "encode", lambda touches: encodings)
     with pytest.raises(NumericalError, match=f"the {part} of touch 2 contains a NaN"):
-        searcher.query(touches[min(touches)][:2])
+        searcher.query(two_grasps)
 
 
 # Photos of a long build -----------------------------------------------------------------------------------------

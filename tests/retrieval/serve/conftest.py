@@ -30,10 +30,10 @@ def browser():
 
 
 @pytest.fixture(scope="module")
-def files(touches, tmp_path_factory):
+def files(two_grasps, tmp_path_factory):
     """The gel images of two grasps of one object, with typical file names."""
-    folder, (first, second, *_) = tmp_path_factory.mktemp("gels"), next(iter(touches.values()))
+    folder = tmp_path_factory.mktemp("gels")
     names = [folder / f"{grasp}_{finger}.png" for grasp in ("first", "second") for finger in "ab"]
-    for name, source in zip(names, [*first, *second], strict=True):
+    for name, source in zip(names, [*two_grasps[0], *two_grasps[1]], strict=True):
         name.write_bytes(source.read_bytes())
     return names

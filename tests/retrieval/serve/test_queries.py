@@ -14,9 +14,9 @@ from tests.verification import POSTERIOR, calibration
 
 
 @pytest.fixture(scope="module")
-def grasps(touches):
+def grasps(two_grasps):
     """The image files of two grasps of one object."""
-    return [[path.read_bytes() for path in grasp] for grasp in touches[min(touches)][:2]]
+    return [[path.read_bytes() for path in grasp] for grasp in two_grasps]
 
 
 def encoded(grasps):
