@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
-from torch.autograd.graph import increment_version
 
 from retrieval.console.interruption import interruption
 from retrieval.console.progress import Bar
@@ -143,9 +142,6 @@ def train_loop(
                     )
                 current.backward()  # type: ignore[no-untyped-call]
                 optimizer.step()
-            # Fused optimisers do not increment the versions of the weights. Without this line, values that were cached
-            # from old weights would seem up to date.
-            increment_version(list(module.parameters()))
             done += 1
             scores = [f"  best {name.replace('_', ' ')} {score:.3f}" for name, score in best.metrics.items()]
             bar.advance(note="".join([f"loss {value:.3f}", *scores[:1]]))

@@ -1,10 +1,11 @@
 """The fit of the gel check on synthetic features, and the foreign pictures that it is fitted on."""
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
-from retrieval.data.dataset import load_grasps
+from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.model.config import MatcherConfig
 from retrieval.model.encode import touch_features
@@ -13,6 +14,7 @@ from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
 from retrieval.training.gel_check import (
     SYNTHETIC_KINDS,
     GelCheckFeatures,
+    contact_levels,
     contact_threshold,
     draw_foreign,
     fit_gel_check,
@@ -24,6 +26,23 @@ def test_the_contact_threshold_is_above_no_contact_gels_and_as_high_as_it_costs_
     no_contact, touches = np.arange(201.0), np.arange(500.0, 601.0)
     assert contact_threshold(no_contact, touches) == pytest.approx(502)  # 2 % of the touches lie below
     assert contact_threshold(no_contact, np.arange(101.0)) == pytest.approx(199)  # exceeded by .5 % of no-contact gels
+
+
+def test_levels_compare_no_contact_frames_of_one_object_and_touches_with_their_own_and_take_the_largest_finger(
+    tmp_path,
+):
+    def files(*levels):
+        for level in levels:
+            cv2.imwrite(str(tmp_path / f"{level}.png"), np.full((16, 16, 3), level, np.uint8))
+        return tuple(tmp_path / f"{level}.png" for level in levels)
+
+    grasps = [
+        Grasp("0", "mug", None, tmp_path, touches=files(110, 101), backgrounds=files(100, 100)),
+        Grasp("1", "mug", None, tmp_path, touches=files(101, 140), backgrounds=files(101, 103)),
+        Grasp("2", "tin", None, tmp_path, touches=files(160, 150), backgrounds=files(150, 150)),
+    ]
+    no_contact, touched = contact_levels(grasps)
+    assert (no_contact, touched) == (pytest.approx([3]), pytest.approx([10, 37, 10]))
 
 
 def test_every_kind_takes_its_turn_and_a_seed_draws_the_same_pictures_again():

@@ -224,7 +224,7 @@ def test_a_recording_that_cannot_train_a_gate_is_refused(tmp_path, case):
 def test_settings_and_files_that_are_not_of_a_gate_are_refused(attempts, model, trained, tmp_path):
     with pytest.raises(ConfigError, match=r"gate\.frame must be one of 'after', 'during'"):
         GateSettings(frame="later")
-    with pytest.raises(CheckpointError, match="is a folder"):
+    with pytest.raises(CheckpointError, match="must be a file"):
         train_gate(attempts, tmp_path, quiet=True)
     with pytest.raises(CheckpointError, match="retrieve train --task"):
         load_gate(model)

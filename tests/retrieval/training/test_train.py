@@ -107,6 +107,8 @@ def test_each_distinct_image_is_loaded_and_passes_through_its_tower_once(recordi
         tower.register_forward_hook(lambda _, images, __: counts.append(len(images[0])))
     trainer.loss(0, loaded)
     assert counts == [2 * 4, len(set(batch.photos))]
+    first, again, next_step = (trainer.loss(step, loaded).item() for step in (0, 0, 1))
+    assert first == again != next_step  # the dropout mask is that of the step
 
 
 def test_shared_images_give_the_loss_and_the_gradients_of_one_pair_at_a_time(recording):
@@ -222,6 +224,18 @@ def test_a_step_depends_on_its_number_alone_and_no_two_steps_show_the_same_augme
     assert torch.equal(first.touches, again.touches)
     assert torch.equal(first.photos, again.photos)
     assert torch.equal(first.touches, next_step.touches) is not augment
+
+
+def test_the_touches_and_the_photos_of_an_object_are_mirrored_together(recording, monkeypatch):
+    flips = []
+    for name in ("augment_touches", "augment_photos"):
+        record = lambda images, *given: (flips.append(given[-2].tolist()), images)[1]  # noqa: E731
+        monkeypatch.setattr(f"retrieval.training.features.{name}", record)
+    batch = PairSampler(load_grasps(recording), seed=0, share_photos=True).batch(0, 6)
+    load(TrainedFeatures(with_training(TINY, augment=True), CPU), batch)
+    mirrored = dict(zip(batch.touch_objects.tolist(), flips[0], strict=True))
+    assert set(mirrored.values()) == {True, False}
+    assert flips[1] == [mirrored[name] for name in batch.photo_objects.tolist()]
 
 
 # A run that stops ------------------------------------------------------------------------------------------------
@@ -405,7 +419,7 @@ def test_a_split_that_leaks_or_lacks_objects_is_refused(recording, tmp_path):
 def test_a_checkpoint_that_cannot_be_written_is_an_error_before_the_first_step(recording, tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     monkeypatch.setattr(Trainer, "loss", lambda *_: pytest.fail("trained"))
-    for name, message in (("", "is a folder; name the file"), ("file/model.safetensors", "cannot be written")):
+    for name, message in (("", "must be a file"), ("file/model.safetensors", "cannot be written")):
         with pytest.raises(CheckpointError, match=message):
             train(recording, tmp_path / name, TINY, quiet=True)
 
