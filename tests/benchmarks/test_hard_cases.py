@@ -6,17 +6,14 @@ from functools import cache
 
 import numpy as np
 import pytest
-import torch
 
 from benchmarks import hard_cases as command
 from benchmarks.hard_cases import KERNELS, hard_cases
 from benchmarks.optics.least_squares import solve
-from indexes.errors import RowError
 from tests.documents import ROOT
-from tests.hard_case import HardCase, error_of
+from tests.hard_case import HardCase
 from tests.retrieval.metrics import hard_probability as probability
 from tests.retrieval.metrics import hard_ranking as ranking
-from tests.retrieval.model import hard_losses as losses
 from tests.retrieval.training import hard_linear as linear
 from tests.robot.sight.hard_sight import naive_circle
 from tests.robot.sim.hard_gel_pictures import _columns, _grams, naive_ridge
@@ -35,22 +32,6 @@ def test_our_results_hold_and_the_naive_formulae_fail_on_the_same_inputs(rows, p
     assert [f"{row.kernel}, {row.case}: {row.naive}" for row in found if row.naive_holds] == []
     assert len({(row.kernel, row.case) for row in found}) == len(found)
     assert all(row.case and row.must_hold and row.naive and row.ours for row in found)
-
-
-def test_a_broken_kernel_is_reported(monkeypatch):
-    monkeypatch.setattr(losses, "match_loss", lambda z, y: -torch.log(torch.sigmoid(z)).mean())
-    row = losses._sure_and_wrong()
-    assert not row.holds
-    assert row.ours == row.naive == "inf, gradient nan"
-
-
-def test_an_accepted_input_or_another_error_does_not_count_as_refused():
-    def refuse():
-        raise RowError("row 7 is NaN")
-
-    assert error_of(refuse, "row 7") == ("refused: row 7 is NaN", True)
-    assert error_of(refuse, "row 8") == ("refused: row 7 is NaN", False)
-    assert error_of(lambda: 3) == ("accepted: 3", False)
 
 
 # The naive formulae are right on easy inputs: they fail by their arithmetic, not by a mistake -----------------

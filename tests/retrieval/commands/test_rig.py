@@ -15,19 +15,16 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_a_check_prints_a_line_for_each_device(capsys, monkeypatch):
+def test_a_check_prints_a_line_for_each_device_and_exits_with_1_if_one_fails(capsys, monkeypatch):
+    def missing(self):
+        raise OSError(2, "No such file or directory")
+
     monkeypatch.setattr("robot.rig_check.MEASURE_S", 0.2)
     assert main(["rig", "check", "--rig", "tests.fake_rig:FakeRig"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[:2] for line in lines] == [
         ["ok", device] for device in ("arm", "gripper", "gel", "gel", "camera", "skew")
     ]
-
-
-def test_a_check_with_a_failing_device_exits_with_1_and_names_it(capsys, monkeypatch):
-    def missing(self):
-        raise OSError(2, "No such file or directory")
-
     monkeypatch.setattr("tests.fake_rig.FakeCamera._connect", missing)
     assert main(["rig", "check", "--rig", "tests.fake_rig:FakeRig"]) == 1
     output = capsys.readouterr()
