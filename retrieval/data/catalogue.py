@@ -309,6 +309,6 @@ def _parse_line(line: bytes, naming: Naming) -> tuple[str, bool, dict[str, Any]]
         return row["object_id"], False, metadata
     path = PurePosixPath(row["file_name"]).as_posix()
     name = naming.object_of(path)
-    if name is None or lookup_key(row.get("object_id", name)) != lookup_key(name):
+    if name is not None and lookup_key(row.get("object_id", name)) != lookup_key(name):
         raise ValueError(f"{path} belongs to object {name}, but the line names {row['object_id']}")
     return path, True, metadata

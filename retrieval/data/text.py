@@ -14,11 +14,7 @@ _SURROGATE = re.compile("[\ud800-\udfff]")
 
 def is_utf8(document: Any) -> bool:
     """Return whether every text of a JSON document, keys included, can be encoded as UTF-8."""
-    try:
-        json.dumps(document, ensure_ascii=False).encode()
-    except UnicodeEncodeError:
-        return False
-    return True
+    return not _SURROGATE.search(json.dumps(document, ensure_ascii=False))
 
 
 def is_inside(path: str) -> bool:

@@ -171,18 +171,22 @@ def test_the_page_of_commands_contains_their_help(monkeypatch, capsys):
 
 
 class FakeGel:
-    """A camera with one picture (BGR) of the gel, whose driver buffers four black images while the program waits."""
+    """A camera with two pictures (BGR) of the gel in turn; its driver buffers black images while the program waits."""
 
     def __init__(self, device):
-        self.picture = cv2.imread({"/dev/gel-a": "a.png", "/dev/gel-b": "b.png"}[device])
-        self.buffered, self.is_stale = 4, True
+        finger = device.removeprefix("/dev/gel-")
+        self.pictures = [cv2.imread(f"{finger}{number}.png") for number in ("", 2)]
+        self.buffered, self.is_stale = 0, True
+
+    def wait(self):
+        self.buffered, self.pictures = 4, self.pictures[::-1]
 
     def grab(self):
         self.is_stale, self.buffered = self.buffered > 0, max(self.buffered - 1, 0)
         return True
 
     def retrieve(self):
-        return True, self.picture * 0 if self.is_stale else self.picture
+        return True, self.pictures[1] * 0 if self.is_stale else self.pictures[1]
 
 
 def run_program_of_readme(keys, monkeypatch):
@@ -195,7 +199,7 @@ def run_program_of_readme(keys, monkeypatch):
 
     def wait_for_key(prompt):
         for gel in opened:
-            gel.buffered = 4
+            gel.wait()
         return next(keys)
 
     (program,) = blocks("python", README)
@@ -205,14 +209,14 @@ def run_program_of_readme(keys, monkeypatch):
 
 
 def test_the_program_of_the_readme_gives_the_same_answers_as_the_command(home, model, monkeypatch, capsys):
-    """Two grasps, then the next object with one grasp; the images of each are newer than the key press."""
+    """Two grasps, then the next object with the second one; the images of each are newer than the key press."""
     assert main(["build-index", "catalog", "--out", "demo/index", "--model", str(model)]) == 0
     capsys.readouterr()
     run_program_of_readme(iter(["", "", "n", "", "q"]), monkeypatch)
     output = capsys.readouterr().out.splitlines()
-    grasp = ["--gelsight", "a.png", "b.png"]
-    for grasps, line in zip((1, 2, 1), output, strict=True):
-        main(["query", *grasp * grasps, "--index", "demo/index", "--json"])
+    first, second = ["--gelsight", "a.png", "b.png"], ["--gelsight", "a2.png", "b2.png"]
+    for grasps, line in zip((first, first + second, second), output, strict=True):
+        main(["query", *grasps, "--index", "demo/index", "--json"])
         document = json.loads(capsys.readouterr().out)
         best, (start, _, probability) = document["results"][0], line.rpartition(" ")
         assert start == f"{document['verdict']} {best['object_id']}"

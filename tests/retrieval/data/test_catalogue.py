@@ -169,6 +169,8 @@ def test_metadata_of_a_missing_photo_or_object_is_a_note_and_no_error(tmp_path):
         "metadata.jsonl names mug/9.png, which is not in the catalogue",
         "metadata.jsonl names cup, which is not in the catalogue",
     )
+    write_metadata(fill(tmp_path, "cover.png"), {"file_name": "cover.png"})
+    assert "metadata.jsonl names cover.png" in list_catalogue(tmp_path, Naming("{object}/{photo}")).notes[0]
 
 
 BAD_LINES = {
