@@ -74,10 +74,12 @@ def store_checkpoint(checkpoint: Checkpoint, path: Path) -> None:
         CheckpointError: The file cannot be written.
     """
     require_writable(path)
-    header: dict[str, Any] = {"config": checkpoint.config.to_dict(), "provenance": checkpoint.provenance}
-    for name in ("split", *PARTS):
-        part = getattr(checkpoint, name)
-        header[name] = None if part is None else asdict(part)
+    parts = {name: getattr(checkpoint, name) for name in ("split", *PARTS)}
+    header = {
+        "config": checkpoint.config.to_dict(),
+        "provenance": checkpoint.provenance,
+        **{name: None if part is None else asdict(part) for name, part in parts.items()},
+    }
     state = checkpoint.matcher.state_dict()
     if checkpoint.queries is not None:
         state[_QUERIES] = torch.from_numpy(checkpoint.queries)

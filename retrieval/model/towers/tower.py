@@ -243,9 +243,8 @@ def without_autocast(images: Tensor) -> AbstractContextManager[Any]:
     Gels differ by a few grey levels, which rounding to bfloat16 removes: the gradient of MobileNetV2 then has a cosine
     of 0.75 with that in float32, and of 0.96 with the layers up to stride 4 in float32.
     """
-    if torch.is_autocast_enabled(images.device.type):
-        return torch.autocast(images.device.type, enabled=False)
-    return nullcontext()
+    kind = images.device.type
+    return torch.autocast(kind, enabled=False) if torch.is_autocast_enabled(kind) else nullcontext()
 
 
 def stage_statistics(maps: Iterable[Tensor]) -> Tensor:
