@@ -84,9 +84,13 @@ class Rows:
         return number if number < len(self) and self[number].path == path else -1
 
     def find_object(self, name: str) -> int:
-        """Return the number of the object with this name, or of the only one with its `lookup_key`; else -1."""
+        """Return the number of the object with exactly this name; -1 if there is none."""
         number = bisect_left(range(self.object_count), name, key=self.object_name)
-        if number < self.object_count and self.object_name(number) == name:
+        return number if number < self.object_count and self.object_name(number) == name else -1
+
+    def look_up_object(self, name: str) -> int:
+        """Return the number of the object that a person names: exactly so, or the only one with its `lookup_key`."""
+        if (number := self.find_object(name)) >= 0:
             return number
         similar = self._numbers_by_key.get(lookup_key(name), [])
         return similar[0] if len(similar) == 1 else -1

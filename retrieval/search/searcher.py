@@ -274,7 +274,7 @@ class Searcher:
                 "cells"
             )
         bounds = calibration.bounds(far)
-        number = self.generation.rows.find_object(expect)
+        number = self.generation.rows.look_up_object(expect)
         if number < 0:
             raise BadInput(f"the catalogue of {self.index} has no object {expect!r}; give the name of its folder")
         return number, bounds, posterior

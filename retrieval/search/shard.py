@@ -129,7 +129,7 @@ class FolderShard:
         """Return the logit of an object for grasps, by all its photos and reference touches.
 
         Args:
-            number: Number of the object (`Rows.find_object`).
+            number: Number of the object (`Rows.look_up_object`).
             partials: (G, touch_partial_width) partial activations of the grasps.
         """
         rows = self.objects.other_rows(np.array([number]), np.zeros(0, dtype=np.int64))
@@ -158,7 +158,7 @@ class FolderShard:
         rows = self.generation.rows
         found = np.arange(len(rows))
         if object_id is not None:
-            found = np.flatnonzero(rows.objects == rows.find_object(object_id))
+            found = np.flatnonzero(rows.objects == rows.look_up_object(object_id))
         if words:
             texts, keys = self._texts, [lookup_key(word) for word in words]
             found = np.array([row for row in found if all(key in texts[row] for key in keys)], dtype=np.int64)
