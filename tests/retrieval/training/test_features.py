@@ -1,6 +1,7 @@
 """Features of frozen towers: their values, the cache, and the variants of controls."""
 
 import dataclasses
+import shutil
 
 import cv2
 import numpy as np
@@ -8,10 +9,11 @@ import pytest
 import torch
 
 from retrieval.data.dataset import load_grasps
+from retrieval.data.pairs import PairSampler
 from retrieval.data.resize import resize
 from retrieval.errors import NumericalError
 from retrieval.training import features as features_module
-from retrieval.training.features import encode_recording, features_by_image, low_pass, photo_margin
+from retrieval.training.features import TrainedFeatures, encode_recording, features_by_image, low_pass, photo_margin
 from retrieval.training.initial_weights import build_matcher
 from tests.conftest import TINY
 
@@ -138,3 +140,29 @@ def test_a_feature_that_is_not_finite_is_an_error_that_names_its_grasp(part, pla
     invalid[1, ..., 0] = np.nan if part == "touch" else -np.inf
     with pytest.raises(NumericalError, match=f"{part} features must be finite; grasp {plain.grasp_ids[1]} has"):
         dataclasses.replace(plain, **{part: invalid})
+
+
+def test_the_touches_and_photos_of_an_object_are_mirrored_together(grasps, tmp_path):
+    """A touch is brighter at its upper side, a photo at its left side; a mirrored one at the other side."""
+    ramp = np.linspace(255, 0, 48).astype(np.uint8)
+    left = np.repeat(np.tile(ramp, (48, 1))[..., None], 3, axis=2)
+    cv2.imwrite(str(tmp_path / "touch.png"), left.transpose(1, 0, 2))
+    cv2.imwrite(str(tmp_path / "photo.png"), left)
+    items = []
+    for grasp in grasps:
+        photo = shutil.copy(tmp_path / "photo.png", tmp_path / f"{grasp.grasp_id}.png")
+        items.append(dataclasses.replace(grasp, touches=(tmp_path / "touch.png",) * 2, photo=photo))
+    config = dataclasses.replace(TINY, training=dataclasses.replace(TINY.training, augment=True, workers=0))
+    sampler = PairSampler(items, seed=0, positives=2, negatives=2, share_photos=True)
+    source, seen = TrainedFeatures(config, torch.device("cpu")), set()
+    for loaded in source.batches(None, [(step, sampler.batch(step, 4)) for step in range(4)]):
+        rows, columns = loaded.touches.mean((1, 2, 4)), loaded.photos.mean((1, 2))
+        is_flipped = (rows[:, :8].mean(1) < rows[:, -8:].mean(1)).tolist()
+        is_mirrored = (columns[:, :8].mean(1) < columns[:, -8:].mean(1)).tolist()
+        sides = [zip(loaded.batch.touch_objects, is_flipped, strict=True)]
+        sides.append(zip(loaded.batch.photo_objects, is_mirrored, strict=True))
+        known = {}
+        for number, side in (pair for pairs in sides for pair in pairs):
+            assert known.setdefault(int(number), side) == side
+            seen.add(side)
+    assert seen == {False, True}
