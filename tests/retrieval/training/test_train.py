@@ -226,18 +226,6 @@ def test_a_step_depends_on_its_number_alone_and_no_two_steps_show_the_same_augme
     assert torch.equal(first.touches, next_step.touches) is not augment
 
 
-def test_the_touches_and_the_photos_of_an_object_are_mirrored_together(recording, monkeypatch):
-    flips = []
-    for name in ("augment_touches", "augment_photos"):
-        record = lambda images, *given: (flips.append(given[-2].tolist()), images)[1]  # noqa: E731
-        monkeypatch.setattr(f"retrieval.training.features.{name}", record)
-    batch = PairSampler(load_grasps(recording), seed=0, share_photos=True).batch(0, 6)
-    load(TrainedFeatures(with_training(TINY, augment=True), CPU), batch)
-    mirrored = dict(zip(batch.touch_objects.tolist(), flips[0], strict=True))
-    assert set(mirrored.values()) == {True, False}
-    assert flips[1] == [mirrored[name] for name in batch.photo_objects.tolist()]
-
-
 # A run that stops ------------------------------------------------------------------------------------------------
 
 
