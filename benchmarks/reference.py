@@ -141,7 +141,7 @@ def _heading(level: str, title: str, thing: Any) -> str:
     named = [item for item in signature.parameters.values() if item.name not in ("self", "cls")]
     bare = [item.replace(annotation=item.empty) for item in named]
     text = str(signature.replace(parameters=bare, return_annotation=signature.empty))
-    arguments = re.sub(r"<built-in function (\w+)>", r"\1", text)
+    arguments = re.sub(r"<built-in function (\w+)>", r"\1", text).replace("'", '"')
     if arguments == "()":
         return f"\n{level} {title}()\n"
     return f"\n{level} {title}\n\n```python\n{title}{arguments}\n```\n"
