@@ -12,9 +12,6 @@ from benchmarks.hard_cases import KERNELS, hard_cases
 from benchmarks.optics.least_squares import solve
 from tests.documents import ROOT
 from tests.hard_case import HardCase
-from tests.retrieval.metrics import hard_probability as probability
-from tests.retrieval.metrics import hard_ranking as ranking
-from tests.retrieval.training import hard_linear as linear
 from tests.robot.sight.hard_sight import naive_circle
 from tests.robot.sim.hard_gel_pictures import _columns, _grams, naive_ridge
 
@@ -35,30 +32,6 @@ def test_our_results_hold_and_the_naive_formulae_fail_on_the_same_inputs(rows, p
 
 
 # The naive formulae are right on easy inputs: they fail by their arithmetic, not by a mistake -----------------
-
-
-def test_the_naive_canonical_correlations_equal_ours_on_easy_features():
-    touch, photo = linear._views(200, 4)
-    ours = linear._correlations(touch, photo).correlations
-    assert linear.naive_correlations(touch, photo) == pytest.approx(ours, abs=1e-9)
-    assert linear._by_eigenvectors(touch, photo) == pytest.approx(ours, abs=1e-5)
-
-
-def test_the_naive_fits_equal_ours_on_overlapping_pairs():
-    rng = np.random.default_rng([8])
-    logits, labels = np.append(rng.normal(1, 1, 20_000), rng.normal(-1, 1, 20_000)), np.repeat([1, 0], 20_000)
-    fitted = probability.fit_calibration(logits, labels)
-    # Platt's targets differ from 0 and 1 by 1 in 20,000.
-    assert probability.naive_fit(logits, labels) == pytest.approx(fitted, rel=1e-3, abs=1e-3)
-    scores = rng.normal(0, 1, (5000, 5)) + 1.5 * np.eye(5)[0]
-    fitted = probability.fit_posterior(probability.scored_choices(scores))
-    assert probability.naive_slope(scores) == pytest.approx(fitted.slope, rel=2e-2)
-
-
-def test_the_naive_interval_is_the_t_interval_of_many_values():
-    values = np.random.default_rng([9]).normal(0.5, 0.1, 400)
-    low, high = ranking.naive_interval(values)
-    assert high - low == pytest.approx(2 * 1.96 * values.std() / 20, rel=0.1)
 
 
 def test_the_naive_circle_is_right_on_a_whole_circle_without_noise():

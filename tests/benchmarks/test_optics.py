@@ -1,19 +1,16 @@
 """Optics fitted to presses: drawn presses are predicted to their noise, and the shipped fits are those of real ones."""
 
-import json
-from dataclasses import replace
 from importlib.util import find_spec
 
 import numpy as np
 import pytest
 
-from _touch_retrieval.documents import typed
 from benchmarks.optics import model_choice as press_model
 from benchmarks.optics import photometric
 from benchmarks.optics.least_squares import OpticsSetting, features, labelled_poses
 from benchmarks.optics.model_choice import fit, held_out_error, picture_error, select, to_optics
 from benchmarks.optics.real_presses import Presses, find_presses, read_presses
-from robot.sim.gel.fitted_optics import FITTED, FittedOptics, fitted_document, load_fitted
+from robot.sim.gel.fitted_optics import FITTED, fitted_document, load_fitted
 from robot.sim.gel.surface import Field, Surface
 
 real = pytest.mark.skipif(find_spec("taxim") is None, reason="real presses come with taxim: pip install .[calibration]")
@@ -46,32 +43,6 @@ def test_a_fit_predicts_held_out_presses_to_their_noise(monkeypatch):
     for index in range(6, 9):
         assert held_out_error(drawn, index, model).mse < 1.6  # noise 1 and rounding 1/12; that of f0 is blurred away
         assert picture_error(drawn, index, 0.0).mse > 20
-
-
-@pytest.mark.slow
-def test_the_command_fits_scores_and_writes_a_file_that_loads(tmp_path, monkeypatch, capsys):
-    drawn, _ = draw_presses(5)
-    arrays = {
-        "f0": drawn.no_contact,
-        "imgs": drawn.pictures,
-        "touch_center": drawn.centres,
-        "touch_radius": drawn.radii,
-    }
-    data = tmp_path / "data"
-    (data / "gelsight").mkdir(parents=True)
-    np.savez(data / "gelsight" / "dataPack.npz", **arrays)
-    monkeypatch.setattr(press_model, "_THICKNESSES_MM", (4.0,))
-    monkeypatch.setattr(photometric, "FIT_COUNT", {"gelsight": 4})
-    monkeypatch.setattr(photometric, "SPLITS", 1)
-    monkeypatch.setattr(photometric, "DEGREES", (2,))
-    monkeypatch.setattr(press_model, "candidates", lambda wide, careful=False: [replace(wide, degree=2)])
-    command = ["--data", str(data), "--sensor", "gelsight", "--out"]
-    assert photometric.main([*command, str(tmp_path / "out")]) == 0
-    output = capsys.readouterr().out
-    assert "background only" in output
-    content = json.loads((tmp_path / "out" / "gelsight.json").read_text())
-    assert typed(content["model"], FittedOptics, "model").weights
-    assert content["held_out"]["labels"]["mse"]["mean"] < 3
 
 
 # Real presses ----------------------------------------------------------------------------------------------

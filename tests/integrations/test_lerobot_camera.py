@@ -79,14 +79,6 @@ def test_the_default_size_and_rate_are_those_of_the_driver(make, sensor, size):
         assert camera.read().shape == (camera.height, camera.width, 3)
 
 
-def test_a_gelsight_mini_has_the_vendors_crop_in_rgb(make):
-    device = FakeVideoDevice(size=(320, 240))
-    with make(device, sensor="gelsight_mini") as camera:
-        picture = camera.read()
-    known = [device.picture(number)[36:204, 48:272, ::-1] for number in range(1, device.pictures + 1)]
-    assert any(np.array_equal(picture, each) for each in known)
-
-
 def test_the_camera_gets_the_frame_rate_and_the_pictures_have_the_requested_size(make):
     device = FakeVideoDevice(size=(64, 48))
     with make(device, sensor="uvc", fps=15, width=32, height=24, settings={**QUICK, "crop": [0.5, 0, 0, 0]}) as camera:

@@ -13,13 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from retrieval.commands.main import main
 from robot.devices import Arm
 from robot.drivers.own_robot import OwnArm, OwnGripper
 from robot.errors import DeviceError
 from robot.readings import Pose, Region
-from robot.recording.folder import read_recording
-from tests.replay_rig import replay_file
 
 FOLDER = Path(__file__).parents[2] / "integrations" / "robots"
 WORKSPACE = Region((-150.0, -150.0, 10.0), (150.0, 150.0, 400.0))
@@ -67,17 +64,13 @@ class FakeUR:
 
 
 @pytest.fixture
-def fake_ur(monkeypatch):
+def ur(monkeypatch):
     fake = FakeUR()
     for module, name in (("rtde_control", "RTDEControlInterface"), ("rtde_receive", "RTDEReceiveInterface")):
         monkeypatch.setitem(sys.modules, module, types.SimpleNamespace(**{name: lambda host: fake}))
-    return fake
-
-
-@pytest.fixture
-def ur(fake_ur):
     with OwnArm(workspace=WORKSPACE, robot="ur_arm:URArm", settings={"host": "ur", **ORIGIN}) as arm:
-        yield fake_ur, arm
+        yield fake, arm
+    assert fake.calls[-1] == "stopScript"
 
 
 class FakeFranka:
@@ -168,21 +161,14 @@ class URCap(socketserver.StreamRequestHandler):
 
 
 @pytest.fixture
-def urcap():
+def robotiq():
     with serving(socketserver.ThreadingTCPServer, URCap) as server:
         server.values, server.calls = {"POS": 0, "PRE": 0, "OBJ": 3, "STA": 3}, []
         server.object_at = round(255 * (1 - 40 / 85))
-        yield server
-
-
-@pytest.fixture
-def robotiq(urcap):
-    settings = {"host": "127.0.0.1", "port": urcap.server_address[1]}
-    gripper = OwnGripper(
-        stroke_mm=85.0, min_force_n=10.0, max_force_n=40.0, robot="robotiq_2f85:Robotiq2F85", settings=settings
-    )
-    with gripper:
-        yield urcap, gripper
+        settings = {"host": "127.0.0.1", "port": server.server_address[1]}
+        ranges = {"stroke_mm": 85.0, "min_force_n": 10.0, "max_force_n": 40.0}
+        with OwnGripper(robot="robotiq_2f85:Robotiq2F85", settings=settings, **ranges) as gripper:
+            yield server, gripper
 
 
 def moves_and_reports(arm: Arm, yaw_rad: float = 0.5) -> None:
@@ -289,38 +275,3 @@ def test_a_robot_on_another_computer_moves_stops_and_its_errors_keep_their_text(
             with pytest.raises(DeviceError, match=r"/arm/move_to answered 409: protective stop"):
                 arm.move_to(Pose(0.0, 0.0, 20.0, 0.0), 150.0)
         assert server.calls[-1] == "/arm/stop"
-
-
-def test_collect_records_grasps_with_the_examples_in_a_rig_file(fake_ur, urcap, tmp_path):
-    """The arm and the gripper of the rig's file are replaced by the examples; camera and gels are recordings."""
-    with replay_file() as path:
-        rig = path.read_text()
-        arm = f"""
-driver = "own"
-robot = "ur_arm:URArm"
-settings = {{host = "ur", origin_mm = [500, 100, -20], tool_mm = 120}}
-
-[gripper]
-driver = "own"
-robot = "robotiq_2f85:Robotiq2F85"
-settings = {{host = "127.0.0.1", port = {urcap.server_address[1]}}}
-stroke_mm = 85
-min_force_n = 10
-
-[grasp]
-force_n = [10, 20]
-
-[sensors.a]"""
-        path.write_text(rig[: rig.index("[arm]") + 5] + arm + rig.split("[sensors.a]")[1])
-        out = tmp_path / "grasps"
-        command = ["collect", "--rig", str(path), "--objects", "1", "--grasps", "1", "--out", str(out)]
-        assert main(command) == 0
-    recording = read_recording(out)
-    accepted = [grasp for grasp in recording.grasps if grasp.grasped]
-    assert len(accepted) == 1
-    assert accepted[0].outcome == "held"
-    assert accepted[0].opening_mm == pytest.approx(40.0, abs=0.4)
-    assert 10 <= accepted[0].force_n <= 20
-    assert recording.info["rig_settings"]["arm"]["robot"] == "ur_arm:URArm"
-    assert {call[0] for call in fake_ur.calls} >= {"moveL"}
-    assert fake_ur.calls[-1] == "stopScript"

@@ -66,18 +66,6 @@ def test_casting_only_the_shadow_rays_near_the_object_gives_the_whole_shadow(ind
     assert len(near) < 0.7 * len(table)
 
 
-def test_depth_of_the_bare_table_is_the_distance_of_its_plane_along_the_axis():
-    view = cast_camera_rays(POST, Placement(), CAMERA)
-    depth = cameras.depth(view, 1)
-    row, column = 250, 10
-    assert not view.is_object[row * CAMERA.px + column]
-    point = view.points[row * CAMERA.px + column]
-    assert point[2] == pytest.approx(0, abs=1e-9)
-    expected_m = (np.linalg.inv(CAMERA.to_rig) @ [*point, 1])[2] / 1000
-    block = depth[row - 3 : row + 4, column - 3 : column + 4]
-    assert np.nanmedian(block) == pytest.approx(expected_m, abs=0.004)
-
-
 def test_depth_has_holes_flying_pixels_and_whole_millimetres():
     view = cast_camera_rays(POST, Placement(), CAMERA)
     depth = cameras.depth(view, 1)

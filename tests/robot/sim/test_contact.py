@@ -8,7 +8,6 @@ from scipy.optimize import nnls
 
 from benchmarks.frontier.closed_forms import closed_form_table
 from robot.errors import SceneError
-from robot.sim.contact import scaled_problem as pressing
 from robot.sim.contact.kernels import influence
 from robot.sim.contact.layer import Layer, press
 
@@ -32,19 +31,8 @@ def matrix(layer, shape, pixel):
 # Closed forms ----------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def table():
-    return closed_form_table()
-
-
-def test_the_solver_is_within_the_tolerance_of_every_closed_form(table):
-    assert [f"{check.case}, {check.quantity}, {check.grid}: {check.error}" for check in table if not check.holds] == []
-
-
-def test_errors_fall_with_the_grid(table):
-    errors = [abs(c.error) for c in table if c.case == "Hertz, 0.5 N" and c.quantity == "depth"]
-    assert errors == sorted(errors, reverse=True)
-    assert len(errors) == 3
+def test_the_solver_is_within_the_tolerance_of_every_closed_form():
+    assert [f"{c.case}, {c.quantity}, {c.grid}: {c.error}" for c in closed_form_table() if not c.holds] == []
 
 
 # Another solver --------------------------------------------------------------------------------------------
@@ -67,32 +55,11 @@ def test_pressure_is_that_of_an_active_set_method(layer, kind):
     assert contact.force_n == pytest.approx(expected.sum() * PIXEL**2, rel=1e-8)
 
 
-@pytest.mark.parametrize("layer", [HALF_SPACE, GEL, Layer(0.2, 0.5, 0.3)])
-def test_a_depth_and_the_force_that_it_takes_are_one_contact(layer):
-    gap = bowl()
-    by_force = press(gap, PIXEL, layer, force_n=0.3, tolerance=1e-8)
-    by_depth = press(gap, PIXEL, layer, depth_mm=by_force.approach_mm, tolerance=1e-8)
-    assert by_depth.force_n == pytest.approx(0.3, rel=1e-6)
-    assert by_depth.pressure_mpa == pytest.approx(by_force.pressure_mpa, abs=1e-5 * by_force.pressure_mpa.max())
-
-
 def test_displacement_is_the_influence_of_the_pressure():
     gap = bowl(12, 10)
     contact = press(gap, PIXEL, GEL, force_n=0.05)
     exact = matrix(GEL, gap.shape, PIXEL) @ contact.pressure_mpa.ravel()
     assert contact.displacement_mm.ravel() == pytest.approx(exact, rel=1e-10)
-
-
-# Coarse grid and window ------------------------------------------------------------------------------------
-
-
-def test_a_start_from_a_coarse_grid_does_not_change_the_result(monkeypatch):
-    gap = bowl(61, 83) + 0.02 * np.random.default_rng([6]).random((61, 83))
-    nested = press(gap, PIXEL, GEL, force_n=0.5, tolerance=1e-8)
-    monkeypatch.setattr(pressing, "_MIN_NESTED_PIXELS", 1000)
-    plain = press(gap, PIXEL, GEL, force_n=0.5, tolerance=1e-8)
-    assert nested.pressure_mpa == pytest.approx(plain.pressure_mpa, abs=1e-6 * plain.pressure_mpa.max())
-    assert nested.approach_mm == pytest.approx(plain.approach_mm, rel=1e-8)
 
 
 def test_a_needle_missed_by_the_coarse_grid_is_found():
@@ -156,14 +123,10 @@ def test_a_resolved_light_press_has_no_flags():
     ("flag", "gap", "options"),
     [
         ("unresolved", bowl(), {"force_n": 1e-6}),
-        ("unresolved", bowl()[:, 20:22], {"force_n": 1e-3}),
         ("at_border", bowl()[:, 20:], {"force_n": 0.3}),
-        ("at_border", np.zeros((1, 1)), {"force_n": 0.3}),
         ("large_strain", bowl(), {"force_n": 5.0}),
         ("steep", bowl(radius=1.0), {"force_n": 2.0}),
-        ("steep", np.arange(9.0)[None, :] * 0.5, {"force_n": 0.2}),
         ("no_contact", bowl(), {"force_n": 0.0}),
-        ("no_contact", bowl() + 1.0, {"depth_mm": 0.5}),
         ("no_contact", bowl(), {"depth_mm": -1.0}),
     ],
 )
@@ -182,26 +145,10 @@ def test_early_stop_is_flagged_and_carries_the_force():
     assert contact.force_n == pytest.approx(0.3, rel=1e-12)
 
 
-def test_an_empty_map_carries_no_force_and_is_flagged():
-    contact = press(np.full((6, 7), np.inf), PIXEL, GEL, force_n=1.0)
-    assert (contact.converged, contact.flags) == (False, ("no_contact",))
-    assert (contact.force_n, contact.approach_mm) == (0.0, 0.0)
-    assert not contact.pressure_mpa.any()
-    assert not contact.displacement_mm.any()
-
-
 # Wrong input -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("gap", "force_n", "message"),
-    [
-        (np.nan, 1.0, "got NaN"),
-        (-np.inf, 1.0, "got NaN or -inf"),
-        (0.0, 1e-300, "consistent units"),
-        (0.0, 1e300, "consistent units"),
-    ],
-)
+@pytest.mark.parametrize(("gap", "force_n", "message"), [(np.nan, 1.0, "got NaN"), (0.0, 1e-300, "consistent units")])
 def test_wrong_input_is_refused_with_a_message(gap, force_n, message):
     with pytest.raises(SceneError, match=message):
         press(np.full((3, 3), gap), PIXEL, GEL, force_n=force_n)

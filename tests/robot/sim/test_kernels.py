@@ -1,5 +1,6 @@
 """Influence of pressure on an elastic surface: against limits, quadrature and plain loops."""
 
+import itertools
 import math
 
 import numpy as np
@@ -21,30 +22,15 @@ from tests.robot.sim.hard_contact import naive_symbol
 POISSON = (-0.9, 0.0, 0.3, 0.48, 0.5)
 
 
-def mirrored(quadrant):
-    """Return the quadrant mirrored to (2 rows - 1, 2 cols - 1)."""
-    half = np.concatenate([quadrant[:0:-1], quadrant])
-    return np.concatenate([half[:, :0:-1], half], axis=1)
-
-
 def by_loops(table, pressure):
     """Return the displacement, summed over each pixel's pressure."""
-    rows, cols = pressure.shape
     total = np.zeros(pressure.shape)
-    for i in range(rows):
-        for j in range(cols):
-            for k in range(rows):
-                for m in range(cols):
-                    total[k, m] += pressure[i, j] * table[abs(k - i), abs(m - j)]
+    for (i, j), (k, m) in itertools.product(np.ndindex(pressure.shape), repeat=2):
+        total[k, m] += pressure[i, j] * table[abs(k - i), abs(m - j)]
     return total
 
 
 # Closed form of the layer ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("poisson", POISSON)
-def test_far_thicker_than_the_wave_a_layer_is_a_half_space(poisson):
-    assert layer_symbol(np.array([30.0, 1e3, 1e300]), poisson) == pytest.approx(1.0, abs=1e-15)
 
 
 @pytest.mark.parametrize("poisson", POISSON)

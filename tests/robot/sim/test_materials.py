@@ -18,17 +18,6 @@ def test_every_object_draws_its_own_numbers_within_bounds():
 # Appearance ------------------------------------------------------------------------------------------------
 
 
-def test_albedo_is_between_0_and_1_and_the_same_again():
-    points = np.random.default_rng(1).uniform(-60, 120, (500, 3))
-    for seed in range(30):
-        appearance = draw_appearance(np.random.default_rng(seed))
-        found = appearance.albedo(points)
-        assert found.shape == (500, 3)
-        assert found.min() >= 0
-        assert found.max() <= 1
-        np.testing.assert_array_equal(found, draw_appearance(np.random.default_rng(seed)).albedo(points))
-
-
 def test_colours_are_spread_evenly_over_hue_and_lightness():
     colours = np.array([draw_appearance(np.random.default_rng(seed)).colour for seed in range(600)])
     lightness = (colours.max(axis=1) + colours.min(axis=1)) / 2

@@ -145,12 +145,3 @@ def test_from_the_side_the_gap_of_an_upright_cylinder_is_turned_by_a_quarter(til
     tilted = dataclasses.replace(pinch(post, yaw=0.3).scene, grip=grip).pinch.gap("a")
     assert np.ptp(upright, axis=0).max() < 1e-3 < np.ptp(upright, axis=1).max()
     assert np.ptp(tilted, axis=1).max() < 1e-3 < np.ptp(tilted, axis=0).max()
-
-
-def test_a_tilted_pose_points_its_fingers_across_the_closing_direction():
-    """By hand: closing along x, tilted by 90 degrees, the fingers point along y; at 45 degrees also down."""
-    down = [-Pose(0, 0, 0, 0, tilt).rotation()[:, 2] for tilt in (0.0, math.pi / 2, -math.pi / 2, math.pi / 4)]
-    half = math.sqrt(0.5)
-    np.testing.assert_allclose(down, [[0, 0, -1], [0, 1, 0], [0, -1, 0], [0, half, -half]], atol=1e-12)
-    rotation = Pose(0, 0, 0, math.pi / 2, math.pi / 2).rotation()
-    np.testing.assert_allclose(rotation, [[0, 0, 1], [1, 0, 0], [0, 1, 0]], atol=1e-12)

@@ -49,18 +49,6 @@ def test_ribs_repeat_after_their_pitch_in_their_direction():
     assert np.ptp(upright, axis=1).max() < 1e-4
 
 
-def test_a_scatter_gives_the_distance_to_its_nearest_point():
-    sheet = Sheet(40.0, 30.0, 61, 80)
-    found = sheet.scatter(np.random.default_rng(0), 8.0, jitter=0.3)
-    rows, columns = np.nonzero(found == 0)
-    i, j = np.meshgrid(np.arange(61), np.arange(80), indexing="ij")
-    sides = np.minimum(np.abs(j[..., None] - columns), 80 - np.abs(j[..., None] - columns)) * 0.5
-    slow = np.hypot(sides, (i[..., None] - rows) * 0.5).min(axis=-1)
-    # The scatter also counts points beyond the upper and lower ends, which are not visible here.
-    middle = slice(16, 45)
-    assert np.mean(np.abs(found - slow)[middle] < 0.05) > 0.9
-
-
 def test_glyphs_can_be_read_from_outside():
     """An L on an unrolled wall has its foot to the right of its stem, and at the bottom."""
     sheet = Sheet(30.0, 16.0, 161, 300)

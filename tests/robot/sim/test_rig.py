@@ -2,14 +2,13 @@
 
 import functools
 import math
-from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from robot.collection import CollectSettings, collect
-from robot.errors import DeviceError, PlanError, RobotConfigError, UnknownName
+from robot.errors import DeviceError, RobotConfigError, UnknownName
 from robot.grasping.attempt import AttemptRunner
 from robot.grasping.settings import AttemptSettings
 from robot.readings import Pose
@@ -151,43 +150,12 @@ def test_an_empty_table_and_an_object_of_another_seed_raise(rig):
     ("settings", "error"),
     [
         ({"fingers": ["a", "c"]}, RobotConfigError),
-        ({"families": ["teapot"]}, RobotConfigError),
         ({"optics": "neon"}, UnknownName),
         ({"gels": 0}, RobotConfigError),
-        ({"contact_grid": [10, 10]}, RobotConfigError),
-        ({"localisation_mm": [3.0, 1.0]}, RobotConfigError),
         ({"grasp": {"force_n": [1.0, 10.0]}}, RobotConfigError),
-        ({"attempt": {"settle_s": -1}}, RobotConfigError),
         ({"gel": {"a": {"modulus_mpa": math.nan}}}, RobotConfigError),
-        ({"gel": {"b": {}}, "fingers": ["a"]}, RobotConfigError),
     ],
 )
 def test_impossible_settings_are_refused(settings, error):
     with pytest.raises(error):
         load_rig("sim", seed=0, **settings)
-
-
-class _NoPlan:
-    needs_depth = True
-
-    def plan(self, rig, image, settings, rng):
-        raise PlanError("no plan")
-
-
-@pytest.mark.parametrize(("has_plan", "photos", "gel_images"), [(False, 1, 0), (True, 1, 4)])
-def test_an_attempt_without_a_plan_renders_one_photo_and_no_gel_image(rig, monkeypatch, has_plan, photos, gel_images):
-    """A planned attempt reads both gels before and during the contact."""
-    rendered = Counter()
-
-    def count(name, device):
-        read = device._read
-        monkeypatch.setattr(device, "_read", lambda *given: rendered.update([name]) or read(*given))
-
-    count("photo", rig.camera)
-    for sensor in rig.sensors.values():
-        count("gel", sensor)
-    if not has_plan:
-        rig.planner = _NoPlan()
-    attempt = AttemptRunner(rig, 4, AttemptSettings(outputs=("before",))).run(rig.object_ids(1)[0], 0)
-    assert (attempt.outcome == "no_plan") is not has_plan
-    assert (rendered["photo"], rendered["gel"]) == (photos, gel_images)

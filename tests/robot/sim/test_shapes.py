@@ -6,7 +6,7 @@ import pytest
 from robot.sim.objects.shapes import SHAPES
 from robot.sim.objects.shapes.extrusion import Extrusion, Polygon, RoundedRectangle
 from robot.sim.objects.shapes.revolution import Ball, Cone, Drum, Revolution, ThreadedRod
-from robot.sim.objects.shapes.shape import CylindricalChart, arctan2, smooth_min
+from robot.sim.objects.shapes.shape import CylindricalChart, arctan2
 from robot.sim.objects.shapes.solids import Brick, Brush, Comb, Ring, Superquadric, TwoSidedChart
 
 
@@ -158,20 +158,9 @@ def test_a_thread_climbs_one_pitch_in_a_turn():
     assert height.max() == pytest.approx(0)
 
 
-# Helpers ---------------------------------------------------------------------------------------------------
-
-
 def test_the_polynomial_arctangent_is_an_arctangent():
     rng = np.random.default_rng(0)
     x, y = np.concatenate([rng.standard_normal((2, 5000)), [[0, 0, 0, 1, -1, 1e-20], [0, 1, -1, 0, 0, 1e-20]]], axis=1)
     x, y = x.astype(np.float32), y.astype(np.float32)
     # 1e-6 rad is 5e-5 mm on the widest object.
     np.testing.assert_allclose(arctan2(y, x), np.arctan2(y, x, dtype=float), atol=1e-6)
-
-
-def test_a_smooth_minimum_is_at_most_a_quarter_of_its_blend_below_the_sharp_one():
-    a, b = np.meshgrid(np.linspace(-9, 9, 50, dtype=np.float32), np.linspace(-9, 9, 50, dtype=np.float32))
-    below = np.minimum(a, b) - smooth_min(a, b, 4)
-    assert below.min() >= 0
-    assert below.max() == pytest.approx(1)
-    np.testing.assert_array_equal(smooth_min(a, b, 0), np.minimum(a, b))
