@@ -2,13 +2,12 @@
 
 import dataclasses
 import json
-import math
 
 import numpy as np
 import pytest
 import torch
 
-from benchmarks import again, rerank, scale
+from benchmarks import rerank, scale
 from benchmarks.frontier import APPROXIMATIONS, NEED_NO_MODEL
 from benchmarks.frontier.__main__ import main
 from retrieval import frontier
@@ -44,7 +43,7 @@ def test_every_approximation_has_points_a_reference_and_a_default_within_its_tol
         assert len({point.name for point in panel.points}) == len(panel.points)
         if name not in ("contact", "gel_optics"):  # their smallest sizes leave the default out
             assert panel.default
-        if name in ("rays", "cca_solver"):
+        if name in ("rays", "cca_solver", "sky_occlusion"):
             assert panel.default.error <= panel.tolerance
 
 
@@ -85,11 +84,3 @@ def test_time_against_the_number_of_photos(tmp_path):
 def test_reranking_with_cells_is_compared_with_reranking_without():
     text = rerank.measure(read_checkpoint_info(shipped_model()).config.matcher, candidates=3, repetitions=1)
     assert text.startswith("3 candidates with ")
-
-
-@pytest.mark.slow
-def test_the_benchmark_of_a_rebuild_has_each_arm():
-    text, seconds = again.measure(photos=6, rounds=1)
-    assert text.startswith("6 photos, ")
-    assert set(seconds) == {"first", "nothing", "one", "looking", "started", "first_encoding", "encoding"}
-    assert all(map(math.isfinite, seconds.values()))  # differences of times may be below 0 for so few photos

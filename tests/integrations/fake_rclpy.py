@@ -43,7 +43,6 @@ def _definitions():
 
 DEFINED, DEFAULTS = _definitions()
 CLASSES: dict[str, Any] = {}
-LEVELS = ("info", "warning")
 
 
 def message_class(name):
@@ -102,13 +101,7 @@ def from_bag(message):
 
 
 class FakeNode:
-    """A node whose topics, services, actions and timers a test uses.
-
-    Attributes:
-        now_ns: The time of its clock.
-        published: Topic -> its messages.
-        log: Level and text of each line.
-    """
+    """A node whose topics, services, actions and timers a test uses."""
 
     def __init__(self, name, overrides):
         self.name, self.overrides, self.now_ns, self.is_destroyed = name, overrides, 0, False
@@ -145,7 +138,7 @@ class FakeNode:
         return SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=self.now_ns, to_msg=to_msg))
 
     def get_logger(self):
-        return SimpleNamespace(**{level: lambda text, at=level: self.log.append((at, text)) for level in LEVELS})
+        return SimpleNamespace(info=self.log.append, warning=self.log.append)
 
     def destroy_node(self):
         self.is_destroyed = True
@@ -180,7 +173,7 @@ class FakeActionServer:
 
 
 class FakeGoal:
-    """A goal handle. The status is the one that the node set, once."""
+    """A goal handle; the node sets its status once."""
 
     def __init__(self, server, request, on_feedback):
         self.server, self.request, self.on_feedback = server, request, on_feedback

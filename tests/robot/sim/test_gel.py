@@ -154,16 +154,6 @@ def test_a_flat_gel_shows_the_backdrop_and_render_of_nothing_is_the_background(k
         np.testing.assert_array_equal(sensor.render(flat, 5), sensor.background(5))
 
 
-def test_the_seed_of_a_picture_changes_only_its_noise():
-    sensor = draw_sensor(2, "a")
-    press = dome(Field(120, 160, 0.1268))
-    one, again, other = (sensor.render(press, seed).astype(float) for seed in (3, 3, 4))
-    np.testing.assert_array_equal(one, again)
-    difference = one - other
-    assert 0.5 < difference.std() / math.sqrt(2) < 2.5
-    assert abs(difference.mean()) < 0.05
-
-
 def test_noise_has_the_documented_variance():
     sensor = GelSensor(LAYER, noise=Noise(1.5, 0.02))
     many = np.stack([sensor.background(seed) for seed in range(60)]).astype(float)

@@ -1,13 +1,9 @@
 """Shading and developing in one compiled pass, against the same formulas array by array in float64."""
 
-import cv2
 import numpy as np
-import pytest
 
 from benchmarks.frontier.light import shaded
-from robot.sim.camera import PinholeCamera, Placement, cast_camera_rays, sky_occlusion
 from robot.sim.light import GBuffer, Lamps, develop, radiance
-from robot.sim.objects.draw import draw_object
 
 
 def surfaces_and_lamps(count=5000, seed=0):
@@ -33,14 +29,3 @@ def test_grey_levels_follow_the_gamma_and_are_clipped():
     np.testing.assert_array_equal(flat, [[[0, 186, 255], [255, 0, 136]]])  # 255 * 0.5^(1/2.2) = 186.08, 135.79
     noisy = develop(linear, np.array([[[-3.0, 2.0, 5.0], [-7.0, 300.0, -200.0]]]))
     np.testing.assert_array_equal(noisy, [[[0, 188, 255], [248, 255, 0]]])
-
-
-@pytest.mark.parametrize("px", [64, 256])
-def test_the_sky_that_an_object_hides_is_blurred_as_on_the_full_grid(px):
-    view = cast_camera_rays(draw_object(0, 3), Placement(), PinholeCamera(px=px, focal_px=860 * px / 256))
-    mask = view.is_object.reshape(px, px).astype(np.float64)
-    exact = cv2.GaussianBlur(mask, (0, 0), 0.03 * px).ravel()
-    error = np.abs(sky_occlusion(view.is_object.reshape(px, px)).ravel() - exact)[~view.is_object]
-    # It scales 0.45 of the sky's light, which is 0.3 of all: an error of 0.01 is a third of a grey level.
-    assert error.max() < 0.02
-    assert error.mean() < 1e-3
