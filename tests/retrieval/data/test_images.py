@@ -5,7 +5,6 @@ import io
 import os
 import struct
 import zlib
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
 import cv2
@@ -17,8 +16,7 @@ from PIL import Image, ImageFile
 
 from retrieval.data import images
 from retrieval.data.images import decode_rgb, read_rgb
-from retrieval.data.resize import to_float
-from retrieval.errors import BadInput, ImageError
+from retrieval.errors import ImageError
 from tests.hostile_pictures import png_chunk as chunk
 
 # Files made by hand ----------------------------------------------------------------------------------------
@@ -35,7 +33,7 @@ def png(colour_type, depth, samples, *extra, size=None):
     return b"\x89PNG\r\n\x1a\n" + b"".join(body)
 
 
-def tiff(samples, orientation=1, extra_samples=None, photometric=None, bits=None):
+def tiff(samples, orientation=1, extra_samples=None, bits=None):
     """An uncompressed little-endian TIFF file of uint8 or uint16 `samples` (H, W, channels)."""
     height, width, channels = samples.shape
     raw = samples.astype(samples.dtype.newbyteorder("<")).tobytes()
@@ -47,7 +45,7 @@ def tiff(samples, orientation=1, extra_samples=None, photometric=None, bits=None
         (257, 3, 1, height),
         (258, 3, channels, offset if channels > 2 else bits),
         (259, 3, 1, 1),
-        (262, 3, 1, photometric if photometric is not None else 2 if channels > 2 else 1),
+        (262, 3, 1, 2 if channels > 2 else 1),
         (273, 4, 1, offset + 2 * channels),
         (274, 3, 1, orientation),
         (277, 3, 1, channels),
@@ -121,14 +119,11 @@ def test_a_lossless_file_returns_its_pixels(tmp_path):
 
 EIGHT_BIT = {
     "grey": (Image.new("L", (1, 1), 51), "PNG", {}, (0.2, 0.2, 0.2)),
-    "1-bit white": (Image.new("1", (1, 1), 1), "PNG", {}, (1, 1, 1)),
     "palette": (Image.new("RGB", (1, 1), (255, 51, 0)).quantize(2), "PNG", {}, (1, 0.2, 0)),
     "cmyk": (Image.new("CMYK", (1, 1), (0, 255, 255, 0)), "TIFF", {}, (1, 0, 0)),
-    "cmyk black": (Image.new("CMYK", (1, 1), (0, 0, 0, 255)), "JPEG", {"quality": 100}, (0, 0, 0)),
     "alpha half": (Image.new("RGBA", (1, 1), (255, 0, 0, 51)), "PNG", {}, (1, 0.8, 0.8)),
     "alpha none": (Image.new("RGBA", (1, 1), (0, 0, 0, 0)), "WEBP", {"lossless": True}, (1, 1, 1)),
     "grey alpha": (Image.new("LA", (1, 1), (0, 51)), "PNG", {}, (0.8, 0.8, 0.8)),
-    "grey key": (Image.new("L", (1, 1), 9), "PNG", {"transparency": 9}, (1, 1, 1)),
     "colour key": (Image.new("RGB", (1, 1), (9, 8, 7)), "PNG", {"transparency": (9, 8, 7)}, (1, 1, 1)),
     "palette key": (Image.new("RGB", (1, 1), (255, 0, 0)).quantize(2), "PNG", {"transparency": 0}, (1, 1, 1)),
 }
@@ -178,16 +173,14 @@ UPRIGHT = {
 
 
 @pytest.mark.parametrize("orientation", UPRIGHT)
-@pytest.mark.parametrize("kind", ["png", "png 16-bit", "webp", "tiff", "tiff 16-bit"])
+@pytest.mark.parametrize("kind", ["png", "png 16-bit", "tiff", "tiff 16-bit"])
 def test_the_exif_orientation_is_applied_once(orientation, kind):
     stored = np.array([[1, 2, 3], [4, 5, 6]])
     eight, sixteen = (stored * 20).astype(np.uint8), (stored * 5000).astype(np.uint16)
     chunk_exif = chunk(b"eXIf", exif(orientation).removeprefix(b"Exif\0\0"))
-    rgb = Image.fromarray(eight).convert("RGB")
     data = {
         "png": saved(Image.fromarray(eight), "PNG", exif=exif(orientation)),
         "png 16-bit": png(0, 16, sixteen, chunk_exif),
-        "webp": saved(rgb, "WEBP", lossless=True, exif=exif(orientation)),
         "tiff": tiff(eight[..., None], orientation),
         "tiff 16-bit": tiff(sixteen[..., None], orientation),
     }[kind]
@@ -226,16 +219,10 @@ REFUSED = {
     "empty": (b"", "is empty"),
     "text": (b"hello, this is no picture at all", "not a PNG, JPEG"),
     "gif": (saved(Image.new("L", (2, 2)), "GIF"), "not a PNG, JPEG"),
-    "zero width": (png(2, 8, np.zeros((0, 0, 3)), size=(3, 0)), "no pixels|header is damaged"),
     "float": (saved(Image.new("F", (2, 2)), "TIFF"), "pixel type .*F.*not supported"),
-    "32-bit": (saved(Image.new("I", (2, 2)), "TIFF"), "pixel type .*I.*not supported"),
     "12-bit": (tiff(np.zeros((2, 2, 1), np.uint16), bits=12), "not supported|truncated"),
-    "inverted 16-bit": (tiff(np.zeros((2, 2, 1), np.uint16), photometric=0), "not supported"),
-    "lab": (saved(Image.new("LAB", (2, 2)), "TIFF"), "pixel type LAB is not supported"),
     "bomb": (png(2, 8, np.zeros((1, 1, 3)), size=(6000, 10000)), "10000 x 6000 = 60000000 pixels; at most 20000000"),
-    "bomb that warns": (png(2, 8, np.zeros((1, 1, 3)), size=(10000, 10000)), "10000 x 10000 = 100000000 pixels"),
     "bomb that raises": (png(2, 8, np.zeros((1, 1, 3)), size=(30000, 30000)), "far more pixels; at most"),
-    "bomb beyond PNG": (png(2, 8, np.zeros((1, 1, 3)), size=(2**31 - 1,) * 2), "at most 20000000|header is damaged"),
 }
 
 
@@ -287,33 +274,6 @@ def test_a_webp_bomb_is_refused_before_pillow_opens_it_since_opening_allocates(m
             decode_rgb(data, "x")
 
 
-def test_a_picture_of_the_largest_size_is_read(monkeypatch):
-    monkeypatch.setattr(images, "MAX_PIXELS", 6)
-    assert decode_rgb(saved(Image.new("L", (3, 2)), "PNG"), "x").shape == (2, 3, 3)
-    with pytest.raises(ImageError, match="7 x 1 = 7 pixels; at most 6"):
-        decode_rgb(saved(Image.new("L", (7, 1)), "PNG"), "x")
-
-
-def test_running_out_of_memory_is_an_image_error(monkeypatch):
-    def exhausted(self):
-        raise MemoryError
-
-    monkeypatch.setattr(ImageFile.ImageFile, "load", exhausted)
-    with pytest.raises(ImageError, match="MemoryError"):
-        decode_rgb(sample_files()["png"], "x")
-
-
-def test_a_truncated_jpeg_is_refused_although_opencv_fills_it_with_grey(tmp_path):
-    data = saved(Image.fromarray(noise(40, 48)), "JPEG")
-    path = tmp_path / "half.jpg"
-    path.write_bytes(data[: len(data) // 2])
-    naive = cv2.imread(str(path))
-    assert naive.shape == (40, 48, 3)
-    assert (naive[-1, -8:] == 128).all()
-    with pytest.raises(ImageError, match="truncated"):
-        read_rgb(path)
-
-
 @pytest.mark.parametrize("name", sample_files())
 def test_a_file_truncated_at_any_length_is_refused_or_gives_the_whole_picture(name):
     data = sample_files()[name]
@@ -340,25 +300,12 @@ def with_flips(name, flips):
     return bytes(data)
 
 
-def with_value(name, place, value):
-    data = sample_files()[name]
-    return data[:place] + value + data[place + 2 :]
-
-
-STARTS = [b"", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*", b"RIFF....WEBP"]
 CHUNKS = [b"IHDR", b"PLTE", b"tRNS", b"iCCP", b"zTXt", b"iTXt", b"eXIf", b"gAMA", b"acTL"]
 names, place = st.sampled_from(sorted(sample_files())), st.floats(0, 1, exclude_max=True)
 DAMAGED = {
-    "random bytes": (80, st.builds(bytes.__add__, st.sampled_from(STARTS), st.binary(max_size=200))),
     "flipped bits": (
         250,
         st.builds(with_flips, names, st.lists(st.tuples(place, st.integers(0, 7)), min_size=1, max_size=6)),
-    ),
-    "extreme values in the header": (
-        150,
-        st.builds(
-            with_value, names, st.integers(0, 63), st.sampled_from([b"\0\0", b"\xff\xff", b"\x7f\xff", b"\0\x20"])
-        ),
     ),
     "a chunk of a PNG file": (
         30,
@@ -386,17 +333,3 @@ def test_damaged_files_are_an_image_error_or_a_picture(kind, monkeypatch):
             assert 0 <= rgb.min() <= rgb.max() <= 1
 
     decode_any()
-
-
-def test_threads_that_decode_at_once_agree():
-    data = sample_files()["tiff lzw"]
-    with ThreadPoolExecutor(8) as pool:
-        first, *others = pool.map(lambda _: decode_rgb(data, "x"), range(8))
-    assert all(np.array_equal(first, other) for other in others)
-
-
-def test_to_float_scales_by_the_type_and_refuses_others():
-    np.testing.assert_array_equal(to_float(np.array([0, 255], np.uint8)), [0, 1])
-    np.testing.assert_array_equal(to_float(np.array([0, 65535], np.uint16)), [0, 1])
-    with pytest.raises(BadInput, match="must be uint8 or uint16, got float64"):
-        to_float(np.zeros(2))

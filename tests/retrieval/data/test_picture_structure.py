@@ -18,10 +18,7 @@ HOSTILE = {
     "scans": (lambda: jpeg_of_scans(448, 4_000), "more than 50 JPEG scans"),
     "comments": (lambda: jpeg_of_segments(19 * MB // 4), "more than 256 JPEG segments before its pixels"),
     "fill bytes": (lambda: b"\xff\xd8" + b"\xff" * 19 * MB, "more than 65536 stray bytes"),
-    "escaped bytes": (lambda: b"\xff\xd8\xff\xfe\0\2" + b"\xff\0" * 9 * MB, "more than 65536 stray bytes"),
-    "junk": (lambda: b"\xff\xd8\xff\xfe\0\2" + bytes(19 * MB), "more than 65536 stray bytes"),
     "chunks before": (lambda: png_file(8, 8, png_chunk(b"teXt", b"") * MB), "more than 256 PNG chunks"),
-    "empty pixels": (lambda: png_file(8, 8, png_chunk(b"IDAT", b"") * MB), r"more than \d+ PNG chunks"),
     "chunks after": (
         lambda: png_file(8, 8, samples=PIXELS)[:-12] + png_chunk(b"teXt", b"") * MB,
         r"more than \d+ PNG chunks",
@@ -29,14 +26,13 @@ HOSTILE = {
     "strips": (lambda: tiff_of_numbers(273, 600_000), "600009 numbers in its TIFF tags"),
     "tags": (lambda: b"MM\0*\0\0\0\x08\xff\xff" + bytes(12 * 65535), "65535 TIFF tags"),
     "thin": (lambda: png_of_zeros(1, 200 * MB), "1 x 20000000 pixels; a side may have at most 65535"),
-    "flat": (lambda: png_of_zeros(20_001, 100), "20001 x 100 pixels; a side may have"),
 }
 
 
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_file_that_costs_more_than_its_pixels_is_refused_with_one_line_before_decoding(name, monkeypatch):
     make, message = HOSTILE[name]
-    if name in ("thin", "flat"):  # the sides of their headers
+    if name == "thin":  # the sides in its header
         monkeypatch.setattr(ImageFile.ImageFile, "load", None)
     else:
         monkeypatch.setattr(Image, "open", None)
@@ -53,11 +49,6 @@ def test_a_video_after_a_photo_and_a_thumbnail_before_it_do_not_count_as_scans()
     assert decode(photo.getvalue() + video, "x").shape == (8, 16, 3)
 
 
-@pytest.mark.parametrize("scans", [1, 10, MAX_SCANS])
-def test_a_progressive_jpeg_with_a_usual_number_of_scans_is_read(scans):
-    assert decode(jpeg_of_scans(64, scans), "x").shape == (64, 64, 3)
-
-
 def test_scans_hidden_behind_other_segments_are_counted():
     data = jpeg_of_scans(64, 60)
     scan = data.rindex(b"\xff\xda")
@@ -71,6 +62,7 @@ def test_scans_hidden_behind_other_segments_are_counted():
 
 
 def test_files_just_within_the_bounds_are_read():
+    assert decode(jpeg_of_scans(64, MAX_SCANS), "x").shape == (64, 64, 3)
     assert decode(jpeg_of_segments(MAX_SEGMENTS - 20), "x").shape == (8, 8, 3)
     stray = jpeg_of_segments(1).replace(b"\xff\xfe\0\2", b"\xff\xfe\0\2" + bytes(MAX_STRAY_BYTES), 1)
     assert decode(stray, "x").shape == (8, 8, 3)

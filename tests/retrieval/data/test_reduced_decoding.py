@@ -1,7 +1,6 @@
 """Large JPEG photos are decoded no larger than their views require: sizes, errors, and unchanged cases."""
 
 import io
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +9,6 @@ from PIL import Image
 from retrieval.data import preprocessing
 from retrieval.data.images import decode, decode_rgb
 from retrieval.data.preprocessing import Preprocessing
-from retrieval.data.resize import to_float
-from retrieval.errors import ImageError
 from retrieval.model.config import Config
 from retrieval.search.embeddings import _preprocess
 from tests.retrieval.data.test_images import exif, saved
@@ -44,13 +41,6 @@ def test_a_jpeg_is_decoded_as_small_as_its_shorter_side_may_be(min_side, shape, 
 def test_other_formats_are_not_reduced_and_a_rotated_photo_is_turned_upright():
     assert decode(saved(Image.new("RGB", (400, 300)), "PNG"), "x", 10).shape == (300, 400, 3)
     assert decode(jpeg(1200, 1600, exif=exif(6)), "x", 300).shape == (400, 300, 3)  # a quarter turn
-
-
-def test_a_reduced_pixel_is_nearly_the_mean_of_its_area():
-    data = jpeg(800, 800)
-    whole, half = decode_rgb(data, "x"), to_float(decode(data, "x", 400))
-    means = whole.reshape(400, 2, 400, 2, 3).mean(axis=(1, 3))
-    assert np.abs(half - means).max() < 3 / 255
 
 
 @pytest.mark.parametrize(("views", "side"), [(("whole",), 128), (("zoom",), 256), (("whole", "grey"), 256)])
@@ -107,8 +97,3 @@ def test_files_and_bytes_give_equal_views_and_decoded_pictures_are_not_reduced(t
         np.testing.assert_array_equal(one, settings.photo_from_bytes(data, "x"))
     picture = Image.open(io.BytesIO(data))
     np.testing.assert_array_equal(_preprocess(picture, "x", settings), settings.photo(decode_rgb(data, "x")))
-
-
-def test_a_truncated_photo_is_refused_with_reduced_decoding_too():
-    with pytest.raises(ImageError):
-        Preprocessing(photo_px=32, reduced=True).photo_from_bytes(jpeg(1024, 1024)[:700], Path("x.jpg"))
