@@ -21,27 +21,27 @@ INFO = {"source": "feedback on queries", "sensor": "drawn gel"}
 
 
 @contextmanager
-def service(index, rig=None, recorder=None, trials=None, **settings):
+def service(index, rig=None, recorder=None, **settings):
     """Yield a client of the application, which runs in this process."""
-    app = create_app(ServiceSettings(index=index, **settings), rig, recorder, trials)
+    app = create_app(ServiceSettings(index=index, **settings), rig, recorder)
     with TestClient(app, base_url="http://127.0.0.1:8000", raise_server_exceptions=False) as client:
         yield client
 
 
 @contextmanager
-def with_history(index, folder, trials=None, rig=None, serve=service, info=INFO):
+def with_history(index, folder, rig=None, serve=service, info=INFO):
     """Run `serve` (`service`, `listening` or `browser.address`) with a history in `folder`; yield its result."""
     with (
         RecordingWriter(folder / "recording", info) as writer,
-        serve(index, rig, writer, trials, history=folder) as found,
+        serve(index, rig, writer, history=folder) as found,
     ):
         yield found
 
 
 @contextmanager
-def listening(index, rig=None, recorder=None, trials=None, **settings):
+def listening(index, rig=None, recorder=None, **settings):
     """Serve the application in a thread on a free port; yield its address and its parts."""
-    app = create_app(ServiceSettings(index=index, port=0, **settings), rig, recorder, trials)
+    app = create_app(ServiceSettings(index=index, port=0, **settings), rig, recorder)
     ports = queue.Queue()
     server = Server(uvicorn_config(app), app.state.service, ports.put)
     thread = threading.Thread(target=server.run)

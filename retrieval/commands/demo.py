@@ -59,7 +59,7 @@ def demo(
     say(f"{TOUCHES} grasps of each object: {_accuracy_summary(index, queries)}")
     say(f"open {out / 'query.html'} and {out / 'recording-preview.png'}")
     if serve:
-        _run(serve_index, index=str(index), trials=recording)
+        _run(serve_index, index=str(index))
 
 
 def _run(command: Callable[..., object], *arguments: Path, **options: object) -> None:

@@ -43,10 +43,6 @@ def serve(
         Path | None, typer.Option(help="folder that stores queries and feedback (default: INDEX-history)")
     ] = None,
     no_history: Annotated[bool, typer.Option("--no-history", help="store no queries and no feedback")] = False,
-    trials: Annotated[
-        Path | None,
-        typer.Option(metavar="RECORDING", help="offer people a test with objects that the model was not trained on"),
-    ] = None,
     workers: Annotated[int, typer.Option(parser=WORKERS, help="requests that run in parallel")] = 1,
     deadline: Annotated[
         float, typer.Option(metavar="SECONDS", parser=SECONDS, help="maximum time for one request")
@@ -106,7 +102,7 @@ def serve(
             deployments = Deployments(stack.enter_context(ray_session()), replica_settings)
             stack.callback(deployments.close)
             open_shards = deployments.open
-        app = create_app(settings, load_live_rig(rig, path), writer, trials, open_shards)
+        app = create_app(settings, load_live_rig(rig, path), writer, open_shards)
 
         def on_start(bound_port: int) -> None:
             say(f"listening on http://{f'[{host}]' if ':' in host else host}:{bound_port}")

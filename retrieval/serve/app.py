@@ -11,7 +11,7 @@ from starlette.staticfiles import StaticFiles
 from threadpoolctl import threadpool_limits
 
 from retrieval.search.opening import OpenShards
-from retrieval.serve import catalogue, errors, history, human_baseline, queries, security
+from retrieval.serve import catalogue, errors, history, queries, security
 from retrieval.serve.service import LiveRig, Service
 from retrieval.serve.settings import ServiceSettings
 from retrieval.serve.store import Recorder
@@ -26,7 +26,6 @@ def create_app(
     settings: ServiceSettings,
     rig: LiveRig | None = None,
     recorder: Recorder | None = None,
-    trials: Path | None = None,
     shards: OpenShards | None = None,
 ) -> FastAPI:
     """Create the service, and open the index of `settings`.
@@ -35,7 +34,6 @@ def create_app(
         settings: Options of the operator.
         rig: Sensors and gripper for the live routes; None without live routes.
         recorder: Writes feedback into the recording in the history folder; None without a history.
-        trials: Recording with unseen objects for the trials of the human baseline; None without trials.
         shards: Opens the shards of a sharded index; None to open them in this process.
 
     Raises:
@@ -51,9 +49,9 @@ def create_app(
         lifespan=_lifespan,
         responses=errors.PROBLEM_RESPONSES,
     )
-    app.state.service = Service(settings, rig, recorder, trials, shards)
+    app.state.service = Service(settings, rig, recorder, shards)
     errors.install_handlers(app)
-    for module in (queries, catalogue, history, human_baseline, security):
+    for module in (queries, catalogue, history, security):
         app.include_router(module.router)
     app.mount("/", StaticFiles(directory=Path(__file__).parent / "page", html=True))
     app.add_middleware(BodyLimit, seconds=settings.body_s)

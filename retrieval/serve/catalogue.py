@@ -102,7 +102,7 @@ def index(parts: Parts) -> dict[str, Any]:
     """Return a description of the index, its model and the service.
 
     sensors: names of live sensors; can_grasp, can_verify: whether POST /v1/grasp and POST /v1/verify work;
-    stores_history: whether queries and feedback are stored; trials: number of unseen objects for the human baseline.
+    stores_history: whether queries and feedback are stored.
     """
     generation = parts.generations.current
     searcher, info = generation.searcher, generation.searcher.manifest
@@ -119,6 +119,5 @@ def index(parts: Parts) -> dict[str, Any]:
         "can_grasp": parts.rig.grasp is not None,
         "can_verify": searcher.can_verify,
         "stores_history": parts.history_writer is not None,
-        "trials": len(parts.trials.unseen(generation)) if parts.trials else 0,
         "version": __version__,
     }

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from threading import Event
 from typing import Annotated
 
@@ -14,7 +13,6 @@ from retrieval.serve.generations import Generations
 from retrieval.serve.queue import Queue
 from retrieval.serve.settings import ServiceSettings
 from retrieval.serve.store import HistoryWriter, Recorder
-from retrieval.serve.trials import Trials
 
 MAX_RIG_GRASPS = 4
 """Maximum number of pending rig grasps, including the one in progress."""
@@ -61,7 +59,6 @@ class Service:
         settings: ServiceSettings,
         rig: LiveRig | None,
         recorder: Recorder | None,
-        trials: Path | None,
         shards: OpenShards | None,
     ) -> None:
         self.settings, self.rig = settings, rig or LiveRig()
@@ -74,7 +71,6 @@ class Service:
         self.history_writer = None
         if settings.history and recorder:
             self.history_writer = HistoryWriter(settings.history, recorder)
-        self.trials = Trials(trials) if trials else None
         self.stopping = Event()
 
     def _queue(self, settings: ServiceSettings) -> Queue:

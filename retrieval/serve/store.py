@@ -1,9 +1,9 @@
 """History of the service: a SQLite database, and a recording of the feedback.
 
-The database is authoritative: queries with their gel images and answers, feedback, trials. It uses a write-ahead log.
-Feedback and trials are on the disk when the method returns; the newest queries may be lost in a power failure. One
-connection serves one thread at a time. The recording, which `retrieve train` and `retrieve check` read, is updated
-after each feedback and at the start. This layer does not import `robot`: the command passes the recording's writer.
+The database is authoritative: queries with their gel images and answers, and feedback. It uses a write-ahead log.
+Feedback is on the disk when the method returns; the newest queries may be lost in a power failure. One connection
+serves one thread at a time. The recording, which `retrieve train` and `retrieve check` read, is updated after each
+feedback and at the start. This layer does not import `robot`: the command passes the recording's writer.
 """
 
 import asyncio
@@ -14,7 +14,7 @@ import sqlite3
 import time
 from collections.abc import Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from string import ascii_lowercase
 from threading import Lock
@@ -48,10 +48,6 @@ CREATE TABLE IF NOT EXISTS feedback (
     query TEXT PRIMARY KEY REFERENCES queries, time REAL NOT NULL, feedback TEXT NOT NULL, object_id TEXT,
     photo BLOB
 ) STRICT;
-CREATE TABLE IF NOT EXISTS trials (
-    recording TEXT NOT NULL, participant TEXT NOT NULL, number INTEGER NOT NULL, choice INTEGER NOT NULL,
-    truth INTEGER NOT NULL, model INTEGER NOT NULL, time REAL NOT NULL, PRIMARY KEY (recording, participant, number)
-) STRICT;
 PRAGMA user_version = {_VERSION};
 COMMIT;
 """
@@ -72,17 +68,6 @@ class StoredQuery:
     answer: dict[str, Any]
     feedback: str | None
     object_id: str | None
-
-
-@dataclass(frozen=True)
-class TrialChoice:
-    """Result of a person's trial, as photo numbers from 1: the person's choice, the right photo, the model's choice."""
-
-    participant: str
-    number: int
-    choice: int
-    truth: int
-    model: int
 
 
 class HistoryStore:
@@ -219,19 +204,6 @@ class HistoryStore:
         text = "SELECT object_id, photo, answer FROM feedback JOIN queries ON id = query WHERE query = ?"
         ((object_id, photo, answer),) = self._read(text, [name])
         return object_id, photo, json.loads(answer)["query"]["grasps"]
-
-    # Trials -------------------------------------------------------------------------------------------------
-
-    def add_choice(self, recording: str, one: TrialChoice) -> bool:
-        """Store the result of a trial; return False if the person has done this trial already."""
-        row = (recording, *astuple(one), time.time())
-        with self._transaction() as database:
-            return database.execute("INSERT OR IGNORE INTO trials VALUES (?, ?, ?, ?, ?, ?, ?)", row).rowcount == 1
-
-    def choices(self, recording: str) -> list[TrialChoice]:
-        """Return the results of all trials with a recording, in their order."""
-        text = "SELECT participant, number, choice, truth, model FROM trials WHERE recording = ? ORDER BY time"
-        return [TrialChoice(*row) for row in self._read(text, [recording])]
 
 
 _COLUMNS = "id, queries.time, verdict, answer, feedback, object_id"

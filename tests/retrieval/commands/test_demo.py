@@ -50,7 +50,7 @@ def test_a_second_demo_collects_and_embeds_nothing_and_keeps_the_users_defaults(
 
 
 def test_a_demo_with_serve_serves_its_index(finished_demo, capsys, monkeypatch):
-    """Its rig can grasp the objects of the index, and the trials use the same objects."""
+    """Its rig can grasp the objects of the index."""
     served = []
 
     def serve(app, started):
@@ -60,7 +60,6 @@ def test_a_demo_with_serve_serves_its_index(finished_demo, capsys, monkeypatch):
     monkeypatch.setattr("retrieval.serve.server.serve", serve)
     assert main(["demo", "--objects", "4", "--out", str(finished_demo), "--serve"]) == 0
     assert served[0].settings.index == finished_demo / "index"
-    assert served[0].trials.folder == finished_demo / "recording"
     names = sorted(path.name for path in (finished_demo / "catalog").iterdir())
     grasp = served[0].rig.grasp(names)
     assert grasp.object_id in names
@@ -68,7 +67,7 @@ def test_a_demo_with_serve_serves_its_index(finished_demo, capsys, monkeypatch):
     assert served[0].rig.sensors["a"]()[:2] == b"\xff\xd8"
     output = capsys.readouterr().err
     assert "listening on http://127.0.0.1:1234" in output
-    assert f"$ retrieve serve --index {finished_demo / 'index'} --trials {finished_demo / 'recording'}\n" in output
+    assert f"$ retrieve serve --index {finished_demo / 'index'}\n" in output
 
 
 def test_wrong_use_of_a_command_ends_the_demo_with_its_exit_code(tmp_path, capsys):

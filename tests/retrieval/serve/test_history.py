@@ -1,7 +1,6 @@
-"""The history: stored queries, feedback as a recording for training, and trials of the human baseline."""
+"""The history: stored queries and feedback as a recording for training."""
 
 import base64
-import shutil
 import sqlite3
 
 import pytest
@@ -11,7 +10,6 @@ from retrieval.data.dataset import load_grasps
 from retrieval.errors import BadInput
 from retrieval.serve.store import HistoryStore
 from robot.recording.folder import RecordingWriter
-from tests import synthetic
 from tests.serving import INFO, problem, service, with_history
 
 
@@ -149,59 +147,5 @@ def test_service_without_history_reports_it(index, touches):
     with service(index) as client:
         encoded = [[base64.b64encode(image).decode() for image in next(iter(touches.values()))[0]]]
         assert "x-query-id" not in client.post("/v1/query", json={"touches": encoded}).headers
-        for path in ("/v1/history", "/v1/history/x", "/v1/trials"):
+        for path in ("/v1/history", "/v1/history/x"):
             problem(client.get(path), 404, "unknown")
-
-
-# The human baseline ---------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def client_with_trials(index, folder, tmp_path):
-    """A service with a recording of twelve unseen objects."""
-    unseen = synthetic.write_recording(tmp_path / "unseen", synthetic.make_objects(12, seed=500), 2)
-    with with_history(index, folder, unseen) as client:
-        yield client
-
-
-def test_a_trial_shows_one_photo_of_the_object_and_nine_of_others(client_with_trials):
-    parts = client_with_trials.app.state.service
-    trials = [parts.trials.trial(parts.generations.current, number) for number in range(1, 25)]
-    for trial in trials:
-        owners = [path.name.rsplit("-", 1)[0] for path in trial.photos]
-        assert len(set(owners)) == 10
-        assert owners[trial.truth - 1] == trial.grasp.object_id
-        assert trial.photos[trial.truth - 1] != trial.grasp.photo  # of another grasp
-    assert len({trial.grasp.object_id for trial in trials[:12]}) == 12
-    assert trials == [parts.trials.trial(parts.generations.current, number) for number in range(1, 25)]
-
-
-def test_choices_of_people_and_of_the_model_are_counted(client_with_trials):
-    known = client_with_trials.get("/v1/trials").json()
-    assert (known["objects"], known["chance"], known["participants"]) == (12, 0.1, [])
-    right = model = 0
-    for number in (1, 2, 3):
-        trial = client_with_trials.get(f"/v1/trials/{number}").json()
-        assert (len(trial["touches"]), len(trial["photos"])) == (2, 10)
-        for path in (*trial["touches"], *trial["photos"]):
-            assert client_with_trials.get(path).headers["content-type"].startswith("image/")
-        done = client_with_trials.post(f"/v1/trials/{number}/Ada", json={"choice": 4}).json()
-        right, model = right + (done["truth"] == 4), model + (done["model"] == done["truth"])
-    problem(client_with_trials.post("/v1/trials/1/Ada", json={"choice": 1}), 409, "conflict")
-    assert client_with_trials.post("/v1/trials/1/Bob%2FB", json={"choice": 1}).status_code == 200
-    problem(client_with_trials.get("/v1/trials/1/touches/c"), 404, "unknown")
-    ada, bob = client_with_trials.get("/v1/trials").json()["participants"]
-    assert (ada["participant"], ada["next"], bob["participant"], bob["next"]) == ("Ada", 4, "Bob/B", 2)
-    assert (ada["human_baseline"]["right"], ada["model"]["right"]) == (right, model)
-    assert ada["human_baseline"]["trials"] == ada["model"]["trials"] == 3
-    human = ada["human_baseline"]
-    assert 0 <= human["low"] <= human["accuracy"] <= human["high"] <= 1
-
-
-def test_too_few_unseen_objects_are_reported(index, folder, recording, tmp_path):
-    """The model was trained on most objects of that recording."""
-    shutil.copytree(recording, tmp_path / "recording")
-    with with_history(index, folder, tmp_path / "recording") as client:
-        assert "requires 10 objects that the model was not trained on" in problem(
-            client.get("/v1/trials/1"), 422, "bad-input"
-        )

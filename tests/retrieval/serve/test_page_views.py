@@ -1,4 +1,4 @@
-"""The page in a real browser: feedback, the history, the catalogue, the human baseline."""
+"""The page in a real browser: feedback, the history, the catalogue."""
 
 import json
 from urllib.parse import parse_qs, urlsplit
@@ -15,10 +15,7 @@ MANY = 100_000
 
 @pytest.fixture(scope="module")
 def url(index, tmp_path_factory):
-    """A service with a history, and a recording of twelve unseen objects."""
-    folder = tmp_path_factory.mktemp("history")
-    unseen = synthetic.write_recording(folder / "unseen", synthetic.make_objects(12, seed=500), 2)
-    with with_history(index, folder, unseen, serve=address) as found:
+    with with_history(index, tmp_path_factory.mktemp("history"), serve=address) as found:
         yield found
 
 
@@ -117,32 +114,13 @@ def test_of_100_000_photos_only_those_on_the_screen_are_requested_and_keys_move_
         opened.locator(f".grid li[aria-posinset='{place + 1}'] button:focus", has_text=f"object {place}").wait_for()
 
 
-def test_trials_work_by_mouse_and_key_and_show_both_results(opened):
-    open_view(opened, "Test")
-    opened.get_by_role("button", name="Begin").wait_for()
-    assert opened.locator("main").get_by_text("false", exact=True).count() == 0
-    opened.get_by_label("Your name").fill("Ada / B")
-    opened.get_by_role("button", name="Begin").click()
-    photos = opened.get_by_role("list", name="Photos to choose from").get_by_role("button")
-    photos.nth(9).wait_for()
-    assert (photos.count(), opened.get_by_alt_text("Gel image of finger").count()) == (10, 2)
-    photos.nth(3).click()
-    opened.get_by_role("button", name="Next").click()
-    opened.get_by_text("Trial 2.").wait_for()
-    opened.keyboard.press("0")
-    opened.get_by_role("button", name="Next").wait_for()
-    assert all(" of 2, " in text and "[" in text for text in opened.locator(".score .p").all_inner_texts())
-    opened.get_by_role("link", name="All results").click()
-    opened.locator(".series").get_by_text("Ada / B").first.wait_for()
-
-
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
 def test_axe_finds_nothing_serious_in_any_view_and_none_is_wider_than_the_screen(browser, url, files, width, scheme):
     with page(browser, url, width, color_scheme=scheme) as opened:
         ask(opened, files)
         opened.get_by_role("button", name="It was another object").click()
         opened.locator(".names button").first.wait_for()
-        for name, shown in (("", ""), ("Catalogue", ".grid li"), ("History", ".query"), ("Test", ".begin")):
+        for name, shown in (("", ""), ("Catalogue", ".grid li"), ("History", ".query")):
             if name:
                 open_view(opened, name)
                 opened.locator(shown).first.wait_for()

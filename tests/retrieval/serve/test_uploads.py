@@ -93,7 +93,7 @@ def test_only_bodies_with_pictures_may_be_large(client):
     }
     assert with_pictures == PICTURE_PATHS
     posted = {path for path, operations in paths.items() if "post" in operations} - PICTURE_PATHS
-    assert posted == {"/v1/session", "/v1/feedback", "/v1/trials/{number}/{participant}", "/v1/grasp"}
+    assert posted == {"/v1/session", "/v1/feedback", "/v1/grasp"}
     for path in posted - {"/v1/grasp"}:
         large = client.post(path.format(participant="x", number=1), content=b"[" * 16_385, headers=JSON)
         assert "at most 16,384 bytes" in problem(large, 413, "too-large")

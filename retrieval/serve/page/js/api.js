@@ -115,8 +115,3 @@ export const noContactFrames = (id, letters) =>
   );
 export const feedback = (query, value, objectId = null) =>
   json("/v1/feedback", jsonPost({ query, feedback: value, ...(objectId && { object_id: objectId }) }));
-
-export const trials = () => json("/v1/trials");
-export const trial = (number) => json(`/v1/trials/${number}`);
-export const choose = (number, participant, choice) =>
-  json(`/v1/trials/${number}/${encodeURIComponent(participant)}`, jsonPost({ choice }));

@@ -6,7 +6,6 @@ import { count } from "./wording.js";
 import { askView } from "./ask.js";
 import { catalogueView } from "./catalogue.js";
 import { historyView } from "./history.js";
-import { trialsView } from "./trials.js";
 
 const main = document.getElementById("main");
 const nav = document.getElementById("nav");
@@ -105,7 +104,6 @@ async function start() {
   addView("", "Ask", askView(index));
   addView("catalogue", "Catalogue", catalogueView(index));
   if (index.stores_history) addView("history", "History", historyView());
-  if (index.stores_history && index.trials) addView("test", "Test", trialsView());
   nav.hidden = views.size < 2;
   foot(index);
   addEventListener("hashchange", route);
