@@ -23,6 +23,12 @@ import torch
 
 OUT = Path(sys.argv[1]).absolute()
 os.environ.update(HF_LEROBOT_HOME=str(OUT / "home"), HF_HUB_OFFLINE="1", HF_DATASETS_CACHE=str(OUT / "cache"))
+try:
+    import torchvision  # noqa: F401
+except RuntimeError:  # torchvision for CUDA with torch for the CPU lacks two operators that LeRobot does not use
+    _OPERATORS = torch.library.Library("torchvision", "DEF")
+    for _name in ("nms", "qnms"):
+        _OPERATORS.define(f"{_name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
 
 import lerobot_camera_gelsight  # noqa: E402, F401
 from lerobot.cameras import CameraConfig, make_cameras_from_configs  # noqa: E402
@@ -222,7 +228,8 @@ def check_exported(recording_folder):
     stored = [cv2.imread(str(recording_folder / grasp.touches["a"]))[..., ::-1] for grasp in recording.grasps]
     worst = max(rms(one, other) for one, other in zip(touched, stored, strict=True))
     print(f"export lerobot: {dataset.num_episodes} episodes, {len(dataset)} frames; largest RMS of touch_a {worst:.3g}")
-    print(f"export lerobot: task {dataset[0]['task']!r}")
+    loader = torch.utils.data.DataLoader(dataset, batch_size=4)  # as in LeRobot's training
+    print(f"export lerobot: task {dataset[0]['task']!r}; one batch {next(iter(loader))['index'].shape}")
 
 
 def main():

@@ -2,12 +2,14 @@
 
 import sys
 import tomllib
+from functools import partial
 from importlib import import_module
 
 import cv2
 import numpy as np
 import pytest
 
+from robot.drivers import discover
 from robot.errors import RobotConfigError, UnknownName
 from robot.real_rig import DRIVERS
 from tests.documents import ROOT
@@ -151,3 +153,12 @@ def test_wrong_settings_are_refused_without_the_device(make):
         make(FakeVideoDevice(), sensor="tests.replay_rig:FolderSensor")
     with pytest.raises(RobotConfigError, match=r"usb-Fake.* has no setting 'exposur'; known settings: .*exposure"):
         make(FakeVideoDevice(), sensor="uvc", settings={"exposur": 1})
+
+
+def test_connected_cameras_are_listed(plugin, tmp_path, monkeypatch):
+    names = tmp_path / "v4l" / "by-id"
+    names.mkdir(parents=True)
+    (names / "usb-Gel_7-video-index0").touch()
+    monkeypatch.setattr(discover, "find_cameras", partial(discover.find_cameras, tmp_path, tmp_path))
+    (found,) = plugin.GelSightCamera.find_cameras()
+    assert (found["type"], found["id"]) == ("gelsight", str(names / "usb-Gel_7-video-index0"))
