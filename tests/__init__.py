@@ -9,7 +9,7 @@
     miniatures, real_data_sets, data            small public data sets, and the folder of real ones
     emulators                                   a WSG-50 and a Sawyer as programs, based on the facts of the drivers
     emulated_rig                                the real drivers with emulated devices and injected faults
-    fake_rig, own_rig, replay_rig, views, meshes    rigs, depth pictures and solids from formulas and from files
+    fake_rig, replay_rig, views, meshes         rigs, depth pictures and solids from formulas and from files
     fake_video, wsg50_bench                     fake cameras, and the gripper's driver with its emulator
     oracle, documents, pages                    expected search results; parsers of documents and pages
     verification                                a calibration of verifications with given bounds

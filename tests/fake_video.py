@@ -102,9 +102,9 @@ class FakeRealSense:
 
     def __init__(self, serials=("123",), distortion=(0.0,) * 5):
         self.serials, self.distortion = serials, distortion
-        self.waiting, self.pictures, self.aligned = 0, 0, 0
+        self.waiting = 0
         self.started, self.stopped, self.streams = [], 0, []
-        self.silent = self.no_depth = False
+        self.silent = False
         self.raw = np.array([[0, 1000, 1000, 2000]] * 3, np.uint16)
         self.camera_info = SimpleNamespace(serial_number="serial", name="name")
         self.stream = SimpleNamespace(depth="depth", color="colour")
@@ -127,7 +127,7 @@ class FakeRealSense:
 
     def align(self, stream):
         assert stream == "colour"
-        return SimpleNamespace(process=self._align)
+        return SimpleNamespace(process=lambda frames: frames)
 
     def rs2_project_point_to_pixel(self, lens, point):
         x, y, z = point
@@ -153,21 +153,12 @@ class FakeRealSense:
     def _wait(self, timeout_ms):
         if self.silent:
             raise RuntimeError(f"Frame didn't arrive within {timeout_ms}")
-        self.pictures += 1
         colour = np.zeros((3, 4, 3), np.uint8)
         colour[..., 0] = 10 * np.arange(4)  # red grows to the right
         colour[..., 2] = self.waiting  # blue: its age
         colour[..., 1] = 1
-        return self._frames(colour)
-
-    def _frames(self, colour):
-        frame = SimpleNamespace(get_data=lambda: colour)
-        depth = None if self.no_depth else SimpleNamespace(get_data=lambda: self.raw)
+        frame, depth = SimpleNamespace(get_data=lambda: colour), SimpleNamespace(get_data=lambda: self.raw)
         return SimpleNamespace(get_color_frame=lambda: frame, get_depth_frame=lambda: depth)
-
-    def _align(self, frames):
-        self.aligned += 1
-        return frames
 
 
 def own_threads():

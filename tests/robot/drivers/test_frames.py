@@ -89,13 +89,6 @@ def test_the_newest_frame_is_returned_and_the_newest_few_are_buffered(script, ma
     assert [reader.near(time_s).time_s for time_s in (0.0, 3.2, 4.4, 4.6, 99.0)] == [3.0, 3.0, 4.0, 5.0, 6.0]
 
 
-def test_a_camera_that_cannot_be_opened_leaves_no_thread(script, make):
-    script.unopenable = 1
-    with pytest.raises(OSError, match="busy"):
-        make().start()
-    assert not own_threads()
-
-
 @pytest.mark.parametrize("error", [DeviceError("it ended"), OSError(19, "No such device"), KeyError()])
 def test_a_lost_stream_is_closed_opened_again_and_counted_and_its_old_frames_are_dropped(script, make, error):
     script.show(1.0)
@@ -166,19 +159,6 @@ def test_a_lost_stream_warms_up_again(script, make):
     reader.recover()
     assert reader.newest().time_s == 32.0
     later.join()
-
-
-def test_closing_ends_the_thread_and_closes_the_camera_also_twice_and_before_starting(script, make):
-    make().close()
-    script.show(1.0)
-    reader = make()
-    reader.start()
-    assert len(own_threads()) == 1
-    threading.Timer(0.02, script.show, args=(2.0,)).start()
-    reader.close()
-    reader.close()
-    assert not own_threads()
-    assert script.closed == script.opened == 1
 
 
 def test_closing_raises_if_the_driver_blocks_and_the_camera_is_closed_later(script, make, monkeypatch):

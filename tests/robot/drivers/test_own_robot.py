@@ -3,14 +3,11 @@
 import numpy as np
 import pytest
 
-from robot.collection import CollectSettings, collect
 from robot.drivers.own_robot import OwnArm, OwnGripper
 from robot.errors import DeviceError, UnknownName
 from robot.readings import Pose, Region
 from robot.real_rig import load_driver
 from tests import plugins
-from tests.fake_rig import FakeRig
-from tests.own_rig import own_rig
 
 WORKSPACE = Region((-100.0, -100.0, 10.0), (100.0, 100.0, 300.0))
 GOAL = Pose(10.0, 20.0, 30.0, 0.5)
@@ -63,22 +60,9 @@ def python_arm(**settings):
     return OwnArm(workspace=WORKSPACE, robot=f"{HERE}Program", settings=settings, max_speed_mm_s=200.0)
 
 
-WORKING = {"robot": f"{HERE}Program"}
-
-
-def test_an_arm_moves_as_requested_and_connecting_moves_nothing():
-    with OwnArm(workspace=WORKSPACE, **WORKING) as arm:
-        assert Program.last.calls == []
-        assert arm.pose() == Pose(0.0, 0.0, 100.0, 0.0)
-        assert arm.move_to(GOAL, 50.0) == GOAL
-        assert Program.last.calls == [("move_to", 50.0)]
-        arm.stop()
-        assert Program.last.calls[-1] == "stop"
-
-
 def test_a_gripper_opens_at_the_speed_limit_and_grasps_with_the_requested_force():
-    with OwnGripper(stroke_mm=80.0, min_force_n=5.0, max_force_n=20.0, max_speed_mm_s=60.0, **WORKING) as gripper:
-        assert Program.last.calls == []
+    limits = {"stroke_mm": 80.0, "min_force_n": 5.0, "max_force_n": 20.0, "max_speed_mm_s": 60.0}
+    with OwnGripper(robot=f"{HERE}Program", **limits) as gripper:
         assert gripper.open(70.0).opening_mm == 70.0
         state = gripper.grasp(15.0, 40.0)
         assert (state.status, state.force_n) == ("holding", 15.0)
@@ -128,11 +112,3 @@ def test_a_rig_file_builds_it_and_a_package_adds_a_robot_by_an_entry_point(tmp_p
     with load_driver("arm", table, "[arm]", workspace=WORKSPACE, max_speed_mm_s=100.0, max_state_age_s=0.5) as arm:
         assert arm.max_speed_mm_s == 100.0
         assert Program.last.lag_mm == 1.0
-
-
-def test_a_collection_with_a_users_robot_records_what_the_rigs_own_arm_records(tmp_path):
-    settings = CollectSettings(grasps=2)
-    for name, make in (("own", own_rig), ("fake", FakeRig)):
-        collect(lambda make=make: make(5), tmp_path / name, objects=["round-1", "round-2"], seed=5, settings=settings)
-    own, fake = (tmp_path / name / "metadata.jsonl" for name in ("own", "fake"))
-    assert own.read_text() == fake.read_text()

@@ -4,14 +4,12 @@ import contextlib
 import json
 import math
 import threading
-import time
 
 import pytest
 
 from robot.drivers.sawyer.codec import encode
 from robot.drivers.sawyer.driver import RosbridgeLink
 from robot.errors import DeviceError
-from tests.waiting import wait_until
 
 
 @contextlib.contextmanager
@@ -47,6 +45,7 @@ def linked(answer, timeout_s=5.0):
     with scripted(answer) as (url, _), contextlib.closing(RosbridgeLink(url, timeout_s=timeout_s)) as link:
         link.open()
         yield link
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("rosbridge ")]
 
 
 def reply_to(operation, **changes):
@@ -59,24 +58,13 @@ def test_values_that_json_cannot_express_are_not_sent(value):
         encode({"op": "publish", "msg": value})
 
 
-def test_a_call_accepts_only_the_answer_with_its_id():
-    """A late answer to another call and noise arrive first."""
-
-    def answer(operation):
-        wrong = reply_to(operation, id="other", values={"x": 2})
-        strange = [reply_to(operation, id=["other"]), {"op": "publish", "topic": {}, "msg": {}}]
-        return [wrong, *strange, "noise", b"\xff", "[]", '{"op": "dance"}', reply_to(operation)]
-
-    with linked(answer) as link:
-        assert link.call("/s", {"a": 1}) == {"x": 1}
-
-
-def test_a_late_answer_is_never_that_of_the_next_call():
+def test_noise_or_a_late_answer_is_never_that_of_the_next_call():
     calls = []
 
     def answer(operation):
         calls.append(operation)
-        return [] if len(calls) == 1 else [reply_to(calls[0], values={"x": "old"}), reply_to(operation)]
+        noise = [reply_to(operation, id=["other"]), "noise", b"\xff", "[]", '{"op": "dance"}']
+        return [] if len(calls) == 1 else [reply_to(calls[0], values={"x": "old"}), *noise, reply_to(operation)]
 
     with linked(answer) as link:
         link.timeout_s = 0.05
@@ -90,8 +78,6 @@ def test_a_late_answer_is_never_that_of_the_next_call():
     ("changes", "message"),
     [
         ({"result": False, "values": "no such thing"}, "/s failed: no such thing"),
-        ({"result": "yes"}, "/s failed"),
-        ({"values": None}, "/s failed: None"),
         ({"values": [1]}, r"/s failed: \[1\]"),
     ],
 )
@@ -110,24 +96,6 @@ def test_a_status_error_that_names_a_call_fails_it_and_others_are_logged(caplog)
     with linked(answer) as link, pytest.raises(DeviceError, match="/s failed: type unknown"):
         link.call("/s", {})
     assert "slow" in caplog.text
-
-
-def test_messages_of_a_topic_are_buffered_with_their_times():
-    def answer(operation):
-        publish = {"op": "publish", "topic": operation["topic"]}
-        return [*({**publish, "msg": {"data": n}} for n in range(3)), {**publish, "msg": 7}, {**publish, "topic": "/x"}]
-
-    with linked(answer) as link:
-        before = time.monotonic()
-        link.subscribe("/t", "std_msgs/Int32")
-        wait_until(lambda: len(link.history("/t")) == 3)
-        history = link.history("/t")
-        assert [arrival.message["data"] for arrival in history] == [0, 1, 2]
-        assert before <= history[0].time_s <= history[-1].time_s <= time.monotonic()
-        assert link.wait_for("/t", since_s=before) == history[-1]
-        link.timeout_s = 0.02
-        with pytest.raises(DeviceError, match=r"no message on /t within 0\.02 s"):
-            link.wait_for("/t", since_s=time.monotonic())
 
 
 def test_an_error_message_is_truncated_and_escaped(caplog):
@@ -151,20 +119,6 @@ def test_a_connection_that_breaks_ends_every_wait_at_once():
         for use, *arguments in uses:
             with pytest.raises(DeviceError, match="is closed"):
                 use(*arguments)
-
-
-def test_a_link_can_be_closed_twice_and_unopened_and_leaves_no_thread():
-    RosbridgeLink("ws://127.0.0.1:1").close()
-    with scripted(lambda _: []) as (url, _):
-        for _ in range(2):  # several in one process
-            link = RosbridgeLink(url)
-            link.open()
-            link.check()
-            link.close()
-            link.close()
-            assert not [thread for thread in threading.enumerate() if thread.name.startswith("rosbridge ")]
-            with pytest.raises(DeviceError, match="is closed"):
-                link.check()
 
 
 def test_nothing_published_on_a_lost_connection_is_sent_later():

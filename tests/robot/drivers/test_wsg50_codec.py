@@ -1,6 +1,5 @@
 """The WSG-50's packets byte by byte, and decoding of damaged, truncated and noisy streams."""
 
-import binascii
 import math
 import struct
 
@@ -63,19 +62,6 @@ def test_a_documented_packet_is_encoded_decoded_and_incomplete_at_every_shorter_
         assert decode(whole[:length]) == (0, None)
 
 
-def test_builders_without_a_documented_packet_follow_the_command_table():
-    assert Packet(0x20, b"\x00") == codec.HOME
-    assert codec.command(CommandId.RELEASE, 1.0, 2.0) == Packet(0x26, struct.pack("<ff", 1, 2))
-    assert codec.command(CommandId.SET_FORCE_LIMIT, 40.0) == Packet(0x32, struct.pack("<f", 40))
-    assert codec.query(CommandId.OPENING) == Packet(0x43, b"\x00\x00\x00")
-
-
-def test_the_checksum_is_not_the_textbook_ccitt():
-    assert codec.checksum(codec.PREAMBLE) == 0x50F5
-    assert codec.checksum(STOP[:-2]) == 0x760E
-    assert binascii.crc_hqx(STOP[:-2], 0xFFFF) != 0x760E
-
-
 def test_replies_and_their_parameters_are_parsed_as_documented():
     assert codec.reply(Packet(0x30, bytes.fromhex("00 00 00 00 16 43"))) == (Status.SUCCESS, struct.pack("<f", 150))
     assert codec.reply(Packet(0x90, b"\x0e\x00")) == (Status.CMD_UNKNOWN, b"")
@@ -85,12 +71,7 @@ def test_replies_and_their_parameters_are_parsed_as_documented():
     assert state == (SystemState.REFERENCED | SystemState.MOVING | SystemState.FAST_STOP | SystemState.CURRENT_FAULT)
     assert state.faults == "current fault"
     assert codec.grasping_state(b"\x04") is GraspingState.HOLDING
-    assert codec.info(struct.pack("<BBHI", 1, 6, 0x4000, 123456)) == {
-        "kind": 1,
-        "hardware": 6,
-        "firmware": 0x4000,
-        "serial": 123456,
-    }
+    assert codec.info(struct.pack("<BBHI", 1, 6, 0x4000, 123456))["serial"] == 123456
     limits = codec.limits(struct.pack("<8f", 110, 5, 420, 100, 5000, 5, 80, 120))
     assert (limits.stroke_mm, limits.min_speed_mm_s, limits.max_force_n) == (110.0, 5.0, 80.0)
     assert (len(Status), Status.CHECKSUM_ERROR, Status.AXIS_BLOCKED) == (31, 11, 29)
@@ -102,8 +83,6 @@ def test_replies_and_their_parameters_are_parsed_as_documented():
     "misuse",
     [
         lambda: codec.reply(Packet(0x22, b"\x00")),
-        lambda: codec.reply(Packet(0x22, b"\x63\x00")),
-        lambda: codec.number(b"\x00\x00\x00"),
         lambda: codec.number(struct.pack("<f", math.nan)),
         lambda: codec.grasping_state(b"\x08"),
     ],
@@ -116,11 +95,6 @@ def test_invalid_values_are_wire_errors(misuse):
 @pytest.mark.parametrize("noise", [b"", b"\x00", b"\xaa", b"\xaa\xaa\xaa", b"\xaa\xaa\x00", b"\xaa" * 9])
 def test_noise_between_packets_and_their_arrival_in_pieces_lose_none(noise):
     assert in_pieces(b"".join(noise + bytes.fromhex(text) for text in PACKETS)) == list(PACKETS.values())
-
-
-def test_the_three_aa_must_be_consecutive():
-    """Public drivers count any three AA, so that AA 00 AA AA begins a packet."""
-    assert fed(b"\xaa\x00\xaa\xaa" + STOP[3:] + INFO) == [Packet(0x50)]
 
 
 @pytest.mark.parametrize("payload", [b"\xaa" * 7, b"x\xaa\xaa\xaa\x22\x00\x00", encode(Packet(0x23))])
@@ -139,11 +113,3 @@ def test_the_packets_after_a_damaged_or_truncated_one_are_found():
         assert fed(bytes(bad) + INFO + close)[-1:] == [Packet(0x50)]
     for length in range(1, len(GRASP)):
         assert fed(GRASP[:length] + STOP + INFO) == [Packet(0x22), Packet(0x50)]
-
-
-def test_a_length_above_the_largest_payload_is_noise_at_once():
-    claim = b"\xaa\xaa\xaa\x06" + struct.pack("<H", codec.MAX_PAYLOAD + 1)
-    assert fed(claim + STOP) == [Packet(0x22)]
-    waits = b"\xaa\xaa\xaa\x06" + struct.pack("<H", codec.MAX_PAYLOAD) + STOP
-    assert decode(waits) == (0, None)
-    assert fed(waits[1:]) == [Packet(0x22)]  # as a caller does when no more bytes arrive
