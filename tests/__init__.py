@@ -10,7 +10,7 @@
     emulators                                   a WSG-50 and a Sawyer as programs, based on the facts of the drivers
     emulated_rig                                the real drivers with emulated devices and injected faults
     fake_rig, replay_rig, views, meshes         rigs, depth pictures and solids from formulas and from files
-    fake_video, wsg50_bench                     fake cameras, and the gripper's driver with its emulator
+    fake_video                                  fake cameras
     oracle, documents, pages                    expected search results; parsers of documents and pages
     verification                                a calibration of verifications with given bounds
     hard_case                                   one stiff or extreme input

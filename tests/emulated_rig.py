@@ -21,12 +21,11 @@ from robot.readings import RGBD, Pose
 from robot.rig import Rig
 from tests import views
 from tests.emulators.wsg50.faults import LineFaults
-from tests.emulators.wsg50.gripper import EmulatedWSG50
+from tests.emulators.wsg50.gripper import HOLDING, EmulatedWSG50
 from tests.emulators.wsg50.server import serve_pty, serve_tcp
 from tests.fake_rig import LENS, PX, WORKSPACE, chord
 from tests.fake_video import FakeVideoDevice
 
-HOLDING = 4
 FRAMES = 4
 """Packets per operation of the gripper: command, pending, state, result. Each can have a fault."""
 QUICK = AttemptSettings(
@@ -95,7 +94,7 @@ class EmulatedGel(FakeVideoDevice):
     """A gel with a blob at the contact."""
 
     def __init__(self, shared, finger):
-        super().__init__(fps=100.0, size=(32, 24), phase_s=0.003 * (finger == "b"))
+        super().__init__(fps=100.0, size=(32, 24))
         self.shared, self.rng = shared, np.random.default_rng([8, shared.seed, ord(finger)])
 
     def picture(self, number):

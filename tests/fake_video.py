@@ -7,10 +7,6 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 
-from tests import views
-
-MISSING = -1.0
-
 
 class FakeVideoDevice:
     """A USB camera that counts its pictures. `open` replaces cv2.VideoCapture and adds to `captures`.
@@ -20,14 +16,12 @@ class FakeVideoDevice:
     Attributes:
         fps: Pictures per second.
         size: (width, height).
-        phase_s: Offset of the pictures on a common clock.
-        stamps: Whether pictures have a time stamp.
         lacks: Settings that it does not have.
         stubborn: Settings that do not change.
     """
 
-    def __init__(self, fps=200.0, size=(8, 6), lacks=(), stubborn=(), phase_s=0.0, stamps=False):
-        self.fps, self.size, self.phase_s, self.stamps = fps, size, phase_s, stamps
+    def __init__(self, fps=200.0, size=(8, 6), lacks=(), stubborn=()):
+        self.fps, self.size = fps, size
         self.lacks, self.stubborn = set(lacks), set(stubborn)
         self.values = {cv2.CAP_PROP_FOURCC: float(cv2.VideoWriter.fourcc(*"YUYV")), cv2.CAP_PROP_FPS: 15.0}
         self.busy = self.dead = self.frozen = False
@@ -69,16 +63,14 @@ class FakeCapture:
 
     def get(self, number):
         if number == cv2.CAP_PROP_POS_MSEC:
-            return 1000 * self.taken_s if self.camera.stamps else 0.0
-        return MISSING if number in self.camera.lacks else self.camera.values.get(number, 0.0)
+            return 1000 * self.taken_s
+        return -1.0 if number in self.camera.lacks else self.camera.values.get(number, 0.0)
 
     def grab(self):
         camera = self.camera
         if camera.dead or self.released:
             return False
-        now = time.monotonic()
-        tick = np.floor((now - camera.phase_s) * camera.fps) + 1
-        time.sleep(max(0.0, camera.phase_s + tick / camera.fps - now))
+        time.sleep(1 / camera.fps - time.monotonic() % (1 / camera.fps))
         self.taken_s = time.monotonic()
         return True
 
@@ -164,6 +156,3 @@ class FakeRealSense:
 def own_threads():
     """Return the threads that read cameras."""
     return [thread for thread in threading.enumerate() if thread.name.startswith("frames of")]
-
-
-EXTRINSICS = views.camera_pose()

@@ -19,7 +19,6 @@ from robot.collection import CollectSettings, collect
 from robot.devices import Camera, TactileSensor, VirtualDevice
 from robot.readings import RGBD, Frame
 from robot.recording.folder import read_recording
-from robot.rig import load_rig
 from robot.sight import hand_eye
 from tests import views
 from tests.emulators.wsg50.gripper import EmulatedWSG50
@@ -89,15 +88,8 @@ class RecordedCamera(VirtualDevice, Camera):
 
 
 @contextlib.contextmanager
-def replay_rig():
-    """The rig, not connected; prompts to a person return at once."""
-    with replay_file() as path:
-        yield load_rig(str(path), seed=0)
-
-
-@contextlib.contextmanager
 def replay_file(emulator=None):
-    """The file of the rig; its devices exist while the context is open."""
+    """The file of the rig; its devices exist while the context is open, and prompts to a person return at once."""
     emulator = emulator or EmulatedWSG50(speed_up=50.0, referenced=True)
     with (
         tempfile.TemporaryDirectory() as name,

@@ -14,13 +14,11 @@ from robot.readings import Pose
 from robot.rig import Rig, load_rig
 from tests.emulated_rig import emulated_rig
 from tests.fake_rig import FakeRig
-from tests.replay_rig import replay_rig
 
 RIGS = {
     "fake": lambda: contextlib.nullcontext(FakeRig(5)),
     "sim": lambda: contextlib.nullcontext(load_rig("sim", seed=5)),
     "emulated": lambda: emulated_rig(5, port="pty"),
-    "replayed": replay_rig,
 }
 """Rigs by name, each a context in which its devices exist."""
 

@@ -36,7 +36,6 @@ class RosbridgeClient:
             self.connection.send(json.dumps(operation))
 
     def drop(self):
-        """Cut the connection without a closing handshake."""
         with contextlib.suppress(OSError):
             self.connection.socket.shutdown(socket.SHUT_RDWR)
 
@@ -59,7 +58,6 @@ class EmulatedSawyer:
         self._clients, self._latched = set(), {}
 
     def press_estop(self):
-        """Press the red button."""
         with self._lock:
             self.model.stopped, self.model.enabled = True, False
             self.model.estop_button, self.model.estop_source = 1, 1
@@ -76,7 +74,6 @@ class EmulatedSawyer:
             client.drop()
 
     def handle(self, connection):
-        """Serve one connection until it ends."""
         client = RosbridgeClient(connection)
         with self._lock:
             self._clients.add(client)
@@ -98,7 +95,6 @@ class EmulatedSawyer:
                     self._publish_to_all(topic, message)
 
     def end(self):
-        """Stop `run`."""
         self._ended.set()
 
     def _advance(self):
@@ -123,11 +119,9 @@ class EmulatedSawyer:
                 "effort": [0.0] * 8,
             },
             "/robot/state": {
-                "ready": model.enabled and not model.stopped,
                 "enabled": model.enabled,
                 "stopped": model.stopped,
                 "error": model.error,
-                "lowVoltage": False,
                 "estop_button": model.estop_button,
                 "estop_source": model.estop_source,
             },
@@ -155,7 +149,6 @@ class EmulatedSawyer:
             client.send(op="publish", topic=topic, msg=self._latched[topic])
 
     def _publish(self, client, operation):
-        """Apply a published message and forward it to subscribers."""
         topic, message = operation["topic"], operation["msg"]
         if topic not in client.advertised:
             raise ValueError(f"{topic} was not advertised")

@@ -15,7 +15,7 @@ from robot.drivers.wsg50.codec import Packet
 IDLE, GRASPING, NO_PART, PART_LOST, HOLDING, RELEASING, POSITIONING, ERROR = range(8)
 OK, NOT_INITIALIZED, RUNNING, UNKNOWN, FORMAT, DENIED, FAILED, ABORTED = 0, 3, 4, 14, 15, 16, 18, 19
 INVALID, PENDING, RANGE, BLOCKED = 24, 26, 28, 29
-FAULT_BITS = {"temperature warning": 13, "temperature": 14, "current": 16}
+FAULT_BITS = {"temperature": 14, "current": 16}
 REFERENCED_BIT, MOVING_BIT, FAST_STOP_BIT = 0, 1, 12
 UPDATES = frozenset({0x40, 0x41, 0x43, 0x45})
 STROKE_MM, SPEEDS, ACCELERATIONS, FORCES = 110.0, (5.0, 420.0), (100.0, 5000.0), (5.0, 80.0)
@@ -62,7 +62,6 @@ class EmulatedWSG50:
 
     @property
     def moves(self):
-        """Whether the jaws move."""
         with self._lock:
             self._advance()
             return self._target_mm is not None
@@ -72,11 +71,6 @@ class EmulatedWSG50:
         """Whether it waits for an acknowledgement."""
         return FAST_STOP_BIT in self._bits
 
-    def warn(self, fault):
-        """Set only the flag of a fault of FAULT_BITS."""
-        with self._lock:
-            self._bits.add(FAULT_BITS[fault])
-
     def fail(self, fault=None):
         """Raise a FAST STOP and set the flag of a fault of FAULT_BITS."""
         with self._lock:
@@ -85,12 +79,10 @@ class EmulatedWSG50:
             self.grasping = ERROR
 
     def lose_reference(self):
-        """Require homing, as after a loss of power."""
         with self._lock:
             self._bits.discard(REFERENCED_BIT)
 
     def connected(self):
-        """Handle a new client."""
         with self._lock:
             self._announced = False
             self._updates.clear()
@@ -104,7 +96,6 @@ class EmulatedWSG50:
             self._outgoing.clear()
 
     def receive(self, packet):
-        """Execute a command and return the immediate answers."""
         with self._lock:
             self._advance()
             self.received.append(packet.id)
@@ -174,10 +165,7 @@ class EmulatedWSG50:
         return _ACTIONS[command](self, payload) if command in _ACTIONS else UNKNOWN
 
     def _update(self, command, flags, period_ms):
-        """Start or stop automatic updates."""
         self._updates.pop(command, None)
-        if flags > 1 or (flags and not period_ms):
-            return RANGE
         if flags:
             self._updates[command] = period_ms / 1000, self._now + period_ms / 1000
         return self._value(command)
@@ -208,9 +196,7 @@ class EmulatedWSG50:
             return DENIED
         return None if 0.0 <= width <= STROKE_MM and SPEEDS[0] <= speed <= SPEEDS[1] else RANGE
 
-    def _home(self, payload):
-        if payload[0] > 2:
-            return INVALID
+    def _home(self, _):
         if self.in_fast_stop or self._running:
             return DENIED if self.in_fast_stop else RUNNING
         self._bits.discard(REFERENCED_BIT)
@@ -220,15 +206,14 @@ class EmulatedWSG50:
             self._bits |= set() if status else {REFERENCED_BIT}
             return status
 
-        return self._begin(0x20, POSITIONING, 0.0 if payload[0] == 2 else STROKE_MM, _HOMING_MM_S, ended)
+        return self._begin(0x20, POSITIONING, STROKE_MM, _HOMING_MM_S, ended)
 
     def _arrived(self):
         self.grasping = IDLE
         return BLOCKED if self._blocked else OK
 
     def _move(self, payload):
-        flags, width, speed = struct.unpack("<Bff", payload)
-        width += self._opening_mm if flags & 1 else 0.0
+        _, width, speed = struct.unpack("<Bff", payload)  # the width is absolute
         return self._refusal((IDLE,), width, speed) or self._begin(0x21, POSITIONING, width, speed, self._arrived)
 
     def _release(self, payload):

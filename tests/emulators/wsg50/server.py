@@ -131,8 +131,6 @@ def _served(emulator, faults, wait_for_client):
 
 
 class _Session:
-    """The connection of one client."""
-
     def __init__(self, emulator, faults, line):
         self.emulator, self.faults, self.line = emulator, faults, line
         self._arrived, self._received = bytearray(), bytearray()

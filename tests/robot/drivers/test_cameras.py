@@ -10,7 +10,8 @@ from robot.drivers import discover
 from robot.drivers.realsense import RealSense
 from robot.drivers.usb_camera.driver import UvcCamera
 from robot.errors import DeviceError
-from tests.fake_video import EXTRINSICS, FakeRealSense, FakeVideoDevice, own_threads
+from tests import views
+from tests.fake_video import FakeRealSense, FakeVideoDevice, own_threads
 
 
 @pytest.fixture
@@ -25,7 +26,7 @@ def install(monkeypatch):
 
 
 def realsense(**more):
-    return RealSense(extrinsics=EXTRINSICS, **{"warmup_frames": 3, **more})
+    return RealSense(extrinsics=views.camera_pose(), **{"warmup_frames": 3, **more})
 
 
 # RealSense --------------------------------------------------------------------------------------------------
@@ -113,7 +114,7 @@ def test_a_plain_camera_returns_colour_has_no_depth_and_may_hang_upside_down(tmp
     monkeypatch.setattr(cv2, "VideoCapture", camera.open)
     monkeypatch.setattr(discover, "DEV", tmp_path)
     name.touch()
-    settings = {"device": str(name), "extrinsics": EXTRINSICS, "warmup_s": 0.0}
+    settings = {"device": str(name), "extrinsics": views.camera_pose(), "warmup_s": 0.0}
     with UvcCamera(width=640, height=480, **settings) as eye:
         image = eye.read(depth=False, max_age_s=10)
         assert (image.depth_m, image.intrinsics) == (None, None)

@@ -10,12 +10,10 @@ from robot.drivers import discover
 from robot.drivers.discover import DiscoveredDevice
 from tests.fake_video import FakeRealSense
 
-MISSING_PACKAGES = ("pyrealsense2", "serial", "serial.tools")
-
 
 @pytest.fixture(autouse=True)
 def _nothing_installed(monkeypatch):
-    for name in MISSING_PACKAGES:
+    for name in ("pyrealsense2", "serial", "serial.tools"):
         monkeypatch.setitem(sys.modules, name, None)
 
 

@@ -48,10 +48,6 @@ def plug(dev, monkeypatch):
     return plugged
 
 
-def written(camera):
-    return [number for number, _ in camera.written]
-
-
 # Names of cameras--------------------------------------------------------------------------------------------
 
 
@@ -85,13 +81,6 @@ def test_a_camera_in_use_cannot_be_connected_and_can_be_later(plug, dev):
         assert camera.captures[-1].path == str(dev / "video4")
         assert camera.captures[-1].backend == cv2.CAP_V4L2
     assert not camera.open_captures
-
-
-def test_the_real_opencv_cannot_open_a_file_that_is_not_a_camera(dev):
-    path = dev / "v4l" / "by-id" / "usb-Printer"
-    path.write_text("no camera")
-    with pytest.raises(DeviceError, match="usb-Printer cannot be opened"):
-        OpencvTactile(finger="a", device=str(path)).connect()
 
 
 # Settings ---------------------------------------------------------------------------------------------------
@@ -143,10 +132,7 @@ def test_the_zoom_control_of_a_digit_sets_its_brightness(plug):
     ("setting", "message"),
     [
         ({"width": 640}, "width and height"),
-        ({"fps": math.nan}, "fps"),
-        ({"fourcc": "MJPEG"}, "fourcc"),
         ({"exposure_ms": 5.0, "auto_exposure": True}, "exposure_ms must be left out"),
-        ({"white_balance_k": 5000.0, "auto_white_balance": True}, "white_balance_k must be left out"),
         ({"led": [1, 2, 16]}, "led"),
         ({"crop": [0.5, 0.0, 0.5, 0.0]}, "crop"),
         ({"timeout_s": math.inf}, "timeout_s"),
@@ -170,16 +156,12 @@ def test_pictures_are_rgb_with_row_0_on_top_and_that_of_a_digit_is_rotated_to_th
     assert turned.shape == (8, 6, 3)
     assert (turned[:, 0, 0] == 200).all()
     assert (turned[:, 1:, 0] == 100).all()
-    picture = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
-    np.testing.assert_array_equal(np.rot90(picture), cv2.flip(cv2.transpose(picture), 0))
 
 
 def test_the_picture_of_a_gelsight_mini_is_cropped_and_resized(plug):
     camera = FakeVideoDevice(size=(100, 80))
     with GelSightMini(finger="a", device=plug(camera), **QUICK) as gel:
         assert gel.read(10).pixels.shape == (56, 70, 3)  # 80 - 2 * 12 by 100 - 2 * 15
-    with GelSightMini(finger="a", device=plug(camera), crop=[0.1, 0.0, 0.1, 0.5], output_px=[40, 30], **QUICK) as gel:
-        assert gel.read(10).pixels.shape == (30, 40, 3)
 
 
 def test_cropping_keeps_the_pixels_and_shrinking_takes_the_means():
@@ -200,7 +182,7 @@ def test_pictures_without_three_colours_are_a_device_error_with_the_remedy(plug,
 
 
 def test_the_time_of_a_picture_is_that_at_which_its_buffer_was_filled(plug):
-    camera = FakeVideoDevice(stamps=True)
+    camera = FakeVideoDevice()
     stream = CaptureStream(plug(camera), UsbCameraSettings(device="gel"), lambda: 1e6)
     capture = camera.captures[0]
     for taken_s, expected_s in ((1e6 - 0.03, 1e6 - 0.03), (1e6 - 2.0, 1e6), (1e6 + 1.0, 1e6), (0.0, 1e6)):
@@ -249,7 +231,7 @@ def test_a_camera_reconnected_under_another_number_gets_its_settings_again(plug)
         gel.recover()
         assert gel.read(10).pixels.shape == (6, 8, 3)
         assert gel._reader.lost_count >= 1
-        assert written(second)[:3] == written(first)[:3]
+        assert [number for number, _ in second.written[:3]] == [number for number, _ in first.written[:3]]
         assert gel.refused == {"fps": "requested 30, has 15"}
     assert not first.open_captures
     assert not second.open_captures

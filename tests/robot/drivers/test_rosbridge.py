@@ -98,19 +98,6 @@ def test_a_status_error_that_names_a_call_fails_it_and_others_are_logged(caplog)
     assert "slow" in caplog.text
 
 
-def test_an_error_message_is_truncated_and_escaped(caplog):
-    def answer(operation):
-        flood = {"op": "status", "level": "warning", "msg": "\x1b[2J" + "x" * 10**5}
-        return [flood, reply_to(operation, result=False, values="\x1b[31mno " + "y" * 10**5)]
-
-    with linked(answer) as link, pytest.raises(DeviceError) as caught:
-        link.call("/s", {})
-    for message in (caplog.text, str(caught.value)):
-        assert "\x1b" not in message
-        assert "\\x1b" in message
-        assert len(message) < 1000
-
-
 def test_a_connection_that_breaks_ends_every_wait_at_once():
     with linked(lambda _: None, timeout_s=60.0) as link:
         with pytest.raises(DeviceError, match=r"the connection to rosbridge at .* is closed"):

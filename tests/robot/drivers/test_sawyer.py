@@ -14,7 +14,7 @@ import pytest
 from robot.drivers.sawyer import codec as messages
 from robot.drivers.sawyer.codec import JOINTS, JointTrajectory, Mount, waypoints
 from robot.drivers.sawyer.driver import Sawyer
-from robot.errors import DeviceError, RobotConfigError
+from robot.errors import DeviceError
 from robot.readings import Pose, Region
 from tests.emulators.sawyer.arm import READY, SawyerModel, forward, inverse
 from tests.emulators.sawyer.server import LIMB, EmulatedSawyer, serve
@@ -147,11 +147,6 @@ def test_the_blocking_reason_names_the_action_for_a_person(fields, text):
     message = {"enabled": True, "stopped": False, "error": False, "estop_button": 0, "estop_source": 0}
     assert messages.parse(message, messages.RobotState).blocking_reason is None
     assert text in messages.parse(message | fields, messages.RobotState).blocking_reason
-
-
-def test_settings_out_of_range_are_refused_without_a_robot():
-    with pytest.raises(RobotConfigError, match="base_xyz_mm"):
-        arm_at("ws://127.0.0.1:9090", base_xyz_mm=[0.0, 0.0, math.nan])
 
 
 # with the emulated robot

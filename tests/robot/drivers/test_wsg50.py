@@ -1,35 +1,53 @@
-"""The WSG-50's driver with an emulated gripper, over TCP and a terminal: motions, faults, lost packets, closing."""
+"""The WSG-50's driver with an emulated gripper, over TCP and a terminal, and its link with scripted answers."""
 
 import contextlib
 import logging
 import os
 import signal
+import socket
+import struct
 import threading
 import time
 from types import SimpleNamespace
 
 import pytest
+from serial.urlhandler import protocol_socket
 
 from robot.drivers.wsg50 import codec
 from robot.drivers.wsg50 import driver as wsg50
-from robot.drivers.wsg50.codec import Status
-from robot.drivers.wsg50.driver import WSG50, LinkLost
+from robot.drivers.wsg50.codec import CommandId, Packet, Status, decode, encode
+from robot.drivers.wsg50.driver import WSG50, Link, LinkLost
 from robot.errors import DeviceError, RobotConfigError
 from tests.emulators.wsg50.faults import LineFaults
 from tests.emulators.wsg50.gripper import EmulatedWSG50
+from tests.emulators.wsg50.server import serve_pty, serve_tcp
 from tests.waiting import wait_until
-from tests.wsg50_bench import (
-    ACK,
-    FAST_STOP,
-    GRASP,
-    HOME,
-    PORTS,
-    RELEASE,
-    STOP,
-    gripper_with_emulator,
-)
 
-DISCONNECT = 0x07
+SERVE = {"tcp": serve_tcp, "pty": serve_pty}
+QUICK = {"timeout_s": 0.3, "reconnect_s": 0.01, "max_state_age_s": 0.5, "opening_speed_mm_s": 400.0}
+DISCONNECT, HOME, STOP, FAST_STOP, ACK, GRASP, RELEASE = 0x07, 0x20, 0x22, 0x23, 0x24, 0x25, 0x26
+PORTS = pytest.mark.parametrize("port", SERVE)
+
+
+@pytest.fixture(autouse=True)
+def _quick_close(monkeypatch):
+    """Skip the 0.3 s that pyserial waits after closing a socket."""
+    monkeypatch.setattr(protocol_socket, "time", SimpleNamespace(sleep=lambda _: None))
+
+
+@contextlib.contextmanager
+def gripper_with_emulator(port="tcp", faults=None, connect=True, emulator=None, **settings):
+    """Yield a driver, connected or not, and its emulated gripper."""
+    emulator = emulator or EmulatedWSG50(referenced=True, speed_up=20.0)
+    with SERVE[port](emulator, faults) as address:
+        gripper = WSG50(port=address, **QUICK | settings)
+        if connect:
+            gripper.connect()
+        try:
+            yield gripper, emulator
+        finally:
+            with contextlib.suppress(DeviceError):
+                gripper.close()
 
 
 def slow(**settings):
@@ -165,8 +183,6 @@ def test_a_fast_stop_is_named_and_never_acknowledged_silently(port, caplog):
 
 def test_after_a_fast_stop_every_call_raises_until_recovery():
     with gripper_with_emulator(acknowledge_faults=True) as (gripper, emulator):
-        emulator.warn("temperature warning")
-        assert gripper.open(60.0).status == "idle"  # a warning alone does not prevent motions
         emulator.fail("temperature")
         for use in (gripper.state, lambda: gripper.open(50.0), lambda: gripper.grasp(10.0)):
             with pytest.raises(DeviceError, match=r"temperature fault.*recover\(\)"):
@@ -395,3 +411,96 @@ def test_a_grasp_that_was_refused_is_not_repeated():
             with pytest.raises(DeviceError, match=f"answered {status.name} to GRASP"):
                 gripper.grasp(10.0, 400.0)
         assert emulator.received.count(GRASP) == 3
+
+
+# The link with scripted answers -------------------------------------------------------------------------------
+
+FORCE = codec.query(CommandId.GET_FORCE_LIMIT)
+ONE, TWO = struct.pack("<f", 1), struct.pack("<f", 2)
+
+
+@contextlib.contextmanager
+def linked_to(answer, timeout_s=0.2):
+    """Yield an open link and the ids that its peer receives; `answer(packet)` returns bytes."""
+    received = []
+
+    def run():
+        buffer = bytearray()
+        with server.accept()[0] as client, contextlib.suppress(OSError):
+            while data := client.recv(4096):
+                buffer += data
+                packet = True
+                while packet:
+                    used, packet = decode(buffer)
+                    del buffer[:used]
+                    if packet:
+                        received.append(packet.id)
+                        client.sendall(answer(packet))
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        link = Link(f"socket://127.0.0.1:{server.getsockname()[1]}", timeout_s=timeout_s)
+        thread = threading.Thread(target=run)
+        thread.start()
+        link.open()
+        yield link, received
+        link.close()
+        thread.join()
+
+
+def reply(packet, parameters=b"", status=0):
+    return encode(Packet(packet.id, status.to_bytes(2, "little") + parameters))
+
+
+def echoing(packet):
+    """Answer only LOOP."""
+    return reply(packet, packet.payload) if packet.id == CommandId.LOOP else b""
+
+
+@pytest.mark.parametrize(
+    "first",
+    [b"", reply(FORCE, b"\x01"), reply(FORCE, status=11), b"\xaa\xaa\xaa\x06\xff\x00"],
+    ids=["lost", "short", "damaged command", "claims bytes that never arrive"],
+)
+def test_an_answer_that_is_not_valid_is_requested_again(first):
+    answers = [first, reply(FORCE, ONE)]
+    with linked_to(lambda packet: echoing(packet) or answers.pop(0), 0.1) as (link, _):
+        assert link.query(FORCE, codec.number) == 1.0
+        assert answers == []
+
+
+def test_a_late_reply_is_never_returned_for_the_next_query():
+    """The first query is answered after the second was sent; without the echo the old value would be returned."""
+    late = []
+
+    def answer(packet):
+        if packet.id == CommandId.LOOP:
+            return b"".join(late) + echoing(packet)
+        if not late:
+            late.append(reply(packet, ONE))
+            return b""
+        return reply(packet, TWO)
+
+    with linked_to(answer, 0.1) as (link, _):
+        assert link.query(FORCE, codec.number) == 2.0
+
+
+def test_an_urgent_stop_does_not_synchronise_first():
+    with linked_to(lambda packet: echoing(packet) or reply(packet)) as (link, received):
+        link.send_urgent(Packet(CommandId.STOP))
+        assert received == [CommandId.STOP]
+
+
+@pytest.mark.parametrize("port", ["/nowhere/tty", "socket://127.0.0.1:1", "socket://127.0.0.1", "what://is this"])
+def test_a_port_that_cannot_be_opened_is_a_lost_link(port):
+    with pytest.raises(LinkLost, match="cannot be opened"):
+        Link(port).open()
+
+
+def test_a_closed_terminal_is_a_lost_link():
+    own, other = os.openpty()
+    link = Link(os.ttyname(other), timeout_s=0.5)
+    link.open()
+    os.close(other)
+    os.close(own)
+    with pytest.raises(LinkLost):
+        link.sync()
