@@ -5,7 +5,8 @@ An importer yields the grasps of its data set one by one as `Item`, or as `Skip`
 resumes where it stopped.
 
     recording.json        also: licence, terms, citation, fingers, notes (caveats, and unverified parts of the layout),
-                          objects (object_id -> metadata of the data set), skipped (reason -> count)
+                          objects (object_id -> metadata of the data set), skipped (reason -> count),
+                          left_out (video -> number of its first images without use, such as black ones)
     splits/published.json a published split: {"seed": 0, "train": [object ids], "validation": [...], "test": [...]}
 """
 
@@ -94,6 +95,8 @@ class Item:
     object_id: str
     images: Images
     fields: Mapping[str, Any] = field(default_factory=dict)
+    left_out: Mapping[str, int] = field(default_factory=dict)
+    """Video -> number of its first images that were left out; it may be filled while the images are read."""
 
 
 @dataclass(frozen=True)
@@ -139,6 +142,9 @@ def import_items(
         names: set[str] = set()
         for done, item in enumerate(_readable(items), start=1):
             skip = item if isinstance(item, Skip) else _append(writer, item, names)
+            left_out = {**writer.info.get("left_out", {}), **(item.left_out if isinstance(item, Item) else {})}
+            if left_out:
+                writer.update_info(left_out=left_out)
             if skip is not None:
                 skipped.setdefault(skip.reason, []).append(skip.name)
             if progress is not None:
@@ -148,6 +154,13 @@ def import_items(
             raise ImporterError(f"no grasp could be imported: {'; '.join(skips) or 'the source contains none'}")
         if split is not None:
             notes = [*_write_split(out, split), *notes]
+        if left_out := writer.info.get("left_out", {}):
+            numbers = ", ".join(f"{number} of {video}" for video, number in list(left_out.items())[:5])
+            notes = [
+                f"left out first images that are black, dim or of another colour than all later ones: {numbers}"
+                f"{' ...' if len(left_out) > 5 else ''}; the next image is the first one used",
+                *notes,
+            ]
         counts = {reason: len(some) for reason, some in skipped.items()}
         writer.update_info(objects=dict(objects), skipped=counts, notes=notes)
     recording = read_recording(out)

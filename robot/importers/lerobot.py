@@ -176,10 +176,13 @@ class _LeRobotSource:
             fields = {key: row[key] for key in _FIELDS if row.get(key) is not None}
             sequence = row.get("sequence_id") or f"episode-{number}"
             moments = self._moments if row["length"] == len(self._moments or ()) else None
-            images = episode_images(partial(self._steps, row), len(self.touch), moments)
+            left_out: dict[str, int] = {}
+            images = episode_images(
+                partial(self._steps, row), len(self.touch), moments, partial(left_out.__setitem__, name)
+            )
             tasks = row.get("tasks")
             object_id = row.get("object_id") or (next(iter(tasks), None) if isinstance(tasks, list) else tasks)
-            yield Item(name, str(object_id or "unknown"), images, {"sequence_id": str(sequence), **fields})
+            yield Item(name, str(object_id or "unknown"), images, {"sequence_id": str(sequence), **fields}, left_out)
 
     def _steps(self, row: _Row) -> Iterator[Step]:
         read = {"image": self._image_frames, "video": self._video_frames}

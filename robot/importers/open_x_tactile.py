@@ -119,8 +119,10 @@ class _Task:
         """Yield one grasp for each episode."""
         for episode, (start, end) in enumerate(itertools.pairwise([0, *self.ends])):
             name = safe_name(self.name, f"{episode:06d}")
-            images = episode_images(partial(self._steps, start, end), self.fingers)
-            yield Item(name, self.name, images, {"sequence_id": name})
+            left_out: dict[str, int] = {}
+            steps = partial(self._steps, start, end)
+            images = episode_images(steps, self.fingers, left_out=partial(left_out.__setitem__, name))
+            yield Item(name, self.name, images, {"sequence_id": name}, left_out)
 
     def _steps(self, start: int, end: int) -> Iterator[Step]:
         for step in range(start, end):

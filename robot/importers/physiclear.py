@@ -10,6 +10,7 @@ order of the file names, part by part.
 """
 
 import heapq
+import itertools
 import re
 from collections.abc import Iterator
 from functools import cache, partial
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 
 from _touch_retrieval.documents import Count, typed
 from robot.errors import ImporterError
+from robot.importers.episodes import NO_USABLE_FRAME, first_usable, thumbnail
 from robot.importers.importing import (
     NOT_STATED,
     DataSet,
@@ -74,16 +76,21 @@ def import_physiclear(src: Path, out: Path, progress: Progress | None = None, *,
 
 def _items(part: str, path: Path, frames: int) -> Iterator[Item | Skip]:
     sequence = safe_name(path.stem)
-    read = cache(partial(strongest_frames, path, frames))  # decoded once, on first use
+    left_out: dict[str, int] = {}
+    read = cache(partial(strongest_frames, path, frames, left_out=left_out))  # decoded once, on first use
     before = SharedImage(safe_name(sequence, "no_contact"), lambda: read()[0])  # type: ignore[arg-type]  # import_items calls it
     for number in range(1, frames + 1):
         name = safe_name(sequence, str(number))
         touch = SharedImage(name, lambda number=number: read()[number])  # type: ignore[arg-type]
-        yield Item(name, part, {"photo": touch, "touch_a": touch, "touch_a_before": before}, {"sequence_id": sequence})
+        images = {"photo": touch, "touch_a": touch, "touch_a_before": before}
+        yield Item(name, part, images, {"sequence_id": sequence}, left_out)
 
 
-def strongest_frames(path: Path, count: int) -> list[Frame]:
+def strongest_frames(path: Path, count: int, start: int = 0, left_out: dict[str, int] | None = None) -> list[Frame]:
     """Return the first frame of a video and the `count` that differ most from it, in order of time: (H, W, 3) RGB.
+
+    The first one is number `start`, or a later one if frames at the start are unusable, such as black ones; their
+    number is stored in `left_out`.
 
     Raises:
         ImporterError: The video cannot be decoded, or too few of its frames differ from the first.
@@ -91,18 +98,27 @@ def strongest_frames(path: Path, count: int) -> list[Frame]:
     av = import_extra("av", _WHAT)
     try:
         with av.open(str(path)) as video:
-            frames = (frame.to_ndarray(format="rgb24") for frame in video.decode(video=0))
-            first = next(frames, None)
+            decoded = (frame.to_ndarray(format="rgb24") for frame in video.decode(video=0))
+            first = next(frames := itertools.islice(decoded, start, None), None)
             if first is None:
                 raise ImporterError("its video contains no frame")
+            thumbnails = [thumbnail(first)]
             # Numbers differ, so frames are never compared; among equal changes the earlier frame is taken.
             changes = (
                 (float(np.abs(frame.astype(np.int16) - first).mean()), -number, frame)
                 for number, frame in enumerate(frames)
+                if not thumbnails.append(thumbnail(frame))  # type: ignore[func-returns-value]
             )
             strongest = heapq.nlargest(count, changes)
     except (av.error.FFmpegError, OSError, ValueError, IndexError) as error:
         raise ImporterError("its video cannot be decoded") from error
+    usable = first_usable(thumbnails)
+    if usable is None:
+        raise ImporterError(NO_USABLE_FRAME)
+    if usable and not start:
+        if left_out is not None:
+            left_out[safe_name(path.stem)] = usable
+        return strongest_frames(path, count, usable)
     if len(strongest) < count or not strongest[-1][0]:
         raise ImporterError(f"its video must have at least {count} frames that differ from the first one")
     return [first, *(frame for _, _, frame in sorted(strongest, key=lambda entry: -entry[1]))]

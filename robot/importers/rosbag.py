@@ -9,12 +9,13 @@ sequence; with a topic of names (`object`) the grasps of one object in a bag are
 is empty for a sensor with one finger. Images are sensor_msgs/Image (rgb8, bgr8, mono8) or CompressedImage, whose files
 are stored unchanged.
 
-A grasp lasts while the gel of any finger differs from the first image of its bag over the fraction `contact` of its
-area, by the rule of the contact-area gate. If a topic marks the grasps, the option `grasp` names it (std_msgs/Bool,
-true while a grasp is held), and its marks decide instead. Interruptions shorter than `settle_s` are ignored, and then
-grasps shorter than it. The touch is the gel image with the strongest change in the grasp, the photo the last camera
-image before it began, and the no-contact frame the gel image in the middle between the previous grasp and this one.
-Messages are ordered by the times at which the bag recorded them.
+A grasp lasts while the gel of any finger differs from the first usable image of its bag (black, dim or blue first
+images of a camera are left out and counted) over the fraction `contact` of its area, by the rule of the contact-area
+gate. If a topic marks the grasps, the option `grasp` names it (std_msgs/Bool, true while a grasp is held), and its
+marks decide instead. Interruptions shorter than `settle_s` are ignored, and then grasps shorter than it. The touch is
+the gel image with the strongest change in the grasp, the photo the last camera image before it began, and the
+no-contact frame the gel image in the middle between the previous grasp and this one. Messages are ordered by the times
+at which the bag recorded them.
 
 `object` names a topic with the name of the object (std_msgs/String); without it the bag's name is the object. `gripper`
 names a sensor_msgs/JointState: the sum of positions, in metre, is the opening, and the mean absolute effort, in newton,
@@ -27,7 +28,7 @@ import contextlib
 import re
 from array import array
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
@@ -42,6 +43,7 @@ from numpy.typing import NDArray
 from _touch_retrieval.documents import NonNegative, typed
 from robot.errors import ImporterError
 from robot.grasping.gates import ContactAreaGate, GraspFrames
+from robot.importers.episodes import NO_USABLE_FRAME, first_usable, thumbnail
 from robot.importers.importing import (
     NOT_STATED,
     DataSet,
@@ -246,6 +248,7 @@ class _Scan:
         changes: Mean change of each gel image from the first one, in grey levels.
         changed: The same as a fraction of the area; empty if a topic marks the grasps.
         unreadable: Number of gel images that cannot be decoded or have another size.
+        left_out: Topic -> number of its first gel images that are unusable, such as black ones.
     """
 
     times: dict[str, "array[int]"] = field(default_factory=lambda: defaultdict(lambda: array("q")))
@@ -255,6 +258,7 @@ class _Scan:
     changes: dict[str, "array[float]"] = field(default_factory=lambda: defaultdict(lambda: array("d")))
     changed: dict[str, "array[float]"] = field(default_factory=lambda: defaultdict(lambda: array("d")))
     unreadable: int = 0
+    left_out: dict[str, int] = field(default_factory=dict)
     first_ns: int = 0
 
     def latest(self, topic: str, time_ns: int) -> int | None:
@@ -268,8 +272,11 @@ class _Scan:
         return None if number is None else self.values[topic][number]
 
 
-def _scan_bag(bag: Bag, topics: _Topics) -> _Scan:
-    """Read all messages of the topics once; each gel image is compared with the first one of its topic."""
+def _scan_bag(bag: Bag, topics: _Topics, left_out: Mapping[str, int] | None = None) -> _Scan:
+    """Read all messages of the topics; each gel image is compared with the first usable one of its topic.
+
+    They are read once, or twice if first images turn out to be unusable.
+    """
     for topic, types in topics.types().items():
         if bag.topics.get(topic) not in types:
             known = ", ".join(f"{name} ({kind})" for name, kind in sorted(bag.topics.items()))
@@ -277,9 +284,10 @@ def _scan_bag(bag: Bag, topics: _Topics) -> _Scan:
                 f"its bag must have the topic {topic} of type {' or '.join(types)}; choose topics with --option "
                 f"touch_a=... touch_b=... photo=... from: {known or 'none'}"
             )
-    scan = _Scan()
+    scan = _Scan(left_out=dict(left_out or {}))
     gate = None if topics.grasp else ContactAreaGate()
     first: dict[str, NDArray[np.uint8]] = {}
+    thumbnails: dict[str, list[NDArray[np.uint8]]] = defaultdict(list)
     for topic, time_ns, decode in bag.messages(topics.types()):
         message = decode()
         scan.first_ns = scan.first_ns or time_ns
@@ -288,6 +296,10 @@ def _scan_bag(bag: Bag, topics: _Topics) -> _Scan:
             gel = decode_picture(picture) if isinstance(picture, bytes) else picture
             if gel is None or gel.shape != first.setdefault(topic, gel.copy()).shape:
                 scan.unreadable += 1
+                continue
+            thumbnails[topic].append(thumbnail(gel))
+            if len(thumbnails[topic]) <= scan.left_out.get(topic, 0):
+                del first[topic]
                 continue
             scan.changes[topic].append(float(np.mean(np.abs(np.subtract(gel, first[topic], dtype=np.int16)))))
             if gate is not None:
@@ -300,6 +312,11 @@ def _scan_bag(bag: Bag, topics: _Topics) -> _Scan:
         else:
             scan.values[topic].append(message.data)
         scan.times[topic].append(time_ns)
+    usable = {topic: first_usable(frames) for topic, frames in thumbnails.items()}
+    if None in usable.values():
+        raise ImporterError(NO_USABLE_FRAME)
+    if left_out is None and (unusable := {topic: number for topic, number in usable.items() if number}):
+        return _scan_bag(bag, topics, unusable)
     return scan
 
 
@@ -323,7 +340,10 @@ def _find_grasps(scan: _Scan, topics: _Topics, contact: float, settle_s: float) 
     if topics.grasp:
         is_held = np.array([bool(scan.latest_value(topics.grasp, time_ns)) for time_ns in first.tolist()])
     else:
-        is_held = np.any([np.array(scan.changed[topic])[number] >= contact for topic, number in fingers], axis=0)
+        changed = np.array([np.array(scan.changed[topic])[number] for topic, number in fingers])
+        is_held = np.any(changed >= contact, axis=0)
+        if reason := _reference_error(changed, is_held):
+            return [reason]
     strength = np.sum([np.array(scan.changes[topic])[number] for topic, number in fingers], axis=0)
     photos = np.array(scan.times[topics.photo], np.int64)
     clocks = [own[number] for own, number in zip(times, numbers, strict=True)]
@@ -343,6 +363,18 @@ def _find_grasps(scan: _Scan, topics: _Topics, contact: float, settle_s: float) 
             found.append(_Grasp(int(before[-1]), no_contact, touch))
         released = stop
     return found
+
+
+def _reference_error(changed: NDArray[np.float64], is_held: NDArray[np.bool_]) -> str:
+    """Return why the first gel image cannot be the no-contact frame: the gel nearly always differs, or all of it."""
+    share = float(is_held.mean())
+    later = slice(int(np.argmax(is_held)), None)
+    if share < 0.9 and not (share and is_held[later].mean() > 0.98 and np.median(changed[:, later].max(0)) > 0.5):
+        return ""
+    return (
+        f"its gel differs from the first usable image in {share:.0%} of its images and does not return to it, so that "
+        "image may not be without contact; cut the bag, or name a topic of marks with --option grasp=..."
+    )
 
 
 def _nearest(times: NDArray[np.int64], to: NDArray[np.int64]) -> NDArray[np.intp]:
@@ -388,12 +420,13 @@ def _items(
                 places[topic, touch].append((name, f"touch_{finger}"))
                 places[topic, rest].append((name, f"touch_{finger}_before"))
         images: dict[str, dict[str, Source]] = defaultdict(dict)
+        left_out = {f"{bag.name}{topic}": number for topic, number in scan.left_out.items()}
         for topic, time_ns, decode in bag.messages((*topics.touch, topics.photo)):
             for name, column in places.pop((topic, time_ns), ()):
                 images[name][column] = partial(lambda decode: picture_of(decode()), decode)
                 if len(images[name]) == 1 + 2 * len(topics.touch):
                     object_id, fields = found.pop(name)
-                    yield Item(name, object_id, images.pop(name), fields)
+                    yield Item(name, object_id, images.pop(name), fields, left_out)
 
 
 def _fields(grasp: _Grasp, scan: _Scan, topics: _Topics) -> dict[str, float]:
