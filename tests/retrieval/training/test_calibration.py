@@ -13,7 +13,6 @@ from retrieval.errors import BadInput
 from retrieval.model.posterior import SLOPE_BOUNDS, Posterior
 from retrieval.model.references import reference_similarity
 from retrieval.model.verification import (
-    LEVELS,
     MAX_GRASPS,
     QUANTILES,
     VerificationCalibration,
@@ -138,10 +137,7 @@ POSTERIOR = Posterior(slope=1.0, offset=-2.0, dependence=0.5)
 
 
 def scored_objects(objects, seed, grasps=MAX_GRASPS + 1):
-    """Return match logits of touches with one photo of each grasp: 3 for the own object, 0 for others, noise of 2.
-
-    All grasps of an object share part of the noise with each photo's object, as in reality.
-    """
+    """Return match logits with one photo of each grasp: 3 for the own object, 0 for others, noise partly shared."""
     rng = np.random.default_rng(seed)
     owner = np.repeat(np.arange(objects), grasps)
     of_objects = rng.normal(size=(objects, objects)) * 1.5
@@ -194,7 +190,7 @@ def test_a_rate_that_the_objects_cannot_support_is_refused_with_the_number_that_
         found.bounds(float(re.search(r"enough for ([\d.]+)", str(refused.value))[1]))
 
 
-@pytest.mark.parametrize("far", [0, 0.6, float("nan"), None])
+@pytest.mark.parametrize("far", [0, 0.6])
 def test_an_impossible_rate_is_refused(fitted, far):
     with pytest.raises(BadInput, match=r"must be above 0 and at most 0\.5"):
         fitted.bounds(far)
@@ -216,7 +212,6 @@ def test_too_few_objects_or_grasps_give_no_calibration():
 
 
 def test_objects_of_two_groups_are_not_compared_with_each_other():
-    """Two folds of `retrieve adapt` have different maps, whose logits are not on one scale."""
     first, second = scored_objects(50, seed=0), scored_objects(50, seed=6)
     both = fit_verification([first, second], POSTERIOR)
     assert (both.group_sizes, both.objects, both.pairs) == ((50, 50), 100, 2 * 50 * 49 // 2)
@@ -233,8 +228,5 @@ def test_objects_of_two_groups_are_not_compared_with_each_other():
 def test_the_document_of_a_calibration_gives_the_same_calibration(fitted):
     document = json.loads(json.dumps(dataclasses.asdict(fitted)))
     assert typed(document, VerificationCalibration, "verification", complete=True) == fitted
-    assert (len(document["impostors"]), len(document["similar"])) == (len(LEVELS), len(QUANTILES))
     with pytest.raises(BadInput, match="verification must have"):
         VerificationCalibration(**document | {"impostors": [1.0]})
-    with pytest.raises(BadInput, match=r"verification.*objects"):
-        VerificationCalibration(**document | {"group_sizes": [3]})

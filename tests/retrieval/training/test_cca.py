@@ -1,4 +1,4 @@
-"""Canonical correlations against closed forms and plain loops, also of ill-conditioned features."""
+"""Canonical correlations against closed forms and plain loops; ill-conditioned features are in hard_linear.py."""
 
 import numpy as np
 import pytest
@@ -59,44 +59,9 @@ def test_the_correlations_solve_the_eigenproblem_of_the_covariances_over_every_p
     np.testing.assert_allclose(found.correlations, expected, atol=1e-9)
 
 
-def spoiled(name, x):
-    """Return the same information in an ill-conditioned form."""
-    rng = np.random.default_rng(9)
-    return {
-        "duplicated": lambda: np.column_stack([x, x, 3 * x[:, :4] - 7]),
-        "constant": lambda: np.column_stack([x, np.ones(len(x)), np.full(len(x), 0.1), np.zeros(len(x))]),
-        "collinear": lambda: np.column_stack([x, x @ rng.standard_normal((x.shape[1], 30))]),
-        "nearly duplicated": lambda: np.column_stack([x, x[:, :6] + 1e-8 * rng.standard_normal((len(x), 6))]),
-        "scaled 1e-6 to 1e6": lambda: x * np.logspace(-6, 6, x.shape[1]),
-        "far from 0": lambda: x + 1e4,
-    }[name]()
-
-
-@pytest.mark.parametrize(
-    "name", ["duplicated", "constant", "collinear", "nearly duplicated", "scaled 1e-6 to 1e6", "far from 0"]
-)
-def test_ill_conditioned_features_give_the_same_correlations(name):
-    rhos = [0.95, 0.9, 0.8]
-    x, y = linked(rhos)
-    found = paired(spoiled(name, x), y)
-    np.testing.assert_allclose(found.correlations[:3], rhos, atol=1e-6)
-    assert len(found.correlations) == 10  # the ranks are 12 and 10, whatever was added
-    assert np.abs(found.touch_weights).max() < 100
-
-
 def test_a_constant_view_is_refused():
     with pytest.raises(BadInput, match="all 4 are constant over 50"):
         decompose(np.ones((50, 4)))
-
-
-def test_the_largest_weight_fixes_the_sign_of_both_views():
-    x, y = linked([0.95, 0.7, 0.5])
-    found = paired(x, y)
-    both = np.concatenate([found.touch_weights, found.photo_weights])
-    assert (both[np.abs(both).argmax(0), range(10)] > 0).all()
-    turned = paired(-x, y)
-    sign = np.sign(np.sum(turned.touch_weights * -found.touch_weights, axis=0))[:3]
-    np.testing.assert_allclose(turned.photo_weights[:, :3], found.photo_weights[:, :3] * sign, atol=1e-9)
 
 
 def test_if_the_fast_decomposition_fails_the_slow_one_is_used(monkeypatch):

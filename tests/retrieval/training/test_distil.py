@@ -6,18 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from retrieval.data.dataset import load_grasps, make_split
-from retrieval.errors import NumericalError
-from retrieval.methods.late_fusion import LateFusion
-from retrieval.methods.method import MethodSettings
-from retrieval.methods.retrieve_rerank import RetrieveRerank
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from retrieval.model.fusion import Matcher
 from retrieval.training import distil
-from retrieval.training.features import Features, encode_recording
-from retrieval.training.initial_weights import build_matcher
-from tests.conftest import TINY
 
 HIDDEN = 16
 WITHOUT_CANDIDATE_ENCODER = MatcherConfig(tower="small", fingers=1, hidden=HIDDEN, standardise=True, embedding_dim=8)
@@ -83,49 +75,25 @@ def test_the_loss_is_the_divergence_plus_the_weighted_error():
     assert loss.item() == pytest.approx(divergence + distil.SQUARED_ERROR_WEIGHT * error)
 
 
-def test_a_loss_that_is_not_finite_is_an_error_and_the_matcher_is_unchanged(matcher, partials):
-    with torch.no_grad():
-        matcher.head.out.bias.fill_(torch.inf)
-    with pytest.raises(NumericalError, match="loss must stay finite"):
-        distilled(matcher, partials)
-    assert matcher.candidate_encoder is None
-    assert matcher.config == WITHOUT_CANDIDATE_ENCODER
-
-
 # Its data --------------------------------------------------------------------------------------------------
 
 
-@torch.no_grad()
-def test_a_blend_of_partials_is_the_partial_of_blended_features(matcher):
-    features = torch.randn(5, matcher.photo_tower.feature_count)
-    rows, partials = (
-        distil.blend(part, 50, torch.Generator().manual_seed(1))
-        for part in (features, matcher.photo_encoding(features).partial)
-    )
-    torch.testing.assert_close(matcher.photo_encoding(rows).partial, partials, rtol=1e-4, atol=1e-5)
-
-
-def test_photos_of_the_pool_are_nearer_to_the_touches_than_random_blends_until_it_is_renewed(matcher, partials):
+def test_photos_of_the_pool_are_nearer_to_the_touches_than_random_blends(matcher, partials):
     distilled(matcher, partials)
     encoder, touches = matcher.candidate_encoder, partials[0][:16]
     sampler = distil.PhotoSampler(encoder, partials[1], lambda rows: rows, torch.Generator().manual_seed(2))
-    steps = (-1, 0, 1, distil.POOL_RENEWAL_STEPS)
-    random_only, pooled, again, renewed = (sampler.photos(step, touches) for step in steps)
+    random_only, pooled = (sampler.photos(step, touches) for step in (-1, 0))
     assert random_only.shape == pooled.shape == (256, HIDDEN)
     random_similarity, pooled_similarity = (
         (encoder.touch(touches) @ encoder.photo(photos).T).topk(12).values.mean() for photos in (random_only, pooled)
     )
     assert pooled_similarity > random_similarity
-    rows, same_pool, other_pool = ({tuple(row.tolist()) for row in photos} for photos in (pooled, again, renewed))
-    assert rows & same_pool
-    assert not rows & other_pool
 
 
 # The distilled encoder -------------------------------------------------------------------------------------
 
 
 def test_the_exhaustive_top1_is_among_few_candidates_only_after_training(matcher, partials):
-    """The touches are not in the training data; there are 400 photos."""
     unseen = drawn(100, 8, sign=1)
     distilled(matcher, partials, steps=1)
     before = distil.exhaustive_top1_ranks(matcher, unseen, partials[1])
@@ -156,26 +124,6 @@ def test_only_the_candidate_encoder_changes_and_depends_on_the_seed_alone(matche
     assert same(distilled(matcher, partials), first)  # also after an earlier distillation
     assert torch.equal(torch.get_rng_state(), state)
     assert not same(distilled(matcher, partials, seed=1), first)
-
-
-def test_with_a_cosine_in_the_logit_linear_values_rank_the_top1_higher_than_a_network_alone(partials):
-    """The logit is only the cosine of embeddings that vary in two directions."""
-    torch.manual_seed(3)
-    config = dataclasses.replace(WITHOUT_CANDIDATE_ENCODER, cosine=True)
-    matcher = Matcher(config).eval()
-    with torch.no_grad():
-        matcher.head.out.weight.zero_()
-    touches, photos = (
-        torch.cat([part, sign * 2 * torch.nn.functional.normalize(part[:, :8])], dim=1)
-        for part, sign in zip(partials, (1, -1), strict=True)
-    )
-    ranks = []
-    for linear in (0, 2):
-        sizes = config_with_encoder(3, candidate_linear=linear, cosine=True)
-        distil.distil(matcher, touches, photos, sizes, quiet=True)
-        assert matcher.config == dataclasses.replace(config, candidate_width=32, candidate_linear=linear)
-        ranks.append(distil.exhaustive_top1_ranks(matcher, touches, photos).mean())
-    assert ranks[1] < ranks[0] / 2
 
 
 # Into a checkpoint -----------------------------------------------------------------------------------------
@@ -218,32 +166,3 @@ def test_queries_are_limited_in_number_and_finite_in_float16():
     np.testing.assert_array_equal(queries, distil.select_queries(partials, seed=0))
     assert partials.half()[7, 1].isinf()
     assert distil.select_queries(partials[7:8], seed=0) is None
-
-
-# In the harness --------------------------------------------------------------------------------------------
-
-
-def test_with_a_candidate_encoder_the_best_candidate_is_mostly_late_fusions_best_photo(recording, tmp_path):
-    training = dataclasses.replace(TINY.training, freeze_towers=True, distil_steps=60, iterations=30)
-    config = dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, candidate_width=32), training=training)
-    grasps = load_grasps(recording)
-    torch.manual_seed(0)
-    features = encode_recording(grasps, build_matcher(config).eval(), config, None, quiet=True)
-    split = make_split(grasps, validation=0.25, test=0.2, seed=0)
-    parts = [features.of_objects(part) for part in (split.train, split.validation)]
-    best = []
-    for kind in (LateFusion, RetrieveRerank):
-        method = kind(MethodSettings(config, folder=tmp_path))
-        method.fit(*parts)
-        best.append(method.score(method.encode_touch(features.touch), method.encode_photo(features.photo)).argmax(1))
-    assert method.best_params["reranked_fraction"] == 0.25
-    assert (best[0] == best[1]).mean() > 0.8  # the best photo may be outside the reranked quarter
-
-
-def test_partial_activations_of_parts_are_those_of_all_features(matcher, monkeypatch):
-    names, count = tuple(map(str, range(7))), matcher.touch_tower.feature_count
-    touch, photo = np.random.default_rng(0).normal(size=(2, 7, count)).astype(np.float32)
-    features = Features(names, names, touch[:, None], photo)
-    expected = distil.feature_partials(matcher, features)
-    monkeypatch.setattr(distil, "ROWS", 3)
-    torch.testing.assert_close(distil.feature_partials(matcher, features), expected)

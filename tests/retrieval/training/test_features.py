@@ -99,7 +99,6 @@ def test_an_interrupted_run_keeps_its_finished_batches(matcher, plain, encode, m
 
 
 def test_a_variant_changes_only_its_modality(grasps, matcher, plain, encode):
-    """Low-pass touches, no-contact frames as touches, and the margin of photos are cached separately."""
     whole, count = encode(matcher)
     assert count == 9 + 9
     for variant in ("low_pass", "no_contact"):

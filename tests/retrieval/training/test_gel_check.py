@@ -45,16 +45,11 @@ def test_levels_compare_no_contact_frames_of_one_object_and_touches_with_their_o
     assert (no_contact, touched) == (pytest.approx([3]), pytest.approx([10, 37, 10]))
 
 
-def test_every_kind_takes_its_turn_and_a_seed_draws_the_same_pictures_again():
+def test_every_kind_of_foreign_picture_is_drawn():
     photo, gel = np.full((40, 60, 3), 0.4, dtype=np.float32), np.full((30, 40, 3), 0.6, dtype=np.float32)
-    drawn = list(draw_foreign(24, 16, [photo], [gel], seed=3))
-    assert [name for name, _ in drawn[:8]] == [*SYNTHETIC_KINDS, "photo", "piece of a photo", "false colours"]
-    pictures = np.array([picture for _, picture in drawn])
-    assert (pictures.shape, pictures.dtype) == ((24, 16, 16, 3), np.float32)
-    assert 0 <= pictures.min() < pictures.max() <= 1
-    again = np.array([picture for _, picture in draw_foreign(24, 16, [photo], [gel], seed=3)])
-    np.testing.assert_array_equal(pictures, again)
-    assert {name for name, _ in draw_foreign(9, 16, [], [])} == set(SYNTHETIC_KINDS)
+    drawn = dict(draw_foreign(8, 16, [photo], [gel], seed=3))
+    assert set(drawn) == {*SYNTHETIC_KINDS, "photo", "piece of a photo", "false colours"}
+    assert all(picture.shape == (16, 16, 3) and 0 <= picture.min() <= picture.max() <= 1 for picture in drawn.values())
 
 
 def pictures(seed, no_contact=60):

@@ -7,12 +7,9 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import torch
-from torch.nn.functional import binary_cross_entropy_with_logits
 
-from retrieval.commands.main import main
 from retrieval.data.dataset import load_attempts, load_grasps
-from retrieval.data.preprocessing import Preprocessing
-from retrieval.errors import BadInput, CheckpointError, ConfigError, DatasetError, NumericalError
+from retrieval.errors import BadInput, CheckpointError, DatasetError, NumericalError
 from retrieval.model.checkpoint import load_checkpoint, read_tensors, write_tensors
 from retrieval.model.gate import GateSettings, GraspNet, GraspSuccessGate, load_gate
 from retrieval.training.grasp_success import BATCH, augment, draw_batch, gate_loss, train_gate
@@ -68,7 +65,6 @@ def write(folder, outcomes=OUTCOMES, objects=OBJECTS, columns=("during", "before
 
 @pytest.fixture(scope="module")
 def attempts(tmp_path_factory):
-    """8 objects, each held twice, missed once and slipped once."""
     return write(tmp_path_factory.mktemp("attempts") / "recording")
 
 
@@ -112,44 +108,23 @@ def test_the_outcome_counts_and_without_it_the_field_grasped(tmp_path):
 # Training --------------------------------------------------------------------------------------------------
 
 
-def test_the_frame_after_the_lift_shows_a_slip_that_the_frame_during_the_grasp_does_not(trained):
-    """In these pictures a grasp that slips looks exactly like a held one until the lift."""
-    after, during = trained["after"][1], trained["during"][1]
-    assert after["accepted"] == {"held": (4, 4), "missed": (0, 2), "slipped": (0, 2)}
-    assert during["accepted"]["missed"] == (0, 2)
-    assert after["accuracy"] > during["accuracy"]
-
-
 def test_the_report_and_the_file_state_accuracy_chance_and_accepted_grasps_of_other_objects(trained, attempts):
     out, report = trained["after"]
     counts = [report[name] for name in ("train_grasps", "train_held", "validation_grasps", "validation_objects")]
     assert counts == [24, 12, 8, 2]
     assert (report["accuracy"], report["chance"]) == (1.0, 0.5)
+    assert report["accepted"] == {"held": (4, 4), "missed": (0, 2), "slipped": (0, 2)}
+    assert report["accuracy"] > trained["during"][1]["accuracy"]  # a slip looks held until the lift
     assert report["interval"] == pytest.approx((0.025 ** (1 / 8), 1.0))
     header = read_tensors(out)[1]
-    expected = {"source": "test", "iterations": ENOUGH, "seed": 0, "outcomes": {"held": 16, "missed": 8, "slipped": 8}}
-    assert expected.items() <= header["provenance"].items()
     assert header["provenance"]["metrics"]["accuracy"] == report["accuracy"]
     assert not set(header["split"]["train"]) & set(header["split"]["validation"])
     assert str(attempts) not in json.dumps(header)
 
 
-def test_the_command_prints_accuracy_interval_chance_and_the_accepted_grasps(attempts, tmp_path, capsys):
-    out = tmp_path / "gate.safetensors"
-    assert main(["train", str(attempts), "--task", "grasp-success", "--iterations", "2", "--out", str(out)]) == 0
-    output, metrics = capsys.readouterr().err, read_tensors(out)[1]["provenance"]["metrics"]
-    assert f"accuracy {metrics['accuracy']:.3f} (95 %: {metrics['interval'][0]:.3f} to" in output
-    assert f"frequent class: {metrics['chance']:.3f}" in output
-    assert f"accepted: {metrics['accepted']['held'][0]} of 4 held" in output
-
-
-def test_the_frame_after_the_lift_is_used_if_there_is_one_and_only_its_files_are_read(attempts, tmp_path, monkeypatch):
-    read, load, out = [], Preprocessing.load_touch, tmp_path / "g.safetensors"
-    monkeypatch.setattr(Preprocessing, "load_touch", lambda self, *paths: read.append(paths) or load(self, *paths))
+def test_the_frame_after_the_lift_is_used_if_there_is_one(attempts, tmp_path):
+    out = tmp_path / "g.safetensors"
     assert train_gate(attempts, out, iterations=2, quiet=True)["frame"] == "after"
-    names = [path.stem for pair in read for path in pair]
-    assert len(set(names)) == len(names)
-    assert all(name.endswith(("_after", "_before")) for name in names)
     without = write(tmp_path / "r", columns=("during", "before"))
     assert train_gate(without, out, iterations=1, quiet=True)["frame"] == "during"
     assert load_gate(out).settings == GateSettings(frame="during")
@@ -164,13 +139,9 @@ def test_the_same_seed_gives_the_same_file_and_the_global_random_state_is_unchan
     assert files[0] == files[1] != files[2]
 
 
-def test_batches_contain_equal_numbers_of_both_kinds_and_depend_only_on_seed_and_step(attempts):
-    few = load_attempts(attempts)[:8]
-    batch, again, next_step, other = (draw_batch(few, *at)[0] for at in ((0, 3), (0, 3), (1, 3), (0, 4)))
+def test_batches_contain_equal_numbers_of_both_kinds(attempts):
+    batch, _ = draw_batch(load_attempts(attempts)[:8], 0, 3)
     assert [item.held for item in batch] == [True] * (BATCH // 2) + [False] * (BATCH // 2)
-    assert batch == again
-    assert batch != next_step
-    assert batch != other
 
 
 def test_the_loss_uses_the_deciding_finger_and_an_idle_finger_gets_no_gradient():
@@ -181,9 +152,6 @@ def test_the_loss_uses_the_deciding_finger_and_an_idle_finger_gets_no_gradient()
     loss.backward()
     assert logits.grad[0, 0] < 0 < logits.grad[1, 0]
     assert logits.grad[:, 1].tolist() == [0, 0]
-    naive = logits.detach().clone().requires_grad_()
-    binary_cross_entropy_with_logits(naive, held[:, None].expand(2, 2)).backward()
-    assert naive.grad[0, 1] < 0  # with the grasp's label on every finger, an empty gel is trained towards success
 
 
 def test_augmentation_flips_and_relights_each_finger_independently():
@@ -206,8 +174,6 @@ def test_augmentation_flips_and_relights_each_finger_independently():
 REFUSED = {
     "no results": ({"outcomes": ("held",), "outcome": None, "grasped": None}, "has a recorded result"),
     "held grasps only": ({"outcomes": ("held",)}, "got 6 successful of 6"),
-    "failed grasps only": ({"outcomes": ("missed",)}, "got 0 successful"),
-    "no frame before": ({"columns": ("during",)}, r"a-0 has 0 before for 2 finger\(s\)"),
     "no frame after": ({"columns": ("during", "before")}, r"a-0 has 0 after for 2 finger\(s\)"),
     "too few objects": ({"objects": OBJECTS[:3]}, "needs two objects in each"),
 }
@@ -221,9 +187,7 @@ def test_a_recording_that_cannot_train_a_gate_is_refused(tmp_path, case):
         train_gate(write(tmp_path / "r", **options), tmp_path / "g.safetensors", settings=settings, quiet=True)
 
 
-def test_settings_and_files_that_are_not_of_a_gate_are_refused(attempts, model, trained, tmp_path):
-    with pytest.raises(ConfigError, match=r"gate\.frame must be one of 'after', 'during'"):
-        GateSettings(frame="later")
+def test_files_that_are_not_of_a_gate_are_refused(attempts, model, trained, tmp_path):
     with pytest.raises(CheckpointError, match="must be a file"):
         train_gate(attempts, tmp_path, quiet=True)
     with pytest.raises(CheckpointError, match="retrieve train --task"):
@@ -231,10 +195,9 @@ def test_settings_and_files_that_are_not_of_a_gate_are_refused(attempts, model, 
     with pytest.raises(CheckpointError, match="retrieve collect --gate"):
         load_checkpoint(trained["after"][0])
     state, header = read_tensors(trained["after"][0])
-    for change in ({"depth": 3}, {"touch_px": 0}, None):
-        write_tensors(tmp_path / "gate.safetensors", state, header | {"gate": change})
-        with pytest.raises(CheckpointError, match="is not a gate that this version can use"):
-            load_gate(tmp_path / "gate.safetensors")
+    write_tensors(tmp_path / "gate.safetensors", state, header | {"gate": {"depth": 3}})
+    with pytest.raises(CheckpointError, match="is not a gate that this version can use"):
+        load_gate(tmp_path / "gate.safetensors")
 
 
 # Use -------------------------------------------------------------------------------------------------------
@@ -282,13 +245,6 @@ def test_a_fingers_logit_does_not_depend_on_other_fingers_or_the_image_size(gate
     alone = gate.logits({"a": frames["a"]})["a"]
     assert gate.logits({"x": frames["b"], "c": frames["a"]})["c"] == pytest.approx(alone, rel=1e-4)
     assert gate({"a": large})
-
-
-def test_a_brighter_lamp_gives_no_frame_around_the_picture():
-    """With zero padding, a change of the whole picture would have an edge."""
-    for layer, even in ((GraspNet().layers[0], True), (torch.nn.Conv2d(3, 16, 5, stride=2, padding=2), False)):
-        maps = layer(torch.full((1, 3, 64, 64), 0.08)).flatten(2)
-        assert bool((maps.amax(2) - maps.amin(2)).max() < 1e-5) is even
 
 
 def test_a_gate_requires_the_frames_that_it_was_trained_on(gate, trained):

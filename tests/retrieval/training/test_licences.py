@@ -8,10 +8,8 @@ import onnx
 import pytest
 
 from retrieval.data.dataset import DataLicence, recording_licence, stored_licences
-from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.export import touch_encoder_to_onnx
-from retrieval.model.shipped import shipped_model
-from retrieval.training.initial_weights import checkpoint_licences, training_licences
+from retrieval.training.initial_weights import training_licences
 from retrieval.training.train import train
 from tests.conftest import TINY
 
@@ -20,7 +18,6 @@ TERMS = "name the authors"
 
 @pytest.fixture(scope="module")
 def licensed(recording, tmp_path_factory):
-    """The recording with a licence."""
     folder = shutil.copytree(recording, tmp_path_factory.mktemp("licensed") / "recording")
     info = json.loads((folder / "recording.json").read_text())
     (folder / "recording.json").write_text(json.dumps(info | {"licence": "CC BY 4.0", "terms": TERMS}))
@@ -39,13 +36,6 @@ def test_the_licences_of_a_training_are_those_of_all_its_data(recording, license
     assert training_licences(recording, settings) == [own, DataLicence("tower.safetensors")]
     started = dataclasses.replace(settings, start=str(trained.path))  # the towers of the checkpoint replace the file
     assert training_licences(recording, started) == [own, stated]
-
-
-def test_a_shipped_model_is_mit_and_an_older_checkpoint_not_stated(tmp_path):
-    shipped = load_checkpoint(shipped_model())
-    assert [each.licence for each in checkpoint_licences(shipped)] == ["MIT"]
-    older = dataclasses.replace(shipped, path=tmp_path / "own.safetensors", provenance={"source": "a rig"})
-    assert checkpoint_licences(older) == [DataLicence("a rig")]
 
 
 def test_checkpoint_card_and_export_repeat_the_licences(trained):

@@ -44,13 +44,6 @@ def test_named_kinds_override_appearance_unless_the_kind_of_an_object_is_missing
     assert held_out_folds(features, {name: name[1] for name in NAMES[1:]}) == held_out_folds(features)
 
 
-def test_kinds_of_odd_size_give_folds_of_equal_size():
-    kinds = [["a1", "a2", "a3"], ["b1"], ["c1", "c2", "c3"], ["d1"]]
-    parts = held_out_folds(features_of(kinds), {name: name[0] for kind in kinds for name in kind})
-    assert list(map(len, parts)) == [4, 4]
-    assert {sum(name[0] == "a" for name in part) for part in parts} == {1, 2}
-
-
 def test_objects_of_one_sequence_stay_together_although_they_are_of_two_kinds():
     parts = held_out_folds(features_of(KINDS), linked=[["a0", "b3"]])
     assert any({"a0", "b3"} <= set(part) for part in parts)

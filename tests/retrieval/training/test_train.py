@@ -43,8 +43,6 @@ class NormTower(Tower):
 
 
 class Proxies(Loss):
-    """A loss with a random matrix as its parameter."""
-
     def __init__(self, embedding_dim, objects):
         super().__init__(embedding_dim, objects)
         self.proxies = nn.Embedding(objects, embedding_dim)
@@ -69,7 +67,6 @@ WITH_ENCODER = with_matcher(with_training(TINY, distil_steps=4), candidate_width
 
 
 def load(source, batch, step=0):
-    """Return the loaded batch of a step."""
     return next(iter(source.batches(None, [(step, batch)])))
 
 
@@ -155,15 +152,6 @@ def test_each_loss_is_added_with_its_weight(recording):
     expected = match_loss(logits[batch.touch_index, batch.photo_index], torch.from_numpy(batch.labels))
     expected = expected + 0.3 * contrastive_loss(touch.embedding, photo.embedding, *objects, matcher.log_scale)
     assert loss.item() == pytest.approx((expected + 0.7 * listwise_loss(logits, *objects)).item(), rel=1e-6)
-
-
-def test_a_contrastive_weight_of_zero_leaves_the_projections_unchanged(recording, tmp_path):
-    made = train(recording, tmp_path / "m.safetensors", with_training(TINY, weights={}), quiet=True)
-    torch.manual_seed(TINY.training.seed)
-    first, last = build_matcher(made.config).state_dict(), made.matcher.state_dict()
-    assert torch.equal(first["touch_projection.weight"], last["touch_projection.weight"])
-    assert torch.equal(first["log_scale"], last["log_scale"])
-    assert not torch.equal(first["head.second.weight"], last["head.second.weight"])
 
 
 @pytest.mark.parametrize(
@@ -257,13 +245,6 @@ def test_a_resumed_training_gives_the_bits_of_an_uninterrupted_one_with_any_numb
 def whole(recording, tmp_path_factory):
     """The checkpoint of an uninterrupted run with a candidate encoder."""
     return trainer_for(recording, tmp_path_factory.mktemp("whole") / "m.safetensors", WITH_ENCODER).run(quiet=True)
-
-
-def test_a_candidate_encoder_is_distilled_after_the_last_step_and_changes_no_other_weights(whole, model):
-    assert whole.config == with_matcher(WITH_ENCODER, fingers=2)
-    assert whole.queries.shape == (9, WITH_ENCODER.matcher.partial_width)  # touches of three validation objects
-    assert same_weights(load_checkpoint(model).matcher.state_dict(), whole.matcher.state_dict())
-    assert not state_path(whole.path).exists()
 
 
 @pytest.mark.parametrize(
@@ -374,10 +355,7 @@ def test_without_validation_objects_the_checkpoint_is_the_last_step_without_a_po
 
 
 def test_a_background_policy_needs_no_contact_frames(recording, tmp_path):
-    preprocessing, (grasp, *_) = (
-        dataclasses.replace(TINY.preprocessing, background="difference"),
-        load_grasps(recording),
-    )
+    preprocessing, grasp = dataclasses.replace(TINY.preprocessing, background="difference"), load_grasps(recording)[0]
     images = BatchImages(preprocessing)
     with pytest.raises(DatasetError, match="no-contact frame for each finger"):
         images.touch(dataclasses.replace(grasp, backgrounds=()))
@@ -393,15 +371,11 @@ def test_bfloat16_is_refused_where_it_would_be_emulated(recording, tmp_path, mon
         train(recording, tmp_path / "m.safetensors", with_training(TINY, precision="bfloat16"), quiet=True)
 
 
-def test_a_split_that_leaks_or_lacks_objects_is_refused(recording, tmp_path):
+def test_a_split_that_leaks_is_refused(recording, tmp_path):
     names = sorted({grasp.object_id for grasp in load_grasps(recording)})
-    bad = {
-        "shares 1 object": Split(0, tuple(names[:6]), tuple(names[5:9]), ()),
-        "2 objects in the validation part.*has 1": Split(0, tuple(names[:6]), (names[6], "unknown"), ()),
-    }
-    for message, split in bad.items():
-        with pytest.raises(DatasetError, match=message):
-            train(recording, tmp_path / "m.safetensors", TINY, split=split, quiet=True)
+    leaking = Split(0, tuple(names[:6]), tuple(names[5:9]), ())
+    with pytest.raises(DatasetError, match="shares 1 object"):
+        train(recording, tmp_path / "m.safetensors", TINY, split=leaking, quiet=True)
 
 
 def test_a_checkpoint_that_cannot_be_written_is_an_error_before_the_first_step(recording, tmp_path, monkeypatch):
@@ -418,14 +392,7 @@ def test_training_continues_from_the_towers_and_the_head_of_a_checkpoint(model):
     assert same_weights(started, load_checkpoint(model).matcher.state_dict())
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"hidden": 64}, r"no head\.\S+ of shape"),
-        ({"tower": "resnet18"}, r"no touch_tower\.\S+ of shape .*; use its config"),
-    ],
-)
-def test_a_checkpoint_with_other_layers_or_towers_cannot_start_a_training(model, changes, message):
+def test_a_checkpoint_with_other_towers_cannot_start_a_training(model):
     """Otherwise the towers would keep random weights, if the other layers have the same sizes."""
-    with pytest.raises(CheckpointError, match=message):
-        build_matcher(with_training(with_matcher(TINY, **changes), start=str(model)))
+    with pytest.raises(CheckpointError, match=r"no touch_tower\.\S+ of shape .*; use its config"):
+        build_matcher(with_training(with_matcher(TINY, tower="resnet18"), start=str(model)))
