@@ -91,10 +91,6 @@ def test_a_flipped_bit_gives_no_wrong_entry(filled):
 
 
 def test_a_cache_that_cannot_be_written_is_an_error_that_names_it(path):
-    path.parent.write_text("a file in place of the folder")
-    with pytest.raises(OSError, match="folder"):
-        Cache(path)
-    path.parent.unlink()
     path.mkdir(parents=True)
     with pytest.raises(OSError, match="cannot be read or written") as caught:
         Cache(path)

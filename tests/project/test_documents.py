@@ -1,7 +1,7 @@
 """Conversion of plain documents to typed values, and errors for invalid ones."""
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -21,9 +21,7 @@ class Gel:
 class Sensor:
     gel: Gel
     sides: tuple[float, float] = (1.0, 1.0)
-    name: str | None = None
     lights: dict[str, float] | None = None
-    by_name: dict[str, Gel] = field(default_factory=dict)
 
 
 def test_tables_become_dataclasses_lists_become_tuples_and_integers_become_floats():
@@ -38,16 +36,8 @@ def test_tables_become_dataclasses_lists_become_tuples_and_integers_become_float
         ({"gel": {"pitch_mm": "2"}}, "[sensor].gel.pitch_mm must be a number, got '2'"),
         ({"gel": {"pitch_mm": 2, "markers": -1}}, "[sensor].gel.markers must be a whole number >= 0, got -1"),
         ({"gel": {}}, "[sensor].gel: object missing required field `pitch_mm`"),
-        ({"gel": [2]}, "[sensor].gel must be a table, got [2]"),
         ({"gel": {"pitch_mm": 2, "lamp": 1}}, "[sensor].gel has no setting 'lamp'; known settings: markers, pitch_mm"),
-        (
-            {"by_name": {"a": {"pitch_mm": 2, "lamp": 1}}},
-            "[sensor].by_name has no setting 'lamp'; known settings: markers",
-        ),
-        ({"sides": [1]}, "[sensor].sides must be a list of length 2, got [1]"),
         ({"sides": [1, "x"]}, "[sensor].sides[1] must be a number, got 'x'"),
-        ({"name": 3}, "[sensor].name must be a text in quotes or nothing, got 3"),
-        ({"lights": {"red": "on"}}, "[sensor].lights must be a number, got `str`"),
         ({"lights": {"red": float("nan")}}, "[sensor].lights.red must be a finite number, got nan"),
         ({"gel": {"pitch_mm": 2**63}}, "[sensor].gel.pitch_mm must fit into 64 bits, got 92233"),
     ],

@@ -85,15 +85,13 @@ def test_a_notebook_runs_and_its_committed_outputs_have_the_same_kinds(name, dem
 
 @every_notebook
 def test_the_first_code_cell_contains_only_the_parameters(name):
-    first, *others = code_cells(name)
+    first = code_cells(name)[0]
     assert first["metadata"] == {"tags": ["parameters"]}
-    assert not any(cell["metadata"] for cell in others)
     found = {}
     for statement in ast.parse("".join(first["source"])).body:
         assert isinstance(statement, ast.Assign)
         found[statement.targets[0].id] = ast.literal_eval(statement.value)
     assert found.keys() == TINY[name].keys()
-    assert not any(str(value).startswith(("/", "~")) for value in found.values())
 
 
 @every_notebook
@@ -104,19 +102,6 @@ def test_committed_outputs_are_small_without_errors_and_without_local_paths(name
     texts = json.dumps([output.get("text", output.get("data", {}).get("text/plain")) for output in outputs])
     assert not re.search(r"(?<![\w.])/(home|root|tmp|work|Users|var|mnt)\b|[A-Z]:\\\\", texts)
     assert (FOLDER / f"{name}.ipynb").stat().st_size < MAX_OUTPUT_BYTES
-
-
-@every_notebook
-def test_a_notebook_contains_no_logic_and_has_a_title(name):
-    document = notebook(name)
-    headings = [cell["source"][0] for cell in document["cells"] if cell["cell_type"] == "markdown"]
-    assert document["cells"][0]["source"][0] == headings[0]
-    assert headings[0].startswith("# ")
-    assert not any(heading.startswith("# ") for heading in headings[1:])
-    for cell in code_cells(name)[2:]:  # after parameters and imports
-        types = [type(node) for node in ast.walk(ast.parse("".join(cell["source"])))]
-        assert not {ast.FunctionDef, ast.ClassDef, ast.While, ast.Try} & set(types)
-    assert not set(document["metadata"]) - {"kernelspec", "language_info"}
 
 
 def test_notebooks_and_the_readme_use_only_public_names_of_the_packages():

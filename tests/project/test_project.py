@@ -13,10 +13,6 @@ LISTED = [*PROJECT["project"]["dependencies"], *chain(*PROJECT["project"]["optio
 BOUNDS = {re.split(r"[<>=\[]", item)[0].lower(): re.search(r">=([\w.]+)", item)[1] for item in LISTED}
 
 
-def test_requirements_of_a_query_have_the_same_bounds():
-    assert set(PROJECT["dependency-groups"]["query"]) <= set(LISTED)
-
-
 def pins(name):
     lines = (ROOT / ".ci" / name).read_text().splitlines()
     return dict(line.lower().split("==") for line in lines if line and not line.startswith("#"))

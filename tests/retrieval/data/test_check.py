@@ -60,11 +60,6 @@ def remarks(folder, split=None):
     return [finding for finding in check_recording(folder, split) if finding.severity != "note"]
 
 
-def note(folder, kind):
-    (found,) = [finding for finding in check_recording(folder) if finding.kind == kind]
-    return found
-
-
 def kinds(findings):
     return {(finding.severity, finding.kind, finding.grasps) for finding in findings}
 
@@ -278,10 +273,7 @@ def let_drift(broken, order=range(30), columns=GELS):
 
 
 def test_drift_identifies_objects_that_were_touched_one_after_another(broken):
-    """In a block of 4, the outer lines have one neighbour of two in the block: (2 + 2 / 2) / 4 = 75 %.
-
-    Nor does an error in the photos hide it: recordings without photos have the touch in place of the photo.
-    """
+    """In a block of 4, the outer lines have one neighbour of two in the block: (2 + 2 / 2) / 4 = 75 %."""
     let_drift(broken)
     broken.change(range(30), lambda row: row.update(photo_file_name=row["touch_a_file_name"]))
     modality, drift = remarks(broken.folder)
@@ -305,8 +297,8 @@ def test_the_same_drift_does_not_identify_objects_that_were_touched_in_rounds(br
     captured = {broken.rows[number]["grasp_id"]: float(place) for place, number in enumerate(rounds)}
     broken.change(range(30), lambda row: row.update(time_s=captured[row["grasp_id"]]))
     assert remarks(broken.folder) == []
-    message = note(broken.folder, "drift").message
-    found = re.search(r"alone identify the object in (\d+)%.*alone in 0% \[0, 0\] \(chance 13%\)", message)
+    (note,) = [finding for finding in check_recording(broken.folder) if finding.kind == "drift"]
+    found = re.search(r"alone identify the object in (\d+)%.*alone in 0% \[0, 0\] \(chance 13%\)", note.message)
     assert int(found[1]) <= 13
 
 

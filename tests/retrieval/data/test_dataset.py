@@ -29,7 +29,6 @@ from tests import synthetic
 
 
 def grasp(object_id, number=0, sequence=None, fingers="ab", photo=None):
-    """A grasp whose files need not exist."""
     name = f"{object_id}-{number}"
     touches = tuple(Path(f"{name}-{finger}.png") for finger in fingers)
     return Grasp(name, object_id, sequence, Path(photo or f"{name}.jpg"), touches, ())
@@ -49,7 +48,6 @@ def pairs(batch):
 
 
 def contents(batch):
-    """Return a batch as plain values, for comparisons."""
     return {
         key: value.tolist() if isinstance(value, np.ndarray) else value
         for key, value in dataclasses.asdict(batch).items()
@@ -334,7 +332,6 @@ def test_shared_negatives_use_every_other_object_and_each_of_its_photos_equally(
 
 
 def test_the_evaluation_pairs_contain_every_touch_once_and_are_never_shared_and_always_the_same():
-    """They do not depend on share_photos, since existing checkpoints were selected on them."""
     grasps = grasps_of(3, 1, 5)
     sampler = PairSampler(grasps, seed=0)
     batch = sampler.evaluation_pairs()

@@ -46,7 +46,6 @@ FOUND = {
     "blue": (photo(), BOX),
     "nearly white": (photo(colour=(0.95, 0.95, 0.9)), BOX),
     "nearly black": (photo(colour=(0.05, 0.05, 0.06)), BOX),
-    "red": (photo(colour=(0.7, 0.3, 0.3)), BOX),
     "with a shadow": (photo(shadow=[(150, 150, 240, 200)]), BOX),
     "in uneven light": (photo(slope=0.3), BOX),
     "on white paper without noise": (white_paper(), (80, 50, 120, 150)),
