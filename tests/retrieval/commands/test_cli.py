@@ -1,10 +1,8 @@
 """The command line for users: commands as documented, exit codes, one-line errors, clean stdout."""
 
 import json
-import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 from itertools import chain
@@ -15,8 +13,6 @@ import typer
 
 from retrieval.commands.main import application, main
 from retrieval.commands.options import Command
-from retrieval.frontier import APPROXIMATIONS
-from retrieval.methods import METHODS
 from retrieval.model.shipped import shipped_model
 from tests import synthetic
 
@@ -79,7 +75,7 @@ def test_the_exit_code_distinguishes_none_of_these_from_a_match(built, capsys):
     assert output.err.splitlines()[-1] == last
 
 
-def test_json_is_the_only_thing_on_stdout_and_has_the_documented_keys(workplace, model, capsys):
+def test_json_is_the_only_thing_on_stdout(workplace, model, capsys):
     main(["build-index", "catalog/", "--model", str(model), "--json"])
     assert json.loads(capsys.readouterr().out)["photos"] == 24
     assert main(["build-index", "catalog/"]) == 0
@@ -87,28 +83,9 @@ def test_json_is_the_only_thing_on_stdout_and_has_the_documented_keys(workplace,
     query = [*QUERY, "--gelsight", "a2.png", "b2.png", "--top", "3", "--json"]
     assert main([*query, *NO_UNKNOWN_OBJECTS]) == 0
     document = json.loads(capsys.readouterr().out)
-    assert set(document) == {
-        *("query", "index", "timing_ms", "verdict", "none_probability", "posterior", "results"),
-        *("more_grasps", "advice", "unlisted_probability"),
-    }
     touches = [["a.png", "b.png"], ["a2.png", "b2.png"]]
     assert document["query"] == {"touches": touches, "grasps": ["contact", "contact"]}
-    assert set(document["posterior"]) == {
-        *("formula", "slope", "offset", "dependence", "tests"),
-        *("none_prior", "grasps", "objects", "scored_objects", "unscored_probability"),
-    }
-    assert set(document["timing_ms"]) == {"decode", "encode", "candidates", "rerank", "total"}
     assert [match["rank"] for match in document["results"]] == [1, 2, 3]
-    probabilities = ("probability", "probability_if_present")
-    assert set(document["results"][0]) == {
-        "rank",
-        "object_id",
-        "logit",
-        *probabilities,
-        "photo",
-        "photo_digest",
-        "metadata",
-    }
 
 
 def test_html_is_written_in_addition_to_the_table_over_pages_only(built, capsys):
@@ -125,21 +102,16 @@ def test_html_is_written_in_addition_to_the_table_over_pages_only(built, capsys)
 
 WRONG_USE = {
     "no index": (QUERY, "run `retrieve build-index CATALOGUE` first"),
-    "one gel image": (["query", "--gelsight", "a.png", "--index", "index"], "takes 2 gel image(s)"),
     "not an image": (["query", "--gelsight", "a.png", "text.png", "--index", "index"], "text.png"),
     "no catalogue": (["build-index", "nowhere/"], "nowhere"),
     "no model": (["build-index", "catalog/", "--model", "none.safetensors"], "there is no checkpoint"),
-    "unknown kind": (["build-index", "catalog/", "--kind", "tree"], "flat"),
     "no recording": (["train", "catalog/", "--out", "m.safetensors"], "recording.json"),
     "no checkpoint": (["train", "nowhere", "--out", "m.txt"], "*.safetensors"),
-    "no preset": (["train", "catalog/", "--out", "m.safetensors", "--config", "huge"], "small"),
     "unknown data set": (["import", "imagenet", "src", "--out", "out"], "billets"),
     "unknown rig": (["collect", "--rig", "sawyer", "--out", "rec"], "one of real, sim"),
     "no rig file": (["collect", "--rig", "rig.toml", "--out", "rec"], "rig.toml cannot be read"),
-    "no such gate": (["collect", "--gate", "none.safetensors", "--out", "rec"], "none.safetensors"),
     "not an empty folder": (["collect", "--out", "catalog"], "catalog contains other files"),
     "bad split": (["check", "catalog", "--split", "text.png"], "not a JSON file"),
-    "no split file": (["check", "catalog", "--split", "none.json"], "none.json"),
 }
 
 
@@ -215,20 +187,11 @@ def test_an_index_is_not_written_among_the_photos(workplace, model, capsys):
     assert sorted(workplace.rglob("*")) == before
 
 
-def test_a_history_that_is_not_a_file_is_refused(built, capsys):
-    Path("history").mkdir()
-    os.mkfifo("history/history.sqlite")
-    assert main(["serve", "--index", "index", "--history", "history", "--port", "0"]) == 2
-    assert "history/history.sqlite must be the history of a service" in capsys.readouterr().err.splitlines()[-1]
-
-
 WRONG_WORDS = {
     "no command": ([], "retrieve: Missing command"),
     "an unknown command": (["fetch"], "retrieve: No such command 'fetch'"),
     "an unknown option": (["check", "rec", "--quick"], "retrieve check: No such option: --quick"),
-    "an argument too many": (["check", "rec", "rec2"], "retrieve check: Got unexpected extra argument(s) (rec2)"),
     "no touch": (["query", "--top", "3"], "retrieve query: Missing option '--gelsight'"),
-    "no choice": (["train", "rec", "--out", "m", "--task", "swim"], "is not one of 'match', 'grasp-success'"),
     "a forgotten folder": (["collect", "--out", "--preview"], "retrieve collect: --out needs a value"),
     "forgotten files": (["query", "--gelsight", "--json"], "retrieve query: --gelsight needs a value"),
     "no task of rig": (["rig"], "retrieve rig: Missing command"),
@@ -267,12 +230,6 @@ def test_the_package_runs_the_command_line():
     assert done.stdout.startswith("Usage: retrieve train ")
 
 
-@pytest.mark.parametrize(("command", "choices"), [("evaluate", METHODS), ("frontier", APPROXIMATIONS)])
-def test_help_lists_the_choices(command, choices, capsys):
-    assert main([command, "--help"]) == 0
-    assert set(choices) <= set(capsys.readouterr().out.replace(",", " ").split())
-
-
 def test_check_prints_the_licence_and_exits_with_1_if_it_finds_errors(tmp_path, capsys):
     recording = synthetic.write_recording(tmp_path / "r", synthetic.make_objects(3), 2)
     assert main(["check", str(recording)]) == 0
@@ -289,41 +246,8 @@ def test_check_prints_the_licence_and_exits_with_1_if_it_finds_errors(tmp_path, 
     assert "is not suitable for training" in output.err
 
 
-def test_the_whole_job_from_recording_to_ranking(recording, workplace, capsys):
-    config = workplace / "tiny.toml"
-    config.write_text(
-        '[matcher]\ntower = "small"\ntower_output = "pooled"\nhidden = 16\nembedding_dim = 8\n'
-        '[training]\nseed = 3\ninit = "random"\niterations = 2\ntouches_per_batch = 2\nvalidation_fraction = 0.25\n'
-    )
-    assert main(["train", str(recording), "--out", "m.safetensors", "--config", "tiny.toml"]) == 0
-    assert "best step 2" in capsys.readouterr().err
-    assert main(["build-index", "catalog", "--model", "m.safetensors"]) == 0
-    assert "model: m.safetensors (given)" in capsys.readouterr().err
-    assert main([*QUERY, "--json", *NO_UNKNOWN_OBJECTS]) == 0
-    assert len(json.loads(capsys.readouterr().out)["results"]) == 8
-
-
 COLLECT = ["collect", "--rig", "tests.fake_rig:FakeRig", "--objects", "2", "--grasps", "2"]
 COLLECT += ["--seed", "3", "--out", "rec"]
-
-
-def test_a_recording_is_collected_and_its_acceptance_printed(workplace, capsys):
-    assert main(COLLECT) == 0
-    output = capsys.readouterr()
-    assert output.out == ""
-    lines = output.err.splitlines()
-    assert any(line.startswith("round-0") for line in lines)
-    assert lines[-1] == "rec: 4 accepted grasps of 2 objects"
-    assert main(COLLECT) == 0  # nothing is left to do
-
-
-def test_ctrl_c_while_collecting_prints_how_to_continue(workplace, capsys, monkeypatch):
-    from tests.fake_rig import FakeGripper
-
-    monkeypatch.setattr(FakeGripper, "_grasp", lambda *_: signal.raise_signal(signal.SIGINT))
-    assert main(COLLECT) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.endswith("stored in rec; run the same command to continue.")
 
 
 def test_meshes_that_cannot_be_grasped_are_listed_and_the_others_are_collected(tmp_path, monkeypatch, capsys):
@@ -361,7 +285,6 @@ def test_a_trained_gate_decides_which_grasps_are_accepted(workplace, capsys):
     ("words", "message"),
     [
         (["collect", "--out", "r", "--dry-run", "--preview"], "--preview has no effect with --dry-run"),
-        (["serve", "--index", "i", "--replicas", "2"], "--replicas needs --cluster"),
         (["serve", "--index", "i", "--no-history", "--history", "h"], "--history contradicts --no-history"),
         (["build-index", "catalog/", "--cluster"], "give --shards too"),
     ],

@@ -2,7 +2,7 @@
 
 import pytest
 
-from retrieval.commands.demo import PHOTOS, SEED, TOUCHES, example_object
+from retrieval.commands.demo import PHOTOS, SEED, TOUCHES
 from retrieval.commands.main import main
 from robot.recording.folder import read_recording
 
@@ -13,12 +13,6 @@ def finished_demo(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo")
     assert main(["demo", "--objects", "4", "--out", str(folder / "demo")]) == 0
     return folder / "demo"
-
-
-def test_the_object_of_the_page_depends_only_on_names_and_numbers_of_grasps():
-    grasps = {"mug": [1, 2, 3], "bowl": [1, 2], "cup": [1, 2, 3], "dish": [1, 2, 3]}
-    assert example_object(grasps) == "cup"
-    assert example_object({"mug": [1], "bowl": [1]}) == "bowl"
 
 
 def test_the_page_has_photos_and_gel_images_and_no_grasp_provides_both(finished_demo):

@@ -72,27 +72,10 @@ def test_a_calibration_is_fitted_printed_and_written_over_an_earlier_one_and_no_
     assert (here / "photo.png").read_bytes() == b"\x89PNG"
 
 
-def scaled(*factors):
-    """Return POINTS with scaled coordinates of the camera."""
-    heading, *lines = POINTS.splitlines()
-    rows = ([float(value) for value in line.split(",")] for line in lines)
-    wrong = [[*(value * each for value, each in zip(row, factors, strict=False)), *row[3:]] for row in rows]
-    return "\n".join([heading, *(",".join(map(str, row)) for row in wrong)])
-
-
-@pytest.mark.parametrize(
-    ("content", "code", "reason"),
-    [
-        ("a,b\n1,2\n", 2, "camera_x_mm"),
-        (scaled(0.001, 0.001, 0.001), 2, "must be in mm"),
-        (scaled(1, 1, -1), 1, "mirrored"),
-    ],
-    ids=["no points", "metres", "mirrored"],
-)
-def test_points_without_a_calibration_are_refused_with_the_reason(here, capsys, content, code, reason):
-    (here / "points.csv").write_text(content)
-    assert main(["rig", "calibrate", "points.csv"]) == code
-    assert reason in capsys.readouterr().err
+def test_points_without_a_calibration_are_refused_with_the_reason(here, capsys):
+    (here / "points.csv").write_text("a,b\n1,2\n")
+    assert main(["rig", "calibrate", "points.csv"]) == 2
+    assert "camera_x_mm" in capsys.readouterr().err
     assert not (here / "hand_eye.json").exists()
 
 

@@ -11,21 +11,8 @@ import pytest
 
 from _touch_retrieval.files import write_atomically
 from retrieval.console.files import require_output, write_output
-from retrieval.errors import BadInput
 
 ROOT = Path(__file__).parents[3]
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("a.html.png", r"must be named \*\.html"),
-        ("absent/page.html", "the folder .*absent does not exist"),
-    ],
-)
-def test_an_output_with_another_suffix_or_without_a_folder_is_refused(tmp_path, name, message):
-    with pytest.raises(BadInput, match=message):
-        require_output(tmp_path / name, ".html")
 
 
 def test_an_output_replaces_a_file_with_its_suffix_and_creates_its_folder(tmp_path):

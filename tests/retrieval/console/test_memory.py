@@ -21,28 +21,10 @@ before = faults()
 keep_freed_memory()
 print(before, faults())
 """
-KEPT = """
-import sys
-from retrieval.commands import main
-main.keep_freed_memory = lambda: print("kept")
-for command in ("train", "build-index", "serve", "demo"):
-    sys.argv = ["retrieve", command, "--help"]
-    main.main()
-"""
 
 
 def output_of(program):
     return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-
-
-def test_only_commands_that_compute_until_they_end_keep_freed_memory():
-    """The demo may end with the service, which must return its memory."""
-    lines = output_of(KEPT).splitlines()
-    shown = [line for line in lines if line == "kept" or line.startswith("Usage:")]
-    assert [" ".join(line.split()[:3]) for line in shown] == [
-        *("kept", "Usage: retrieve train", "kept", "Usage: retrieve build-index"),
-        *("Usage: retrieve serve", "Usage: retrieve demo"),
-    ]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only the GNU C library returns freed memory like this")

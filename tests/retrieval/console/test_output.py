@@ -6,8 +6,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from retrieval.commands.main import main
 from retrieval.console.output import print_json, printable, say, show
@@ -29,12 +27,6 @@ ROOT = Path(__file__).parents[3]
 )
 def test_control_characters_and_hidden_characters_are_escaped(name, shown):
     assert printable(name) == shown
-
-
-@given(st.text())
-def test_printable_text_is_one_line_and_encodable(text):
-    assert len(printable(text).splitlines()) <= 1
-    printable(text).encode("utf-8")
 
 
 def test_all_output_functions_escape_their_text(capsys):

@@ -37,13 +37,6 @@ def test_resumed_work_is_counted_in_full_and_timed_from_its_resumption(clock, ca
     assert capsys.readouterr().err == "embed: 70/100 photos, 0.5 per second, 60 s left\n"
 
 
-def test_quiet_work_prints_nothing(clock, capsys):
-    with Bar("check", 3, "images", quiet=True) as bar:
-        clock[0] += 100.0
-        bar.advance(3)
-    assert capsys.readouterr() == ("", "")
-
-
 def test_the_first_call_of_show_states_the_total(clock, capsys):
     with Bar("collect", 0, "grasps") as bar:
         clock[0] += 60.0  # what comes before the first call is not counted

@@ -1,27 +1,19 @@
 """Checkpoints: round trips, one clear error for every kind of damage, and a crash that leaves the old file."""
 
-import contextlib
 import dataclasses
 import hashlib
 import json
 import os
-import re
-from pathlib import Path
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import safetensors.torch
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from safetensors import safe_open
 
-import indexes
-import retrieval
-import robot
 from retrieval.data.dataset import Split
-from retrieval.errors import BadInput, CheckpointError
+from retrieval.errors import CheckpointError
 from retrieval.model.checkpoint import (
     Checkpoint,
     load_checkpoint,
@@ -35,6 +27,7 @@ from retrieval.model.gate import load_gate
 from retrieval.model.gel_check import GelCheck
 from retrieval.model.posterior import Posterior
 from tests.conftest import TINY
+from tests.reference_model import REFERENCE_CALIBRATION
 
 SPLIT = Split(seed=3, train=("cup", "mug"), validation=("jar", "pan"), test=("red ball", "Töpfchen"))
 POSTERIOR = Posterior(slope=1.25, offset=-0.5, dependence=0.375, tests=40)
@@ -182,8 +175,6 @@ DEEP = f'{{"format": {FORMAT}, "a": ' + "[" * 900 + "]" * 900 + "}"
 OTHERS = [
     (with_header(None), FOREIGN),
     (safetensors.torch.save({"weight": torch.ones(2)}, {"format": "pt"}), FOREIGN),
-    (b"", r"m\.safetensors is not a readable \.safetensors file .*truncated"),
-    (b"PK\x03\x04", r"m\.safetensors is not a readable \.safetensors file .*truncated"),
     *[(with_header(text), r"header of .*m\.safetensors is damaged") for text in ("{", "3", "{}", "[" * 100_000, DEEP)],
     *[
         (
@@ -214,7 +205,6 @@ def test_a_weight_that_is_not_finite_is_refused(saved):
     ("entry", "message"),
     [
         ({"config": {"matcher": {"colour": 1}}}, "matcher has no setting 'colour'"),
-        ({"config": {"matcher": {"tower": "vgg"}}}, "tower must be one of"),
         ({"config": [1]}, "it must be a table"),
         (
             {"config": dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, hidden=64)).to_dict()},
@@ -223,6 +213,8 @@ def test_a_weight_that_is_not_finite_is_refused(saved):
         ({"split": {"train": ["a"]}}, "split must have .*; validation is missing"),
         ({"posterior": {"slope": 1.0}}, "posterior must have .*; formula is missing"),
         ({"posterior": dataclasses.asdict(POSTERIOR) | {"formula": "another"}}, "posterior.formula"),
+        ({"posterior": dataclasses.asdict(POSTERIOR) | {"dependence": 2.0}}, "posterior.dependence must be"),
+        ({"references": dataclasses.asdict(REFERENCE_CALIBRATION) | {"weight": -1.0}}, "references.weight must be"),
         ({"gel_check": dataclasses.asdict(GEL_CHECK) | {"level_above": "1"}}, "gel_check.level_above must be a number"),
     ],
 )
@@ -232,24 +224,6 @@ def test_a_header_of_another_version_or_model_is_refused_with_the_wrong_entry(sa
         CheckpointError, match=rf"m\.safetensors is not a checkpoint that this version can use: .*{message}"
     ):
         load_checkpoint(saved)
-
-
-JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(max_size=5),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
-    max_leaves=5,
-)
-
-
-@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(part=st.sampled_from(["config", "split", "posterior", "provenance", "format", "software", "task"]), value=JSON)
-def test_any_part_of_a_header_may_be_forged(saved, part, value):
-    forged = saved.with_name("forged.safetensors")
-    state, header = read_tensors(saved)
-    write_tensors(forged, state, header | {part: value})
-    for read in (load_checkpoint, read_checkpoint_info, load_gate):
-        with contextlib.suppress(BadInput):
-            read(forged)
 
 
 # Writing ---------------------------------------------------------------------------------------------------
@@ -268,22 +242,3 @@ def test_a_failed_write_leaves_the_old_checkpoint_and_no_other_file(saved, monke
     assert saved.read_bytes() == before
     assert sorted(os.listdir(saved.parent)) == files == ["m.md", "m.safetensors"]
     assert load_checkpoint(saved).provenance["step"] == 4
-
-
-# No pickle -------------------------------------------------------------------------------------------------
-
-# A module that unpickles, or a loader without the argument without which it runs code from the file.
-UNSAFE = re.compile(
-    r"^\s*(?:import|from) (?:pickle|cloudpickle|dill|joblib|shelve)\b"
-    r"|\b(?:torch|np|numpy)\.load\((?!(?:[^()]|\([^()]*\))*(?:weights_only=True|allow_pickle=False))",
-    re.MULTILINE,
-)
-
-
-def test_no_module_unpickles_anything():
-    assert UNSAFE.search("state = torch.load(str(path), map_location=device)")
-    assert not UNSAFE.search("np.load(str(path),\n    allow_pickle=False)")
-    folders = [Path(package.__file__).parent for package in (retrieval, indexes, robot)]
-    sources = [path for folder in folders for path in folder.rglob("*.py")]
-    assert len(sources) > 100
-    assert [path for path in sources if UNSAFE.search(path.read_text("utf-8"))] == []

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -52,26 +51,12 @@ def test_the_preset_paper_contains_the_papers_numbers():
     assert round(98 * tables["training"]["test_fraction"]) == 18
 
 
-def test_the_defaults_are_the_papers_which_has_no_candidate_encoder():
-    paper = load_config("paper")
-    assert paper.matcher.candidate_width > 0
-    assert Config() == dataclasses.replace(paper, matcher=dataclasses.replace(paper.matcher, candidate_width=0))
-
-
-def test_paper_exact_reverts_the_differences_that_the_table_lists_as_revertible():
+def test_paper_exact_reverts_the_differences_that_are_revertible():
     paper, exact = load_config("paper"), load_config("paper-exact")
     training = dataclasses.replace(
         paper.training, validation_fraction=0.0, negatives="dataset", precision="float32", distil_steps=600
     )
     assert exact == dataclasses.replace(paper.without_candidate_encoder(), training=training)
-    table = (Path(__file__).parents[3] / "docs" / "paper.md").read_text("utf-8")
-    for setting in (
-        "validation_fraction = 0.0",
-        'negatives = "dataset"',
-        'precision = "float32"',
-        "candidate_width = 0",
-    ):
-        assert f"`{setting}`" in table
 
 
 def test_photos_may_have_another_tower_and_another_tower_for_both_replaces_it():
@@ -120,18 +105,15 @@ def test_an_unknown_key_is_refused_with_the_known_ones(table):
 
 REFUSED = [
     ("matcher", "fingers", 0),
-    ("matcher", "dropout", 1.0),
     ("matcher", "dropout", math.nan),
     ("matcher", "tower_output", "other"),
     ("matcher", "candidate_linear", 3),  # without a cosine
     ("training", "learning_rate", 0.0),
     ("training", "contrastive_weight", -0.1),
-    ("training", "listwise_weight", math.inf),
-    *[("training", name, "other") for name in ("schedule", "negatives", "precision", "workers")],
+    ("training", "precision", "other"),
     ("training", "validation_fraction", 1.0),
     ("training", "seed", 2**32),
     ("preprocessing", "touch_px", 4097),
-    ("preprocessing", "background", "green"),
 ]
 
 
@@ -146,12 +128,8 @@ def test_settings_from_python_are_checked_and_converted_like_those_of_a_file():
     training = TrainingConfig(learning_rate=1, seed=np.int64(3), weights={"listwise": np.float64(0.5)})
     assert training == TrainingConfig.from_dict({"learning_rate": 1.0, "seed": 3, "listwise_weight": 0.5})
     assert [type(value) for value in (training.learning_rate, training.seed)] == [float, int]
-    with pytest.raises(ConfigError, match=r"training\.seed must be a whole number, got '3'"):
-        TrainingConfig(seed="3")
     with pytest.raises(ConfigError, match=r"training\.listwise_weight must be a number, got '1'"):
         TrainingConfig(weights={"listwise": "1"})
-    with pytest.raises(ConfigError, match=r"training\.precision must be one of 'auto', 'float32', 'bfloat16'"):
-        TrainingConfig(precision="other")
 
 
 def test_a_weight_of_an_unknown_loss_is_refused(tmp_path):

@@ -8,11 +8,9 @@ import torch
 from torch import nn
 
 from retrieval.errors import NumericalError
-from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.config import MatcherConfig
 from retrieval.model.encode import encode_photos, for_inference, photo_features, to_batch
 from retrieval.model.fusion import Matcher
-from retrieval.model.shipped import shipped_model
 
 SIDE = 48
 
@@ -46,26 +44,6 @@ def test_folded_towers_are_as_close_to_float64_as_the_plain_ones(tower):
     rounding, error = (float((features - exact).abs().max() / exact.abs().max()) for features in (plain, ours))
     assert error <= 3 * rounding + 1e-6
     assert error <= 1e-3
-
-
-@torch.inference_mode()
-def test_the_shipped_model_gives_the_partial_activations_and_embeddings_of_its_plain_towers():
-    matcher = load_checkpoint(shipped_model()).matcher
-    photos = smooth_pictures()
-    plain, ours = (
-        matcher.photo_search_encoding(matcher.photo_features(to_batch(photos))),
-        encode_photos(matcher, photos),
-    )
-    # Features that hardly vary are scaled up fifty times, and with them the float32 rounding of their large means.
-    assert float((ours.partial - plain.partial).abs().max() / plain.partial.abs().max()) <= 1e-4
-    assert float((ours.embedding - plain.embedding).abs().max()) <= 1e-4
-
-
-def smooth_pictures():
-    """Return smooth pictures, which are closer to photos than noise."""
-    axis = np.linspace(0, 6, 224, dtype=np.float32)
-    waves = [np.sin(k * axis)[:, None] * np.cos((k + 1) * axis)[None] for k in range(1, 5)]
-    return [np.stack([wave, wave.T, wave**2], axis=2) / 2 + 0.5 for wave in waves]
 
 
 def test_encoding_leaves_the_matcher_unchanged():

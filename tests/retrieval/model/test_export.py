@@ -199,14 +199,9 @@ def test_a_checkpoint_gets_an_export_in_the_cache_once_unless_one_is_next_to_it(
     assert not cached.exists()
 
 
-@pytest.mark.parametrize("trouble", ["a file in the way", "no home"])
-def test_without_a_cache_a_build_continues(trouble, model_copy, monkeypatch, tmp_path):
+def test_without_a_cache_a_build_continues(model_copy, monkeypatch, tmp_path):
     (tmp_path / "file").touch()
-    if trouble == "a file in the way":
-        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    else:
-        monkeypatch.delenv("XDG_CACHE_HOME")
-        monkeypatch.setattr(Path, "home", lambda: (_ for _ in ()).throw(RuntimeError("no home")))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     checkpoint = load_checkpoint(model_copy)
     assert exporting.export_to_cache(checkpoint) is None
     assert onnx_encoder.find_export(checkpoint) is None
@@ -221,8 +216,6 @@ def test_the_command_writes_the_export_next_to_the_checkpoint_or_to_the_requeste
     assert model_copy.with_suffix(".onnx").is_file()
     assert export(load_checkpoint(model_copy), tmp_path / "other.onnx") == tmp_path / "other.onnx"
     assert (tmp_path / "other.onnx").is_file()
-    with pytest.raises(BadInput, match=r"must be named \*\.onnx"):
-        export(load_checkpoint(model_copy), tmp_path / "other.bin")
 
 
 def test_nothing_is_written_if_the_numbers_differ_or_a_package_is_missing(model_copy, monkeypatch):
@@ -261,10 +254,3 @@ def test_a_query_by_onnx_needs_only_the_package_group_for_queries(model_copy, in
     done = run_blocked(code, blocked)
     assert done.returncode == 0, done.stderr
     assert "Which object is in the hand?" in (tmp_path / "q.html").read_text()
-
-
-def test_help_and_an_error_about_the_index_import_no_encoder_and_no_pydantic(tmp_path):
-    arguments = ["query", "--gelsight", "a.png", "--index", str(tmp_path)]
-    code = f"from retrieval.commands.main import main\nmain({arguments!r})"
-    done = run_blocked(code, ("torch", "onnxruntime", "onnx", "pydantic"))
-    assert "run `retrieve build-index` first" in done.stderr, done.stderr

@@ -2,7 +2,6 @@
 
 import math
 
-import numpy as np
 import pytest
 import torch
 from torch.nn import functional
@@ -37,7 +36,8 @@ def test_the_logit_from_partial_activations_equals_the_concatenated_forward(name
     torch.testing.assert_close(matcher(touches, photos), ours, rtol=1e-4, atol=1e-4 * float(naive.abs().max()))
 
 
-def test_the_cosine_of_the_embeddings_adds_to_the_logit_and_is_part_of_the_partial_activations():
+def test_the_cosine_of_the_embeddings_adds_to_the_logit_and_is_part_of_the_partial_activations(monkeypatch):
+    monkeypatch.setattr(fusion_scorer, "BLOCK", 2)
     torch.manual_seed(0)
     config = MatcherConfig(tower="small", tower_output="pooled", hidden=64, embedding_dim=16, cosine=True)
     matcher = Matcher(config).eval()
@@ -89,32 +89,3 @@ def test_the_partial_activation_layers_start_like_one_layer_over_the_concatenati
     bound = 1 / math.sqrt(3000)
     for weight in (head.touch_partial.weight, head.photo_partial.weight):
         assert bound * 0.99 < float(weight.detach().abs().max()) <= bound
-
-
-def small_head(hidden=32, seed=0):
-    torch.manual_seed(seed)
-    return FusionHead(10, 10, MatcherConfig(hidden=hidden))
-
-
-@pytest.mark.parametrize("block", [5, 37])
-def test_scores_of_many_photos_are_the_logits_of_single_pairs_for_any_block_size(block, monkeypatch):
-    monkeypatch.setattr(fusion_scorer, "BLOCK", block)
-    head, photos = small_head().eval(), np.random.default_rng(0).normal(size=(37, 32)).astype(np.float32)
-    touches = torch.randn(3, 32)
-    with torch.inference_mode():
-        expected = [
-            sum(float(head(touch[None], torch.from_numpy(photo[None]))) for touch in touches) for photo in photos
-        ]
-    np.testing.assert_allclose(head.scorer.logits(touches.numpy(), photos), expected, rtol=1e-5, atol=1e-5)
-
-
-def test_views_of_a_photo_reach_the_tower_one_by_one_with_channels_last():
-    """Convolutions in training take longer on memory that is laid out channel by channel."""
-    matcher = Matcher(MatcherConfig(tower="small", tower_output="pooled", hidden=8), views=2)
-    strips = torch.rand(3, 16, 32, 3).permute(0, 3, 1, 2)  # as from `to_batch`
-    inputs = []
-    matcher.photo_tower.register_forward_pre_hook(lambda _, images: inputs.extend(images))
-    matcher.photo_features(strips)
-    expected = [strips[photo, :, :, 16 * view : 16 * view + 16] for photo in range(3) for view in range(2)]
-    assert torch.equal(inputs[0], torch.stack(expected))
-    assert inputs[0].is_contiguous(memory_format=torch.channels_last)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from retrieval.model.fusion import LOG_SCALE_MAX
-from retrieval.model.losses.listwise import contrastive_loss, pick_loss
+from retrieval.model.losses.listwise import contrastive_loss
 from retrieval.model.losses.loss import match_loss
 
 
@@ -36,16 +36,6 @@ def test_the_contrastive_loss_equals_that_of_plain_loops():
     expected = (loss_by_loops(scores, rows, columns) + loss_by_loops(transposed, columns, rows)) / 2
     got = contrastive_loss(touch, photo, touch_objects, photo_objects, scale)
     assert got.item() == pytest.approx(expected, rel=1e-5)  # float32 inside
-
-
-def test_a_row_without_negatives_does_not_count_in_the_mean():
-    """Rows: two positives; a positive at 1 and a negative at 3; two negatives. Only the second one counts."""
-    scores = torch.tensor([[5.0, -5.0], [1.0, 3.0], [0.0, 0.0]], requires_grad=True)
-    loss = pick_loss(scores, torch.tensor([[True, True], [True, False], [False, False]]))
-    loss.backward()
-    assert loss.item() == pytest.approx(math.log(1 + math.exp(2)), rel=1e-6)
-    assert torch.equal(scores.grad[[0, 2]], torch.zeros(2, 2))
-    assert scores.grad[1].tolist() == pytest.approx([-1 / (1 + math.exp(-2)), 1 / (1 + math.exp(-2))], rel=1e-6)
 
 
 def test_the_match_loss_equals_the_formula():

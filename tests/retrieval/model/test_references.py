@@ -1,15 +1,11 @@
 """Calibration of reference touches, by hand."""
 
 import math
-from dataclasses import asdict
 
 import numpy as np
 import pytest
 
-from _touch_retrieval.documents import typed
-from retrieval.errors import BadInput
-from retrieval.model.references import SHARPNESS, ReferenceCalibration, reference_similarity
-from tests.reference_model import REFERENCE_CALIBRATION
+from retrieval.model.references import SHARPNESS, reference_similarity
 
 
 def test_several_references_are_averaged_as_likelihoods():
@@ -20,12 +16,3 @@ def test_several_references_are_averaged_as_likelihoods():
         for part, got in zip(parts, row, strict=True):
             mean = sum(math.exp(SHARPNESS * float(cosines[grasp, place])) for place in part) / len(part)
             assert got == pytest.approx(math.log(mean) / SHARPNESS, abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{"weight": math.inf}, {"weight": -1.0}, {"weight": None}, {"objects": "many"}, {"touch_only": {}}, {"more": 1}],
-)
-def test_an_invalid_calibration_is_refused(change):
-    with pytest.raises(BadInput):
-        typed(asdict(REFERENCE_CALIBRATION) | change, ReferenceCalibration, complete=True, error=BadInput)

@@ -30,11 +30,9 @@ def picture(tmp_path):
     [
         (["a.png", Path("b.png")], 2, [["a.png", "b.png"]]),
         ([["a.png", "b.png"], ("c.png", "d.png")], 2, [["a.png", "b.png"], ["c.png", "d.png"]]),
-        ("a.png", 1, [["a.png"]]),
         ([["a.png"], ["b.png"]], 1, [["a.png"], ["b.png"]]),
         ([b"12345", bytearray(b"678")], 2, [["grasp 1, finger a", "grasp 1, finger b"]]),
         (np.stack([[GREY], [GREY]]), 1, [["grasp 1, finger a"], ["grasp 2, finger a"]]),
-        (GREY, 1, [["grasp 1, finger a"]]),
         (
             [[GREY, "b.png"], [Image.fromarray(GREY)] * 2],
             2,
@@ -52,11 +50,9 @@ def test_the_nesting_of_images_gives_the_grasps_and_files_keep_their_names(touch
         ([], "give at least one touch"),
         ([[]], r"got 0: "),
         (["a.png", "b.png", "c.png"], "got 3"),
-        ([["a.png", "b.png"], ["c.png"]], r"got 1: c\.png"),
         (["a.png", ["b.png", "c.png"]], "a list mixes images with lists of images"),
         ([[["a.png", "b.png"]]], "query several objects with query_many"),
         (None, "got NoneType"),
-        ((image for image in ("a.png", "b.png")), "got generator"),
     ],
 )
 def test_every_other_input_is_refused_with_one_sentence(touches, message):
@@ -101,7 +97,6 @@ def test_an_array_need_not_be_contiguous():
     [
         (GREY / 255, r"must contain uint8 samples in 0\.\.255, got float64; convert samples in 0\.\.1 with np\.rint"),
         (GREY[..., 0], r"must be \(height, width, 3\) in RGB order, got \(4, 6\); repeat a grey image"),
-        (np.concatenate([GREY, GREY[..., :1]], axis=2), r"got \(4, 6, 4\)"),
         (GREY.transpose(2, 0, 1), r"got \(3, 4, 6\).*put channels last"),
         (GREY[:0], "has no pixels"),
     ],

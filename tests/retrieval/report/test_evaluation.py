@@ -11,7 +11,6 @@ from retrieval.errors import BadInput
 from retrieval.model.posterior import FORMULA
 from retrieval.report.document import Card, Cards, Document, Picture, Section, Table, Text, to_html, to_markdown
 from retrieval.report.evaluation import write_report
-from retrieval.report.numbers import format_number, interval, p_value, percent, with_interval
 from tests.pages import HtmlPage
 from tests.synthetic_evaluation import OBJECTS, PROTOCOL, write_synthetic_results
 
@@ -198,16 +197,6 @@ def test_protocols_of_real_data_have_low_pass_controls_verdicts_and_a_section_ea
 
 
 # Numbers and documents -------------------------------------------------------------------------------
-
-
-def test_numbers_are_written_for_readers():
-    assert [format_number(value) for value in (None, 0.0, 3.0, 4.004, 0.0361, 99.95, 123.4, 12345.6)] == [
-        *("–", "0", "3", "4.00", "0.0361", "100", "123", "12,346")
-    ]
-    assert [percent(0.71249), percent(None), percent(0.5, 0)] == ["71.2", "–", "50"]
-    assert interval(0.5, 0.4, 0.625) == "50.0 [40.0, 62.5]"
-    assert with_interval(None) == "–"
-    assert [p_value(p) for p in (0.0, 0.00012, 0.0512, 0.5)] == ["< 0.0001", "0.00012", "0.051", "0.50"]
 
 
 def test_markdown_and_html_have_the_same_content(tmp_path):

@@ -111,14 +111,6 @@ def test_the_pictures_are_thumbnails_with_unchanged_shape_and_colours(tmp_path):
     np.testing.assert_allclose(decoded.mean(axis=(0, 1)), (0, 0, 200), atol=4)  # loss of JPEG
 
 
-def test_the_page_shows_the_formula_its_parameters_and_unscored_objects():
-    text = page_of(ONE).text
-    assert POSTERIOR["formula"] in text
-    assert "slope 0.750, offset -1.25, dependence 0.500, grasps 2, none_prior 0.500, objects 500" in text
-    assert "420 of 500 objects, with a total probability of 12.5 %" in text
-    assert "add up to 1" in text
-
-
 def test_names_and_metadata_cannot_inject_markup():
     page = page_of((SCRIPT, 1.5, 0.8, SCRIPT, {SCRIPT: SCRIPT}), touches=[[SCRIPT, "b.png"]])
     assert page.all("script") == []

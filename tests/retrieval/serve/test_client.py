@@ -53,18 +53,13 @@ def test_the_client_answers_like_the_searcher_for_images_of_every_kind(client, s
     assert client.photo(found.results[0]) == found.results[0].photo_path.read_bytes()
 
 
-def test_bad_queries_raise_the_errors_of_the_searcher(client, touch, tmp_path):
-    (tmp_path / "x.png").write_bytes(b"not a picture")
+def test_bad_queries_raise_the_errors_of_the_searcher(client, touch):
     with pytest.raises(ImageError, match=r"missing\.png: no such file"):
         client.query([touch[0], "missing.png"])
-    with pytest.raises(ImageError, match="grasp 1, finger b: not a PNG"):
-        client.query([touch[0], tmp_path / "x.png"])
     with pytest.raises(BadInput, match=r"takes 2 gel image\(s\) for one touch; got 1"):
         client.query([touch[0]])
     with pytest.raises(BadInput, match="top: Input should be greater than or equal to 1"):
         client.query(touch, top=0)
-    with pytest.raises(BadInput, match="tip: Extra inputs are not permitted"):
-        client.query(touch, tip=3)
     with pytest.raises(ImageError, match="an array must contain uint8"):
         client.query([np.zeros((4, 4, 3))] * 2)
 

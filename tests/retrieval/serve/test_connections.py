@@ -75,11 +75,6 @@ def test_headers_above_the_limit_and_invalid_http_are_refused_at_once(service_at
             assert received(line).startswith(b"HTTP/1.1 400 ")
 
 
-def test_a_flood_of_pipelined_requests_is_answered_one_by_one(service_at):
-    with connect(service_at[0], (BEGIN + b"\r\n") * 1_000) as line:
-        assert received(line).count(b"HTTP/1.1 200 ") == 1_000
-
-
 def test_a_client_that_does_not_read_its_response_is_cut_off(index, monkeypatch):
     monkeypatch.setattr(server, "UNREAD_S", 0.5)
     with listening(index) as (url, _), socket.socket() as line:

@@ -9,12 +9,10 @@ from contextlib import contextmanager
 
 import httpx
 import pytest
-from threadpoolctl import threadpool_info
 
 from retrieval.indexing.build import build_index
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.serve.service import LiveRig
-from retrieval.serve.settings import ServiceSettings
 from tests import synthetic
 from tests.serving import command, connect, listening, problem, received, service
 from tests.waiting import wait_until
@@ -99,15 +97,6 @@ def test_late_requests_are_dropped(index, body):
             lambda: later.append(post_query(url, body)) or later[-1].status_code == 200
         )  # a busy machine is late
         assert len(encoder.calls) <= 1 + len(later)
-
-
-def test_one_core_stays_free_for_the_event_loop_and_blas_uses_one_thread(index, monkeypatch):
-    monkeypatch.setattr("os.cpu_count", lambda: 9)
-    assert [ServiceSettings(index=index, workers=workers).threads for workers in (1, 2, 9)] == [8, 4, 1]
-    monkeypatch.setattr("os.cpu_count", lambda: 2)
-    with service(index):
-        own = [one for one in threadpool_info() if one.get("threading_layer") == "pthreads"]
-    assert {one["num_threads"] for one in own} == {1}
 
 
 # Generations ---------------------------------------------------------------------------------------------------------
