@@ -1,8 +1,5 @@
 """Kinds of index: results, checks of input, refusals, and a class of a user."""
 
-import subprocess
-import sys
-
 import faiss
 import numpy as np
 import pytest
@@ -91,13 +88,6 @@ def test_a_search_setting_trades_time_for_recall():
     assert indexes.recall_against_exact(index, QUERIES) == recalls[0]
 
 
-def test_the_same_input_gives_the_same_index(built, tmp_path):
-    other = indexes.build(unit(N), built.kind)
-    assert built.save(tmp_path / "one") == other.save(tmp_path / "other") == (not built.exact)
-    if not built.exact:
-        assert (tmp_path / "one").read_bytes() == (tmp_path / "other").read_bytes()
-
-
 def test_a_saved_index_loads_and_gives_the_same_results(built, tmp_path):
     built.save(tmp_path / "x")
     loaded = indexes.load_kind(built.kind).load(tmp_path / "x", built.vectors, built.kind)
@@ -153,11 +143,8 @@ def test_an_index_needs_a_vector_and_queries_of_its_size():
     ("kind", "words"),
     [
         ("octree", "could not parse"),
-        ("", "flat"),
         ("HNSW1", "at least 2 neighbours"),
-        ("PQ5", "multiple of the number of subquantizers"),
         ("IVF8,Flat;probes=2", "probes"),
-        ("IVF8,Flat;nprobe", "nprobe"),
         ("nowhere:Nothing", "cannot be imported"),
     ],
 )
@@ -204,15 +191,3 @@ def test_a_users_own_class_is_a_kind(tmp_path, monkeypatch):
 def test_exceptions_of_faiss_become_our_error():
     with pytest.raises(EngineError, match="FAISS failed while reading nothing"), faiss_call("reading nothing", 1):
         faiss.read_index("/nowhere")
-
-
-def test_faiss_is_imported_only_when_it_is_needed():
-    code = (
-        "import sys, numpy, indexes, indexes.store.folder\n"
-        "axes = numpy.eye(4, dtype=numpy.float32)\n"
-        "indexes.build(axes).search(axes, 2)\n"
-        "assert 'faiss' not in sys.modules\n"
-        "indexes.build(axes, 'HNSW8')\n"
-        "assert 'faiss' in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

@@ -1,21 +1,17 @@
-"""Embedding on GPUs: which processes request one from Ray, and that a build computes on the model's device.
+"""Embedding on GPUs: how many processes request one from Ray, and that a build computes on the model's device.
 
-No GPU is needed. Ray assigns as many as its settings state, and the device is PyTorch's `meta`, which computes only
-shapes and raises an error if data are read without a copy to the CPU.
+No GPU is needed: the device is PyTorch's `meta`, which computes only shapes and raises an error if data are read
+without a copy to the CPU.
 """
 
-import os
 from importlib.util import find_spec
 from types import SimpleNamespace
 
 import pytest
 import torch
 
-from indexes.store.sharded import read_sharded_manifest
 from retrieval.indexing import candidates
 from retrieval.indexing.build import build_index
-from retrieval.indexing.sharded import build_sharded
-from retrieval.model.checkpoint import load_checkpoint
 from tests import reference_model
 from tests.retrieval.indexing.test_candidates import checkpoint_of
 
@@ -89,35 +85,3 @@ def test_there_are_as_many_processes_as_gpus_or_else_cpus(capsys):
     assert not capsys.readouterr().err
     assert ray_worker_pool(mixed(has_gpus=False)) == (110, {"num_cpus": 1, "num_gpus": 0})
     assert "PyTorch cannot use them there; CPUs embed the photos" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_each_process_of_the_pool_requests_its_own_gpu(catalogue, model, tmp_path, monkeypatch, capsys):
-    from retrieval.cluster import building
-    from retrieval.cluster.session import ray_session
-
-    reports = tmp_path / "reports"
-    reports.mkdir()
-
-    class ReportingWorker(building.ShardBuildWorker):
-        def _build(self, job):
-            import ray
-
-            gpus = ray.get_runtime_context().get_accelerator_ids()["GPU"]
-            visible, threads = os.environ["CUDA_VISIBLE_DEVICES"], torch.get_num_threads()
-            (reports / job.folder.name).write_text(f"{gpus} {visible} {threads}")
-            return super()._build(job)
-
-    monkeypatch.delenv("OMP_NUM_THREADS")
-    monkeypatch.setenv("RAY_OVERRIDE_RESOURCES", '{"CPU": 4, "GPU": 2}')
-    checkpoint = load_checkpoint(model)
-    with ray_session() as ray:
-        assert ray.cluster_resources()["GPU"] == 2
-        assert building.ray_worker_pool(ray) == (4, {"num_cpus": 1, "num_gpus": 0})
-        assert "PyTorch cannot use them there" in capsys.readouterr().err
-        monkeypatch.setattr(building, "_has_gpu", lambda: True)
-        monkeypatch.setattr(building, "ShardBuildWorker", ReportingWorker)
-        report = build_sharded(catalogue, checkpoint, tmp_path / "c", 4, quiet=True, run=building.build_on_ray)
-    assert (report.photos, report.embedded) == (24, 24)
-    names = [entry.folder for entry in read_sharded_manifest(tmp_path / "c").shards]
-    assert {(reports / name).read_text() for name in names} <= {"['0'] 0 2", "['1'] 1 2"}

@@ -13,7 +13,6 @@ from retrieval.data.dataset import Split, load_grasps
 from retrieval.errors import BadInput, ConfigError, DatasetError, JobInterrupted
 from retrieval.evaluation import UNSEEN_OBJECTS
 from retrieval.evaluation.evaluate import evaluate
-from retrieval.evaluation.experiment import permute_touches
 from retrieval.evaluation.inputs import TowerEncoder
 from retrieval.evaluation.protocol import read_recording_facts
 from retrieval.evaluation.protocols.recording import with_split
@@ -213,16 +212,6 @@ def test_a_second_run_fits_only_new_and_edited_methods_of_a_user(made, run, monk
     assert "Constant" in (made[1] / "report.md").read_text()
 
 
-def test_shuffling_permutes_touches_and_leaves_photos():
-    touch = np.arange(40, dtype=np.float32).reshape(20, 1, 2)
-    features = Features(tuple(map(str, range(20))), ("a",) * 10 + ("b",) * 10, touch, touch[:, 0])
-    permuted = permute_touches(features, 0)
-    assert sorted(permuted.touch[:, 0, 0]) == sorted(touch[:, 0, 0])
-    assert (permuted.touch != touch).any()
-    np.testing.assert_array_equal(permuted.photo, features.photo)
-    assert permuted.object_ids == features.object_ids
-
-
 def test_a_control_is_left_out_without_no_contact_frames(run, tmp_path):
     bare = synthetic.write_recording(tmp_path / "bare", synthetic.make_objects(12), 3, before=False)
     results = run(tmp_path / "out", recording=bare, methods=("chance",))
@@ -318,21 +307,17 @@ def test_the_command_writes_a_report_and_one_json_document(grasped, tmp_path, ca
     for role in ("", " (permuted)", " (low_pass)"):
         assert f"evaluate: late_fusion, seed 0{role}\n" in output.err
     assert json.loads(output.out) == json.loads((out / "results.json").read_text())
-    assert f"report: {out / 'report.md'}" in output.err
     assert (out / "report.html").is_file()
     assert json.loads(output.out)["setting"]["preset"] == "tiny"
     assert main([*command, "--methods", "late_fusion,cca,chance"]) == 0  # resumes
     table = capsys.readouterr().out.splitlines()
     assert table[0].split()[:3] == ["method,", "%", "pair"]
     assert any(line.startswith("No pair accuracy of CCA, random scores: ") for line in table)
-    labels = ["late fusion", "CCA", "random scores", "chance, closed form"]
-    assert [line.split("  ")[0] for line in table[1:5]] == labels
-    assert [line.count("[") for line in table[1:4]] == [2, 1, 1]  # late fusion has its own threshold
+    assert [line.split("  ")[0] for line in table[1:4]] == ["late fusion", "CCA", "random scores"]
 
 
 def test_the_command_refuses_conflicting_options(grasped, tmp_path, capsys):
     command = ["evaluate", str(grasped), "--out", str(tmp_path / "r"), "--model", "m.safetensors"]
     assert main([*command, "--config", "paper"]) == 2
     assert "give either --model or --config and --init" in capsys.readouterr().err
-    assert main([*command[:-2], "--methods", "oracle"]) == 2
     assert main(command) == 2

@@ -4,14 +4,13 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from retrieval.data.dataset import Grasp, Split
 from retrieval.errors import DatasetError
 from retrieval.evaluation import PROTOCOLS, UNSEEN_OBJECTS
 from retrieval.evaluation.aggregate import verdict
-from retrieval.evaluation.inputs import clock_features, missing_no_contact_reason
+from retrieval.evaluation.inputs import missing_no_contact_reason
 from retrieval.evaluation.protocol import RecordingFacts
 from retrieval.evaluation.results import Verdict
 from retrieval.metrics.intervals import Difference, Summary
@@ -130,14 +129,6 @@ def test_the_published_splits_of_the_paper_and_of_objectfolder():
 
 
 # Controls and verdicts -------------------------------------------------------------------------------
-
-
-def test_clock_features_are_similar_for_near_places_only():
-    found = clock_features(100)
-    assert found.shape == (100, 84)
-    steps = np.linalg.norm(found - found[50], axis=1)
-    assert (np.diff(steps[50:56]) > 0).all()
-    assert steps[51] < steps[90] / 3
 
 
 def test_no_contact_control_needs_one_frame_per_grasp():

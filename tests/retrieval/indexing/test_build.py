@@ -348,18 +348,6 @@ def test_ctrl_c_keeps_the_finished_embeddings_and_reports_it(
 # Unusable input ------------------------------------------------------------------------------------------------------
 
 
-def test_long_lists_are_truncated_in_text_and_complete_in_json(catalogue_copy, checkpoint, index):
-    for number in range(30):
-        (catalogue_copy / f"broken{number:02}.png").write_bytes(b"x")
-        (catalogue_copy / f"note{number:02}.txt").write_text("x")
-    (catalogue_copy / "metadata.jsonl").write_text('{"object_id": "nobody", "price": 3}\n')
-    report = build_index(catalogue_copy, checkpoint, index, quiet=True)
-    lines = list(report.lines())
-    assert "  metadata.jsonl names nobody, which is not in the catalogue" in lines
-    assert len(lines) < 42
-    assert len(report.skipped) == len(report.ignored) == 30
-
-
 def test_a_catalogue_of_only_broken_photos_raises_and_the_old_index_stays(catalogue_copy, checkpoint, index):
     build_index(catalogue_copy, checkpoint, index, quiet=True)
     for path in catalogue_copy.rglob("*.jpg"):
@@ -407,7 +395,7 @@ def test_a_second_writer_raises(catalogue_copy, checkpoint, index, embedded):
     assert embedded == []
 
 
-# The report and the threads ------------------------------------------------------------------------------------------
+# The report ------------------------------------------------------------------------------------------------------
 
 
 def test_the_error_of_float16_partials_is_within_the_reported_bound(catalogue_copy, checkpoint, index):
@@ -419,11 +407,3 @@ def test_the_error_of_float16_partials_is_within_the_reported_bound(catalogue_co
     assert stored.dtype == np.float16
     assert np.abs(stored - exact).max() <= report.partial_error + 1e-5  # in other batches of the tower
     assert report.partial_error == pytest.approx(2**-11 * np.abs(exact).max(), rel=1e-2)
-
-
-def test_recall_and_time_of_an_approximate_kind_are_measured_and_printed(catalogue_copy, checkpoint, index):
-    report = build_index(catalogue_copy, checkpoint, index, kind="HNSW8", quiet=True)
-    assert report.recall == IndexStore(index).open().manifest.recall
-    assert 0 <= report.recall["value"] <= 1
-    assert min(report.recall["ms"], report.recall["exact_ms"]) > 0
-    assert f"Recall@10 compared with exact search: {report.recall['value']:.3f}" in "\n".join(report.lines())

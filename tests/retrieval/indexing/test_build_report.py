@@ -78,20 +78,6 @@ def test_an_invalid_rule_raises_before_anything_is_written(tmp_path, photos, che
     assert not index.exists()
 
 
-def test_the_report_has_three_examples_and_the_left_out_files(tmp_path, photos, checkpoint, index):
-    names = ["mug/0.jpg", "mug/1.jpg", "mug/2.jpg", "cup/0.jpg", "cup/1.jpg", "ball.jpg"]
-    own = catalogue_of(tmp_path / "own", photos, *names)
-    for name in ("a.txt", "b.TXT", "README", "mug/1.gif"):
-        (own / name).write_text("x")
-    (own / "mug" / "3.jpg").write_bytes(b"")
-    report = build_index(own, checkpoint, index, quiet=True)
-    assert report.ignored == ["README", "a.txt", "b.TXT"]
-    assert [item.path for item in report.skipped] == ["mug/1.gif", "mug/3.jpg"]
-    assert (report.objects_from, report.warnings, report.without_photo) == ("folder", [], [])
-    assert report.examples == [("ball", "ball.jpg"), ("cup", "cup/0.jpg"), ("mug", "mug/0.jpg")]
-    assert "  mug <- mug/0.jpg" in list(report.lines())
-
-
 def test_objects_without_a_readable_photo_are_listed_and_give_exit_code_1(tmp_path, photos, model, index, capsys):
     own = catalogue_of(tmp_path / "own", photos, "mug/0.jpg", "cup/0.jpg", "cup/1.jpg", "ball/0.jpg")
     command = ["build-index", str(own), "--model", str(model), "--out", str(index)]

@@ -12,7 +12,7 @@ from indexes.store.folder import IndexStore
 from retrieval.indexing import build as building
 from retrieval.indexing import candidates as measuring
 from retrieval.indexing.build import build_index
-from retrieval.indexing.candidates import candidates_sentence, kept_measurement, measure_candidates, query_codes
+from retrieval.indexing.candidates import candidates_sentence, kept_measurement, measure_candidates
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
 from retrieval.model.fusion import Matcher
 from retrieval.model.fusion_scorer import FusionScorer
@@ -96,14 +96,6 @@ def test_few_photos_are_all_scored_and_a_model_without_touches_measures_nothing(
     assert "stores no touches" in candidates_sentence(None, PHOTOS)
 
 
-def test_larger_catalogues_use_fewer_touches(checkpoint, gallery, monkeypatch):
-    monkeypatch.setattr(measuring, "MIN_QUERIES", 6)
-    monkeypatch.setattr(measuring, "MEASUREMENT_FLOPS", 2.0 * PHOTOS * checkpoint.config.matcher.hidden**2 * 10)
-    assert measure_candidates(checkpoint, indexes.build(gallery[0]), gallery[1])["queries"] == 10
-    monkeypatch.setattr(measuring, "MEASUREMENT_FLOPS", 1.0)
-    assert measure_candidates(checkpoint, indexes.build(gallery[0]), gallery[1])["queries"] == 6
-
-
 @pytest.mark.parametrize(
     ("photos", "encoded", "k"), [(1000, 0, 500), (1050, 60, 500), (940, 0, 500), (1101, 0, None), (1000, 101, None)]
 )
@@ -135,9 +127,3 @@ def test_the_measurement_is_in_manifest_and_report_and_kept_by_small_changes(
     recall = build_index(catalogue_copy, queried, index, kind="HNSW8", quiet=True).recall
     assert (recall["queries"], recall["how"]) == (TOUCHES, "measured on the given queries")
     assert [len(partials) for _, _, partials in measured] == [24, 25]  # another kind is measured again
-
-
-def test_the_touches_are_embedded_by_the_candidate_encoder(checkpoint):
-    partials, embeddings = query_codes(checkpoint, 3)
-    assert partials.shape == (3, checkpoint.config.matcher.partial_width)
-    np.testing.assert_allclose(np.linalg.norm(embeddings, axis=1), 1, atol=1e-6)

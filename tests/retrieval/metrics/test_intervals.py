@@ -92,31 +92,10 @@ def coverage(interval_of, trials=200):
     return covered / trials
 
 
-def plain_percentile(hits):
-    drawn = np.random.default_rng(0).choice(hits.mean(1), (1000, len(hits))).mean(1)
-    return np.quantile(drawn, (0.025, 0.975))
-
-
-def test_the_interval_by_object_has_its_nominal_coverage_and_naive_ones_do_not():
-    """Six objects; 200 trials measure a coverage of .95 to +- .03. Naive: resampling queries; plain percentiles."""
+def test_the_interval_by_object_has_its_nominal_coverage_and_a_naive_one_does_not():
+    """Six objects; 200 trials measure a coverage of .95 to +- .03. Naive: resampling queries."""
     assert 0.91 <= coverage(lambda hits: bootstrap_interval(hits.mean(1, keepdims=True), draws=1000)) <= 0.99
     assert coverage(lambda hits: bootstrap_interval(hits.reshape(-1, 1), draws=400), trials=40) < 0.75
-    assert coverage(plain_percentile) < 0.90
-
-
-@pytest.mark.parametrize(("objects", "stated"), [(2, 0.50), (3, 0.74), (5, 0.91), (10, 0.94)])
-def test_the_coverage_for_few_objects_is_as_documented(objects, stated):
-    """1,500 samples of normal object means; the measured coverage has a standard error of 0.013."""
-    means = np.random.default_rng(objects).normal(size=(objects, 1500))
-    low, high = bootstrap_interval(means, draws=1000)
-    assert np.mean((low <= 0) & (high >= 0)) == pytest.approx(stated, abs=0.04)
-
-
-def test_results_of_fewer_than_five_objects_are_marked():
-    for objects, few in ((1, True), (2, True), (4, True), (5, False), (12, False)):
-        measure = measure_of(some_objects(objects))
-        assert summarise([measure]).few_objects is few
-        assert compare([measure], [measure]).few_objects is few
 
 
 # Comparisons -----------------------------------------------------------------------------------------------
@@ -149,8 +128,6 @@ def test_a_small_difference_on_every_object_is_significant_although_the_interval
     assert 0.019 < found.low <= found.high < 0.021
     assert found.p == pytest.approx(2 / 2**18)
     assert summarise([a]).low[0] < summarise([b]).high[0] - 0.1
-    back = compare([b], [a])
-    assert (back.value, back.p) == (pytest.approx(-0.02), found.p)
 
 
 # Choices of test objects -----------------------------------------------------------------------------------

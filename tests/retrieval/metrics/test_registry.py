@@ -1,4 +1,4 @@
-"""Metrics against two plain loops, by hand, and with scorers without or with complete information."""
+"""Metrics against plain loops, by hand, and with scorers without or with complete information."""
 
 from itertools import combinations, product
 
@@ -74,14 +74,6 @@ def test_pair_accuracy_and_auc_equal_those_of_two_loops():
         assert area[row] == pytest.approx(np.mean(wins), abs=1e-12)
 
 
-def test_an_object_with_many_photos_is_a_rival_as_often_as_one_with_few():
-    """Naively, over photos, the area would be 10/11: object 2 has ten photos below, object 1 has one above."""
-    owner = [0, 0, 1] + [2] * 10
-    table = table_of([[0, 5, 9, *[1] * 10]], [0], owner, own=[[1] + [0] * 12])
-    assert pair_auc(table).values[0, 0] == pytest.approx(0.5)
-    assert pair_accuracy(table, 3.0).values[0, 0] == pytest.approx((1 + 0.5) / 2)
-
-
 # K-way -----------------------------------------------------------------------------------------------------
 
 
@@ -108,36 +100,6 @@ def test_k_way_curves_converge_to_those_over_every_draw(k, photos):
         exact = k_way_by_enumeration(table, row, k, photos)
         np.testing.assert_allclose(found.values[row], exact, atol=0.1)  # five standard errors of 600 draws
     assert k_way(table, 5) is None  # there are four objects
-
-
-# Full gallery ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("transposed", [False, True], ids=["touch to photo", "photo to touch"])
-def test_measures_of_the_full_gallery_equal_those_of_two_loops(transposed):
-    """Without ties; tests of the ranking enumerate the orders of ties."""
-    table = uneven()
-    table = table_of(np.random.default_rng(1).permutation(196).reshape(14, 14), table.touch_owner)
-    table = table.transposed() if transposed else table
-    found = full_gallery(table)
-    for row in range(14):
-        ranked = sorted(np.flatnonzero(~table.own[row]), key=lambda column: -table.scores[row, column])
-        owners = table.photo_owner[ranked]
-        places = [place for place, name in enumerate(owners, 1) if name == table.touch_owner[row]]
-        for k in (1, 5, 10):
-            assert found[f"recall_{k}"].values[row, 0] == (places[0] <= k)
-        precision = np.mean([count / place for count, place in enumerate(places, 1)])
-        assert found["map"].values[row, 0] == pytest.approx(precision, abs=1e-12)
-
-
-def test_with_the_own_photo_a_scorer_that_only_recognises_each_grasps_lighting_would_beat_chance():
-    """Its own photo first, all else tied: chance without the own photo, more than twice chance with it."""
-    table = table_of(np.eye(40), np.repeat(np.arange(10), 4))
-    left_out, included = full_gallery(table)["map"], average_precision(table.with_own())
-    assert left_out.values.mean() == pytest.approx(left_out.chance[0])
-    assert included.values.mean() > 2 * included.chance[0]
-    assert "included" in included.gallery
-    assert "left out" in left_out.gallery
 
 
 # The table of metrics --------------------------------------------------------------------------------------

@@ -8,8 +8,8 @@ import pytest
 
 from retrieval.errors import BadInput, NumericalError
 from retrieval.metrics.measure import Measure, pooled
-from retrieval.metrics.table import ScoreTable, object_scores
-from tests.retrieval.metrics.test_registry import table_of, uneven
+from retrieval.metrics.table import object_scores
+from tests.retrieval.metrics.test_registry import table_of
 
 # The table -------------------------------------------------------------------------------------------------
 
@@ -53,11 +53,3 @@ def test_queries_of_several_galleries_are_pooled_under_their_units():
     assert whole.owner.tolist() == [0, 1, 1]
     assert whole.values.ravel().tolist() == [1.0, 0.5, 0.0]
     assert whole.chance.tolist() == [pytest.approx((0.25 + (0.25 + 0.5) / 2) / 2)]  # equal unit weights
-
-
-def test_the_draws_depend_on_the_seed_and_not_on_the_scores():
-    table = uneven()
-    doubled = ScoreTable(2 * table.scores, table.touch_owner, table.photo_owner, table.own)
-    first = object_scores(table, 1, 3, seed=4)
-    np.testing.assert_array_equal(object_scores(doubled, 1, 3, seed=4), 2 * first)
-    assert (object_scores(table, 1, 3, seed=5) != first).any()

@@ -14,7 +14,6 @@ from retrieval.errors import BadInput
 from retrieval.indexing import candidates
 from retrieval.indexing.build import build_index
 from retrieval.indexing.sharded import build_sharded
-from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
 from retrieval.model.posterior import Posterior
 from retrieval.model.references import ReferenceCalibration
 from retrieval.search.searcher import Searcher
@@ -38,14 +37,6 @@ def checkpoint(tmp_path):
 def index(catalogue, checkpoint, tmp_path):
     build_index(catalogue, checkpoint, tmp_path / "index", quiet=True)
     return tmp_path / "index"
-
-
-def test_a_photo_takes_two_bytes_for_each_pooled_number_and_one_for_each_number_of_a_cell(index):
-    with Searcher.open(index) as searcher:
-        arrays = searcher.generation.arrays
-        assert (arrays["partials"].dtype, arrays["partials"].shape[1]) == (np.float16, CELLS.pooled_width)
-        assert (arrays["cells"].dtype, arrays["cells"].shape[1]) == (np.int8, 3 * 3 * 4)
-        assert 0 < searcher.generation.manifest.about["partial_error"] < 0.02
 
 
 # Cells left out -------------------------------------------------------------------------------------------------------
@@ -111,18 +102,6 @@ def test_a_model_without_cells_refuses_the_option(catalogue, tmp_path, cells):
         build_sharded(catalogue, model, tmp_path / "none", 2, cells=cells, quiet=True)
 
 
-def test_a_sharded_index_without_cells_gives_the_results_of_one_folder(
-    pooled_index, catalogue, checkpoint, tmp_path, touches
-):
-    report = build_sharded(catalogue, checkpoint, tmp_path / "sharded", 2, cells=False, quiet=True)
-    assert report.cells is False
-    assert not build_sharded(catalogue, checkpoint, tmp_path / "sharded", 2, quiet=True).written
-    files = next(iter(touches.values()))[0]
-    with Searcher.open(tmp_path / "sharded") as sharded, Searcher.open(pooled_index) as whole:
-        for mine, other in zip(sharded.query(files).results, whole.query(files).results, strict=True):
-            assert (mine.object_id, mine.logit) == (other.object_id, pytest.approx(other.logit, abs=1e-5))
-
-
 def test_reference_touches_are_reused_with_the_calibration_of_pooled_logits(
     catalogue_with_touches, checkpoint, tmp_path, touches
 ):
@@ -135,17 +114,6 @@ def test_reference_touches_are_reused_with_the_calibration_of_pooled_logits(
     with Searcher.open(tmp_path / "index") as searcher:
         posterior = searcher.query(next(iter(touches.values()))[0]).posterior
         assert posterior["references"]["calibration"] == dataclasses.asdict(POOLED_REFERENCES)
-
-
-def test_only_a_checkpoint_with_cells_stores_the_calibration_of_pooled_logits(checkpoint, tmp_path):
-    assert (checkpoint.pooled_posterior, checkpoint.pooled_references) == (POOLED_POSTERIOR, POOLED_REFERENCES)
-    pooled = checkpoint.without_cells()
-    assert pooled.digest == checkpoint.digest
-    assert pooled.without_cells() is pooled
-    store_checkpoint(pooled, tmp_path / "stored.safetensors")
-    stored = load_checkpoint(tmp_path / "stored.safetensors")
-    assert (stored.posterior, stored.references) == (POOLED_POSTERIOR, POOLED_REFERENCES)
-    assert (stored.pooled_posterior, stored.pooled_references) == (None, None)
 
 
 def test_the_pooled_posterior_is_fitted_on_the_logits_of_the_matcher_without_cells(checkpoint, monkeypatch):

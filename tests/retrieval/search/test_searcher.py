@@ -56,18 +56,6 @@ def test_several_objects_give_the_results_of_single_queries(searcher, grasps):
         assert answer.none_probability == pytest.approx(single.none_probability, abs=1e-4)
 
 
-def test_the_grasps_of_all_objects_are_encoded_in_batches(searcher, grasps, monkeypatch):
-    sizes, encode = [], searcher.encoder.encode
-
-    def counted(touches):
-        sizes.append(len(touches))
-        return encode(touches)
-
-    monkeypatch.setattr(searcher.encoder, "encode", counted)
-    assert len(searcher.query_many([grasps[0][:2]] * 20, top=1)) == 20
-    assert sizes == [32, 8]
-
-
 def test_the_bad_one_of_several_objects_is_reported_before_reading(searcher, grasps):
     with pytest.raises(BadInput, match=r"object 2, this model takes 2 gel image\(s\) for one touch; got 1"):
         searcher.query_many([["absent.png", "absent.png"], grasps[0][0][:1]])
@@ -245,18 +233,6 @@ def test_touches_are_encoded_with_the_requested_threads_from_any_thread(index, t
             assert (opened.query(touch).results != [], torch.get_num_threads()) == (True, 2)
     finally:
         torch.set_num_threads(before)
-
-
-@forking
-def test_a_fork_of_a_multi_threaded_process_computes_on_one_thread(searcher):
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        sums = torch.ones(1 << 20).add(1).sum()
-        found = in_fork(lambda: (torch.get_num_threads(), float(torch.ones(1 << 20).add(1).sum())))
-    finally:
-        torch.set_num_threads(before)
-    assert found == repr((1, float(sums)))
 
 
 @forking

@@ -16,13 +16,8 @@ from indexes.store.sharded import read_sharded_manifest, shard_number, write_sha
 from retrieval.errors import BadInput, RetrievalError
 from retrieval.indexing.sharded import build_sharded
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.model.posterior import Posterior
-from retrieval.search.objects import ListedPhoto
 from retrieval.search.searcher import Searcher
-from retrieval.search.shard import RankedObject, ShardResult, Shards
-from tests.retrieval.search.test_search import give_posterior
-
-STEEP = Posterior(slope=2.0, offset=-1.5, dependence=0.25, tests=1)
+from tests.retrieval.search.test_search import STEEP, give_posterior
 
 
 @pytest.fixture(scope="module")
@@ -78,32 +73,6 @@ def test_rows_are_found_in_every_shard(divided, searcher):
     assert divided.shard.photos(requested)[-1] is None
 
 
-def test_a_result_has_the_number_of_shards_and_folder_attributes_raise(divided, searcher, touch, cluster):
-    index = divided.query(touch).index
-    assert index["shards"] == len(read_sharded_manifest(cluster).shards)
-    assert "shards" not in searcher.query(touch).index
-    with pytest.raises(BadInput, match="is a sharded index, but one index folder is required"):
-        _ = divided.generation
-
-
-# Merging by hand ------------------------------------------------------------------------------------------------------
-
-
-def scored(*objects, photos=10):
-    best = [RankedObject(logit, ListedPhoto(name, f"{name}/1.jpg", {})) for name, logit in objects]
-    mass = STEEP.mass([logit for _, logit in objects])
-    return ShardResult(photos, len(best), best, mass, {"candidates": 1.0, "rerank": photos / 10})
-
-
-def test_merged_objects_are_ordered_by_logit_then_by_name():
-    results = [scored(("tin", 2.0), ("cup", 1.0)), scored(("mug", 2.0), ("jar", 0.5), photos=30)]
-    shards = [SimpleNamespace(search=lambda *_, result=result: result) for result in results]
-    found = Shards(None, shards).search(None, 3, None)
-    assert [one.photo.object_id for one in found.best] == ["mug", "tin", "cup"]
-    assert (found.photos, found.objects) == (40, 4)
-    assert found.timing_ms == {"candidates": 1.0, "rerank": 3.0}
-
-
 # Building -------------------------------------------------------------------------------------------------------------
 
 
@@ -123,14 +92,6 @@ def test_every_photo_is_only_in_the_shard_of_its_object(cluster, searcher):
     assert together == sorted(searcher.generation.rows, key=lambda row: row.path)
     manifest = read_sharded_manifest(cluster)
     assert (manifest.photos, manifest.objects) == (24, 8)
-
-
-def test_a_shard_is_a_searchable_index_folder(cluster, divided, touch):
-    entry = read_sharded_manifest(cluster).shards[0]
-    with Searcher.open(cluster / entry.folder) as opened:
-        names = {match.object_id for match in opened.query(touch).results}
-    assert names == {row.object_id for row in rows_of(cluster)[entry.folder]}
-    assert names < {match.object_id for match in divided.query(touch).results}
 
 
 @pytest.fixture
@@ -301,11 +262,8 @@ ENTRY = {"folder": "shard-00-of-01", "generation": "gen-000001", "sha256": "0" *
     [
         ("shards", []),
         ("shards", [ENTRY | {"folder": "../elsewhere"}]),
-        ("shards", [ENTRY | {"generation": "gen/../1"}]),
         ("shards", [ENTRY | {"photos": -1}]),
-        ("generation", "gen-000001"),
         ("fingerprint", {"checkpoint": 1}),
-        ("about", []),
         ("of", 0),
     ],
 )

@@ -103,12 +103,6 @@ def test_contact_is_detected_by_comparison_with_a_no_contact_frame(searcher, gra
     assert searcher.query(later.backgrounds, background=grasp.backgrounds).grasps == ["no contact"]
 
 
-def test_several_objects_have_separate_verdicts(searcher, grasps):
-    results = searcher.query_many([grasps[0].touches, grasps[0].backgrounds, [picture("black")] * 2])
-    assert [result.verdict for result in results][1:] == ["no contact", "not a gel image"]
-    assert results[0].results
-
-
 def test_the_command_gives_the_verdict_as_exit_code_in_json_and_on_the_page(index, grasps, tmp_path, capsys):
     Image.fromarray(picture("black")).save(tmp_path / "black.png")
     black = [str(tmp_path / "black.png")] * 2

@@ -10,7 +10,6 @@ from retrieval.commands.main import main
 from retrieval.errors import BadInput
 from retrieval.indexing.build import build_index
 from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
-from retrieval.model.fusion_scorer import FusionScorer
 from retrieval.model.verification import MAX_GRASPS
 from tests.verification import POSTERIOR, calibration
 
@@ -63,29 +62,6 @@ def test_a_sequence_that_ends_without_a_decision_is_rejected(open_index, touches
         assert len(found.log_ratios) == MAX_GRASPS
 
 
-def test_only_the_photos_of_the_expected_object_are_scored(open_index, touches, monkeypatch):
-    name, counts, logits = sorted(touches)[0], [], FusionScorer.logits
-
-    def counted(scorer, partials, photos, rows=None):
-        counts.append(len(rows))
-        return logits(scorer, partials, photos, rows)
-
-    monkeypatch.setattr(FusionScorer, "logits", counted)
-    with open_index(calibration(0.0, -1.0)) as searcher:
-        searcher.verify(touches[name][:1], name)
-    assert counts == [3]  # the catalogue has three photos of each object
-
-
-@pytest.mark.parametrize(
-    ("fitted", "name", "words"),
-    [(calibration(0.0, -1.0), "anvil", "has no object 'anvil'"), (None, None, "no error rates for verification")],
-)
-def test_an_unknown_object_and_a_model_without_error_rates_are_refused(open_index, touches, fitted, name, words):
-    first = sorted(touches)[0]
-    with open_index(fitted) as searcher, pytest.raises(BadInput, match=words):
-        searcher.verify(touches[first][:1], name or first)
-
-
 def test_the_command_prints_the_decision_and_exits_with_its_code(open_index, touches, capsys):
     name = sorted(touches)[0]
     with open_index(calibration(-1e3, -2e3)) as searcher:
@@ -101,3 +77,5 @@ def test_the_command_prints_the_decision_and_exits_with_its_code(open_index, tou
     assert "has no object 'anvil'" in capsys.readouterr().err
     assert main(["verify", "--expect", name, "--gelsight", *images, "--index", index, "--far", "0.00001"]) == 2
     assert "validation objects; the model has 100" in capsys.readouterr().err
+    with open_index(None) as searcher, pytest.raises(BadInput, match="no error rates for verification"):
+        searcher.verify(touches[name][:1], name)
