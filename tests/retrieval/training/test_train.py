@@ -20,7 +20,7 @@ from retrieval.model.checkpoint import load_checkpoint, read_tensors
 from retrieval.model.losses.listwise import contrastive_loss, listwise_loss
 from retrieval.model.losses.loss import Loss, match_loss
 from retrieval.model.towers.tower import Tower
-from retrieval.training.augmentation import augment_photos, augment_touches
+from retrieval.training.augmentation import augment_photos
 from retrieval.training.features import BatchImages, TrainedFeatures
 from retrieval.training.initial_weights import build_matcher
 from retrieval.training.loop import state_path
@@ -182,15 +182,6 @@ def test_fingers_are_shuffled_within_a_touch_by_the_seed():
     same, other = ((shuffled == each.repeat(50, 1)).all(1) for each in (features, swapped))
     assert (same ^ other).all()
     assert 60 < int(other.sum()) < 140
-
-
-def test_the_fingers_of_a_touch_are_flipped_together_top_to_bottom():
-    touches = torch.zeros(2, 2, 3, 64, 64)
-    touches[:, :, :, :16] = 1.0  # the top quarter is bright
-    turned = augment_touches(touches, np.array([False, True]), np.random.default_rng(0))
-    top, bottom = turned[..., :16, :].mean((2, 3, 4)), turned[..., -16:, :].mean((2, 3, 4))
-    assert (top[0] > bottom[0] + 0.3).all()
-    assert (bottom[1] > top[1] + 0.3).all()
 
 
 def test_the_views_of_a_photo_are_flipped_together_left_to_right_and_stay_in_their_places():
