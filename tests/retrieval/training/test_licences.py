@@ -8,8 +8,10 @@ import onnx
 import pytest
 
 from retrieval.data.dataset import DataLicence, recording_licence, stored_licences
+from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.export import touch_encoder_to_onnx
-from retrieval.training.initial_weights import training_licences
+from retrieval.model.shipped import shipped_model
+from retrieval.training.initial_weights import checkpoint_licences, training_licences
 from retrieval.training.train import train
 from tests.conftest import TINY
 
@@ -36,6 +38,10 @@ def test_the_licences_of_a_training_are_those_of_all_its_data(recording, license
     assert training_licences(recording, settings) == [own, DataLicence("tower.safetensors")]
     started = dataclasses.replace(settings, start=str(trained.path))  # the towers of the checkpoint replace the file
     assert training_licences(recording, started) == [own, stated]
+
+
+def test_a_shipped_model_is_mit():
+    assert [each.licence for each in checkpoint_licences(load_checkpoint(shipped_model()))] == ["MIT"]
 
 
 def test_checkpoint_card_and_export_repeat_the_licences(trained):
