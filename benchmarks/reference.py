@@ -69,6 +69,8 @@ retrieve check recording/                                   # before training
 An importer reads a public data set in its published layout, or your own pictures, and writes a
 [recording](formats.md#recording) for training, evaluation and search. It processes one grasp at a time, so memory
 grows only with names and with the lines of the recording. An interrupted import continues when you run it again.
+With other options, or if a file changed or is gone (`sources.json` lists them), it is refused: give another `--out`.
+New files are added. First images of a video that are black, dim or in another colour are left out and counted.
 Unreadable items are skipped, counted by reason and reported. `recording.json` stores the counts under `skipped`, the
 licence with its terms, the citation, and under `objects` the data set's own information on them. Pictures that many
 grasps share, such as one no-contact frame, are stored once. A published split by objects is in `splits/<name>.json`,

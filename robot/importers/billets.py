@@ -44,7 +44,7 @@ def import_billets(src: Path, out: Path, progress: Progress | None = None) -> Re
     items = list(_places(src))
     if not any(isinstance(item, Item) for item in items):
         raise DATA_SET.mismatch_error(src, "it contains no pair")
-    return import_items(DATA_SET, items, out, total=len(items), progress=progress)
+    return import_items(DATA_SET, items, out, total=len(items), progress=progress, source=src)
 
 
 def _places(src: Path) -> Iterator[Item | Skip]:

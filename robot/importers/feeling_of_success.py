@@ -83,7 +83,7 @@ def import_feeling_of_success(src: Path, out: Path, progress: Progress | None = 
     with contextlib.suppress(ImportError):
         import_module("hdf5plugin")  # registers its filters
     total = sum(_count(h5py, path) for path in files)
-    return import_items(DATA_SET, _items(h5py, files), out, total=total, progress=progress)
+    return import_items(DATA_SET, _items(h5py, files), out, total=total, progress=progress, source=src)
 
 
 def _count(h5py: Any, path: Path) -> int:

@@ -78,7 +78,15 @@ def import_folder(
         fingers=len(matches.fingers),
         background="as in the pictures" if matches.has_background else "none",
     )
-    return import_items(data_set, matches.items(), out, total=matches.total, progress=progress)
+    return import_items(
+        data_set,
+        matches.items(),
+        out,
+        total=matches.total,
+        progress=progress,
+        source=src,
+        options={"touch": touch, "photo": photo, "background": background, "sensor": sensor, "licence": licence},
+    )
 
 
 class _Pattern:

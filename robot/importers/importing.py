@@ -2,14 +2,17 @@
 
 An importer yields the grasps of its data set one by one as `Item`, or as `Skip` for one that is not available;
 `import_items` does the rest. Grasps that the recording already contains are not read again, so a stopped import
-resumes where it stopped.
+resumes where it stopped. It is refused if its options differ, or if a file of the source changed or is gone; new files
+are added.
 
     recording.json        also: licence, terms, citation, fingers, notes (caveats, and unverified parts of the layout),
                           objects (object_id -> metadata of the data set), skipped (reason -> count),
                           left_out (video -> number of its first images without use, such as black ones)
+    sources.json          options of the import, and size, time (ns) and SHA-256 of each file of the source
     splits/published.json a published split: {"seed": 0, "train": [object ids], "validation": [...], "test": [...]}
 """
 
+import contextlib
 import json
 import os
 import re
@@ -19,11 +22,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from _touch_retrieval.files import write_atomically
+from _touch_retrieval.files import file_digest, write_atomically
 from _touch_retrieval.names import is_system_name
 from robot.errors import ImporterError, RecordingError
 from robot.recording.folder import Recording, RecordingWriter, SharedImage, read_recording
-from robot.storage import ImageSource, file_content, storage_errors
+from robot.storage import ImageSource, file_content, read_json_object, storage_errors
 
 Progress = Callable[[int, int], None]
 """Called with (done, total) after each grasp, whether it was read, already stored or skipped."""
@@ -38,6 +41,7 @@ NOT_STATED = "not stated"
 """Licence of a data set whose files and repository state none, or of which we know none."""
 
 SPLITS_FOLDER = "splits"
+SOURCES_FILE = "sources.json"
 _END_MARKERS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9"}
 _TAIL = 65536
 """Bytes that a camera may write after the end of a JPEG."""
@@ -114,6 +118,8 @@ def import_items(
     *,
     total: int,
     progress: Progress | None = None,
+    source: Path | None = None,
+    options: Mapping[str, Any] = {},
     objects: Mapping[str, Mapping[str, Any]] = {},
     split: Mapping[str, Sequence[str]] | None = None,
 ) -> Recording:
@@ -125,6 +131,8 @@ def import_items(
         out: Recording folder to write or continue.
         total: Number of items, for the progress.
         progress: Called with (done, total) after each item.
+        source: File or folder that is imported; None does not check its files.
+        options: Options of the import.
         objects: object_id -> metadata, plain JSON.
         split: The published split: part (train, validation, test) -> object ids.
 
@@ -133,12 +141,13 @@ def import_items(
 
     Raises:
         ImporterError: No grasp can be imported.
-        RecordingError: The recording cannot be continued.
+        RecordingError: The recording cannot be continued, or was imported with other options or files.
         StorageError: The recording cannot be written.
     """
     skipped: dict[str, list[str]] = {}  # reason -> names
     notes = data_set.notes()
     with RecordingWriter(out, data_set.info()) as writer:
+        _check_same_import(writer, data_set, source, options)
         names: set[str] = set()
         for done, item in enumerate(_readable(items), start=1):
             skip = item if isinstance(item, Skip) else _append(writer, item, names)
@@ -165,6 +174,56 @@ def import_items(
         writer.update_info(objects=dict(objects), skipped=counts, notes=notes)
     recording = read_recording(out)
     return replace(recording, notes=(*recording.notes, *skips, *notes))
+
+
+def _check_same_import(
+    writer: RecordingWriter, data_set: DataSet, source: Path | None, options: Mapping[str, Any]
+) -> None:
+    """Store options and files of the source, or raise RecordingError that names what differs from the stored ones."""
+    path = writer.folder / SOURCES_FILE
+    old = read_json_object(path, RecordingError) if path.is_file() else None
+    if old is None and source is not None and writer.grasp_ids:
+        raise RecordingError(f"{writer.folder} has grasps but no {SOURCES_FILE}; give another folder")
+    stored = old or {"options": {}, "files": {}}
+    options = {"licence": data_set.licence, "fingers": data_set.fingers, **options}
+    new = {"options": options, "files": _source_files(source, writer.folder, stored["files"]) if source else {}}
+    before = stored["options"]
+    changes = [
+        f"{key} {before.get(key)!r}, not {now!r}" for key, now in options.items() if old and before.get(key) != now
+    ]
+    for name, (*_, digest) in stored["files"].items():
+        if digest != (now := new["files"].get(name, ("is gone",))[-1]):
+            changes.append(f"the file {name}, which {now if now == 'is gone' else 'has changed'}")
+    if changes:
+        more = f" and {len(changes) - 3} more differences" if len(changes) > 3 else ""
+        raise RecordingError(
+            f"{writer.folder} was imported with {'; '.join(changes[:3])}{more}, and its grasps would stay as they are; "
+            "give another folder, or delete this one"
+        )
+    if old != new:
+        with storage_errors(path):
+            write_atomically(path, json.dumps(new, indent=1).encode() + b"\n")
+
+
+def _source_files(source: Path, out: Path, known: Mapping[str, list[Any]]) -> dict[str, list[Any]]:
+    """Return size, time (ns) and SHA-256 of the files of a source, except those of systems and of the recording.
+
+    A file whose size and time are known is not read.
+    """
+    paths = [source] if source.is_file() else []
+    for folder, folders, names in os.walk(source):
+        folders[:] = [
+            name for name in folders if not is_system_name(name) and not os.path.samefile(Path(folder, name), out)
+        ]
+        paths += [path for name in names if not is_system_name(name) and (path := Path(folder, name)).is_file()]
+    found = {}
+    for path in sorted(paths):
+        name = os.fsencode(path.relative_to(source) if path != source else path.name).decode(errors="backslashreplace")
+        facts = [path.stat().st_size, path.stat().st_mtime_ns]
+        stored = known.get(name, [])
+        with contextlib.suppress(OSError):  # what cannot be read is no source
+            found[name] = stored if stored[:2] == facts else [*facts, file_digest(path)]
+    return found
 
 
 def _readable(items: Iterable[Item | Skip]) -> Iterator[Item | Skip]:

@@ -83,6 +83,8 @@ def import_lerobot(
         out,
         total=total,
         progress=progress,
+        source=src,
+        options={"touch": touch, "photo": photo},
     )
 
 

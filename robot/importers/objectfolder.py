@@ -72,6 +72,7 @@ def import_objectfolder(src: Path, out: Path, progress: Progress | None = None) 
         out,
         total=sum(len(touches) for touches, _ in objects.values()),
         progress=progress,
+        source=src,
         split=_split(src / "split.json") if is_pack else None,
     )
 

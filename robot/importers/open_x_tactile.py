@@ -84,7 +84,13 @@ def import_open_x_tactile(
     items = (item for task in tasks for item in task.items())
     total = sum(len(task.ends) for task in tasks)
     return import_items(
-        replace(DATA_SET, sensor=sensors, fingers=fingers.pop()), items, out, total=total, progress=progress
+        replace(DATA_SET, sensor=sensors, fingers=fingers.pop()),
+        items,
+        out,
+        total=total,
+        progress=progress,
+        source=src,
+        options={"camera": camera},
     )
 
 

@@ -71,7 +71,9 @@ def import_physiclear(src: Path, out: Path, progress: Progress | None = None, *,
         raise DATA_SET.mismatch_error(src, "it contains no such video")
     import_extra("av", _WHAT)
     items = (item for match, path in videos for item in _items(match["part"], path, frames))
-    return import_items(DATA_SET, items, out, total=len(videos) * frames, progress=progress)
+    return import_items(
+        DATA_SET, items, out, total=len(videos) * frames, progress=progress, source=src, options={"frames": frames}
+    )
 
 
 def _items(part: str, path: Path, frames: int) -> Iterator[Item | Skip]:

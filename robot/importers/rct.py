@@ -79,6 +79,8 @@ def import_rct(
         out,
         total=len(rows),
         progress=progress,
+        source=src,
+        options={"touch": touch, "photo": photo, "sensor": sensor},
         objects={name: {"frames": count} for name, count in counts.items()},
     )
 

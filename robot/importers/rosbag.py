@@ -131,7 +131,26 @@ def import_rosbag(
     start_ns = min(scan.first_ns for scan in scans.values())
     items = (item for path, scan in scans.items() for item in _items(path, scan, grasps[path], topics, start_ns))
     total = len(skips) + sum(map(len, grasps.values()))
-    return import_items(facts, chain(skips, items), out, total=total, progress=progress)
+    return import_items(
+        facts,
+        chain(skips, items),
+        out,
+        total=total,
+        progress=progress,
+        source=src,
+        options={
+            "touch_a": touch_a,
+            "touch_b": touch_b,
+            "photo": photo,
+            "gripper": gripper,
+            "grasp": grasp,
+            "object": object,
+            "contact": contact,
+            "settle_s": settle_s,
+            "sensor": sensor,
+            "licence": licence,
+        },
+    )
 
 
 def _bag_paths(source: Path) -> list[Path]:

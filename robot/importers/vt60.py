@@ -94,6 +94,7 @@ def import_vt60(src: Path, out: Path, progress: Progress | None = None) -> Recor
         out,
         total=sum(map(len, touches.values())),
         progress=progress,
+        source=src,
         objects=objects,
     )
 

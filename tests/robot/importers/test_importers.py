@@ -1,6 +1,8 @@
 """Common behaviour of all importers, on a miniature of each data set; test_<name>.py tests each importer."""
 
+import json
 import re
+import shutil
 import sys
 from hashlib import sha256
 from importlib import import_module
@@ -14,7 +16,7 @@ from retrieval.data.check.split import check_split
 from retrieval.data.dataset import Split, load_grasps
 from robot.errors import ImporterError, RecordingError, RobotError, UnknownName
 from robot.importers import IMPORTERS, data_set_of, load_importer, options_of, read_options, title_of
-from robot.importers.importing import SPLITS_FOLDER, DataSet, Item, Skip, import_items, numbered_files
+from robot.importers.importing import SOURCES_FILE, SPLITS_FOLDER, DataSet, Item, Skip, import_items, numbered_files
 from robot.recording.folder import RecordingWriter, SharedImage, read_recording, safe_name
 from robot.storage import parse_object
 from tests.data import touch_data
@@ -103,6 +105,17 @@ def test_a_stopped_import_resumes_and_ends_with_the_same_bytes(name, source, imp
     assert 0 < len(read_recording(tmp_path / "out").grasps) < miniature(name).GRASPS
     importer(source, tmp_path / "out")
     assert content(tmp_path / "out") == content(imported[0].folder)
+
+
+def test_an_import_of_changed_files_into_the_same_recording_is_refused(name, source, imported, tmp_path):
+    out = shutil.copytree(imported[0].folder, tmp_path / "out")
+    sources = json.loads((out / SOURCES_FILE).read_text())
+    assert sources["options"].keys() == {"licence", "fingers", *options_of(load_importer(name))}
+    changed = list(sources["files"])[-1]
+    sources["files"][changed] = [0, 0, "another digest"]
+    (out / SOURCES_FILE).write_text(json.dumps(sources))
+    with pytest.raises(RecordingError, match=rf"the file {re.escape(changed)}, which has changed"):
+        load_importer(name)(source, out)
 
 
 @pytest.mark.parametrize("exists", [False, True])
