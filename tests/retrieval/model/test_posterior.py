@@ -4,6 +4,8 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from retrieval.errors import BadInput, NumericalError
 from retrieval.model.posterior import EvidenceMass, Posterior, require_prior
@@ -33,10 +35,41 @@ def test_probabilities_equal_those_calculated_by_hand():
     )
 
 
-def test_the_probability_if_present_counts_unscored_objects():
+@given(
+    st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=30),
+    st.floats(0, 0.99),
+    st.integers(1, 9),
+    st.lists(st.floats(-1e6, 1e6), max_size=5),
+)
+def test_probabilities_add_up_to_one_and_have_the_order_of_the_logits(logits, prior, grasps, sample):
+    posterior = Posterior(slope=0.7, offset=-0.3, dependence=0.6)
+    found = probabilities(posterior, logits, grasps, none_prior=prior, unscored=7 if sample else 0, sample=sample)
+    assert found.none + found.unscored + found.objects.sum() == pytest.approx(1)
+    order = np.argsort(logits)
+    assert (np.diff(found.objects[order]) >= 0).all()
+
+
+def test_large_logits_give_probabilities_where_the_naive_formula_gives_nan():
+    logits = np.array([1000.0, 999.0])
+    with np.errstate(over="ignore", invalid="ignore"):
+        naive = np.exp(logits) / (np.exp(logits).sum() + 1)
+    assert np.isnan(naive).all()
+    found = probabilities(ADDING, logits, none_prior=0.5)
+    assert found.objects == pytest.approx([1 / (1 + math.exp(-1)), math.exp(-1) / (1 + math.exp(-1))])
+    assert probabilities(ADDING, -logits, none_prior=0.5).none == 1.0
+
+
+def test_the_probability_if_present_equals_that_by_hand_for_any_prior_and_offset():
+    # Weights 3 and 1, together 4.
+    for offset, prior in ((0.0, 0.5), (-3.0, 0.9), (2.0, 0.0)):
+        found = probabilities(Posterior(1.0, offset, 0.0), [math.log(3), 0.0], none_prior=prior)
+        assert found.objects_if_present == pytest.approx([3 / 4, 1 / 4])
     # Four objects, two of them scored: weights 4 and 1; the two others weigh 2 each, the mean of the sample.
     found = probabilities(ADDING, [math.log(4), 0.0], unscored=2, sample=[0.0, math.log(3)])
     assert found.objects_if_present == pytest.approx([4 / 9, 1 / 9])
+    # Two grasps: w = 1 / 1.5, so logits of 1.5 log 3 and 0 weigh 3 and 1.
+    found = probabilities(Posterior(1.0, 0.0, 0.5), [1.5 * math.log(3), 0.0], 2)
+    assert found.objects_if_present == pytest.approx([3 / 4, 1 / 4])
 
 
 def test_merged_parts_of_a_catalogue_give_the_probability_if_present_of_the_whole():
@@ -52,6 +85,11 @@ def test_where_none_rounds_to_one_the_probability_if_present_is_exact_and_the_qu
     with np.errstate(invalid="ignore"):
         assert np.isnan(found.objects / (1 - found.none)).all()
     assert found.objects_if_present == pytest.approx([1 / (1 + math.exp(-1)), 1 / (1 + math.e)])
+    # Before that point the quotient has lost its digits: 1 - P(none) is a multiple of 1e-16.
+    found = probabilities(ADDING, [-32.0, -33.0])
+    exact = 1 / (1 + math.exp(-1))
+    assert found.objects[0] / (1 - found.none) != pytest.approx(exact, rel=1e-3)
+    assert found.objects_if_present[0] == pytest.approx(exact)
 
 
 @pytest.mark.parametrize(
@@ -60,6 +98,7 @@ def test_where_none_rounds_to_one_the_probability_if_present_is_exact_and_the_qu
         # Of four objects at even odds w l must exceed log 4 = 1.386. At dependence 0.5, 1 to 5 grasps of logit 1 weigh
         # 1, 1.333, 1.5, 1.6 and 1.667 together.
         (0.5, 1.0, 1, 0.5, 2),
+        (0.5, 1.1, 1, 0.5, 1),  # 1.1 * 1.333 = 1.467
         (0.5, 0.8, 1, 0.5, None),  # 0.8 * 1.667 = 1.333
         (0.5, 2.0, 2, 0.5, 1),  # a sum of two grasps of logit 1
         (0.5, 4.1, 5, 0.5, None),  # no estimate beyond five grasps
