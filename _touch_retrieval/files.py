@@ -21,6 +21,8 @@ from typing import Any, BinaryIO
 
 import msgspec
 
+from _touch_retrieval.text import decode_text
+
 
 @contextmanager
 def durable_file(path: Path) -> Iterator[BinaryIO]:
@@ -121,17 +123,20 @@ def read_json(path: str | Path, max_bytes: int = MAX_JSON_BYTES) -> Any:
 
 
 def parse_json(text: str | bytes, *, own: bool = False) -> Any:
-    """Return the document in a JSON text in UTF-8.
+    """Return the document in a JSON text.
 
     Args:
-        text: The text.
+        text: The text; bytes as `decode_text` reads them.
         own: Whether `json.dumps` wrote it: it may contain paths that are not UTF-8, which msgspec refuses.
 
     Raises:
         ValueError: The text is not JSON, has a number that is not finite, or is nested deeper than `MAX_DEPTH`.
     """
     try:
-        document = json.loads(text, parse_constant=_finite, parse_float=_finite) if own else msgspec.json.decode(text)
+        if own:
+            document = json.loads(text, parse_constant=_finite, parse_float=_finite)
+        else:
+            document = msgspec.json.decode(decode_text(text) if isinstance(text, bytes) else text)
         _require_depth(document, MAX_DEPTH)
     except RecursionError as error:
         raise ValueError(f"it is nested deeper than {MAX_DEPTH} levels") from error

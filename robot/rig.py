@@ -21,6 +21,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from _touch_retrieval.registry import Registry
+from _touch_retrieval.text import decode_text
 from robot.devices import Arm, Camera, Clock, Device, Gripper, TactileSensor
 from robot.errors import RobotConfigError, UnknownName
 from robot.grasping.settings import AttemptSettings, GraspSettings
@@ -260,7 +261,7 @@ def load_rig(spec: str, *, seed: int, **settings: Any) -> Rig:
     name, where = spec, ""
     if spec.endswith(".toml"):
         try:
-            document = tomllib.loads(read_content(spec, RobotConfigError).decode())
+            document = tomllib.loads(decode_text(read_content(spec, RobotConfigError)))
         except ValueError as error:
             raise RobotConfigError(f"{spec} is not TOML: {error}") from error
         name, where, settings = document.pop("rig", None), spec, {**document, **settings}

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from _touch_retrieval.files import open_regular
+from _touch_retrieval.text import decode_text
 from robot.errors import RecordingError, RobotError, StorageError
 
 PART_SUFFIX = ".part"
@@ -179,8 +180,8 @@ def read_content(path: str | Path, error_type: type[RobotError]) -> bytes:
 def parse_object(text: bytes, error_type: type[RobotError], name: str = "it") -> dict[str, Any]:
     """Parse the JSON object of a line or file; raise `error_type` for anything else, NaN and infinity included."""
     try:
-        return msgspec.json.decode(text, type=dict[str, Any])
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        return msgspec.json.decode(decode_text(text), type=dict[str, Any])
+    except ValueError as error:
         raise error_type(f"{name} must be one JSON object in UTF-8, without NaN and Infinity: {error}") from error
 
 

@@ -23,8 +23,11 @@ from pathlib import Path, PurePosixPath
 from string import ascii_lowercase
 from typing import Any
 
+import msgspec
+
 from _touch_retrieval.files import open_regular, parse_json, read_regular
 from _touch_retrieval.names import is_system_name, lookup_key
+from _touch_retrieval.text import decode_text
 from retrieval.console.output import abbreviate_list
 from retrieval.data.images import EXTENSIONS, is_picture
 from retrieval.data.naming import MAX_EXAMPLES, STEM, Naming
@@ -277,9 +280,11 @@ def _read_metadata(file: Path, naming: Naming) -> tuple[dict[str, dict[str, Any]
     by_object: dict[str, dict[str, Any]] = {}
     by_photo: dict[str, dict[str, Any]] = {}
     try:
-        lines = read_regular(file).split(b"\n") if os.path.lexists(file) else []
+        lines = decode_text(read_regular(file)).split("\n") if os.path.lexists(file) else []
     except OSError as error:
         raise DatasetError(f"{file} cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise DatasetError(f"{file}, {error}") from error
     for number, line in enumerate(lines, start=1):
         if not line.strip():
             continue
@@ -288,17 +293,19 @@ def _read_metadata(file: Path, naming: Naming) -> tuple[dict[str, dict[str, Any]
             name, table = lookup_key(name), by_photo if is_photo else by_object
             if name in table:
                 raise ValueError(f"{name} has two lines; merge them")
+        except msgspec.DecodeError as error:
+            raise DatasetError(f"{file}, line {number}: must be one JSON object a line, no NaN: {error}") from error
         except ValueError as error:
             raise DatasetError(f"{file}, line {number}: {error}") from error
         table[name] = metadata
     return by_object, by_photo
 
 
-def _parse_line(line: bytes, naming: Naming) -> tuple[str, bool, dict[str, Any]]:
+def _parse_line(line: str, naming: Naming) -> tuple[str, bool, dict[str, Any]]:
     """Return (photo path or object_id, whether it is a photo, the other keys)."""
     row = parse_json(line)
     if not isinstance(row, dict):
-        raise ValueError("must be one JSON object in braces")
+        raise ValueError("must be one JSON object a line, in braces")
     keys = [key for key in ("file_name", "object_id") if key in row]
     if not keys:
         raise ValueError("must name a photo (file_name) or an object (object_id)")
@@ -307,7 +314,7 @@ def _parse_line(line: bytes, naming: Naming) -> tuple[str, bool, dict[str, Any]]
     metadata = {key: value for key, value in row.items() if key not in keys}
     if "file_name" not in row:
         return row["object_id"], False, metadata
-    path = PurePosixPath(row["file_name"]).as_posix()
+    path = PurePosixPath(row["file_name"].replace("\\", "/")).as_posix()  # scripts write paths of Windows, too
     name = naming.object_of(path)
     if name is not None and lookup_key(row.get("object_id", name)) != lookup_key(name):
         raise ValueError(f"{path} belongs to object {name}, but the line names {row['object_id']}")

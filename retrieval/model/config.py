@@ -14,6 +14,7 @@ from msgspec import Meta
 
 from _touch_retrieval.documents import Count, NonNegative, Positive, Seed, check_fields, typed
 from _touch_retrieval.files import read_regular
+from _touch_retrieval.text import decode_text
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import ConfigError
 from retrieval.model.losses import LOGIT_LOSSES, LOSSES
@@ -316,7 +317,7 @@ def load_config(name_or_path: str) -> Config:
             f"--config must be one of {', '.join(preset_names())} or a TOML file; there is no {name_or_path!r}"
         )
     try:
-        config = Config.from_dict(tomllib.loads(read_regular(file).decode()))
+        config = Config.from_dict(tomllib.loads(decode_text(read_regular(file))))
     except OSError as error:
         raise ConfigError(f"{name_or_path} cannot be read: {error.strerror}") from error
     except ValueError as error:  # invalid TOML or UTF-8

@@ -23,6 +23,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
+from _touch_retrieval.text import decode_text
 from robot.errors import ImporterError
 from robot.importers.episodes import Picture, Step, episode_images
 from robot.importers.importing import (
@@ -110,9 +111,9 @@ class _Info(msgspec.Struct):
 
 def _read_info(path: Path) -> _Info:
     try:
-        info = msgspec.json.decode(read_content(path, ImporterError), type=_Info)
+        info = msgspec.json.decode(decode_text(read_content(path, ImporterError)), type=_Info)
         msgspec.convert(info.recording, _Moments)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise ImporterError(f"{path} must be that of a LeRobot data set: {error}") from error
     if not re.fullmatch(r"v3(\.\d+)*", info.codebase_version):
         raise ImporterError(f"{path} must have LeRobot version 3, got {info.codebase_version}; convert it with lerobot")

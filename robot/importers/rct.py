@@ -9,16 +9,17 @@ Missing pictures are counted. A material is an object; a press (material, positi
 a grasp. `sensor` selects the rows of one of the three sensors.
 """
 
-import csv
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from _touch_retrieval.text import read_table
 from robot.errors import ImporterError
 from robot.importers.importing import NOT_STATED, DataSet, Item, Progress, Skip, import_items
 from robot.recording.folder import Recording, SharedImage, safe_name
+from robot.storage import read_content
 
 DATA_SET = DataSet(
     source="RCT, arXiv 2606.31694",
@@ -63,7 +64,11 @@ def import_rct(
     for option, pattern in (("touch", touch), ("photo", photo)):
         if set(_FIELD.findall(pattern)) - set(_COLUMNS):
             raise ImporterError(f"braces of {option} must contain one of {', '.join(_COLUMNS)}, got {pattern!r}")
-    rows = list(_rows(table, sensor))
+    try:
+        forces = read_table(read_content(table, ImporterError), _COLUMNS)
+    except ValueError as error:
+        raise ImporterError(f"{table}: {error}") from error
+    rows = [row for _, row in forces.rows if sensor in ("", row["sensor"])]
     if not any(_find(src, touch, row) and _find(src, photo, row) for row in rows):
         content = ", ".join(sorted(path.name for path in src.iterdir())[:8])
         raise DATA_SET.mismatch_error(
@@ -75,7 +80,7 @@ def import_rct(
     counts = Counter(row["material_id"] for row in rows)
     return import_items(
         facts,
-        _items(src, rows, touch, photo),
+        _items(src, rows, touch, photo, forces.number),
         out,
         total=len(rows),
         progress=progress,
@@ -85,19 +90,9 @@ def import_rct(
     )
 
 
-def _rows(table: Path, sensor: str) -> Iterator[dict[str, str]]:
-    """Yield the rows of a sensor, all if empty."""
-    try:
-        with open(table, encoding="utf-8", errors="replace", newline="") as file:
-            for row in csv.DictReader(file, skipinitialspace=True):
-                values = {key: (row.get(key) or "").strip() for key in (*_COLUMNS, "raw_fz")}
-                if sensor in ("", values["sensor"]):
-                    yield values
-    except (OSError, csv.Error) as error:
-        raise ImporterError(f"{table} cannot be read: {error}") from error
-
-
-def _items(src: Path, rows: Sequence[dict[str, str]], touch: str, photo: str) -> Iterator[Item | Skip]:
+def _items(
+    src: Path, rows: Sequence[dict[str, str]], touch: str, photo: str, number: Callable[[str], float]
+) -> Iterator[Item | Skip]:
     for row in rows:
         name = safe_name(*(row[key] for key in _COLUMNS))
         touch_file, photo_file = _find(src, touch, row), _find(src, photo, row)
@@ -105,7 +100,7 @@ def _items(src: Path, rows: Sequence[dict[str, str]], touch: str, photo: str) ->
             yield Skip(f"no picture matches the option {'touch' if touch_file is None else 'photo'}", name)
             continue
         shared = SharedImage(safe_name("photo", row["material_id"]), photo_file)
-        fields = {"sequence_id": "-".join(row[key] for key in _COLUMNS[:3])} | _force(row["raw_fz"])
+        fields = {"sequence_id": "-".join(row[key] for key in _COLUMNS[:3])} | _force(row.get("raw_fz", ""), number)
         yield Item(name, row["material_id"], {"photo": shared, "touch_a": touch_file}, fields)
 
 
@@ -119,9 +114,9 @@ def _find(src: Path, pattern: str, row: dict[str, str]) -> Path | None:
     return next((path for path in found if path.is_file()), None)
 
 
-def _force(text: str) -> dict[str, float]:
+def _force(text: str, number: Callable[[str], float]) -> dict[str, float]:
     try:
-        force = abs(float(text))
+        force = abs(number(text))
     except ValueError:
         return {}
     return {"force_n": force} if force < 1e6 else {}

@@ -4,7 +4,6 @@ Points are (N, 3) in mm, in the camera frame of robot.devices and in the rig's f
 `Camera.extrinsics`. (For the nine points of the paper's authors the mean residual is 8.7 mm.)
 """
 
-import csv
 import json
 import warnings
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from _touch_retrieval.documents import typed
 from _touch_retrieval.files import write_atomically
+from _touch_retrieval.text import read_table
 from robot.errors import RobotConfigError
 from robot.storage import read_content, read_json_object, storage_errors
 
@@ -94,21 +94,11 @@ def fit_hand_eye(camera_mm: npt.ArrayLike, rig_mm: npt.ArrayLike, *, written: da
 
 
 def read_pairs(path: Path) -> tuple[Points, Points]:
-    """Read camera and rig points from a CSV file with the columns COLUMNS, in any order; or raise RobotConfigError."""
-    numbers, line = [], 1
+    """Read camera and rig points from a CSV file with COLUMNS, as `read_table` does; raise RobotConfigError."""
     try:
-        rows = csv.DictReader(read_content(path, RobotConfigError).decode("utf-8-sig").splitlines(), strict=True)
-        if sorted(rows.fieldnames or ()) != sorted(COLUMNS):
-            raise RobotConfigError(f"{path} must have the columns {', '.join(COLUMNS)}; it has {rows.fieldnames}")
-        for row in rows:
-            line = rows.line_num
-            if len(row) != len(COLUMNS):
-                raise ValueError(f"it has {len(row)} columns")
-            numbers.append([float(row[column]) for column in COLUMNS])
-    except (csv.Error, UnicodeDecodeError) as error:
-        raise RobotConfigError(f"{path} is not CSV text: {error}") from error
-    except (TypeError, ValueError) as error:
-        raise RobotConfigError(f"{path}, line {line}: every column must contain a number in mm: {error}") from error
+        numbers = read_table(read_content(path, RobotConfigError), COLUMNS).numbers(COLUMNS)
+    except ValueError as error:
+        raise RobotConfigError(f"{path}: {error}") from error
     pairs = np.array(numbers, dtype=np.float64).reshape(-1, 6)
     return pairs[:, :3], pairs[:, 3:]
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from robot.errors import RobotConfigError
 from robot.sight import hand_eye
-from robot.sight.hand_eye import fit_hand_eye, load_hand_eye, read_pairs
+from robot.sight.hand_eye import fit_hand_eye, load_hand_eye
 from tests.robot.test_devices import Eye, picture
 
 
@@ -127,30 +127,3 @@ def test_a_file_that_is_not_a_calibration_is_refused(tmp_path, content):
         load_hand_eye(saved(tmp_path, note=1), 30)
     with pytest.raises(RobotConfigError, match="cannot be read"):
         load_hand_eye(tmp_path / "none.json", 30)
-
-
-def test_pairs_are_read_from_columns_in_any_order(tmp_path):
-    text = "\ufeffrig_x_mm,rig_y_mm,rig_z_mm,camera_z_mm,camera_y_mm,camera_x_mm\r\n1,2,3,4,5,6\r\n-1,0,1e2,0,0,.5\r\n"
-    (tmp_path / "pairs.csv").write_text(text)
-    camera, rig = read_pairs(tmp_path / "pairs.csv")
-    np.testing.assert_array_equal(camera, [[6, 5, 4], [0.5, 0, 0]])
-    np.testing.assert_array_equal(rig, [[1, 2, 3], [-1, 0, 100]])
-
-
-HEAD = ",".join(hand_eye.COLUMNS) + "\n"
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "must have the columns camera_x_mm"),
-        (HEAD + "1,2,3,4,5\n", "line 2: every column must contain a number"),
-        (HEAD + "1,2,3,4,5,six\n", "line 2: every column"),
-        (HEAD + "1,2,3,4,5,6,7\n", "line 2: every column"),
-        ("\udcff", "not CSV text"),
-    ],
-)
-def test_an_invalid_file_of_pairs_is_refused(tmp_path, text, message):
-    (tmp_path / "pairs.csv").write_bytes(text.encode("utf-8", "surrogateescape"))
-    with pytest.raises(RobotConfigError, match=message):
-        read_pairs(tmp_path / "pairs.csv")
