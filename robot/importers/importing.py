@@ -14,6 +14,7 @@ are added.
 
 import contextlib
 import json
+import math
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -43,6 +44,8 @@ NOT_STATED = "not stated"
 SPLITS_FOLDER = "splits"
 SOURCES_FILE = "sources.json"
 _END_MARKERS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9"}
+_MAX_OPENING_MM = 200.0
+"""Largest opening that is believed: more may be the angle of a joint, or another unit."""
 _TAIL = 65536
 """Bytes that a camera may write after the end of a JPEG."""
 
@@ -149,8 +152,14 @@ def import_items(
     with RecordingWriter(out, data_set.info()) as writer:
         _check_same_import(writer, data_set, source, options)
         names: set[str] = set()
+        openings: list[str] = []
+        infinite: list[str] = []
         for done, item in enumerate(_readable(items), start=1):
             skip = item if isinstance(item, Skip) else _append(writer, item, names)
+            numbers = {key: value for key, value in getattr(item, "fields", {}).items() if isinstance(value, float)}
+            infinite += [key for key, value in numbers.items() if not math.isfinite(value)]
+            if not 0 <= (opening := numbers.get("opening_mm", 0.0)) <= _MAX_OPENING_MM and math.isfinite(opening):
+                openings.append(f"{opening:.0f} mm")
             left_out = {**writer.info.get("left_out", {}), **(item.left_out if isinstance(item, Item) else {})}
             if left_out:
                 writer.update_info(left_out=left_out)
@@ -163,10 +172,18 @@ def import_items(
             raise ImporterError(f"no grasp could be imported: {'; '.join(skips) or 'the source contains none'}")
         if split is not None:
             notes = [*_write_split(out, split), *notes]
+        if openings:
+            notes.insert(
+                0,
+                f"the opening of {len(openings)} grasp(s), such as {openings[0]}, is doubtful: grippers open 0 to "
+                f"{_MAX_OPENING_MM:.0f} mm; the source may state an angle, or another unit",
+            )
+        if infinite:
+            notes.insert(0, f"left out {len(infinite)} number(s) that are not finite, such as {infinite[0]}")
         if left_out := writer.info.get("left_out", {}):
-            numbers = ", ".join(f"{number} of {video}" for video, number in list(left_out.items())[:5])
+            starts = ", ".join(f"{number} of {video}" for video, number in list(left_out.items())[:5])
             notes = [
-                f"left out first images that are black, dim or of another colour than all later ones: {numbers}"
+                f"left out first images that are black, dim or of another colour than all later ones: {starts}"
                 f"{' ...' if len(left_out) > 5 else ''}; the next image is the first one used",
                 *notes,
             ]
@@ -249,7 +266,8 @@ def _append(writer: RecordingWriter, item: Item, names: set[str]) -> Skip | None
                 images[column] = source
             else:
                 images[column] = SharedImage(source.name, picture_bytes(column, source.source))
-        writer.append(item.grasp_id, item.object_id, images, **item.fields)
+        finite = (pair for pair in item.fields.items() if not isinstance(pair[1], float) or math.isfinite(pair[1]))
+        writer.append(item.grasp_id, item.object_id, images, **dict(finite))
     except (ImporterError, RecordingError) as error:
         return Skip(str(error), item.grasp_id)
     return None

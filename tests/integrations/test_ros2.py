@@ -233,7 +233,7 @@ def test_a_missing_finger_a_stale_image_and_an_unknown_encoding_are_one_error_an
     assert result.error == (
         "finger a (/gel/a): the newest image is 3.0 s old by its time stamp; check the publisher, and that its clock "
         "agrees with the clock of this node; finger b (/gel/b): the encoding of its images must be rgb8, bgr8, mono8, "
-        "got 'yuv422'"
+        "rgba8, bgra8, got 'yuv422'"
     )
     assert sum(text.startswith("Identify: ") for text in node.log) == 2
     player.without = ()

@@ -150,7 +150,7 @@ def test_topics_and_options_are_checked(tmp_path, options, message):
 def test_an_unknown_encoding_is_an_error_that_names_the_known_ones(tmp_path):
     content = [at(0, GEL_A, "sensor_msgs/Image", **rosbag.image_fields(rosbag.gel("a", 0), "yuv422"))]
     write_bag(tmp_path / "a.bag", merged(content, list(rosbag.messages())[1:]))
-    with pytest.raises(ImporterError, match="must be rgb8, bgr8, mono8, got 'yuv422'"):
+    with pytest.raises(ImporterError, match=r"must be rgb8, .*bgra8, got 'yuv422'"):
         import_rosbag(tmp_path / "a.bag", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

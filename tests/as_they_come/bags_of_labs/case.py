@@ -1,0 +1,66 @@
+"""The content decides what is a bag; pictures with alpha are read; a number that cannot be costs no grasp."""
+
+import shutil
+
+import numpy as np
+import pytest
+from rosbags.rosbag2.reader import zstd
+
+from robot.errors import ImporterError
+from robot.importers.rosbag import import_rosbag
+from tests.miniatures import rosbag
+
+
+def content(encoding, effort=5.0, joint_m=0.001):
+    """Yield the miniature with an encoding of gel a, and the gripper's numbers."""
+    for time_ns, topic, short, fields in rosbag.messages():
+        number = (time_ns - rosbag.START_NS) // rosbag.INTERVAL_NS
+        if topic == rosbag.GEL_A:
+            gel = rosbag.gel("a", number)[..., [2, 1, 0] if encoding.startswith("bgr") else [0, 1, 2]]
+            fields = rosbag.image_fields(np.dstack([gel, np.full(gel.shape[:2], 128, np.uint8)]), encoding)
+        elif topic == rosbag.GRIPPER:
+            fields = {**fields, "effort": np.array([effort, 5.0]), "position": np.array([joint_m])}
+        yield time_ns, topic, short, fields
+
+
+def check(folder, get):
+    get("no_fsync")
+    source, expected = folder / "src", get("tmp_path") / "expected"
+    source.mkdir()
+    ros1, sqlite, mcap = (
+        rosbag.write_bag(folder / name, content(encoding))
+        for name, encoding in (("a.bag", "rgba8"), ("sqlite", "bgra8"), ("mcap", "rgba8"))
+    )
+    (database,), (log,) = sqlite.glob("*.db3"), mcap.glob("*.mcap")
+    (source / "zipped.db3.zstd").write_bytes(zstd.compress(database.read_bytes()))
+    shutil.copy(ros1, source / "crashed.bag.active")
+    shutil.copy(log, source / "no-suffix")
+    shutil.copy(ros1, source / "wrong.db3")
+    for name in ("zipped folder", "empty metadata"):
+        (source / name).mkdir()
+    (source / "zipped folder/0.mcap.zstd").write_bytes(zstd.compress(log.read_bytes()))
+    shutil.copy(database, source / "empty metadata/0.sqlite")
+    (source / "empty metadata/metadata.yaml").touch()
+    (source / "notes.txt").write_text("no bag")
+    (source / "other.zst").write_bytes(zstd.compress(b"no bag either"))
+    recording = import_rosbag(source, folder / "out")
+    names = {"crashed", "empty metadata", "no-suffix", "wrong", "zipped", "zipped folder"}
+    assert {grasp.object_id for grasp in recording.grasps} == names
+    assert recording.info["skipped"] == {}
+    before = import_rosbag(rosbag.write_bag(folder / "plain.bag", rosbag.messages()), expected).grasps
+    pictures = [(expected / grasp.touches["a"]).read_bytes() for grasp in before]
+    assert [(folder / "out" / grasp.touches["a"]).read_bytes() for grasp in recording.grasps] == pictures * len(names)
+
+    shutil.copy(database, folder / "left.db3")
+    (folder / "left.db3-wal").write_bytes(b"messages")
+    with pytest.raises(ImporterError, match=r"left.db3-wal; add them: sqlite3 left.db3"):
+        import_rosbag(folder / "left.db3", folder / "refused")
+
+    for effort, joint_m, force_n, note in (
+        (np.inf, 0.05, None, "not finite, such as force_n"),
+        (5.0, 0.41, 5.0, "410 mm"),
+    ):
+        bag = rosbag.write_bag(folder / f"{joint_m}.bag", content("rgba8", effort, joint_m))
+        recording = import_rosbag(bag, folder / f"{joint_m}", gripper=rosbag.GRIPPER)
+        assert [(grasp.force_n, grasp.opening_mm) for grasp in recording.grasps] == [(force_n, 1000 * joint_m)] * 2
+        assert any(note in line for line in recording.notes)
