@@ -30,10 +30,12 @@ MIN_SPREAD = 0.02
 
 Errors of 5 mm in such points make the camera's rotation arbitrary.
 """
-_MIN_EXTENT_MM = 5.0
-"""Points of a smaller extent are in metres; a calibration spans more than a few mm."""
-_METRES_RATIO = 100.0
-"""If one extent exceeds the other by this factor, the smaller one is in metres."""
+_MIN_EXTENT_MM = 25.0
+"""Points of a smaller extent are in metres, centimetres or inches, or too near to each other for a rotation."""
+_UNIT_RATIO = 5.0
+"""If one extent exceeds the other by this factor, the smaller one has another unit: a motion keeps distances."""
+_SAME_MM = 10.0
+"""Points within this distance are one point that was measured again."""
 _MAX_CLOCK_ERROR = timedelta(days=1)
 
 
@@ -69,17 +71,21 @@ def fit_hand_eye(camera_mm: npt.ArrayLike, rig_mm: npt.ArrayLike, *, written: da
         raise RobotConfigError(f"points must be two arrays of N x 3 mm, got {camera.shape} and {rig.shape}")
     if not (np.isfinite(camera).all() and np.isfinite(rig).all()):
         raise RobotConfigError("points must be finite numbers of mm; measure the others again")
-    distinct = min(len(np.unique(points, axis=0)) for points in (camera, rig))
-    if distinct < 4:
-        raise RobotConfigError(f"a calibration requires at least 4 different points, got {distinct}; measure more")
     arms = [points - points.mean(0) for points in (camera, rig)]
     extents = [float(np.sqrt((arm**2).sum(1).mean())) for arm in arms]
-    for name, arm, own, other in zip(("camera", "rig"), arms, extents, extents[::-1], strict=True):
-        if own < _MIN_EXTENT_MM or own * _METRES_RATIO < other:
+    for name, own, other in zip(("camera", "rig"), extents, extents[::-1], strict=True):
+        if own < _MIN_EXTENT_MM or own * _UNIT_RATIO < other:
             raise RobotConfigError(
                 f"the {name} points must be in mm, but extend only {own:.3g}, and those of the other frame "
-                f"{other:.3g}; if they are in metres, multiply them by 1000"
+                f"{other:.3g}; if they are in metres, multiply them by 1000 (centimetres: 10, inches: 25.4), else "
+                "measure points that are farther apart"
             )
+    distinct = min(map(_distinct, (camera, rig)))
+    if distinct < 4:
+        raise RobotConfigError(
+            f"a calibration requires at least 4 different points, got {distinct}; measure more, {_SAME_MM:g} mm apart"
+        )
+    for name, arm in zip(("camera", "rig"), arms, strict=True):
         along, across, _ = np.linalg.svd(arm, compute_uv=False)
         if across < MIN_SPREAD * along:
             raise RobotConfigError(f"the {name} points must not lie on one line; add points beside it")
@@ -91,6 +97,14 @@ def fit_hand_eye(camera_mm: npt.ArrayLike, rig_mm: npt.ArrayLike, *, written: da
     rigid[:3, 3] = rig.mean(0) - rotation.apply(camera.mean(0))
     residuals = np.linalg.norm(rotation.apply(arms[0]) - arms[1], axis=1)
     return HandEye(rigid, residuals, (written or datetime.now(UTC)).replace(microsecond=0))
+
+
+def _distinct(points: Points) -> int:
+    kept: list[Points] = []
+    for point in points:
+        if all(np.linalg.norm(point - other) > _SAME_MM for other in kept):
+            kept.append(point)
+    return len(kept)
 
 
 def read_pairs(path: Path) -> tuple[Points, Points]:
@@ -130,4 +144,7 @@ def load_hand_eye(path: Path, max_age_days: float) -> Points:
             f"{path} must be at most {max_age_days:g} days old, got {age / timedelta(days=1):.0f}; calibrate again, or "
             "allow more days"
         )
-    return np.array(document.rigid)
+    rigid = np.array(document.rigid)
+    if (far := float(np.linalg.norm(rigid[:3, 3]))) < _SAME_MM:
+        raise RobotConfigError(f"{path}: its translation must be in mm, got {far:.3g}; multiply one in metres by 1000")
+    return rigid

@@ -73,13 +73,6 @@ def test_residuals_are_those_of_two_plain_loops_and_points_of_one_plane_are_enou
     assert 0.5 < found.residuals_mm.mean() < 10
 
 
-@pytest.mark.parametrize(("camera", "rig", "name"), [(1e-3, 1, "camera"), (1, 1e-3, "rig"), (1e-3, 1e-3, "camera")])
-def test_metres_are_refused(camera, rig, name):
-    points = 3 * cube()[[0, 2, 5, 8]]
-    with pytest.raises(RobotConfigError, match=f"the {name} points must be in mm.*multiply them by 1000"):
-        fit_hand_eye(camera * points, rig * measured(points))
-
-
 LINE = [[t, 2 * t, 3 * t] for t in (0.0, 10.0, 20.0, 30.0, 40.0)]
 
 
@@ -87,7 +80,6 @@ LINE = [[t, 2 * t, 3 * t] for t in (0.0, 10.0, 20.0, 30.0, 40.0)]
     ("camera", "rig", "message"),
     [
         (cube()[:8], cube(), "got .8, 3. and .9, 3."),
-        (np.repeat(cube()[:3], 3, axis=0), cube(), "at least 4 different points, got 3"),
         (LINE, cube()[:5], "the camera points must not lie on one line"),
         (cube()[:5], LINE, "the rig points must not lie on one line"),
         ([*cube()[:5], [math.nan, 0, 0]], cube()[:6], "finite"),
