@@ -114,9 +114,15 @@ def _feedback_writer(folder: Path, index: str | Path, stack: ExitStack) -> "Reco
     """Open the writer of the recording of people's feedback."""
     from retrieval.model.checkpoint_info import read_checkpoint_info
     from retrieval.search.opening import manifest_of, model_of
+    from retrieval.serve.store import ADVICE
+    from robot.errors import RobotError
     from robot.recording.folder import RecordingWriter
 
     stored = read_checkpoint_info(model_of(manifest_of(index)))
     info = {"source": "feedback on queries", "sensor": f"as {stored.provenance.get('source', 'unknown')}"}
+    try:
+        writer = stack.enter_context(RecordingWriter(folder / "recording", info))
+    except RobotError as error:
+        raise BadInput(f"{error}. {ADVICE}") from error
     say(f"queries and feedback are stored in {folder}")
-    return stack.enter_context(RecordingWriter(folder / "recording", info))
+    return writer

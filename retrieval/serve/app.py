@@ -46,6 +46,7 @@ def create_app(
         version=__version__,
         docs_url=None,  # the default page loads scripts from other hosts
         redoc_url=None,
+        servers=[{"url": "."}],  # relative to the document, so that a proxy may add a prefix
         lifespan=_lifespan,
         responses=errors.PROBLEM_RESPONSES,
     )

@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 from string import ascii_lowercase
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Query, Request, Response
 from pydantic import Field
 
 from retrieval.data.images import read_bytes
@@ -50,11 +50,12 @@ def _entry(parts: Service, name: str) -> StoredQuery:
     return stored
 
 
-def _item(stored: StoredQuery) -> dict[str, Any]:
-    """Return a query without its answer. touches: paths of the gel images of each grasp."""
+def _item(request: Request, stored: StoredQuery) -> dict[str, Any]:
+    """Return a query without its answer. touches: paths of the gel images of each grasp, relative to the request's."""
+    root = "../" * (request.scope["path"].count("/") - 1)  # a proxy may serve this below a prefix
     best = (stored.answer["results"] or [{}])[0]
     touches = [
-        [f"/v1/history/{stored.id}/touches/{grasp}/{ascii_lowercase[finger]}" for finger in range(len(images))]
+        [f"{root}v1/history/{stored.id}/touches/{grasp}/{ascii_lowercase[finger]}" for finger in range(len(images))]
         for grasp, images in enumerate(stored.answer["query"]["touches"], start=1)
     ]
     return {
@@ -72,6 +73,7 @@ def _item(stored: StoredQuery) -> dict[str, Any]:
 
 @router.get("/v1/history")
 def history(
+    request: Request,
     parts: Parts,
     offset: Annotated[int, Query(ge=0, le=2**31)] = 0,
     limit: Annotated[int, Query(ge=1, le=500)] = 50,
@@ -85,14 +87,15 @@ def history(
     total, found = store.history(words=search.split()[:20], feedback=feedback, offset=offset, limit=limit)
     end = offset + len(found)
     following = end if offset < end < total else None
-    return {"total": total, "offset": offset, "next": following, "items": [_item(stored) for stored in found]}
+    items = [_item(request, stored) for stored in found]
+    return {"total": total, "offset": offset, "next": following, "items": items}
 
 
 @router.get("/v1/history/{name}")
-def entry(name: str, parts: Parts) -> dict[str, Any]:
+def entry(request: Request, name: str, parts: Parts) -> dict[str, Any]:
     """Return a query with its whole answer, the document of `retrieve query --json`."""
     stored = _entry(parts, name)
-    return {**_item(stored), "answer": stored.answer}
+    return {**_item(request, stored), "answer": stored.answer}
 
 
 @router.get("/v1/history/{name}/touches/{grasp}/{finger}", response_class=Response, responses=IMAGE_RESPONSES)

@@ -68,6 +68,8 @@ class Guard:
             await self.app(scope, receive, send)
             return
 
+        if scope["method"] == "HEAD":  # of the answer to GET, the server sends only the headers
+            scope = {**scope, "method": "GET"}
         begun = False
 
         async def with_headers(message: Message) -> None:
@@ -105,10 +107,10 @@ class Guard:
             return HttpProblem(
                 "wrong-host", "This service answers only this machine: use the host localhost or 127.0.0.1."
             )
-        origin = headers.get("origin")
-        if origin is not None and urlsplit(origin).netloc != headers.get("host"):
+        origin, site = headers.get("origin"), headers.get("sec-fetch-site")  # browsers set them, pages cannot
+        if origin is not None and site != "same-origin" and urlsplit(origin).netloc != headers.get("host"):
             return HttpProblem("refused", "Pages of another origin may not use this service.")
-        if headers.get("sec-fetch-site") in ("cross-site", "same-site") and headers.get("sec-fetch-mode") != "navigate":
+        if site in ("cross-site", "same-site") and headers.get("sec-fetch-mode") != "navigate":
             return HttpProblem("refused", "Pages of another site may not use this service.")
         token = self.settings.token
         if token is None or path in _OPEN_PATHS or not path.startswith("/v1/"):
@@ -159,12 +161,13 @@ class SessionBody(RequestBody):
 async def session(body: SessionBody, parts: Parts) -> Response:
     """Store the token in a cookie that scripts cannot read.
 
-    The page needs it, because requests for images cannot send a header.
+    The page needs it, because requests for images cannot send a header. Browsers send it back only below the path of
+    this route, so other services of the host do not receive it.
     """
     token = parts.settings.token
     if token is not None and not same_token(body.token, token):
         raise HttpProblem("no-token", "This is not the service's token.", {"www-authenticate": "Bearer"})
     response = Response(status_code=204)
     if token is not None:
-        response.set_cookie(COOKIE, token, httponly=True, samesite="strict", path="/")
+        response.set_cookie(COOKIE, token, httponly=True, samesite="strict", path=None)
     return response

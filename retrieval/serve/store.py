@@ -34,6 +34,7 @@ IMAGE_TYPES = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
 """First bytes of the image formats that every browser shows, and a recording may contain -> media type."""
 RIGHT, OBJECT, NONE = "right", "object", "none"
 """Values of the feedback: the answer is right, it is another object, the catalogue lacks the object."""
+ADVICE = "Give another folder with --history, or store nothing with --no-history."
 _VERSION = 3
 _SCHEMA = f"""
 BEGIN;
@@ -79,8 +80,8 @@ class HistoryStore:
 
     def __init__(self, path: Path, max_queries: int = 5_000) -> None:
         self.path, self._max_queries, self._lock = path, max_queries, Lock()
-        path.parent.mkdir(parents=True, exist_ok=True)
         try:
+            path.parent.mkdir(parents=True, exist_ok=True)
             self._database = sqlite3.connect(path, check_same_thread=False)
             execute = self._database.execute
             execute("PRAGMA journal_mode = WAL")
@@ -89,8 +90,8 @@ class HistoryStore:
             if version != _VERSION and execute("SELECT 1 FROM sqlite_master").fetchone():
                 raise sqlite3.DatabaseError(f"it has version {version}, not {_VERSION}")
             self._database.executescript(_SCHEMA)
-        except sqlite3.Error as error:
-            raise BadInput(f"{path} must be the history of a service: {error}. Use another folder.") from error
+        except (sqlite3.Error, OSError) as error:
+            raise BadInput(f"{path} must be the history of a service, and writable: {error}. {ADVICE}") from error
         self._database.create_function("casefold", 1, str.casefold, deterministic=True)
 
     def close(self) -> None:

@@ -22,7 +22,7 @@ async function reply(path, options) {
     if (error.name === "AbortError") throw error;
     throw new HttpProblem(0, "The service does not answer", "It may have stopped. Start `retrieve serve` again.");
   }
-  if (response.status === 401 && requestToken && path !== "/v1/session") {
+  if (response.status === 401 && requestToken && path !== "v1/session") {
     await requestToken();
     return reply(path, options);
   }
@@ -33,6 +33,12 @@ async function reply(path, options) {
 }
 
 const json = async (path, options) => (await reply(path, options)).json();
+
+/** An item of the history, from `address`; its paths, which are relative to that address, become whole addresses. */
+const withAddresses = (item, address) => ({
+  ...item,
+  touches: item.touches.map((grasp) => grasp.map((path) => new URL(path, address).href)),
+});
 const encodedPath = (id) => id.split("/").map(encodeURIComponent).join("/");
 const jsonPost = (body) => ({
   method: "POST",
@@ -70,23 +76,23 @@ function decoded(text) {
   return new Blob([bytes], { type: "image/png" });
 }
 
-export const photoURL = (id) => `/v1/photos/${encodedPath(id)}`;
+export const photoURL = (id) => `v1/photos/${encodedPath(id)}`;
 export const thumbnailURL = (id, px = 480) => `${photoURL(id)}?px=${px}`;
 
-export const index = () => json("/v1/index");
-export const session = (token) => reply("/v1/session", jsonPost({ token }));
+export const index = () => json("v1/index");
+export const session = (token) => reply("v1/session", jsonPost({ token }));
 export const blob = async (path) => (await reply(path)).blob();
-export const frame = (name) => blob(`/v1/sensors/${encodeURIComponent(name)}/frame`);
+export const frame = (name) => blob(`v1/sensors/${encodeURIComponent(name)}/frame`);
 
 /** The answer to touches, and its id in the history, null if no history is stored. */
 export async function query(touches, background, options) {
-  const response = await reply("/v1/query", form(touches, background, options));
+  const response = await reply("v1/query", form(touches, background, options));
   return { answer: await response.json(), id: response.headers.get("x-query-id") };
 }
 
 /** Grasp an object with the simulated rig: the named one, else a random one. */
 export async function grasp(objectId = null) {
-  const result = await json(withParameters("/v1/grasp", { object: objectId }), { method: "POST" });
+  const result = await json(withParameters("v1/grasp", { object: objectId }), { method: "POST" });
   return {
     objectId: result.object_id,
     touches: result.touches.map(decoded),
@@ -102,16 +108,23 @@ async function postTouches(path, touches, background, values) {
 }
 
 export const verify = (expect, touches, background, far) =>
-  postTouches("/v1/verify", touches, background, { expect, far });
+  postTouches("v1/verify", touches, background, { expect, far });
 
-export const catalogue = (parameters, signal = null) => json(withParameters("/v1/catalogue", parameters), { signal });
+export const catalogue = (parameters, signal = null) => json(withParameters("v1/catalogue", parameters), { signal });
 
-export const history = (parameters) => json(withParameters("/v1/history", parameters));
-export const entry = (id) => json(`/v1/history/${encodeURIComponent(id)}`);
+export async function history(parameters) {
+  const response = await reply(withParameters("v1/history", parameters));
+  const page = await response.json();
+  return { ...page, items: page.items.map((item) => withAddresses(item, response.url)) };
+}
+export async function entry(id) {
+  const response = await reply(`v1/history/${encodeURIComponent(id)}`);
+  return withAddresses(await response.json(), response.url);
+}
 /** The no-contact frames of a query; null if it has none. */
 export const noContactFrames = (id, letters) =>
-  Promise.all(letters.map((letter) => blob(`/v1/history/${encodeURIComponent(id)}/touches/0/${letter}`))).catch(
+  Promise.all(letters.map((letter) => blob(`v1/history/${encodeURIComponent(id)}/touches/0/${letter}`))).catch(
     () => null,
   );
 export const feedback = (query, value, objectId = null) =>
-  json("/v1/feedback", jsonPost({ query, feedback: value, ...(objectId && { object_id: objectId }) }));
+  json("v1/feedback", jsonPost({ query, feedback: value, ...(objectId && { object_id: objectId }) }));

@@ -87,7 +87,7 @@ function foot(index) {
     .replaceChildren(
       h("span", {}, `${count(index.photos, "photo")} of ${count(index.objects, "object")}, ${index.generation}`),
       h("span", {}, `${index.model}, trained on: ${index.trained_on}`),
-      h("span", {}, `touch-retrieval ${index.version} `, h("a", { href: "/openapi.json" }, "API")),
+      h("span", {}, `touch-retrieval ${index.version} `, h("a", { href: "openapi.json" }, "API")),
     );
 }
 
