@@ -9,11 +9,11 @@ from retrieval.serve.store import HistoryStore
 
 
 def check(folder, get):
-    capsys, file = get("capsys"), folder / "file"
+    capsys, index, file = get("capsys"), str(get("index")), folder / "file"
     file.write_text("no folder")
 
     def assert_refused(history, text):
-        assert main(["serve", "--index", str(get("index")), "--history", str(history)]) == 2
+        assert main(["serve", "--index", index, "--history", str(history)]) == 2
         message = capsys.readouterr().err.splitlines()[-1]
         assert text in message
         assert "--no-history" in message
