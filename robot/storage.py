@@ -2,6 +2,7 @@
 
 import contextlib
 import fcntl
+import io
 import json
 import os
 from collections.abc import Iterator, Mapping
@@ -158,14 +159,30 @@ def file_content(column: str, source: ImageSource) -> tuple[bytes, str]:
 
 
 def decode_picture(data: bytes) -> npt.NDArray[np.uint8] | None:
-    """Return (H, W, 3) RGB of an image file's content, or None if it cannot be decoded."""
+    """Return (H, W, 3) RGB of an image file's content, transparent on white; None if it cannot be decoded.
+
+    `retrieval.data.images.decode` returns the same for a picture of 8 bits.
+    """
     import cv2
+    from PIL import Image
 
     try:
+        if not data.startswith(b"\xff\xd8"):  # not JPEG, which is opaque
+            with Image.open(io.BytesIO(data)) as image:
+                if image.has_transparency_data and not image.mode.startswith("I"):
+                    return _on_white(image)
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         return None if pixels is None else np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), np.uint8)
-    except cv2.error:  # empty data, or a header that claims too many pixels
+    except (cv2.error, OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # damaged, empty or too large
         return None
+
+
+def _on_white(image: Any) -> npt.NDArray[np.uint8]:
+    from PIL import ImageOps
+
+    samples = np.asarray(ImageOps.exif_transpose(image).convert("RGBA"), np.float32) / 255
+    rgb, alpha = samples[..., :3], samples[..., 3:]
+    return np.rint(255 * (rgb * alpha + (1 - alpha))).astype(np.uint8)
 
 
 def read_content(path: str | Path, error_type: type[RobotError]) -> bytes:

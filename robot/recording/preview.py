@@ -11,7 +11,7 @@ from _touch_retrieval.files import write_atomically
 from robot.errors import RecordingError
 from robot.recording.folder import read_recording
 from robot.recording.grasp import RecordedGrasp
-from robot.storage import storage_errors
+from robot.storage import decode_picture, storage_errors
 
 Picture = npt.NDArray[np.uint8]
 MAX_ROWS, TILE_PX, _CAPTION_PX = 12, 160, 24
@@ -44,22 +44,25 @@ def write_preview(folder: str | Path, out: str | Path) -> Path:
 def _row(folder: Path, grasp: RecordedGrasp, columns: Sequence[str]) -> Picture:
     """Return the tiles of one grasp, BGR, with its name and force below."""
     images = grasp.images()
-    row = np.hstack([_tile(folder / images[column] if column in images else None) for column in columns])
+    row = np.hstack([_tile(folder / images[column] if column in images else None, column) for column in columns])
     text = f"{grasp.object_id}   {grasp.force_n or 0:.1f} N   jaws {grasp.opening_mm or 0:.1f} mm"
     return np.vstack([row, _caption(f"{text}   {grasp.outcome or ''}", row.shape[1])])
 
 
-def _tile(path: Path | None) -> Picture:
+def _tile(path: Path | None, column: str) -> Picture:
     """Fit an image into a square tile, depth as colours over its own range; without an image the tile is grey."""
     tile = np.full((TILE_PX, TILE_PX, 3), 238, np.uint8)
-    image = None if path is None else cv2.imread(str(path), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
+    if path is None or not path.is_file():
+        return tile
+    depth = column == "depth"
+    image = cv2.imread(str(path), cv2.IMREAD_ANYDEPTH) if depth else decode_picture(path.read_bytes())
     if image is None:
         return tile
-    if image.dtype == np.uint16:
+    if depth:
         level = cv2.normalize(image, np.empty(0), 255, 0, cv2.NORM_MINMAX, cv2.CV_8U, (image > 0).astype(np.uint8))
         image = cv2.applyColorMap(level, cv2.COLORMAP_VIRIDIS) * (image > 0)[..., None]
-    elif image.ndim == 2:
-        image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    else:
+        image = np.ascontiguousarray(image[..., ::-1])
     height, width = (round(side * (TILE_PX - 4) / max(image.shape[:2])) for side in image.shape[:2])
     top, left = (TILE_PX - height) // 2, (TILE_PX - width) // 2
     tile[top : top + height, left : left + width] = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
