@@ -101,17 +101,19 @@ def strongest_frames(path: Path, count: int, start: int = 0, left_out: dict[str,
     try:
         with av.open(str(path)) as video:
             decoded = (frame.to_ndarray(format="rgb24") for frame in video.decode(video=0))
-            first = next(frames := itertools.islice(decoded, start, None), None)
+            frames = itertools.islice(decoded, start, None)
+            first = next(frames, None)
             if first is None:
                 raise ImporterError("its video contains no frame")
             thumbnails = [thumbnail(first)]
-            # Numbers differ, so frames are never compared; among equal changes the earlier frame is taken.
-            changes = (
-                (float(np.abs(frame.astype(np.int16) - first).mean()), -number, frame)
-                for number, frame in enumerate(frames)
-                if not thumbnails.append(thumbnail(frame))  # type: ignore[func-returns-value]
-            )
-            strongest = heapq.nlargest(count, changes)
+
+            def changes() -> Iterator[tuple[float, int, Frame]]:
+                """Yield numbers that differ, so frames are not compared; of equal changes the earlier is taken."""
+                for number, frame in enumerate(frames):
+                    thumbnails.append(thumbnail(frame))
+                    yield float(np.abs(frame.astype(np.int16) - first).mean()), -number, frame
+
+            strongest = heapq.nlargest(count, changes())
     except (av.error.FFmpegError, OSError, ValueError, IndexError) as error:
         raise ImporterError("its video cannot be decoded") from error
     usable = first_usable(thumbnails)
