@@ -308,7 +308,9 @@ def _parse_line(line: str, naming: Naming) -> tuple[str, bool, dict[str, Any]]:
         raise ValueError("must be one JSON object a line, in braces")
     keys = [key for key in ("file_name", "object_id") if key in row]
     if not keys:
-        raise ValueError("must name a photo (file_name) or an object (object_id)")
+        raise ValueError(
+            f"must name a photo (file_name) or an object (object_id); it has {', '.join(row) or 'nothing'}"
+        )
     if bad := [key for key in keys if not isinstance(row[key], str) or not row[key]]:
         raise ValueError(f"{bad[0]} must be a non-empty string, got {row[bad[0]]!r}")
     metadata = {key: value for key, value in row.items() if key not in keys}

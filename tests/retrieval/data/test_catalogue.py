@@ -175,7 +175,7 @@ def test_metadata_of_a_missing_photo_or_object_is_a_note_and_no_error(tmp_path):
 
 BAD_LINES = {
     '{"object_id": "mug"': "truncated",
-    '{"price": 5}': "must name a photo",
+    '{"price": 5}': "must name a photo .*it has price",
     '{"object_id": 5}': "object_id must be a non-empty string, got 5",
     '{"object_id": "mug", "x": NaN}': "malformed",
     '{"object_id": "first"}': "first has two lines; merge them",
