@@ -4,8 +4,8 @@ import unicodedata
 
 SYSTEM_NAMES = frozenset(
     {"#recycle", "#snapshot", "$recycle.bin", "@eadir", "@recently-snapshot", "@recycle", "@tmp", "__macosx"}
-    | {"desktop.ini", "ehthumbs.db", "found.000", "icon\r", "lost+found", "network trash folder", "recycled"}
-    | {"recycler", "system volume information", "temporary items", "thumbs.db", "__pycache__"}
+    | {"desktop.ini", "ehthumbs.db", "found.000", "icon\r", "lost+found", "network trash folder"}
+    | {"system volume information", "temporary items", "thumbs.db", "__pycache__"}
 )
 """Names of what Windows, macOS and network drives leave in folders, in lower case."""
 

@@ -32,7 +32,7 @@ from _touch_retrieval.documents import Positive, typed
 from _touch_retrieval.registry import Registry
 from robot.devices import Actuator, Arm, Clock, Gripper
 from robot.drivers.packages import package_errors
-from robot.errors import DeviceError, UnknownName
+from robot.errors import DeviceError, RobotConfigError, UnknownName
 from robot.readings import GripperState, Pose, Region
 
 ROBOTS: "Registry[Callable[..., Any]]" = Registry("robot", "robots", {}, error=UnknownName)
@@ -155,6 +155,9 @@ class OwnGripper(OwnDevice, Gripper):
         max_speed_mm_s: float = 420.0,
         clock: Clock = time.monotonic,
     ) -> None:
+        """Check the settings; raise RobotConfigError, or UnknownName for a class that cannot be imported."""
+        if min_force_n > max_force_n:
+            raise RobotConfigError(f"min_force_n must be at most max_force_n, got {min_force_n} and {max_force_n}")
         super().__init__(
             robot=robot,
             settings=settings,

@@ -117,10 +117,15 @@ class RealSense(Camera):
                 pipeline.stop()
 
     def _recover(self) -> None:
-        """Close the camera despite errors, then connect again."""
+        """Close the camera despite errors, then connect completely or not at all."""
         with contextlib.suppress(DeviceError, OSError):
             self._close()
-        self._connect()
+        try:
+            self._connect()
+        except BaseException:
+            with contextlib.suppress(DeviceError, OSError):
+                self._close()
+            raise
 
     def _wait(self) -> Any:
         return self._pipeline.wait_for_frames(round(1000 * self._options.timeout_s))

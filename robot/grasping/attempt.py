@@ -60,7 +60,7 @@ class AttemptRunner:
 
     def __init__(self, rig: Rig, seed: int, settings: AttemptSettings) -> None:
         typed(seed, Seed, "seed", error=RobotConfigError)
-        settings.grasp.check(rig.gripper)
+        settings.grasp.check(rig.arm, rig.gripper)
         self.rig, self.seed, self.settings = rig, seed, settings
 
     def run(self, object_id: str, number: int) -> GraspAttempt:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from _touch_retrieval.documents import NonNegative, Positive
-from robot.devices import Gripper
+from robot.devices import Arm, Gripper
 from robot.errors import RobotConfigError
 from robot.settings import TypedSettings, build
 
@@ -44,14 +44,16 @@ class GraspSettings(TypedSettings):
         if not 0 < self.force_n[0] <= self.force_n[1]:
             raise RobotConfigError(f"force_n must be a range of forces above 0, lower first, got {self.force_n}")
 
-    def check(self, gripper: Gripper) -> None:
-        """Raise RobotConfigError if the forces exceed the limits of this gripper."""
+    def check(self, arm: Arm, gripper: Gripper) -> None:
+        """Raise RobotConfigError if the settings exceed the limits of this arm and gripper."""
         low, high = self.force_n
         if low < gripper.min_force_n or high > gripper.max_force_n:
             raise RobotConfigError(
                 f"force_n must be within {gripper.min_force_n:g} to {gripper.max_force_n:g} N, the range of "
                 f"{gripper.name}; got {low:g} to {high:g}"
             )
+        if self.floor_mm > arm.workspace.upper[2]:
+            raise RobotConfigError(f"floor_mm must lie below the workspace's top {arm.workspace.upper[2]:g} mm")
 
 
 @dataclass(frozen=True)

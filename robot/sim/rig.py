@@ -187,7 +187,7 @@ class SimRig(Rig):
             attempt=attempt,
             planner=load_planner(options.planner, "mesh" if self.meshes else "cylinder"),
         )
-        self.attempt.grasp.check(self.gripper)
+        self.attempt.grasp.check(self.arm, self.gripper)
 
     def object_ids(self, count: int) -> list[str]:
         """Return the first `count` objects; raise RobotConfigError if there are fewer meshes."""

@@ -418,26 +418,32 @@ class WSG50(Gripper):
     def _recover(self) -> None:
         """Open a lost link again, with increasing waits, then restore reference and settings as on connecting."""
         with self._moving("cannot recover"):
-            self._reconnecting(self._connect, self._options.reconnect_tries)
+            tries = self._options.reconnect_tries
+            for number in range(tries):
+                try:
+                    self._connect()
+                    return
+                except (LinkLost, NoEcho) as error:
+                    self._link.close()
+                    if number == tries - 1:
+                        raise DeviceError(f"{self.name} cannot be reached after {tries} tries: {error}") from error
+                    wait_s = min(self._options.reconnect_s * 2**number, _LONGEST_WAIT_S)
+                    _log.warning("%s: no connection (%s); trying again in %.2g s", self.name, error, wait_s)
+                time.sleep(wait_s)
 
     def _stop(self) -> None:
-        """Stop the jaws; after a motion, open a lost link again first."""
-        self._reconnecting(self._stop_over_link, self._options.reconnect_tries if self._may_be_moving else 1)
-
-    def _reconnecting(self, action: Callable[[], None], tries: int) -> None:
-        """Open the link and call `action`; after a loss of the link do it again, with increasing waits."""
-        for number in range(tries):
+        """Stop the jaws; after a motion, open a lost link again first. The waits do not grow: the jaws may move."""
+        tries = self._options.reconnect_tries if self._may_be_moving else 1
+        for tries_left in reversed(range(tries)):
             try:
                 self._link.open()
-                action()
+                self._stop_over_link()
                 return
-            except (LinkLost, NoEcho) as error:
-                self._link.close()
-                if number == tries - 1:
-                    raise LinkLost(f"{self.name} cannot be reached after {tries} tries: {error}") from error
-                wait_s = min(self._options.reconnect_s * 2**number, _LONGEST_WAIT_S)
-                _log.warning("%s: no connection (%s); trying again in %.2g s", self.name, error, wait_s)
-            time.sleep(wait_s)
+            except LinkLost:
+                if not tries_left:
+                    raise
+            _log.warning("%s: lost the link during a possible motion: opening it again to stop the jaws", self.name)
+            time.sleep(self._options.reconnect_s)
 
     def _state(self) -> GripperState:
         return self._as_state(self._read())
@@ -544,7 +550,10 @@ class WSG50(Gripper):
                 break
             self._check_updates(now)
             system, grasping = (link.updates[command][0] for command in _UPDATED)
-            is_moving = GripperReading(codec.system_state(system), codec.grasping_state(grasping)).is_moving
+            try:
+                is_moving = GripperReading(codec.system_state(system), codec.grasping_state(grasping)).is_moving
+            except WireError:
+                is_moving = True  # unknown: read again
             if is_moving or status is Status.CMD_PENDING:
                 still_since = now
             if now - still_since > link.timeout_s:

@@ -217,6 +217,15 @@ def test_missing_state_updates_stop_the_motion():
         assert not emulator.moves
 
 
+def test_an_unknown_state_during_a_motion_is_read_again_and_does_not_end_it():
+    emulator = slow(object_mm=60.0)
+    with gripper_with_emulator(emulator=emulator) as (gripper, _):
+        emulator.unknown_states = 1
+        assert gripper.grasp(10.0, 400.0).status == "holding"
+        assert emulator.unknown_states == 0
+        assert STOP not in emulator.received
+
+
 def test_a_fault_during_a_motion_is_named():
     emulator = slow()
     with gripper_with_emulator(emulator=emulator) as (gripper, _):

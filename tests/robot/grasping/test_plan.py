@@ -13,7 +13,7 @@ from robot.grasping.planner import plan_grasp
 from robot.grasping.settings import GraspSettings
 from robot.readings import Region
 from robot.sight.cylinder import CylinderFit
-from tests.fake_rig import WORKSPACE, FakeGripper, FakeRigState
+from tests.fake_rig import WORKSPACE, FakeRig
 
 FIT = CylinderFit(12.0, -7.0, 100.0, 30.0, 0.5, "circle", (30.0, 30.0))
 STROKE = 110.0
@@ -106,9 +106,11 @@ def test_a_setting_out_of_range_is_refused(name, value):
         GraspSettings(**{name: value})
 
 
-def test_forces_outside_the_grippers_range_are_refused_before_any_motion():
-    gripper = FakeGripper(FakeRigState(0))
-    GraspSettings().check(gripper)
+def test_forces_and_a_floor_outside_the_rigs_limits_are_refused_before_any_motion():
+    rig = FakeRig()
+    GraspSettings().check(rig.arm, rig.gripper)
     for force in ((4.0, 25.0), (5.0, 81.0)):
         with pytest.raises(RobotConfigError, match="force_n must be within 5 to 80 N, the range of fake gripper"):
-            GraspSettings(force_n=force).check(gripper)
+            GraspSettings(force_n=force).check(rig.arm, rig.gripper)
+    with pytest.raises(RobotConfigError, match="floor_mm must lie below the workspace's top"):
+        GraspSettings(floor_mm=rig.arm.workspace.upper[2] + 1).check(rig.arm, rig.gripper)
