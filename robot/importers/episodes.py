@@ -29,7 +29,7 @@ MOMENT_SUFFIXES = {"before": "_before", "during": "", "after": "_after"}
 
 _CELLS, _NOISE_LEVELS, _DARK_LEVELS = 8, 8, 10
 _UNLIKE_SHARE = 0.5
-_MAX_LEFT_OUT = 10
+_MAX_LEFT_OUT = 30
 
 
 def thumbnail(picture: Picture) -> Picture:
@@ -42,7 +42,7 @@ def first_usable(thumbnails: Sequence[Picture]) -> int | None:
 
     Many cameras deliver black, dim or blue frames first. Such a frame differs over half of its area from nearly all
     later ones, while the gel without contact is seen again. Left out are black frames, and of the first tenth of the
-    frames, at most 10, those unlike the later ones.
+    frames, at most 30, those unlike the later ones.
     """
     frames = np.array(thumbnails, np.int16)
     is_dark = frames.max((1, 2, 3)) < _DARK_LEVELS

@@ -175,9 +175,9 @@ def _bag_paths(source: Path) -> list[Path]:
 
 
 def _has_metadata(folder: Path) -> bool:
-    """Whether a folder has the metadata.yaml of a ROS 2 bag; a crash can leave it empty."""
+    """Whether a folder has the metadata.yaml of a ROS 2 bag; a crash, or a repair, can leave it without the storage."""
     path = folder / "metadata.yaml"
-    return path.is_file() and b"rosbag2_bagfile_information" in path.read_bytes()
+    return path.is_file() and bool(re.search(rb"storage_identifier: *[\"']?\w", path.read_bytes()))
 
 
 def _storage_files(path: Path) -> list[Path]:

@@ -40,7 +40,7 @@ def check(folder, get):
         (source / name).mkdir()
     (source / "zipped folder/0.mcap.zstd").write_bytes(zstd.compress(log.read_bytes()))
     shutil.copy(database, source / "empty metadata/0.sqlite")
-    (source / "empty metadata/metadata.yaml").touch()
+    (source / "empty metadata/metadata.yaml").write_text('rosbag2_bagfile_information:\n  storage_identifier: ""')
     (source / "notes.txt").write_text("no bag")
     (source / "other.zst").write_bytes(zstd.compress(b"no bag either"))
     recording = import_rosbag(source, folder / "out")
