@@ -32,6 +32,7 @@ MAX_SIDE, MAX_ASPECT = 65_535, 200
 """Largest side in pixels (the limit of JPEG), and largest ratio of the longer to the shorter side."""
 MAX_BYTES = 512 * 2**20
 
+_JPEG_FORMATS = ("JPEG", "MPO")  # an MPO file is a JPEG picture with further ones behind it
 _FORMATS: tuple[str, ...] = ("BMP", "JPEG", "PNG", "TIFF", "WEBP")
 _NO_IMAGE = "not a PNG, JPEG, BMP, TIFF, WebP, AVIF or HEIC picture, or its header is damaged or of an unsupported kind"
 _EIGHT_BIT_MODES = frozenset({"1", "L", "P", "RGB", "RGBX", "CMYK", "YCbCr", "LA", "PA", "RGBA", "RGBa"})
@@ -179,7 +180,7 @@ def _apply_draft_mode(image: Image.Image, min_side: int | None) -> None:
     stores the whole picture.
     """
     width, height = image.size
-    if image.format != "JPEG" or width * height > MAX_DRAFT_PIXELS:
+    if image.format not in _JPEG_FORMATS or width * height > MAX_DRAFT_PIXELS:
         return
     progressive = bool(image.info.get("progressive"))
     if progressive and width * height > MAX_PIXELS:

@@ -13,6 +13,7 @@ are added.
 """
 
 import contextlib
+import io
 import json
 import math
 import os
@@ -22,6 +23,8 @@ from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from _touch_retrieval.files import file_digest, write_atomically
 from _touch_retrieval.names import is_system_name
@@ -43,11 +46,8 @@ NOT_STATED = "not stated"
 
 SPLITS_FOLDER = "splits"
 SOURCES_FILE = "sources.json"
-_END_MARKERS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9"}
 _MAX_OPENING_MM = 200.0
 """Largest opening that is believed: more may be the angle of a joint, or another unit."""
-_TAIL = 65536
-"""Bytes that a camera may write after the end of a JPEG."""
 
 
 @dataclass(frozen=True)
@@ -279,18 +279,25 @@ def picture_bytes(column: str, source: Source) -> bytes:
     Raises:
         ImporterError: The image is missing, cut off or not a picture. The message does not name the file.
     """
+    from PIL import Image
+
     label = column.replace("_", " ")
     image = source() if callable(source) else source
     if isinstance(image, str | Path) and not os.path.isfile(image):
         raise ImporterError(f"its {label} is missing")
     try:
-        data, suffix = file_content(column, image)
+        data, _ = file_content(column, image)
     except RecordingError as error:
         is_file = isinstance(image, str | Path | bytes)
         required = "a readable PNG or JPEG file" if is_file else "a picture with 8-bit colours"
         raise ImporterError(f"its {label} is not {required}") from error
-    if _END_MARKERS[suffix] not in data[-_TAIL:]:
-        raise ImporterError(f"its {label} is cut off")
+    if not isinstance(image, np.ndarray):
+        try:  # OpenCV fills what is missing with grey; what follows the picture, such as a film, is not read
+            with Image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as picture:
+                picture.draft(None, (1, 1))
+                picture.load()
+        except Exception as error:  # of Pillow: OSError, SyntaxError, struct.error, ...
+            raise ImporterError(f"its {label} is cut off or damaged") from error
     return data
 
 
