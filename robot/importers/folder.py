@@ -7,7 +7,8 @@ A pattern is a path with words in braces. `{object}` is the name of the object, 
 `{finger}` is the name of a finger; use it if a touch has one picture per finger. All other words, and the text that
 each `*` matches, distinguish the grasps of an object. So by default `touch_0_a.png` and `touch_0_b.png` are two grasps;
 with `touch={object}/touch_{n}_{finger}` they are the two fingers of one grasp. A word or `*` never matches a "/". The
-suffix of the file name is optional. Words that occur in two patterns must have the same value: with
+suffix of the file name is optional; BMP, TIFF and WebP are stored as PNG, and HEIC and AVIF are named as left out.
+Words that occur in two patterns must have the same value: with
 `touch={object}/{n}_{finger}` and `photo={object}/{n}_photo` each touch gets the photo with its number. If several
 photos match, the first touch gets the first photo, the second touch the second photo, and so on, cyclically.
 `background` is a pattern for the no-contact frames: `rest_{finger}.png` for one per finger, `{object}/rest.png` for one
@@ -46,7 +47,7 @@ DATA_SET = DataSet(
     expects="`<object>/touch_*.png` and `<object>/photo_*.jpg`, or files that match the patterns",
     fingers=0,
 )
-_ENDINGS = (".png", ".jpg", ".jpeg")
+_ENDINGS = (".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".bmp", ".tif", ".tiff", ".webp", ".heic", ".heif", ".avif")
 _WORD = re.compile(r"(\{\w+\}|\*)")
 
 Words = Mapping[str, str]

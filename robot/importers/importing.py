@@ -30,7 +30,7 @@ from _touch_retrieval.files import file_digest, write_atomically
 from _touch_retrieval.names import is_system_name
 from robot.errors import ImporterError, RecordingError
 from robot.recording.folder import Recording, RecordingWriter, SharedImage, read_recording
-from robot.storage import ImageSource, file_content, read_json_object, storage_errors
+from robot.storage import ImageSource, file_content, read_content, read_json_object, storage_errors
 
 Progress = Callable[[int, int], None]
 """Called with (done, total) after each grasp, whether it was read, already stored or skipped."""
@@ -273,8 +273,21 @@ def _append(writer: RecordingWriter, item: Item, names: set[str]) -> Skip | None
     return None
 
 
+def _png_or_jpeg(image: bytes | str | Path) -> bytes:
+    """Return the content of a picture file, BMP, TIFF and WebP as PNG; anything else unchanged."""
+    from PIL import Image, ImageOps
+
+    data = image if isinstance(image, bytes) else read_content(image, RecordingError)
+    with contextlib.suppress(Exception), Image.open(io.BytesIO(data), formats=("BMP", "TIFF", "WEBP")) as picture:
+        if picture.mode in ("L", "RGB"):
+            png = io.BytesIO()
+            ImageOps.exif_transpose(picture).convert("RGB").save(png, "PNG")
+            return png.getvalue()
+    return data
+
+
 def picture_bytes(column: str, source: Source) -> bytes:
-    """Return the content of a complete PNG or JPEG file.
+    """Return the content of a complete PNG or JPEG file; a BMP, TIFF or WebP file becomes PNG.
 
     Raises:
         ImporterError: The image is missing, cut off or not a picture. The message does not name the file.
@@ -286,10 +299,11 @@ def picture_bytes(column: str, source: Source) -> bytes:
     if isinstance(image, str | Path) and not os.path.isfile(image):
         raise ImporterError(f"its {label} is missing")
     try:
-        data, _ = file_content(column, image)
+        data, _ = file_content(column, image if isinstance(image, np.ndarray) else _png_or_jpeg(image))
     except RecordingError as error:
-        is_file = isinstance(image, str | Path | bytes)
-        required = "a readable PNG or JPEG file" if is_file else "a picture with 8-bit colours"
+        required = "a picture with 8-bit colours"
+        if not isinstance(image, np.ndarray):
+            required = "a readable picture of 8 bits (PNG, JPEG, BMP, TIFF, WebP)"
         raise ImporterError(f"its {label} is not {required}") from error
     if not isinstance(image, np.ndarray):
         try:  # OpenCV fills what is missing with grey; what follows the picture, such as a film, is not read

@@ -19,5 +19,5 @@ def test_incomplete_and_damaged_places_are_skipped_with_a_note(source, tmp_path)
     assert [grasp.grasp_id for grasp in recording.grasps] == ["ground1-01"]
     assert recording.notes[:2] == (
         "skipped 1: its photo or touch is missing, such as welded1/01_touch.png",
-        "skipped 1: its touch a is not a readable PNG or JPEG file, such as welded1-02",
+        "skipped 1: its touch a is not a readable picture of 8 bits (PNG, JPEG, BMP, TIFF, WebP), such as welded1-02",
     )
