@@ -7,7 +7,8 @@ They are read with pyarrow and PyAV, without lerobot. This was checked on a data
     videos/<key>/chunk-000/file-000.mp4     a camera, the episodes of a file one after the other
 
 The option `touch` names the gel cameras, separated by commas, and `photo` the camera that shows the object. By default
-cameras with touch, tactile, gel or digit in their name are gel cameras, and the first other camera takes the photo. An
+cameras with the word touch, tactile, gel or digit in their name are gel cameras, and the first other camera that is not
+stated to be of depth takes the photo; both are printed. An
 episode becomes one grasp: its first step provides the no-contact frame and the photo, and the step whose gel images
 differ most from the first is the touch. If the episodes have fields for object and sequence, like the exports of
 `retrieve export-recording`, these fields are imported. Otherwise the task is the object and the episode the sequence.
@@ -59,7 +60,8 @@ DATA_SET = DataSet(
 _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 DATA_PATH, EPISODES_PATH = f"data/{_FILE}.parquet", f"meta/episodes/{_FILE}.parquet"
 VIDEO_PATH = "videos/{video_key}/" + f"{_FILE}.mp4"
-_GEL = re.compile("touch|tactile|gel|digit", re.IGNORECASE)
+_GEL = re.compile(r"(?<![a-z])(touch|tactile|gels?|gelsight[a-z]*|gelslim|digit|digit360)(?![a-z])", re.IGNORECASE)
+"""Whole words in the name of a gel camera: touchscreen, digital and angel are others."""
 _FIELDS = ("force_n", "opening_mm", "touch_skew_s", "time_s", "outcome", "grasped", "pose")
 _WHAT = "a LeRobot data set"
 
@@ -78,8 +80,14 @@ def import_lerobot(
         raise DATA_SET.mismatch_error(src, "there is no such file")
     source = _LeRobotSource(src, touch, photo)
     total = sum(1 for _ in source.episodes(("episode_index",)))
+    cameras = f"gel cameras: {', '.join(source.touch)}; photo: {source.photo}; others: --option touch=... photo=..."
     return import_items(
-        replace(DATA_SET, fingers=len(source.touch), **source.stored_facts()),
+        replace(
+            DATA_SET,
+            fingers=len(source.touch),
+            caveats=(cameras, *DATA_SET.caveats),
+            **source.stored_facts(),
+        ),
         source.items(),
         out,
         total=total,
@@ -91,6 +99,12 @@ def import_lerobot(
 
 class _Feature(msgspec.Struct):
     dtype: str
+    info: dict[str, Any] | None = None
+
+    @property
+    def is_depth(self) -> bool:
+        """Whether the data set states that a camera's pictures are depth, as LeRobot and older versions write it."""
+        return any((self.info or {}).get(key) for key in ("is_depth_map", "video.is_depth_map"))
 
 
 class _Moments(msgspec.Struct):
@@ -132,8 +146,13 @@ class _LeRobotSource:
         self.src, self._info = src, _read_info(src / "meta" / "info.json")
         kinds = {name: each.dtype for name, each in self._info.features.items() if each.dtype in ("video", "image")}
         self._kinds = kinds
-        self.touch = [name.strip() for name in touch.split(",")] if touch else sorted(filter(_GEL.search, kinds))
-        self.photo = photo or next((name for name in kinds if name not in self.touch), "")
+        self.touch = (
+            [name.strip() for name in touch.split(",")]
+            if touch
+            else sorted(name for name in kinds if _GEL.search(_words(name)))
+        )
+        others = (name for name in kinds if name not in self.touch and not self._info.features[name].is_depth)
+        self.photo = photo or next(others, "")
         if not self.touch or any(name not in kinds for name in (*self.touch, self.photo)):
             raise ImporterError(
                 f"{src} must have a camera for the photo and gel cameras; choose them with --option photo=... "
@@ -244,6 +263,11 @@ class _LeRobotSource:
             yield
         except (self._arrow.ArrowException, OSError, ValueError, KeyError) as error:
             raise ImporterError(f"{path} cannot be read: {str(error)[:200]!r}") from error
+
+
+def _words(name: str) -> str:
+    """Return the name of a camera with its words apart: wristTouch becomes wrist_Touch."""
+    return re.sub("(?<=[a-z])(?=[A-Z])", "_", name)
 
 
 def _file_of(row: _Row, kind: str) -> str:
