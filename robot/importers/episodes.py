@@ -11,6 +11,7 @@ import itertools
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache, partial
 from string import ascii_lowercase
+from typing import Any
 
 import cv2
 import numpy as np
@@ -41,8 +42,9 @@ def first_usable(thumbnails: Sequence[Picture]) -> int | None:
     """Return the number of a camera's first usable frame, which shows its gel without contact; None without one.
 
     Many cameras deliver black, dim or blue frames first. Such a frame differs over half of its area from nearly all
-    later ones, while the gel without contact is seen again. Left out are black frames, and of the first tenth of the
-    frames, at most 30, those unlike the later ones.
+    later ones, while the gel without contact is seen again; and its colours are those of another frame with a gain and
+    an offset, which contact does not do. Left out are black frames, and such ones among the first tenth of the frames,
+    at most 30.
     """
     frames = np.array(thumbnails, np.int16)
     is_dark = frames.max((1, 2, 3)) < _DARK_LEVELS
@@ -59,7 +61,20 @@ def first_usable(thumbnails: Sequence[Picture]) -> int | None:
     if unlike[0, len(later) // 20] < _UNLIKE_SHARE:
         return dark
     common = unlike[:, len(later) // 8]  # more of the later frames than those that follow a slow change at once
-    return dark + int(np.argmax(common <= common.min() + 0.01)) if common.min() < _UNLIKE_SHARE else None
+    usable = int(np.argmax(common <= common.min() + 0.01))
+    if common.min() >= _UNLIKE_SHARE:
+        return None if _is_relit(frames[0], np.median(later, axis=0)) else dark
+    return dark + usable if all(_is_relit(frame, frames[usable]) for frame in frames[:usable]) else dark
+
+
+def _is_relit(frame: NDArray[Any], other: NDArray[Any]) -> bool:
+    """Whether a gain and an offset of each colour convert those cells of the other frame that differ to `frame`'s."""
+    unlike = np.abs(frame - other).max(-1) > _NOISE_LEVELS
+    for cells, others in zip(frame[unlike].T, other[unlike].T, strict=True):
+        gain, offset = np.linalg.lstsq(np.stack([others, np.ones(len(others))], 1), cells, rcond=None)[0]
+        if np.abs(gain * others + offset - cells).mean() > _NOISE_LEVELS / 4:
+            return False
+    return True
 
 
 NO_USABLE_FRAME = "its first gel images are unlike all later ones, so none of them can be the no-contact frame"

@@ -161,7 +161,7 @@ def import_items(
             if not 0 <= (opening := numbers.get("opening_mm", 0.0)) <= _MAX_OPENING_MM and math.isfinite(opening):
                 openings.append(f"{opening:.0f} mm")
             left_out = {**writer.info.get("left_out", {}), **(item.left_out if isinstance(item, Item) else {})}
-            if left_out:
+            if left_out != writer.info.get("left_out", {}):
                 writer.update_info(left_out=left_out)
             if skip is not None:
                 skipped.setdefault(skip.reason, []).append(skip.name)

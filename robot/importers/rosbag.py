@@ -397,8 +397,8 @@ def _scan_bag(bag: Bag, topics: _Topics, left_out: Mapping[str, int] | None = No
             scan.values[topic].append(message.data)
         scan.times[topic].append(time_ns)
     usable = {topic: first_usable(frames) for topic, frames in thumbnails.items()}
-    if None in usable.values():
-        raise ImporterError(NO_USABLE_FRAME)
+    if None in usable.values() and not topics.grasp:
+        raise ImporterError(f"{NO_USABLE_FRAME}; cut the bag, or name a topic of marks with --option grasp=...")
     if left_out is None and (unusable := {topic: number for topic, number in usable.items() if number}):
         return _scan_bag(bag, topics, unusable)
     return scan
