@@ -88,19 +88,16 @@ class Rows:
         number = bisect_left(range(self.object_count), name, key=self.object_name)
         return number if number < self.object_count and self.object_name(number) == name else -1
 
-    def look_up_object(self, name: str) -> int:
-        """Return the number of the object that a person names: exactly so, or the only one with its `lookup_key`."""
-        if (number := self.find_object(name)) >= 0:
-            return number
-        similar = self._numbers_by_key.get(lookup_key(name), [])
-        return similar[0] if len(similar) == 1 else -1
+    def names_like(self, name: str) -> list[str]:
+        """Return the name if an object has exactly this one, else the names of objects with its `lookup_key`."""
+        return [name] if self.find_object(name) >= 0 else self._names_by_key.get(lookup_key(name), [])
 
     @cached_property
-    def _numbers_by_key(self) -> dict[str, list[int]]:
-        numbers: dict[str, list[int]] = defaultdict(list)
-        for number in range(self.object_count):
-            numbers[lookup_key(self.object_name(number))].append(number)
-        return dict(numbers)
+    def _names_by_key(self) -> dict[str, list[str]]:
+        names: dict[str, list[str]] = defaultdict(list)
+        for name in map(self.object_name, range(self.object_count)):
+            names[lookup_key(name)].append(name)
+        return dict(names)
 
     def object_name(self, number: int) -> str:
         """Return the name of an object."""

@@ -16,10 +16,12 @@ def require_output(path: Path, suffix: str) -> None:
         suffix: Suffix of the command's output, such as ".html".
 
     Raises:
-        BadInput: `path` has another suffix, or its folder does not exist.
+        BadInput: `path` has another suffix, is a folder, or its folder does not exist.
     """
     if path.suffix != suffix:
         raise BadInput(f"{path} must be named *{suffix}. Name another file.")
+    if path.is_dir():
+        raise BadInput(f"{path} is a folder. Name a file.")
     if not path.parent.is_dir():  # more likely a typing error than intended
         raise BadInput(
             f"{path} cannot be written: the folder {path.parent} does not exist. Create it, or name another file."

@@ -16,7 +16,7 @@ slashes, is its stable id.
 import os
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from pathlib import Path, PurePosixPath
@@ -192,8 +192,7 @@ def _notes_on_files(catalogue: Catalogue, names: Sequence[str], system: Sequence
     """Yield remarks on what a user may have expected to be in the catalogue."""
     if system:
         yield f"{len(system)} file(s) or folder(s) of the system left out: {abbreviate_list(system, MAX_EXAMPLES)}"
-    used = {str(folder) for path in catalogue.paths for folder in PurePosixPath(path).parents}
-    folders = {str(folder) for name in names for folder in PurePosixPath(name).parents}
+    used, folders = _folders(catalogue.paths), _folders(names)
     indexes = {name.rpartition("/")[0] for name in names if name.endswith(("/CURRENT", "/SHARDS.json"))}
     if empty := sorted(folder for folder in folders - used - indexes if str(PurePosixPath(folder).parent) in used):
         yield f"no picture in {len(empty)} folder(s) that contain files: {abbreviate_list(empty, MAX_EXAMPLES)}"
@@ -202,6 +201,12 @@ def _notes_on_files(catalogue: Catalogue, names: Sequence[str], system: Sequence
             f"{abbreviate_list(tables, MAX_EXAMPLES)}: not read; titles and other facts of objects can be given in "
             f'{METADATA_FILE}, a line such as {{"object_id": "mug", "title": "Blue mug"}} for each'
         )
+
+
+def _folders(paths: Iterable[str]) -> set[str]:
+    """Return all folders above these files; the catalogue itself is "."."""
+    nearest = {path.rpartition("/")[0] for path in paths}
+    return {str(folder) for path in nearest for folder in PurePosixPath(path, "file").parents}
 
 
 def _list_files(folder: Path) -> tuple[list[str], list[SkippedPhoto], list[str]]:

@@ -61,7 +61,7 @@ def read_bytes(path: str | Path, digest: str | None = None) -> bytes:
     except (OSError, ValueError, MemoryError) as error:
         raise ImageError(path, f"cannot be read: {_reason(error)}") from error
     if digest is not None and hashlib.sha256(data).hexdigest() != digest:
-        raise ImageError(path, "has changed since the index was built; run `retrieve build-index` again")
+        raise ImageError(path, "the file has changed since the index was built")
     return data
 
 

@@ -113,8 +113,11 @@ class TowerEncoder:
         if kind == "no_contact":
             return missing_no_contact_reason(self.grasps)
         if kind == "photo_to_photo":
-            photos = {grasp.photo: grasp.object_id for grasp in self.grasps}
-            return None if len(photos) > len(set(photos.values())) else "no object has two photos"
+            features = self.inputs("touch")
+            photos = {
+                (owner, row.tobytes()) for owner, row in zip(features.owner.tolist(), features.photo, strict=True)
+            }
+            return None if len(photos) > len(set(features.object_ids)) else "no object has two different photos"
         return None
 
     def _inputs(self, kind: str, with_cells: bool, max_grasps: int | None) -> Features:

@@ -156,6 +156,9 @@ def with_common_frame(grasps: Sequence[Grasp], folder: Path, *, quiet: bool = Tr
     """Return the grasps with images of their contact differences on one common no-contact frame, that of the first.
 
     An image is common + touch - no-contact frame, clipped to 8 bits. It is written to `folder`, unless it exists.
+
+    Raises:
+        DatasetError: The frames differ in size.
     """
     common = [read_rgb(path) for path in grasps[0].backgrounds]
     folder.mkdir(parents=True, exist_ok=True)
@@ -166,7 +169,13 @@ def with_common_frame(grasps: Sequence[Grasp], folder: Path, *, quiet: bool = Tr
             for finger, (touch, before) in enumerate(zip(grasp.touches, grasp.backgrounds, strict=True)):
                 path = folder / f"{grasp.grasp_id}-{finger}.png"
                 if not path.is_file():
-                    image = np.rint(255 * (common[finger] + read_rgb(touch) - read_rgb(before)))
+                    pressed, no_contact, shared = read_rgb(touch), read_rgb(before), common[finger]
+                    if not pressed.shape == no_contact.shape == shared.shape:
+                        raise DatasetError(
+                            f"{touch}, its no-contact frame and the first no-contact frame of the recording must have "
+                            f"the same size, got {pressed.shape}, {no_contact.shape} and {shared.shape}."
+                        )
+                    image = np.rint(255 * (shared + pressed - no_contact))
                     write_atomically(path, encode_image(np.clip(image, 0, 255).astype(np.uint8)))
                 files.append(path)
             found.append(dataclasses.replace(grasp, touches=tuple(files), backgrounds=grasps[0].backgrounds))

@@ -87,18 +87,20 @@ def build_index(
     catalogue = list_catalogue(folder, options.naming)
     report = build_listed(catalogue, checkpoint, store.path, options)
     store.discard_before(report.generation)
-    warnings = [*replaced_catalogue(before, catalogue), *report.warnings]
+    warnings = [*catalogue_warnings(before, catalogue, options.naming), *report.warnings]
     return replace(report, warnings=warnings, reason=" ".join(filter(None, (note, report.reason))))
 
 
-def replaced_catalogue(before: Mapping[str, Any], catalogue: Catalogue) -> list[str]:
-    """Return a warning if the existing index, with the entries `before`, is of another catalogue that still exists."""
+def catalogue_warnings(before: Mapping[str, Any], catalogue: Catalogue, naming: Naming) -> list[str]:
+    """Return warnings on the names of objects, and if the existing index is of another catalogue that still exists."""
+    warnings = naming_warnings(((photo.object_id, photo.path) for photo in catalogue.photos), naming)
     old = str(before.get("catalogue", catalogue.where))
     if old == catalogue.where or not Path(old).is_dir():
-        return []
+        return warnings
     return [
+        *warnings,
         f"the index was of the catalogue {old} and is now of {catalogue.where}: objects of the first are no longer "
-        "found; to search both, put both below one folder, or give each its own --out"
+        "found; to search both, put both below one folder, or give each its own --out",
     ]
 
 
@@ -273,7 +275,7 @@ def _report(
         objects=len(names),
         objects_from=options.naming.text,
         examples=[(name, first_photo[name]) for name in shown],
-        warnings=[*naming_warnings(((row.object_id, row.path) for row in rows), options.naming), *_shared_photos(rows)],
+        warnings=_shared_photos(rows),
         embedded=contents.encoded,
         skipped=contents.skipped,
         ignored=[name for name in catalogue.ignored if not (catalogue.folder / name).resolve().is_relative_to(inside)],

@@ -27,9 +27,8 @@ from indexes.store.sharded import (
     write_sharded_manifest,
 )
 from retrieval.data.catalogue import Catalogue, list_catalogue
-from retrieval.data.naming import naming_warnings
 from retrieval.errors import BadInput, NoReadablePhoto
-from retrieval.indexing.build import BuildOptions, build_listed, build_options, replaced_catalogue
+from retrieval.indexing.build import BuildOptions, build_listed, build_options, catalogue_warnings
 from retrieval.indexing.contents import no_photo, require_reference_calibration
 from retrieval.indexing.report import BuildReport
 from retrieval.model.checkpoint import Checkpoint
@@ -119,7 +118,10 @@ def build_sharded(
         report,
         generation=manifest.generation,
         written=written,
-        warnings=[*replaced_catalogue(before.about if before else {}, catalogue), *report.warnings],
+        warnings=[
+            *catalogue_warnings(before.about if before else {}, catalogue, options.naming),
+            *report.warnings,
+        ],
         reason=" ".join(filter(None, (note, unusable, report.reason))),
         shards=[asdict(entry) for entry in manifest.shards],
     )
@@ -175,7 +177,7 @@ def _report(
         reports[0],
         **{name: sum(getattr(report, name) for report in reports) for name in ("photos", "objects", "embedded")},
         index=str(out),
-        warnings=naming_warnings(((photo.object_id, photo.path) for photo in catalogue.photos), options.naming),
+        warnings=[warning for report in reports for warning in report.warnings],
         skipped=skipped,
         ignored=list(catalogue.ignored),
         without_photo=sorted(lost.union(*(report.without_photo for report in reports))),

@@ -40,7 +40,7 @@ from retrieval.search.answer import (
 )
 from retrieval.search.objects import Objects
 from retrieval.search.opening import OpenShards, open_index
-from retrieval.search.shard import FolderShard, ShardResult, Shards
+from retrieval.search.shard import FolderShard, ShardResult, Shards, resolve_object
 
 
 class Searcher:
@@ -274,7 +274,7 @@ class Searcher:
                 "cells"
             )
         bounds = calibration.bounds(far)
-        number = self.generation.rows.look_up_object(expect)
+        number = self.generation.rows.find_object(resolve_object(self.shard, expect))
         if number < 0:
             raise BadInput(f"the catalogue of {self.index} has no object {expect!r}; give the name of its folder")
         return number, bounds, posterior

@@ -129,7 +129,7 @@ class FolderShard:
         """Return the logit of an object for grasps, by all its photos and reference touches.
 
         Args:
-            number: Number of the object (`Rows.look_up_object`).
+            number: Number of the object (`Rows.find_object`).
             partials: (G, touch_partial_width) partial activations of the grasps.
         """
         rows = self.objects.other_rows(np.array([number]), np.zeros(0, dtype=np.int64))
@@ -146,6 +146,10 @@ class FolderShard:
             found.append(image if image is not None or number < 0 else listed_photo(rows[number]))
         return found
 
+    def names_like(self, name: str) -> list[str]:
+        """Return the objects that a person can mean by this name (`Rows.names_like`)."""
+        return self.generation.rows.names_like(name)
+
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
         """Return a page of the photos that contain all words in object, path or metadata.
 
@@ -158,7 +162,7 @@ class FolderShard:
         rows = self.generation.rows
         found = np.arange(len(rows))
         if object_id is not None:
-            found = np.flatnonzero(rows.objects == rows.look_up_object(object_id))
+            found = np.flatnonzero(rows.objects == rows.find_object(object_id))
         if words:
             texts, keys = self._texts, [lookup_key(word) for word in words]
             found = np.array([row for row in found if all(key in texts[row] for key in keys)], dtype=np.int64)
@@ -247,6 +251,11 @@ class Shards:
         found = self.call(self.shards, "photos", list(paths))
         return [next((photo for photo in photos if photo is not None), None) for photos in zip(*found, strict=True)]
 
+    def names_like(self, name: str) -> list[str]:
+        """As `FolderShard.names_like`."""
+        names = [found for some in self.call(self.shards, "names_like", name) for found in some]
+        return [name] if name in names else names
+
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
         """As `FolderShard.page`, in the order of the shards."""
         total, photos = 0, list[ListedPhoto]()
@@ -256,3 +265,9 @@ class Shards:
             total += found.total
             photos += found.photos
         return Page(total, photos)
+
+
+def resolve_object(shard: FolderShard | Shards, name: str) -> str:
+    """Return the object that a person names: exactly so, or the only one with its `lookup_key`; else `name`."""
+    names = shard.names_like(name)
+    return names[0] if len(names) == 1 else name

@@ -14,6 +14,7 @@ from retrieval.data.images import read_bytes
 from retrieval.data.text import replace_surrogates
 from retrieval.errors import ImageError
 from retrieval.report.pages import thumbnail
+from retrieval.search.shard import resolve_object
 from retrieval.serve.errors import HttpProblem
 from retrieval.serve.service import Parts
 from retrieval.serve.store import IMAGE_TYPES, as_png_or_jpeg
@@ -45,6 +46,7 @@ def catalogue(
     name the photo, `object_id`, and the user's own `metadata`.
     """
     generation = parts.generations.current
+    name = name and resolve_object(generation.shard, name)
     found = generation.shard.page(search.casefold().split(), name, offset, limit)
     end = offset + len(found.photos)
     return {
@@ -80,7 +82,8 @@ def photo(
         if not data.startswith(tuple(IMAGE_TYPES)):
             data = _thumbnail(path, listed.digest, px or MAX_PHOTO_PX)
     except ImageError as error:
-        raise HttpProblem("unknown", f"The photo {photo!r} cannot be shown: it {error.reason}.") from error
+        detail = f"The photo {photo!r} cannot be shown: {error.reason}. Run `retrieve build-index` again."
+        raise HttpProblem("unknown", detail) from error
     return image_response(data, headers)
 
 

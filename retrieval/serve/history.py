@@ -11,6 +11,7 @@ from pydantic import Field
 from retrieval.data.images import read_bytes
 from retrieval.errors import BadInput, ImageError
 from retrieval.search.answer import MATCH, NONE_OF_THESE, UNCALIBRATED
+from retrieval.search.shard import resolve_object
 from retrieval.serve.catalogue import IMAGE_RESPONSES, image_response
 from retrieval.serve.errors import HttpProblem
 from retrieval.serve.generations import ServedGeneration
@@ -154,11 +155,12 @@ def _resolve_feedback(
         raise HttpProblem("bad-input", 'Feedback "object" requires object_id.')
     shown = next((one["photo"] for one in results if one["object_id"] == body.object_id), None)
     if shown is None:
-        photos = generation.shard.page([], body.object_id, 0, 1).photos
+        name = resolve_object(generation.shard, body.object_id)
+        photos = generation.shard.page([], name, 0, 1).photos
         if not photos:
             detail = f'The index has no object {body.object_id!r}. Send "none" if the catalogue lacks the object.'
             raise HttpProblem("bad-input", detail)
-        shown = photos[0].path
+        return OBJECT, name, _read_photo(generation, photos[0].path)
     return OBJECT, body.object_id, _read_photo(generation, shown)
 
 

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import Field
 
+from retrieval.search.shard import resolve_object
 from retrieval.serve.errors import DocumentResponse, HttpProblem
 from retrieval.serve.generations import ServedGeneration
 from retrieval.serve.service import Parts
@@ -114,6 +115,7 @@ def _object_ids(generation: ServedGeneration, name: str | None) -> list[str]:
     """Return `[name]` if a name is given, else ids of objects spread over the catalogue; raises HttpProblem."""
     shard, photos = generation.shard, generation.searcher.manifest.photos
     if name is not None:
+        name = resolve_object(shard, name)
         if not shard.page([], name, 0, 1).total:
             raise HttpProblem("unknown", f"The index has no object {name!r}. /v1/catalogue lists the objects.")
         return [name]
