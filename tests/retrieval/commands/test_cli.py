@@ -162,6 +162,12 @@ def test_the_command_line_rejects_numbers_out_of_range(words, option, tmp_path, 
     assert not list(tmp_path.iterdir())
 
 
+def test_a_folder_in_place_of_an_output_file_is_refused_before_the_work(built, capsys):
+    Path("page.html").mkdir()
+    assert main([*QUERY, "--html", "page.html"]) == 2
+    assert "page.html is a folder. Name a file." in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     "words",
     [

@@ -232,7 +232,7 @@ def test_ceilings_compare_touches_with_touches_and_photos_with_photos(tmp_path):
     np.testing.assert_array_equal(photos.touch, photo[:, None])
     assert touches.touch is touch
     assert photos.photo is photo
-    assert towers.missing_reason("photo_to_photo") == "no object has two photos"
+    assert towers.missing_reason("photo_to_photo") == "no object has two different photos"
 
 
 @pytest.fixture(scope="module")

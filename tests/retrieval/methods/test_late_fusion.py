@@ -134,3 +134,13 @@ def test_a_model_without_trained_embeddings_scores_every_photo(parts, tmp_path):
     assert method.best_params["reranked_fraction"] == 1.0
     late = fit(LateFusion, parts, tmp_path, with_training(FROZEN, weights={}))
     np.testing.assert_array_equal(method.score(*encodings(method, parts[2])), late.score(*encodings(late, parts[2])))
+
+
+def test_candidates_come_from_the_candidate_encoder_of_the_configuration(parts, tmp_path):
+    config = dataclasses.replace(FROZEN, matcher=dataclasses.replace(FROZEN.matcher, candidate_width=8))
+    own, plain = (fit(RetrieveRerank, parts, tmp_path / name, each) for name, each in (("a", config), ("b", FROZEN)))
+    for side, width in enumerate((FROZEN.matcher.touch_partial_width, FROZEN.matcher.partial_width)):
+        ours, others = encodings(own, parts[2])[side], encodings(plain, parts[2])[side]
+        np.testing.assert_allclose(ours[:, :width], others[:, :width], rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(np.linalg.norm(ours[:, width:], axis=1), 1, rtol=1e-5)
+        assert np.abs((ours[:, width:] * others[:, width:]).sum(1)).max() < 0.9  # other embeddings

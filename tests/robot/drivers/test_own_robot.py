@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from robot.drivers.own_robot import OwnArm, OwnGripper
-from robot.errors import DeviceError, UnknownName
+from robot.errors import DeviceError, RobotConfigError, UnknownName
 from robot.readings import Pose, Region
 from robot.real_rig import load_driver
 from tests import plugins
@@ -104,6 +104,8 @@ def test_a_program_that_does_not_fit_is_refused_with_the_reason():
         Program.last.at = {"x_mm": 1.0}
         with pytest.raises(DeviceError, match=r"pose of .*y_mm"):
             arm.pose()
+    with pytest.raises(RobotConfigError, match="min_force_n must be at most max_force_n"):
+        OwnGripper(stroke_mm=80.0, min_force_n=30.0, max_force_n=20.0, robot=f"{HERE}Program")
 
 
 def test_a_rig_file_builds_it_and_a_package_adds_a_robot_by_an_entry_point(tmp_path, monkeypatch):
