@@ -7,6 +7,7 @@ import unicodedata
 from retrieval.data.catalogue import list_catalogue
 from retrieval.data.naming import Naming, naming_warnings
 from retrieval.indexing.build import build_index
+from retrieval.indexing.sharded import build_sharded
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.searcher import Searcher
 from retrieval.search.shard import resolve_object
@@ -32,6 +33,12 @@ def check(folder, get):
         for name in (NFC, NFD, f" {NFC}"):
             (photo,) = searcher.shard.page([], resolve_object(searcher.shard, name), 0, 1).photos
             assert photo.metadata == {"shelf": "B4"}
+
+    (catalogue / names[4]).rename(catalogue / NFC)
+    build_sharded(catalogue, load_checkpoint(get("model")), folder / "shards", 3, quiet=True)
+    with Searcher.open(folder / "shards") as searcher:
+        for name, meant in ((NFC, NFC), (NFD, NFD), (f" {NFC}", f" {NFC}"), (f"{names[5]} ", names[5])):
+            assert resolve_object(searcher.shard, name) == meant  # with a space two objects could be meant
 
     same = {"Mug": 1, "mug": 1, "blue  cup": 1, "blue cup": 1, NFC: 1, NFD: 1, "tin": 1}
     (warning,) = naming_warnings([(name, f"{name}/1.jpg") for name in same], Naming())
