@@ -6,6 +6,7 @@
     conftest                                    pictures and models that several files use
     synthetic                                   synthetic pictures
     synthetic_evaluation, reference_model       synthetic results, and a model with reference calibration
+    as_they_come                                inputs as cameras, shops, spreadsheets and systems leave them
     miniatures, real_data_sets, data            small public data sets, and the folder of real ones
     emulators                                   a WSG-50 and a Sawyer as programs, based on the facts of the drivers
     emulated_rig                                the real drivers with emulated devices and injected faults
