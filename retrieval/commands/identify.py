@@ -130,7 +130,15 @@ class _Run:
         from retrieval.model.verification import ACCEPT, REJECT
 
         self.heights_mm[:] = [grasp.pose[2] for grasp in grasps if grasp.pose is not None]
-        touches = [self._files(grasp.touches) for grasp in grasps]
+        touches, seen = list[list[Path]](), set[bytes]()
+        for grasp in grasps:
+            files = self._files(grasp.touches)
+            pictures = {file.read_bytes() for file in files}
+            if seen & pictures:  # a camera that stands still: a picture counts once
+                say(f"{grasp.grasp_id} repeats a picture of an earlier grasp and does not count; check the gel cameras")
+            else:
+                touches.append(files)
+            seen |= pictures
         background = self._files(grasps[-1].touches_before) if self.searcher.reader.takes_background else None
         if self.expect is None:
             self.answer = self.searcher.query(touches, background=background)
