@@ -155,14 +155,18 @@ def import_items(
         openings: list[str] = []
         infinite: list[str] = []
         for done, item in enumerate(_readable(items), start=1):
-            skip = item if isinstance(item, Skip) else _append(writer, item, names)
-            numbers = {key: value for key, value in getattr(item, "fields", {}).items() if isinstance(value, float)}
-            infinite += [key for key, value in numbers.items() if not math.isfinite(value)]
-            if not 0 <= (opening := numbers.get("opening_mm", 0.0)) <= _MAX_OPENING_MM and math.isfinite(opening):
-                openings.append(f"{opening:.0f} mm")
-            left_out = {**writer.info.get("left_out", {}), **(item.left_out if isinstance(item, Item) else {})}
-            if left_out != writer.info.get("left_out", {}):
-                writer.update_info(left_out=left_out)
+            if isinstance(item, Skip):
+                skip: Skip | None = item
+            else:
+                finite = {key: value for key, value in item.fields.items() if not _is_infinite(value)}
+                infinite += [key for key in item.fields if key not in finite]
+                opening = finite.get("opening_mm")
+                if isinstance(opening, float) and not 0 <= opening <= _MAX_OPENING_MM:
+                    openings.append(f"{opening:.0f} mm")
+                skip = _append(writer, replace(item, fields=finite), names)
+                stored = writer.info.get("left_out", {})
+                if item.left_out.items() - stored.items():
+                    writer.update_info(left_out={**stored, **item.left_out})
             if skip is not None:
                 skipped.setdefault(skip.reason, []).append(skip.name)
             if progress is not None:
@@ -243,6 +247,10 @@ def _source_files(source: Path, out: Path, known: Mapping[str, list[Any]]) -> di
     return found
 
 
+def _is_infinite(value: Any) -> bool:
+    return isinstance(value, float) and not math.isfinite(value)
+
+
 def _readable(items: Iterable[Item | Skip]) -> Iterator[Item | Skip]:
     try:
         yield from items
@@ -266,8 +274,7 @@ def _append(writer: RecordingWriter, item: Item, names: set[str]) -> Skip | None
                 images[column] = source
             else:
                 images[column] = SharedImage(source.name, picture_bytes(column, source.source))
-        finite = (pair for pair in item.fields.items() if not isinstance(pair[1], float) or math.isfinite(pair[1]))
-        writer.append(item.grasp_id, item.object_id, images, **dict(finite))
+        writer.append(item.grasp_id, item.object_id, images, **item.fields)
     except (ImporterError, RecordingError) as error:
         return Skip(str(error), item.grasp_id)
     return None
@@ -298,20 +305,22 @@ def picture_bytes(column: str, source: Source) -> bytes:
     image = source() if callable(source) else source
     if isinstance(image, str | Path) and not os.path.isfile(image):
         raise ImporterError(f"its {label} is missing")
+    if isinstance(image, np.ndarray):
+        try:
+            return file_content(column, image)[0]
+        except RecordingError as error:
+            raise ImporterError(f"its {label} is not a picture with 8-bit colours") from error
     try:
-        data, _ = file_content(column, image if isinstance(image, np.ndarray) else _png_or_jpeg(image))
+        data, _ = file_content(column, _png_or_jpeg(image))
     except RecordingError as error:
-        required = "a picture with 8-bit colours"
-        if not isinstance(image, np.ndarray):
-            required = "a readable picture of 8 bits (PNG, JPEG, BMP, TIFF, WebP)"
+        required = "a readable picture of 8 bits (PNG, JPEG, BMP, TIFF, WebP)"
         raise ImporterError(f"its {label} is not {required}") from error
-    if not isinstance(image, np.ndarray):
-        try:  # OpenCV fills what is missing with grey; what follows the picture, such as a film, is not read
-            with Image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as picture:
-                picture.draft(None, (1, 1))
-                picture.load()
-        except Exception as error:  # of Pillow: OSError, SyntaxError, struct.error, ...
-            raise ImporterError(f"its {label} is cut off or damaged") from error
+    try:  # OpenCV fills what is missing with grey; what follows the picture, such as a film, is not read
+        with Image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as picture:
+            picture.draft(None, (1, 1))
+            picture.load()
+    except Exception as error:  # of Pillow: OSError, SyntaxError, struct.error, ...
+        raise ImporterError(f"its {label} is cut off or damaged") from error
     return data
 
 
