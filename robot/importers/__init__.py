@@ -32,6 +32,7 @@ IMPORTERS: "Registry[Importer]" = Registry(
     "importers",
     {
         "billets": "robot.importers.billets:import_billets",
+        "estimate-modulus": "robot.importers.estimate_modulus:import_estimate_modulus",
         "feeling-of-success": "robot.importers.feeling_of_success:import_feeling_of_success",
         "folder": "robot.importers.folder:import_folder",
         "lerobot": "robot.importers.lerobot:import_lerobot",

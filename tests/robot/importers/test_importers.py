@@ -165,6 +165,7 @@ def test_broken_files_cost_their_own_grasps_and_no_traceback(name, tmp_path):
     ("real", "grasps", "objects", "sequences", "skipped"),
     [
         ("billets", 9 * 16, 9 * 16, 9, 0),
+        pytest.param("estimate-modulus", 45 * 5, 11, 45, 0, marks=pytest.mark.slow),
         pytest.param("physiclear", 241 * 5, 44, 241, 0, marks=pytest.mark.slow),
         pytest.param("vt60", 4991, 40, 36, 4, marks=pytest.mark.slow),
     ],

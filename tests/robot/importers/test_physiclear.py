@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from robot.errors import ImporterError
-from robot.importers.physiclear import import_physiclear, strongest_frames
+from robot.importers.physiclear import import_physiclear
+from robot.importers.press_videos import strongest_frames
 from tests.miniatures import physiclear
 
 
