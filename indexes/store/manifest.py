@@ -14,7 +14,7 @@ from _touch_retrieval.documents import typed
 from _touch_retrieval.files import file_digest, open_regular, parse_json, read_regular
 from indexes.errors import AGAIN, CorruptIndex, UnsupportedFormat
 
-FORMAT = 7
+FORMAT = 8
 NAME = "manifest.json"
 MAX_BYTES = 4 * 2**20
 """Largest manifest. With the names and digests of 4096 shards it has 1 MiB."""

@@ -68,6 +68,14 @@ Background = Annotated[
     ),
 ]
 
+Opening = Annotated[
+    list[float] | None,
+    typer.Option(
+        metavar="MM",
+        help="distance between the fingers, in millimetres; once for each --gelsight, in the same order, or not at all",
+    ),
+]
+
 
 class NumberParser:
     """Parser of an option with a number that an annotation allows, such as `Annotated[int, Meta(ge=1)]`.

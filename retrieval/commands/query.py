@@ -5,7 +5,17 @@ from typing import Annotated
 
 import typer
 
-from retrieval.commands.options import COUNT, FRACTION, Background, GelSight, Index, IndexModel, Json, resolve_index
+from retrieval.commands.options import (
+    COUNT,
+    FRACTION,
+    Background,
+    GelSight,
+    Index,
+    IndexModel,
+    Json,
+    Opening,
+    resolve_index,
+)
 from retrieval.console.files import require_output, write_output
 from retrieval.console.output import print_json, say
 
@@ -14,6 +24,7 @@ def query(
     *,
     gelsight: GelSight,
     background: Background = None,
+    opening: Opening = None,
     index: Index = None,
     model: IndexModel = None,
     top: Annotated[int, typer.Option(parser=COUNT, help="number of objects to return")] = 10,
@@ -35,6 +46,7 @@ def query(
     result = searcher.query(
         [[Path(image) for image in grasp] for grasp in gelsight],
         background=None if background is None else [Path(image) for image in background],
+        opening_mm=opening or None,
         top=top,
         none_prior=none_prior,
     )

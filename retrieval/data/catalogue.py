@@ -6,7 +6,8 @@
     catalog/<object_id>/touch_<name>_a.png, touch_<name>_b.png   or of two fingers, in this order
     catalog/metadata.jsonl          optional: one JSON object per line, with `file_name` (a photo's path in the
                                     catalogue) or `object_id` (all its photos) and any other keys; a photo's
-                                    value of a key takes precedence over its object's
+                                    value of a key takes precedence over its object's; `opening_mm` in the line
+                                    of a touch's gel image, or of the object, is the opening of the jaws
 
 A picture is recognised by its extension, or by its content if it has no extension of a picture. Hidden files and those
 of systems and network drives are left out (`_touch_retrieval.names`). A photo's path in the catalogue, with forward
@@ -31,6 +32,7 @@ from _touch_retrieval.text import decode_text
 from retrieval.console.output import abbreviate_list
 from retrieval.data.images import EXTENSIONS, is_picture
 from retrieval.data.naming import MAX_EXAMPLES, STEM, Naming
+from retrieval.data.opening import require_opening
 from retrieval.data.text import is_utf8
 from retrieval.errors import BadInput, DatasetError
 
@@ -66,11 +68,19 @@ class CataloguePhoto:
 
 @dataclass(frozen=True, slots=True)
 class CatalogueTouch:
-    """One touch of an object: its gel images' paths relative to the catalogue, in finger order, and metadata."""
+    """One touch of an object.
+
+    Attributes:
+        object_id: The object.
+        paths: Paths of its gel images relative to the catalogue, in finger order.
+        metadata: Metadata of the object and of these images; the first image takes precedence.
+        opening_mm: Distance between the fingers, from these metadata.
+    """
 
     object_id: str
     paths: tuple[str, ...]
     metadata: dict[str, Any] = field(default_factory=dict, hash=False)
+    opening_mm: float | None = None
 
 
 @dataclass(frozen=True)
@@ -135,8 +145,11 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
     names, skipped, system = _list_files(root)
     by_object, by_photo = _read_metadata(root / METADATA_FILE, naming)
 
-    def metadata_of(name: str, path: str) -> dict[str, Any]:
-        return {**by_object.get(lookup_key(name), {}), **by_photo.get(lookup_key(path), {})}
+    def metadata_of(name: str, *paths: str) -> dict[str, Any]:
+        found = by_object.get(lookup_key(name), {})
+        for path in reversed(paths):
+            found = {**found, **by_photo.get(lookup_key(path), {})}
+        return found
 
     photos: list[CataloguePhoto] = []
     gels: dict[tuple[str, str], list[tuple[str, str]]] = defaultdict(list)  # (touch, object) -> (finger, path)
@@ -166,7 +179,11 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
             reason = f"its touch has the images {', '.join(paths)}; {_TOUCH_NAMES}"
             skipped += [SkippedPhoto(path, reason) for path in paths]
         else:
-            touches.append(CatalogueTouch(name, paths, metadata_of(name, paths[0])))
+            metadata = metadata_of(name, *paths)
+            opening = metadata.get("opening_mm")
+            if opening is not None:
+                opening = require_opening(opening, f"{root / METADATA_FILE}: opening_mm of {paths[0]}")
+            touches.append(CatalogueTouch(name, paths, metadata, opening))
     if not photos and not touches:
         raise _no_photo_error(root, ignored, skipped, unfit, naming)
     catalogue = Catalogue(root, tuple(photos), tuple(ignored), (*skipped, *unfit), touches=tuple(touches))

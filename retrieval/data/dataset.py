@@ -28,6 +28,7 @@ class Grasp:
         touches: Gel images, one file per finger, in order a, b.
         backgrounds: No-contact frames of the same fingers, if recorded.
         height_mm: Height of the point between the fingertips, in the rig's frame, if recorded.
+        opening_mm: Distance between the fingers, if recorded.
     """
 
     grasp_id: str
@@ -37,6 +38,7 @@ class Grasp:
     touches: tuple[Path, ...]
     backgrounds: tuple[Path, ...]
     height_mm: float | None = None
+    opening_mm: float | None = None
 
 
 AnyRecording = str | Path | Recording
@@ -114,6 +116,7 @@ def load_all_attempts(folder: Path) -> list[Attempt]:
                 touches=in_finger_order(line.touches),
                 backgrounds=in_finger_order(line.touches_before),
                 height_mm=None if line.pose is None else line.pose[2],
+                opening_mm=line.opening_mm,
             ),
             outcome=line.outcome or {None: "unknown", True: "held", False: "failed"}[line.grasped],
             accepted=line.grasped is not False,

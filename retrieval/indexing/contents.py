@@ -34,8 +34,8 @@ class ReferenceTouches:
     """The reference touches of a catalogue.
 
     Attributes:
-        documents: Documents of the generation: object, paths of the gel images and their digests of each touch, and
-            the partial activations (touches, touch_partial_width); empty without references.
+        documents: Documents of the generation: object, paths of the gel images, their digests and opening of each
+            touch, and the partial activations (touches, touch_partial_width); empty without references.
         about: Entries of the manifest; empty without references.
         report: Numbers for the report; None without references.
         pictures: A gel image of each object without photos, in place of its photo.
@@ -130,7 +130,8 @@ def _find_references(
             skipped.append(SkippedPhoto(touch.paths[0], f"{shows}: not usable as a reference touch"))
             continue
         digests = [files.digest(path) for path in touch.paths]
-        rows.append({"object_id": touch.object_id, "touch": list(touch.paths), "digests": digests})
+        row = {"object_id": touch.object_id, "touch": list(touch.paths), "digests": digests}
+        rows.append(row | {"opening_mm": touch.opening_mm})
         if touch.object_id not in photographed:
             picture = CataloguePhoto(touch.paths[0], touch.object_id, touch.metadata)
             pictures.setdefault(touch.object_id, picture)

@@ -13,6 +13,7 @@ from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.config import Config
 from retrieval.model.fusion_scorer import FusionScorer
 from retrieval.model.gel_check import GelCheck
+from retrieval.model.opening import OpeningCalibration
 from retrieval.model.posterior import Posterior
 from retrieval.model.references import ReferenceCalibration
 from retrieval.model.verification import VerificationCalibration
@@ -36,6 +37,7 @@ class CheckpointInfo:
         gel_check: Thresholds that separate touches, no-contact gels and other images; None without a gel head.
         verification: Error rates of `Searcher.verify`; None if there were too few validation objects.
         references: Calibration of reference touches; None if there were too few data.
+        opening: Calibration of the opening of the jaws; None if it was not measured.
         pooled_posterior: As `posterior`, of the logits without late interaction; None for a model without cells.
         pooled_references: As `references`, of the same logits.
     """
@@ -48,6 +50,7 @@ class CheckpointInfo:
     gel_check: GelCheck | None = None
     verification: VerificationCalibration | None = None
     references: ReferenceCalibration | None = None
+    opening: OpeningCalibration | None = None
     pooled_posterior: Posterior | None = None
     pooled_references: ReferenceCalibration | None = None
 
@@ -74,6 +77,7 @@ PARTS: dict[str, type[Any]] = {
     "gel_check": GelCheck,
     "verification": VerificationCalibration,
     "references": ReferenceCalibration,
+    "opening": OpeningCalibration,
     "pooled_posterior": Posterior,
     "pooled_references": ReferenceCalibration,
 }

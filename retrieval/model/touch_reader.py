@@ -71,6 +71,20 @@ class EncodedTouches(NamedTuple):
     partials: Floats
 
 
+class EncodedQuery(NamedTuple):
+    """The grasps of a query.
+
+    Attributes:
+        embeddings: As in `EncodedTouches`.
+        partials: As in `EncodedTouches`.
+        openings_mm: (G,) float64 openings of the jaws, NaN where none was measured.
+    """
+
+    embeddings: Floats
+    partials: Floats
+    openings_mm: NDArray[np.float64]
+
+
 class Stopwatch:
     """Milliseconds of named stages and the total."""
 

@@ -1,7 +1,7 @@
 """The result of a query: a verdict and a ranking of objects with probabilities, with the index and the timing."""
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +27,8 @@ class NearestReference:
         touch: Paths of its gel images in the catalogue.
         digests: SHA-256 of these files in the index.
         cosine: Cosine with the nearest grasp.
-        adds: Difference that all references of the object make to the logit of its photos, perhaps negative; None for
-            an object without photos.
+        adds: Difference that all references of the object, with their openings, make to the logit of its photos,
+            perhaps negative; None for an object without photos.
     """
 
     touch: tuple[str, ...]
@@ -110,6 +110,7 @@ class QueryResult:
         more_grasps: If the verdict is "none of these" and the ranking is clear (`CLEAR_PROBABILITY`): number of further
             grasps like these after which "match" is expected (`Posterior.more_grasps`). None otherwise, and if too many
             are needed.
+        opening_mm: Opening of the jaws in each grasp, None where none was measured.
 
     >>> with retrieval.open("index") as searcher:
     ...     answer = searcher.query(["a.png", "b.png"])
@@ -128,6 +129,7 @@ class QueryResult:
     posterior: dict[str, Any] | None
     results: list[Match]
     more_grasps: int | None = None
+    opening_mm: list[float | None] = field(default_factory=list)
 
     @property
     def top(self) -> Match | None:
@@ -165,14 +167,16 @@ class QueryResult:
             matches = [_match(match, Path(document["index"]["catalogue"])) for match in document["results"]]
             query = {name: document["query"][name] for name in ("touches", "grasps")}
             names = ("index", "timing_ms", "verdict", "none_probability", "posterior", "more_grasps")
-            return cls(**query, results=matches, **{name: document[name] for name in names})
+            openings = document["query"].get("opening_mm", [None] * len(query["touches"]))
+            return cls(**query, results=matches, **{name: document[name] for name in names}, opening_mm=openings)
         except (KeyError, TypeError) as error:
             raise BadInput(f"this is not a document of `retrieve query --json`: {error!r}") from error
 
     def to_dict(self) -> dict[str, Any]:
         """Return the document of `retrieve query --json`."""
+        openings = {"opening_mm": self.opening_mm} if any(one is not None for one in self.opening_mm) else {}
         return {
-            "query": {"touches": self.touches, "grasps": self.grasps},
+            "query": {"touches": self.touches, "grasps": self.grasps, **openings},
             "index": self.index,
             "timing_ms": self.timing_ms,
             "verdict": self.verdict,

@@ -11,6 +11,7 @@ from _touch_retrieval.documents import typed
 from indexes.errors import AGAIN, CorruptIndex
 from indexes.store.generation import Generation
 from indexes.store.rows import Row
+from retrieval.data.opening import require_opening
 from retrieval.data.text import is_inside
 from retrieval.model.checkpoint_info import CheckpointInfo
 from retrieval.model.posterior import Posterior
@@ -24,8 +25,6 @@ from retrieval.search.answer import NearestReference
 
 Floats = NDArray[np.float32]
 Rows = NDArray[np.int64]
-Similarities = NDArray[np.float64]
-"""C (count,) of each object with the grasps of a query (`retrieval.model.references`); NaN without a reference."""
 SAMPLE = 100
 """Number of random objects that represent those that a query does not score."""
 
@@ -56,6 +55,20 @@ def listed_photo(row: Row) -> ListedPhoto:
     return ListedPhoto(row.object_id, row.path, row.metadata, row.digest)
 
 
+class ReferenceEvidence(NamedTuple):
+    """Comparison of the grasps of a query with the reference touches of each object.
+
+    Attributes:
+        similarities: C (count,) of the gel images (`retrieval.model.references`); NaN without a reference.
+        openings: (count,) sum of the log likelihood ratios of the openings (`retrieval.model.opening`), 0 without one.
+        compared: Number of objects whose opening was compared.
+    """
+
+    similarities: NDArray[np.float64]
+    openings: NDArray[np.float64]
+    compared: int
+
+
 class ScoredObjects(NamedTuple):
     """Objects with a scored photo, or with a gel image in its place.
 
@@ -82,11 +95,12 @@ class ScoredObjects(NamedTuple):
 
 @dataclass(frozen=True)
 class _ReferenceTouch:
-    """A reference touch: its object, the paths of its gel images, and the digests of their files."""
+    """A reference touch: its object, the paths of its gel images, the digests of their files, and the opening."""
 
     object_id: str
     touch: tuple[str, ...]
     digests: tuple[str, ...]
+    opening_mm: float | None = None
 
 
 @dataclass(frozen=True)
@@ -115,12 +129,14 @@ class Objects:
         self._of_row, self.count = rows.objects, rows.object_count
         self._originals = rows.originals
         self._photos = np.bincount(self._of_row)
-        self._columns, self._calibration = columns, stored.references
+        self._columns, self._calibration, self._opening = columns, stored.references, stored.opening
         try:
             self._references = typed(documents.get(REFERENCE_ROWS, {"touches": [], "touch_only": []}), _References)
             for one in self._references.touches:
                 if len(one.touch) != len(one.digests) or not all(map(is_inside, one.touch)):
                     raise ValueError("a gel image is outside the catalogue or has no digest")
+                if one.opening_mm is not None:
+                    require_opening(one.opening_mm, "opening_mm")
         except ValueError as error:
             raise CorruptIndex(
                 f"{generation.folder}: the list of reference touches is invalid ({error}); {AGAIN}"
@@ -134,6 +150,7 @@ class Objects:
         self._touches = [listed.touches[place] for place in order]
         partials = documents.get(REFERENCE_PARTIALS, np.empty((0, columns.stop), np.float32))
         self._codes = unit_embeddings(partials[order], columns)
+        self._openings_mm = np.array([one.opening_mm for one in self._touches], dtype=np.float64)  # None becomes NaN
         self._owners = numbers[order]
         self._touched, self._starts = np.unique(self._owners, return_index=True)
         self._touch_only = np.isin(np.arange(self.count), [number_of[name] for name in listed.touch_only])
@@ -147,21 +164,30 @@ class Objects:
             for path, digest in zip(one.touch, one.digests, strict=True)
         }
 
-    def similarities(self, partials: Floats) -> Similarities:
-        """Return C of each object with grasps, given by their partial activations (G, touch_partial_width)."""
-        found = np.full(self.count, np.nan)
+    def compare_references(self, partials: Floats, openings_mm: NDArray[np.float64] | None = None) -> ReferenceEvidence:
+        """Compare grasps with the reference touches of all objects.
+
+        Args:
+            partials: (G, touch_partial_width) partial activations of the grasps.
+            openings_mm: (G,) openings of the jaws, NaN where none was measured. Default: none was measured.
+        """
+        similarities, openings, compared = np.full(self.count, np.nan), np.zeros(self.count), 0
         if len(self._touched):
             cosines = unit_embeddings(partials, self._columns) @ self._codes.T
-            found[self._touched] = reference_similarity(cosines, self._starts).sum(0)
-        return found
+            similarities[self._touched] = reference_similarity(cosines, self._starts).sum(0)
+            if self._opening is not None and openings_mm is not None and np.isfinite(openings_mm).any():
+                ratios = self._opening.log_ratios(openings_mm, self._openings_mm, self._starts)
+                openings[self._touched] = ratios.sum(0)
+                compared = len(np.unique(self._owners[np.isfinite(self._openings_mm)]))
+        return ReferenceEvidence(similarities, openings, compared)
 
-    def score(self, rows: Rows, logits: Floats, similarities: Similarities, grasps: int) -> ScoredObjects:
+    def score(self, rows: Rows, logits: Floats, evidence: ReferenceEvidence, grasps: int) -> ScoredObjects:
         """Return the objects of scored photos with their logits and best photos; ties take the first photo.
 
         Args:
             rows: Rows (n,) of the scored photos.
             logits: Their match logits (n,), summed over the grasps.
-            similarities: Similarities of the grasps with the reference touches.
+            evidence: Comparison of the grasps with the reference touches.
             grasps: Number of grasps.
         """
         # Equal photos get equal logits, of the first one: a matrix product may round its last rows differently.
@@ -174,7 +200,7 @@ class Objects:
 
         posterior, counts = self.posterior, self._photos[numbers]
         from_photos = posterior.object_logits(logits, owner, counts, grasps)
-        combined, mine, touch_only = from_photos.copy(), similarities[numbers], self._touch_only[numbers]
+        combined, mine, touch_only = from_photos.copy(), evidence.similarities[numbers], self._touch_only[numbers]
         if (calibration := self._calibration) is not None:
             one, both = np.isfinite(mine) & touch_only, np.isfinite(mine) & ~touch_only
             combined[one] = posterior.logit_of(calibration.touch_only.log_ratio(mine[one], grasps), grasps)
@@ -183,6 +209,7 @@ class Objects:
                 sums = calibration.with_photos.object_logits(logits, owner, counts, grasps) + calibration.weight * mine
                 ratios = calibration.with_photos.log_ratio(sums[both], grasps)
                 combined[both] = posterior.logit_of(ratios, grasps)
+        combined += evidence.openings[numbers] / posterior.slope  # a log ratio, as summed match logits are
         return ScoredObjects(numbers, combined, rows[first], np.where(touch_only, np.nan, from_photos))
 
     def other_rows(self, numbers: Rows, rows: Rows) -> Rows:
@@ -204,10 +231,11 @@ class Objects:
         rows = np.flatnonzero(drawn[self._of_row])
         return rows, self._of_row[rows]
 
-    def nearest_by_reference(self, similarities: Similarities, maximum: int) -> Rows:
-        """Return the objects with the largest similarities, at most `maximum`."""
-        order = np.argsort(-similarities[self._touched], kind="stable")
-        return np.asarray(self._touched[order[:maximum]])
+    def nearest_by_reference(self, evidence: ReferenceEvidence, maximum: int) -> Rows:
+        """Return the objects that their reference touches make most likely, at most `maximum`."""
+        slope = 1.0 if self._calibration is None else self._calibration.touch_only.slope
+        ratios = slope * evidence.similarities[self._touched] + evidence.openings[self._touched]
+        return np.asarray(self._touched[np.argsort(-ratios, kind="stable")[:maximum]])
 
     def nearest_reference(self, scored: ScoredObjects, place: int, partials: Floats) -> NearestReference | None:
         """Return the reference touch of the object at `place` nearest to one of the grasps; None if it has none."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from indexes.store.generation import Generation
 from indexes.store.sharded import ShardedManifest
+from retrieval.data.opening import Openings, parse_openings
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint_info import CheckpointInfo, read_scorer
 from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
@@ -20,6 +21,7 @@ from retrieval.model.onnx_encoder import find_export
 from retrieval.model.posterior import NONE_PRIOR, Posterior, require_prior
 from retrieval.model.references import REFERENCE_ROWS
 from retrieval.model.touch_reader import (
+    EncodedQuery,
     EncodedTouches,
     Stopwatch,
     TouchEncoder,
@@ -139,6 +141,7 @@ class Searcher:
         touches: AnyTouches,
         *,
         background: Sequence[AnyImage] | None = None,
+        opening_mm: Openings = None,
         top: int = 10,
         candidates: int | None = None,
         none_prior: float = NONE_PRIOR,
@@ -153,6 +156,9 @@ class Searcher:
                 model with one finger a single image is a grasp too. An image is a path, the bytes of a file, a Pillow
                 image, or an array (height, width, 3) of uint8, red first (OpenCV: `image[..., ::-1]`).
             background: The fingers' no-contact frames, for a model that uses them.
+            opening_mm: Distance between the fingers in each grasp, in millimetres; None for a grasp without a
+                measurement, and by default for all. A number is that of one grasp. It is compared with the openings of
+                reference touches (`retrieval.model.opening`), and changes nothing where there is none.
             top: Number of objects to return.
             candidates: Number of photos that each shard reranks, at least `top`: those nearest to the sum of the
                 grasps' embeddings. Default: as measured by `build-index`. All photos of the best objects, and of the
@@ -165,20 +171,26 @@ class Searcher:
             ImageError: An image cannot be read.
             NumericalError: A logit is not finite.
         """
-        return self.query_many([touches], background=background, top=top, candidates=candidates, none_prior=none_prior)[
-            0
-        ]
+        return self.query_many(
+            [touches],
+            background=background,
+            opening_mm=[opening_mm],
+            top=top,
+            candidates=candidates,
+            none_prior=none_prior,
+        )[0]
 
     def query_many(
         self,
         objects: Sequence[AnyTouches],
         *,
         background: Sequence[AnyImage] | None = None,
+        opening_mm: Sequence[Openings] | None = None,
         top: int = 10,
         candidates: int | None = None,
         none_prior: float = NONE_PRIOR,
     ) -> list[QueryResult]:
-        """Return one result for each of several objects in the hand; give each object's touches as for `query`.
+        """Return one result for each of several objects in the hand; give touches and openings of each as for `query`.
 
         Touches are encoded in batches, so logits differ by at most 1e-4 from single queries. If the touches of one
         object are invalid, the error names the object and no query runs.
@@ -188,29 +200,32 @@ class Searcher:
         if not all(isinstance(count, int | np.integer) and count >= 1 for count in counts):
             raise BadInput(f"top and candidates must be whole numbers of 1 or more; got {top} and {candidates}")
         require_prior(none_prior)
-        many = len(objects) > 1
-        parsed = [
-            parse_grasps(one, opened.reader.fingers, of=f"object {number}, " if many else "")
-            for number, one in enumerate(objects, 1)
+        prefixes = [f"object {number}, " if len(objects) > 1 else "" for number in range(1, len(objects) + 1)]
+        parsed = [parse_grasps(one, opened.reader.fingers, of=of) for one, of in zip(objects, prefixes, strict=True)]
+        given = [None] * len(objects) if opening_mm is None else opening_mm
+        if len(given) != len(objects):
+            raise BadInput(f"opening_mm needs an entry for each object: got {len(given)} for {len(objects)} objects")
+        openings = [
+            parse_openings(one, len(grasps), of) for one, grasps, of in zip(given, parsed, prefixes, strict=True)
         ]
         if not parsed:
             return []
         codes, shown = opened._encoded([grasp for grasps in parsed for grasp in grasps], background, clock)
         found, start = list[tuple[list[str], ShardResult | None]](), 0
-        for grasps in parsed:
+        for grasps, openings_mm in zip(parsed, openings, strict=True):
             span = slice(start, start := start + len(grasps))
             classes, result = shown[span], None
             if _fault(classes) is None:
                 used = classes == CONTACT
                 require_distinct(compress(grasps, used), compress(codes.pictures[span], used))
-                query = EncodedTouches(codes.embeddings[span][used], codes.partials[span][used])
+                query = EncodedQuery(codes.embeddings[span][used], codes.partials[span][used], openings_mm[used])
                 result = opened.shard.search(query, top, candidates)
             clock.add({stage: result.timing_ms[stage] if result else 0.0 for stage in ("candidates", "rerank")})
             found.append((classes.tolist(), result))
         timing_ms = clock.finish(len(parsed))
         return [
-            opened._result(grasps, classes, timing_ms, result, none_prior)
-            for grasps, (classes, result) in zip(parsed, found, strict=True)
+            opened._result(grasps, openings_mm, classes, timing_ms, result, none_prior)
+            for grasps, openings_mm, (classes, result) in zip(parsed, openings, found, strict=True)
         ]
 
     def encode(self, touches: AnyTouches, *, background: Sequence[AnyImage] | None = None) -> EncodedTouches:
@@ -232,6 +247,8 @@ class Searcher:
         self, touches: AnyTouches, expect: str, *, far: float = 0.01, background: Sequence[AnyImage] | None = None
     ) -> Verification:
         """Decide whether the object in the hand is the expected one, at a stated false-accept rate.
+
+        Openings of the jaws are not used: the error rates were measured without them.
 
         Args:
             touches: As for `query`; at most the first four grasps with contact are used.
@@ -299,6 +316,7 @@ class Searcher:
     def _result(
         self,
         grasps: Sequence[Sequence[InputImage]],
+        openings_mm: NDArray[np.float64],
         classes: list[str],
         timing_ms: dict[str, float],
         found: ShardResult | None,
@@ -324,6 +342,12 @@ class Searcher:
             }
             if (references := manifest.about.get(REFERENCE_ROWS)) and self.checkpoint.references is not None:
                 formula[REFERENCE_ROWS] = {**references, "calibration": asdict(self.checkpoint.references)}
+            if np.isfinite(openings_mm).any():
+                opening = self.checkpoint.opening
+                formula["opening"] = {
+                    "compared_objects": found.compared_openings,
+                    "calibration": None if opening is None else asdict(opening),
+                }
         sharding = {"shards": len(manifest.shards)} if isinstance(manifest, ShardedManifest) else {}
         return QueryResult(
             touches=[[image.name for image in grasp] for grasp in grasps],
@@ -361,6 +385,7 @@ class Searcher:
                 for place, one in enumerate(found.best if found else ())
             ],
             more_grasps=more_grasps,
+            opening_mm=[None if np.isnan(one) else one for one in openings_mm.tolist()],
         )
 
 

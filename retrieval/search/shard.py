@@ -22,9 +22,9 @@ from indexes.store.sharded import ShardedManifest
 from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_scorer
 from retrieval.model.fusion_scorer import StoredPartials
 from retrieval.model.posterior import EvidenceMass
-from retrieval.model.touch_reader import EncodedTouches, Stopwatch
+from retrieval.model.touch_reader import EncodedQuery, Stopwatch
 from retrieval.search.answer import NearestReference
-from retrieval.search.objects import ListedPhoto, Objects, Rows, Similarities, listed_photo
+from retrieval.search.objects import ListedPhoto, Objects, ReferenceEvidence, Rows, listed_photo
 
 DEFAULT_CANDIDATES = 1000
 MIN_COMPLETED_OBJECTS = 20
@@ -51,6 +51,7 @@ class ShardResult:
         objects: Number of scored objects.
         best: The best objects, ordered by (-logit, name), at most the requested number.
         mass: Evidence mass of all objects.
+        compared_openings: Number of objects whose opening was compared with that of a grasp.
         timing_ms: Milliseconds by stage; of several shards, those of the slowest.
     """
 
@@ -58,6 +59,7 @@ class ShardResult:
     objects: int
     best: list[RankedObject]
     mass: EvidenceMass
+    compared_openings: int
     timing_ms: Mapping[str, float]
 
 
@@ -88,7 +90,7 @@ class FolderShard:
         self.objects = Objects(generation, stored, self.scorer.cosine_columns)
         self._has_embeddings = stored.config.has_embeddings
 
-    def search(self, query: EncodedTouches, top: int, candidates: int | None) -> ShardResult:
+    def search(self, query: EncodedQuery, top: int, candidates: int | None) -> ShardResult:
         """Return the best objects for the grasps of a query, and the evidence mass of all objects.
 
         Args:
@@ -104,17 +106,17 @@ class FolderShard:
         with clock("candidates"):
             measured = self.manifest.about.get("candidates") or {"k": DEFAULT_CANDIDATES}
             limit = max(top, int(measured["k"]) if candidates is None else candidates)
-            similarities = objects.similarities(query.partials)
-            rows = self._candidates(query.embeddings, similarities, limit)
+            evidence = objects.compare_references(query.partials, query.openings_mm)
+            rows = self._candidates(query.embeddings, evidence, limit)
         with clock("rerank"):
             logits = self._logits(query.partials, rows)
-            scored = objects.score(rows, logits, similarities, len(query.partials))
+            scored = objects.score(rows, logits, evidence, len(query.partials))
             best = scored.numbers[scored.best(max(top, MIN_COMPLETED_OBJECTS))]
             if len(rest := objects.other_rows(best, rows)):
                 rows = np.concatenate([rows, rest])
                 logits = np.concatenate([logits, self._logits(query.partials, rest)])
-                scored = objects.score(rows, logits, similarities, len(query.partials))
-            mass = self._mass(query.partials, scored.numbers, scored.logits, similarities)
+                scored = objects.score(rows, logits, evidence, len(query.partials))
+            mass = self._mass(query.partials, scored.numbers, scored.logits, evidence)
         ranked = [
             RankedObject(
                 float(scored.logits[place]),
@@ -123,18 +125,18 @@ class FolderShard:
             )
             for place in scored.best(top).tolist()
         ]
-        return ShardResult(len(rows), len(scored.numbers), ranked, mass, clock.finish(1))
+        return ShardResult(len(rows), len(scored.numbers), ranked, mass, evidence.compared, clock.finish(1))
 
     def object_logit(self, number: int, partials: Floats) -> float:
-        """Return the logit of an object for grasps, by all its photos and reference touches.
+        """Return the logit of an object for grasps, by all its photos and reference touches, without openings.
 
         Args:
             number: Number of the object (`Rows.find_object`).
             partials: (G, touch_partial_width) partial activations of the grasps.
         """
         rows = self.objects.other_rows(np.array([number]), np.zeros(0, dtype=np.int64))
-        similarities = self.objects.similarities(partials)
-        scored = self.objects.score(rows, self._logits(partials, rows), similarities, len(partials))
+        evidence = self.objects.compare_references(partials)
+        scored = self.objects.score(rows, self._logits(partials, rows), evidence, len(partials))
         return float(scored.logits[0])
 
     def photos(self, paths: Sequence[str]) -> list[ListedPhoto | None]:
@@ -176,16 +178,16 @@ class FolderShard:
             for row in self.generation.rows
         ]
 
-    def _candidates(self, embeddings: Floats, similarities: Similarities, k: int) -> Rows:
+    def _candidates(self, embeddings: Floats, evidence: ReferenceEvidence, k: int) -> Rows:
         """Return the rows to score.
 
-        These are the k photos nearest to all grasps together, and photos of the k objects with the nearest reference
-        touches; all rows if k covers them or there are no embeddings.
+        These are the k photos nearest to all grasps together, and photos of the k objects that are most likely by
+        their reference touches and openings; all rows if k covers them or there are no embeddings.
         """
         if not self._has_embeddings or k >= self.generation.count:
             return np.arange(self.generation.count)
         rows = np.sort(self.generation.index.candidates(combined_embedding(embeddings), k)[0])
-        nearest = self.objects.nearest_by_reference(similarities, k)
+        nearest = self.objects.nearest_by_reference(evidence, k)
         return np.union1d(rows, self.objects.other_rows(nearest, rows)) if len(nearest) else rows
 
     def _logits(self, partials: Floats, rows: Rows) -> Floats:
@@ -194,14 +196,14 @@ class FolderShard:
         return self.scorer.logits(partials, StoredPartials(self.generation.arrays), None if every else rows)
 
     def _mass(
-        self, partials: Floats, scored: Rows, logits: NDArray[np.float64], similarities: Similarities
+        self, partials: Floats, scored: Rows, logits: NDArray[np.float64], evidence: ReferenceEvidence
     ) -> EvidenceMass:
         """Return the evidence mass of all objects, of which those in `scored` have these logits."""
         # A sample of unscored objects estimates their mass. Without a sample, use the lowest logit of the scored ones,
         # an upper estimate: unscored objects are expected to be worse than candidates.
         sample = logits.min(keepdims=True)
         if len(scored) < self.objects.count and len(rows := self.objects.sample_rows_without(scored)):
-            sample = self.objects.score(rows, self._logits(partials, rows), similarities, len(partials)).logits
+            sample = self.objects.score(rows, self._logits(partials, rows), evidence, len(partials)).logits
         unscored = self.objects.count - len(scored)
         return self.objects.posterior.mass(logits, len(partials), unscored=unscored, sample=sample)
 
@@ -234,7 +236,7 @@ class Shards:
         """Return the results of a method of `FolderShard` for some shards."""
         return [getattr(shard, method)(*arguments) for shard in shards]
 
-    def search(self, query: EncodedTouches, top: int, candidates: int | None) -> ShardResult:
+    def search(self, query: EncodedQuery, top: int, candidates: int | None) -> ShardResult:
         """As `FolderShard.search`; each shard reranks `candidates` photos."""
         results: list[ShardResult] = self.call(self.shards, "search", query, top, candidates)
         best = [one for result in results for one in result.best]
@@ -243,6 +245,7 @@ class Shards:
             sum(result.objects for result in results),
             sorted(best, key=lambda one: (-one.logit, one.photo.object_id))[:top],
             EvidenceMass.merged([result.mass for result in results]),
+            sum(result.compared_openings for result in results),
             {stage: max(result.timing_ms[stage] for result in results) for stage in results[0].timing_ms},
         )
 

@@ -417,10 +417,11 @@ def test_equal_photos_give_the_same_logit_for_any_number_of_them(photos):
     """Their mean equals each of them; rounding in the last bit would put the later of two names first."""
     count = photos + 1
     rows = SimpleNamespace(objects=np.arange(count) // photos, object_count=2, originals=np.arange(count))
-    header = SimpleNamespace(posterior=Posterior(slope=0.9), references=None)
+    header = SimpleNamespace(posterior=Posterior(slope=0.9), references=None, opening=None)
     objects = Objects(SimpleNamespace(rows=rows, documents={}), header, slice(0, 4))
     logits = np.full(count, 1.3, np.float32)
-    many, one = objects.score(np.arange(count), logits, np.full(2, np.nan), 1).logits
+    evidence = objects.compare_references(np.zeros((1, 4), np.float32))
+    many, one = objects.score(np.arange(count), logits, evidence, 1).logits
     assert many == one
 
 

@@ -1,0 +1,48 @@
+"""Openings of the jaws on an object, in millimetres between the fingers: which are believed, and their input."""
+
+from collections.abc import Sequence
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.errors import BadInput
+
+Openings: TypeAlias = float | Sequence[float | None] | None
+"""The opening of each grasp in millimetres, None where it was not measured; a number for one grasp; None for none."""
+RANGE_MM = (0.5, 300.0)
+"""Openings that are believed: what grippers hold. Less is metres in most cases, more another unit or an angle."""
+
+
+def parse_openings(openings: Openings, grasps: int, of: str = "") -> NDArray[np.float64]:
+    """Return the openings (grasps,) in millimetres, NaN where none was measured.
+
+    Args:
+        openings: As `Openings`.
+        grasps: Number of grasps.
+        of: Prefix of messages, such as "object 3, ".
+
+    Raises:
+        BadInput: The number of openings is not that of grasps, or an opening is outside `RANGE_MM`.
+    """
+    if openings is None:
+        return np.full(grasps, np.nan)
+    given: Sequence[object] = openings if isinstance(openings, Sequence | np.ndarray) else [openings]
+    if len(given) != grasps:
+        raise BadInput(
+            f"{of}give one opening for each grasp, or none: got {len(given)} opening(s) for {grasps} grasp(s); None "
+            "stands for a grasp without one"
+        )
+    return np.array([np.nan if one is None else require_opening(one, f"{of}opening_mm") for one in given])
+
+
+def require_opening(value: object, name: str) -> float:
+    """Return an opening in millimetres. Raises BadInput with its name if it is not a number in `RANGE_MM`."""
+    low, high = RANGE_MM
+    is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    if is_number and low <= (number := float(value)) <= high:  # type: ignore[arg-type]
+        return number
+    hint = "; the value looks like metres" if is_number and 0 < float(value) < low else ""  # type: ignore[arg-type]
+    raise BadInput(
+        f"{name} must be the distance between the fingers in millimetres, from {low:g} to {high:g}; got {value!r}{hint}"
+    )
