@@ -10,8 +10,8 @@ Written with pyarrow and PyAV according to the source of lerobot 0.4.4.
     videos/observation.images.<camera>/chunk-000/file-000.mp4      camera: photo, touch_a, touch_b, ...
 
 A grasp is an episode. Its steps are the moments before, during and after the touch that every grasp has. `moment` of a
-step is 0 before, 1 during, 2 after the touch; all steps of an episode have the same photo. Videos are H.264 with key
-frames only and colours at full resolution, but not lossless: on 144 touches of a GelSight Mini the root mean square
+step is 0 before, 1 during, 2 after the touch; all steps of an episode share its photo. Videos are H.264 with key frames
+only and colours at full resolution, but not lossless: on 144 touches of a GelSight Mini the root mean square
 error is 0.86 grey levels, at most 1.2.
 """
 
@@ -83,7 +83,7 @@ def export_lerobot(recording: Recording, out: Path, progress: Progress | None = 
     recorded = {moment: [set(some) <= grasp.images().keys() for grasp in grasps] for moment, some in columns.items()}
     moments = [moment for moment, each in recorded.items() if all(each)]
     suffixes = [MOMENT_SUFFIXES[moment] for moment in moments]
-    per_camera = {"photo": ["photo"] * len(moments)}
+    per_camera = {"photo": ["photo"] * len(moments)} if all(grasp.photo for grasp in grasps) else {}
     per_camera |= {f"touch_{each}": [f"touch_{each}{suffix}" for suffix in suffixes] for each in fingers}
     first = grasps[0].images()
     cameras = [

@@ -25,6 +25,7 @@ class Grasp:
     """The files of one grasp.
 
     Attributes:
+        photo_file: The photo; None in a recording of touches only.
         touches: Gel images, one file per finger, in order a, b.
         backgrounds: No-contact frames of the same fingers, if recorded.
         height_mm: Height of the point between the fingertips, in the rig's frame, if recorded.
@@ -34,11 +35,27 @@ class Grasp:
     grasp_id: str
     object_id: str
     sequence_id: str | None
-    photo: Path
+    photo_file: Path | None
     touches: tuple[Path, ...]
     backgrounds: tuple[Path, ...]
     height_mm: float | None = None
     opening_mm: float | None = None
+
+    @property
+    def photo(self) -> Path:
+        """The photo. Raises DatasetError if the grasp has none, for everything that compares touches with photos."""
+        if self.photo_file is None:
+            raise DatasetError(
+                f"grasp {self.grasp_id} has no photo, as in a recording of touches only; `retrieve train` fits a model "
+                "to such touches, `build-index` and `enrol` accept them, and `evaluate --protocol touch-to-touch` "
+                "tests them; everything else needs photos"
+            )
+        return self.photo_file
+
+    @property
+    def photos(self) -> tuple[Path, ...]:
+        """The photo, or nothing."""
+        return () if self.photo_file is None else (self.photo_file,)
 
 
 AnyRecording = str | Path | Recording
@@ -51,7 +68,7 @@ def folder_of(recording: AnyRecording) -> Path:
 
 
 def load_grasps(recording: AnyRecording) -> list[Grasp]:
-    """Read the successful grasps of a recording that have a photo and a touch, in the order of collection.
+    """Read the successful grasps of a recording, in the order of collection.
 
     Raises DatasetError if the recording cannot be read, has no such grasps, or mixes numbers of fingers.
 
@@ -66,7 +83,7 @@ def require_accepted(folder: Path, attempts: Iterable["Attempt"]) -> list[Grasp]
     """Return the accepted grasps of `load_all_attempts(folder)`. Raises DatasetError like `load_grasps`."""
     grasps = [attempt.grasp for attempt in attempts if attempt.accepted]
     if not grasps:
-        raise DatasetError(f"{folder} contains no successful grasp with a photo and a touch")
+        raise DatasetError(f"{folder} contains no successful grasp")
     finger_count(grasps)
     return grasps
 
@@ -112,7 +129,7 @@ def load_all_attempts(folder: Path) -> list[Attempt]:
                 grasp_id=line.grasp_id,
                 object_id=line.object_id,
                 sequence_id=line.sequence_id,
-                photo=folder / line.photo,
+                photo_file=None if line.photo is None else folder / line.photo,
                 touches=in_finger_order(line.touches),
                 backgrounds=in_finger_order(line.touches_before),
                 height_mm=None if line.pose is None else line.pose[2],
@@ -207,7 +224,7 @@ def data_digest(grasps: Iterable[Grasp]) -> str:
     digest = hashlib.sha256()
     for grasp in grasps:
         digest.update(json.dumps([grasp.grasp_id, grasp.object_id, grasp.sequence_id]).encode())
-        for path in (grasp.photo, *grasp.touches, *grasp.backgrounds):
+        for path in (*grasp.photos, *grasp.touches, *grasp.backgrounds):
             try:
                 digest.update(bytes.fromhex(file_digest(path)))
             except OSError as error:

@@ -70,7 +70,7 @@ def trained_checkpoint(settings: MethodSettings, train: Features, validation: Fe
     known = train.concatenate(validation)
     # Grasps to draw pairs from. Their files are only names and are never opened.
     grasps = [
-        Grasp(grasp_id, object_id, None, photo=Path(grasp_id), touches=(), backgrounds=())
+        Grasp(grasp_id, object_id, None, photo_file=Path(grasp_id), touches=(), backgrounds=())
         for grasp_id, object_id in zip(known.grasp_ids, known.object_ids, strict=True)
     ]
     objects = [tuple(sorted(set(part.object_ids))) for part in (train, validation)]

@@ -7,8 +7,9 @@
     attempts.jsonl    only if a rig collected it: all attempts (robot.recording.attempt_log)
 
 A line contains the fields of `RecordedGrasp` without the values that were not recorded. Images are paths relative to
-the folder: photo_file_name, depth_file_name and for each finger (a, b, ...) touch_a_file_name, touch_a_before_file_name
-(no contact) and touch_a_after_file_name. Hugging Face datasets ("imagefolder") opens the folder as it is.
+the folder: photo_file_name (absent in a recording of touches only), depth_file_name and for each finger (a, b, ...)
+touch_a_file_name, touch_a_before_file_name (no contact) and touch_a_after_file_name. Hugging Face datasets
+("imagefolder") opens the folder as it is.
 
 A line is written after its images are on disk, so a crash leaves complete grasps; an incomplete last line is dropped.
 """

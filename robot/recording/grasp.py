@@ -27,7 +27,7 @@ class RecordedGrasp:
     Attributes:
         grasp_id: Unique id.
         object_id: The object.
-        photo: Colour picture of the object before the grasp.
+        photo: Colour picture of the object before the grasp; None in a recording of touches only.
         touches: Gel images of the closed jaws.
         touches_before: No-contact frames, just before the jaws close.
         touches_after: Gel images after the lift, before the release.
@@ -50,7 +50,7 @@ class RecordedGrasp:
 
     grasp_id: str
     object_id: str
-    photo: str
+    photo: str | None
     touches: Mapping[str, str] = field(hash=False)
     touches_before: Mapping[str, str] = field(default_factory=dict, hash=False)
     touches_after: Mapping[str, str] = field(default_factory=dict, hash=False)
@@ -80,7 +80,8 @@ class RecordedGrasp:
 
     def images(self) -> dict[str, str]:
         """Return the files by column name without `_file_name`: photo, depth, touch_a, touch_a_before, ..."""
-        files = {"photo": self.photo} | ({} if self.depth is None else {"depth": self.depth})
+        views = {"photo": self.photo, "depth": self.depth}
+        files = {column: path for column, path in views.items() if path is not None}
         for moment, touches in {"": self.touches, "_before": self.touches_before, "_after": self.touches_after}.items():
             files |= {f"touch_{finger}{moment}": touches[finger] for finger in sorted(touches)}
         return files
@@ -93,7 +94,7 @@ class RecordedGrasp:
     @classmethod
     def from_row(cls, row: Mapping[str, Any]) -> Self:
         """Parse a row of `to_row`; null means not recorded, unknown keys are ignored; raise RecordingError on error."""
-        values: dict[str, Any] = {"touches": {}, "touches_before": {}, "touches_after": {}}
+        values: dict[str, Any] = {"photo": None, "touches": {}, "touches_before": {}, "touches_after": {}}
         for key, value in row.items():
             if value is None:
                 continue
@@ -107,9 +108,9 @@ class RecordedGrasp:
                     values[f"touches{moment or ''}"][finger] = value
                 else:
                     values[whole] = value
-        for key in ("grasp_id", "object_id", "photo"):
+        for key in ("grasp_id", "object_id"):
             if key not in values:
-                raise RecordingError(f"{key}{'_file_name' * (key == 'photo')} is missing")
+                raise RecordingError(f"{key} is missing")
         return typed(values, cls, error=RecordingError)
 
 

@@ -54,6 +54,7 @@ def check_swapped_modalities(grasps: Sequence[Grasp], records: ImageRecords) -> 
     lie close to their median, and photos lie far from it. A grasp is suspect if its photo lies at less than half
     the distance of its touch. The whole recording is suspect if its photos are twice as alike as its touches.
     """
+    grasps = [grasp for grasp in grasps if grasp.photos]
     if len(grasps) < 3:
         return
     touches = small_images(records, [one.touches[0] for one in grasps])

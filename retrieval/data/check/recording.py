@@ -46,10 +46,13 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
     accepted = require_accepted(folder, attempts)
     records, broken = read_pictures(
         {path for attempt in attempts for path in _pictures(attempt)},
-        copied={path for grasp in accepted for path in (grasp.photo, *grasp.touches)},
+        copied={path for grasp in accepted for path in (*grasp.photos, *grasp.touches)},
     )
     findings = [Finding("error", "broken", f"{path.relative_to(folder)}: {reason}") for path, reason in broken.items()]
     findings += _single_grasps(accepted)
+    if any(grasp.photos for grasp in accepted):
+        without = [grasp.grasp_id for grasp in accepted if not grasp.photos]
+        findings += findings_for("error", "no-photo", "no photo, unlike in the others,", without, accepted)
     findings += _duplicates(folder, [attempt.grasp for attempt in attempts], records)
     readable = [attempt for attempt in attempts if not broken.keys() & set(_pictures(attempt))]
 
@@ -69,10 +72,9 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
     used = [attempt for attempt in readable if attempt.accepted]
     findings += _shared_backgrounds(unnamed(used), records)
     findings += _repeated_touches(unnamed(used), records)
-    # A recording without photos has the touch in place of the photo; its no-contact frames are checked all the same.
     if all(attempt.time_s is not None for attempt in used):
         used.sort(key=lambda attempt: attempt.time_s or 0.0)
-    findings += check_drift(unnamed(used, besides="same-modality"), records)
+    findings += check_drift(unnamed(used), records)
     # A mirrored image may be a near copy, too.
     findings += _near_copies(unnamed(used, besides=appearance.COLOUR_LAYOUT), records, accepted)
     if split:
@@ -91,25 +93,24 @@ def check_gel_layout(folder: Path) -> list[Finding]:
 
 def _pictures(attempt: Attempt) -> tuple[Path, ...]:
     grasp = attempt.grasp
-    return (grasp.photo, *grasp.touches, *grasp.backgrounds, *attempt.after)
+    return (*grasp.photos, *grasp.touches, *grasp.backgrounds, *attempt.after)
 
 
 def _single_grasps(grasps: Sequence[Grasp]) -> Iterator[Finding]:
     counts = Counter(grasp.object_id for grasp in grasps)
     if single := sorted(name for name, count in counts.items() if count == 1):
-        yield Finding(
-            "warning",
-            "one-grasp",
-            f"{len(single)} of {len(counts)} object(s) have only one grasp, so photo and touch of a pair always come "
-            f"from the same moment: {abbreviate_list(single)}",
-        )
+        effect = "photo and touch of a pair always come from the same moment"
+        if not any(grasp.photos for grasp in grasps):
+            effect = "no other touch of them can be recognised"
+        text = f"{len(single)} of {len(counts)} object(s) have only one grasp, so {effect}: {abbreviate_list(single)}"
+        yield Finding("warning", "one-grasp", text)
 
 
 def _duplicates(folder: Path, grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
     """Find files of two objects with the same bytes."""
     users: dict[str, dict[str, Path]] = defaultdict(dict)
     for grasp in grasps:
-        for path in filter(records.get, (grasp.photo, *grasp.touches)):
+        for path in filter(records.get, (*grasp.photos, *grasp.touches)):
             users[records[path].digest].setdefault(grasp.object_id, path)
     for objects in users.values():
         if len(objects) > 1:
@@ -122,16 +123,17 @@ def _same_or_flat_images(attempts: Sequence[Attempt], records: ImageRecords) -> 
     names: dict[tuple[str, str, str], list[str]] = defaultdict(list)
     for attempt in attempts:
         grasp = attempt.grasp
-        photo, touches = records[grasp.photo], [records[path] for path in grasp.touches]
+        photos, touches = [records[path] for path in grasp.photos], [records[path] for path in grasp.touches]
         backgrounds = [records[path] for path in grasp.backgrounds]
         digests = {touch.digest for touch in touches}
+        is_touch = any(photo.digest in digests for photo in photos)
         # A grasp that missed may leave the gel untouched.
         is_frozen = attempt.accepted and digests & {frame.digest for frame in backgrounds}
         for is_faulty, severity, kind, text in (
-            (photo.digest in digests, "error", "same-modality", "photo and touch are the same image"),
+            (is_touch, "error", "same-modality", "photo and touch are the same image"),
             (len(digests) < len(touches), "warning", "same-fingers", "two fingers have the same image"),
             (is_frozen, "error", "frozen-frame", "touch and no-contact frame are the same image"),
-            (photo.is_flat, "error", "dead-frame", "the photo has a single colour"),
+            (any(photo.is_flat for photo in photos), "error", "dead-frame", "the photo has a single colour"),
             (any(one.is_flat for one in touches), "error", "dead-frame", "a touch has a single colour"),
             (any(one.is_flat for one in backgrounds), "error", "dead-frame", "a no-contact frame has a single colour"),
         ):
@@ -204,7 +206,8 @@ def _near_copies(grasps: Sequence[Grasp], records: ImageRecords, accepted: Seque
 
 def _by_kind(grasps: Sequence[Grasp]) -> dict[str, dict[Path, Grasp]]:
     """Return, for photos and for the touches of each finger, one grasp for each picture file."""
-    kinds = {"photo": {grasp.photo: grasp for grasp in grasps}}
+    photos = {path: grasp for grasp in grasps for path in grasp.photos}
+    kinds = {"photo": photos} if photos else {}
     for finger in fingers_of(grasps):
         kinds[f"touch {ascii_lowercase[finger]}"] = {grasp.touches[finger]: grasp for grasp in grasps}
     return kinds

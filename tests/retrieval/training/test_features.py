@@ -81,7 +81,7 @@ def test_only_images_that_the_cache_lacks_are_encoded(grasps, matcher, plain, en
     assert encode(build_matcher(TINY))[1] == 2 * 9  # other weights
     smaller = dataclasses.replace(TINY, preprocessing=dataclasses.replace(TINY.preprocessing, touch_px=40))
     assert encode(matcher, smaller)[1] == 2 * 9
-    shared = [dataclasses.replace(grasp, photo=grasps[0].photo) for grasp in grasps[:3]]
+    shared = [dataclasses.replace(grasp, photo_file=grasps[0].photo) for grasp in grasps[:3]]
     features, count = encode(matcher, items=shared, cache=None)
     assert count == 3 + 1
     np.testing.assert_array_equal(features.photo[0], features.photo[2])
@@ -150,7 +150,7 @@ def test_the_touches_and_photos_of_an_object_are_mirrored_together(grasps, tmp_p
     items = []
     for grasp in grasps:
         photo = shutil.copy(tmp_path / "photo.png", tmp_path / f"{grasp.grasp_id}.png")
-        items.append(dataclasses.replace(grasp, touches=(tmp_path / "touch.png",) * 2, photo=photo))
+        items.append(dataclasses.replace(grasp, touches=(tmp_path / "touch.png",) * 2, photo_file=photo))
     config = dataclasses.replace(TINY, training=dataclasses.replace(TINY.training, augment=True, workers=0))
     sampler = PairSampler(items, seed=0, positives=2, negatives=2, share_photos=True)
     source, seen = TrainedFeatures(config, torch.device("cpu")), set()

@@ -15,6 +15,7 @@ import pytest
 from robot.errors import RecordingError, StorageError
 from robot.recording.folder import RecordingWriter, SharedImage, read_recording
 from robot.recording.grasp import RecordedGrasp
+from robot.recording.preview import TILE_PX, write_preview
 
 INFO = {"source": "test", "sensor": "GelSight", "seed": 3}
 ROW = {"grasp_id": "1", "object_id": "mug", "photo_file_name": "p.png", "touch_a_file_name": "a.png"}
@@ -100,6 +101,19 @@ def test_datasets_opens_a_recording(tmp_path):
     np.testing.assert_array_equal(np.asarray(rows[1]["touch_b"]), pixels(4))
 
 
+def test_a_recording_of_touches_only_is_opened_by_readers_datasets_and_the_preview(tmp_path):
+    datasets = pytest.importorskip("datasets")
+    with RecordingWriter(tmp_path / "r", INFO) as writer:
+        grasp = writer.append("1", "mug", {"touch_a": pixels(1), "touch_a_before": pixels(2)})
+    assert read_recording(tmp_path / "r").grasps == (grasp,)
+    assert (grasp.photo, [*grasp.images()]) == (None, ["touch_a", "touch_a_before"])
+    folders = {"data_dir": str(tmp_path / "r"), "cache_dir": str(tmp_path / "cache")}
+    (row,) = datasets.load_dataset("imagefolder", split="train", **folders)
+    np.testing.assert_array_equal(np.asarray(row["touch_a"]), pixels(1))
+    sheet = cv2.imread(str(write_preview(tmp_path / "r", tmp_path / "sheet.png")))
+    assert sheet.shape[1] == 2 * TILE_PX
+
+
 def test_pixels_are_read_back_and_files_and_bytes_are_copied_unchanged(tmp_path):
     """Pixels are RGB, depth has 16 bits."""
     depth = np.array([[0, 256, 65535]], np.uint16)
@@ -143,7 +157,6 @@ BAD_LINES = {
     "[]": "one JSON object",
     json.dumps({**ROW, "grasp_id": "0"}): "grasp_id must be unique, got '0' twice",
     json.dumps({**ROW, "object_id": None}): "object_id is missing",
-    json.dumps({key: ROW[key] for key in ROW if key != "photo_file_name"}): "photo_file_name is missing",
     json.dumps({key: ROW[key] for key in ROW if key != "touch_a_file_name"}): "at least one touch",
     json.dumps({**ROW, "grasp_id": 5}): "grasp_id must be a text in quotes, got 5",
     json.dumps({**ROW, "force_n": "5"}): "force_n must be a number or nothing, got '5'",
@@ -264,7 +277,6 @@ def test_bad_info_is_refused_before_a_folder_is_made(tmp_path, info, reason):
 
 
 BAD_IMAGES = {
-    "missing photo": ({"touch_a": pixels()}, "photo_file_name is missing"),
     "float": ({"photo": pixels() / 255, "touch_a": pixels()}, "photo must be H x W x 3 uint8 RGB"),
     "grey": ({"photo": pixels()[..., 0], "touch_a": pixels()}, "photo must be H x W x 3 uint8 RGB"),
     "no pixels": ({"photo": pixels(), "touch_a": np.zeros((0, 2, 3), np.uint8)}, "touch_a must be H x W"),
