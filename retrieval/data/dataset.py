@@ -30,6 +30,7 @@ class Grasp:
         backgrounds: No-contact frames of the same fingers, if recorded.
         height_mm: Height of the point between the fingertips, in the rig's frame, if recorded.
         opening_mm: Distance between the fingers, if recorded.
+        session: Name of the sitting in which the grasp was recorded, if stated; it does not restrict splits.
     """
 
     grasp_id: str
@@ -40,6 +41,7 @@ class Grasp:
     backgrounds: tuple[Path, ...]
     height_mm: float | None = None
     opening_mm: float | None = None
+    session: str | None = None
 
     @property
     def photo(self) -> Path:
@@ -134,6 +136,7 @@ def load_all_attempts(folder: Path) -> list[Attempt]:
                 backgrounds=in_finger_order(line.touches_before),
                 height_mm=None if line.pose is None else line.pose[2],
                 opening_mm=line.opening_mm,
+                session=line.session,
             ),
             outcome=line.outcome or {None: "unknown", True: "held", False: "failed"}[line.grasped],
             accepted=line.grasped is not False,
@@ -223,7 +226,8 @@ def data_digest(grasps: Iterable[Grasp]) -> str:
     """Return the SHA-256 (hex) of ids and image bytes; training on recordings with equal digests is equal."""
     digest = hashlib.sha256()
     for grasp in grasps:
-        digest.update(json.dumps([grasp.grasp_id, grasp.object_id, grasp.sequence_id]).encode())
+        ids = [grasp.grasp_id, grasp.object_id, grasp.sequence_id]
+        digest.update(json.dumps(ids if grasp.session is None else [*ids, grasp.session]).encode())
         for path in (*grasp.photos, *grasp.touches, *grasp.backgrounds):
             try:
                 digest.update(bytes.fromhex(file_digest(path)))

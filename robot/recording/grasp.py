@@ -14,8 +14,8 @@ Outcome = Literal["held", "missed", "slipped", "no_plan"]
 """Outcome of an attempt: held after the lift, nothing between the jaws, lost during the lift, or no grasp planned."""
 
 _NUMBERS = ("force_n", "opening_mm", "touch_skew_s", "time_s")
-_PLAIN_KEYS = ("grasp_id", "object_id", *_NUMBERS, "pose", "grasped", "outcome", "sequence_id")
-_REPEATED_KEY = re.compile(r"object_id|sequence_id|outcome|photo_file_name|touch_[a-z]_before_file_name")
+_PLAIN_KEYS = ("grasp_id", "object_id", *_NUMBERS, "pose", "grasped", "outcome", "sequence_id", "session")
+_REPEATED_KEY = re.compile(r"object_id|sequence_id|session|outcome|photo_file_name|touch_[a-z]_before_file_name")
 """Keys with equal values in many lines; their strings are interned."""
 _IMAGE_KEY = re.compile(r"(photo|depth|touch_([a-z])(_before|_after)?)_file_name")
 
@@ -39,6 +39,7 @@ class RecordedGrasp:
         grasped: Whether the gate accepted the grasp, not if the object was held; training omits grasps with false.
         outcome: What the gripper reports.
         sequence_id: Id shared by grasps that no split separates.
+        session: Name of the sitting in which the grasp was recorded; light and gels drift from one session to the next.
         time_s: Time since the recording began.
 
     >>> grasp = robot.read_recording("recording").grasps[0]
@@ -62,11 +63,12 @@ class RecordedGrasp:
     grasped: bool | None = None
     outcome: Outcome | None = None
     sequence_id: str | None = None
+    session: str | None = None
     time_s: float | None = None
 
     def __post_init__(self) -> None:
         """Raise RecordingError for an invalid name or path, or without a touch; `from_row` checks types too."""
-        for key in ("grasp_id", "object_id", "sequence_id"):
+        for key in ("grasp_id", "object_id", "sequence_id", "session"):
             if getattr(self, key) is not None:
                 check_name(key, getattr(self, key))
         for column, path in self.images().items():

@@ -43,8 +43,9 @@ def test_a_recording(tmp_path, recording):
         writer.update_info(skipped_objects={"ball": "wider than the gripper opens"})
     read = read_recording(tmp_path / "recording")
     check(0, read.info)
-    numbers = dict.fromkeys(("force_n", "opening_mm", "touch_skew_s", "time_s"), 1.0)
-    check(1, replace(read.grasps[0], **numbers, pose=(0.0,), grasped=True, outcome="held", sequence_id="s").to_row())
+    others = dict.fromkeys(("force_n", "opening_mm", "touch_skew_s", "time_s"), 1.0)
+    others |= {"sequence_id": "s", "session": "monday", "outcome": "held"}
+    check(1, replace(read.grasps[0], **others, pose=(0.0,), grasped=True).to_row())
 
 
 def test_an_index_and_the_answer_to_a_query(tmp_path, catalogue, model, touch, capsys):

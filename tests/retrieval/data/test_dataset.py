@@ -76,6 +76,7 @@ def test_grasps_are_in_collection_order_and_their_files_in_finger_order(small_re
     for item, row in zip(grasps, rows, strict=True):
         assert item.object_id == row["object_id"]
         assert item.sequence_id == row["sequence_id"]
+        assert item.session is None
         assert item.photo == small_recording / row["photo_file_name"]
         assert item.touches == tuple(small_recording / row[f"touch_{finger}_file_name"] for finger in "ab")
         assert item.backgrounds == tuple(small_recording / row[f"touch_{finger}_before_file_name"] for finger in "ab")
@@ -105,6 +106,7 @@ def test_the_data_digest_depends_on_bytes_and_ids_and_not_on_the_folder(small_re
     assert before == data_digest(load_grasps(small_recording))
     assert before != data_digest(grasps[::-1])
     assert before != data_digest([dataclasses.replace(grasps[0], object_id="other"), *grasps[1:]])
+    assert before != data_digest([dataclasses.replace(grasps[0], session="monday"), *grasps[1:]])
     for path in (grasps[0].photo, grasps[1].touches[1], grasps[2].backgrounds[0]):
         data = path.read_bytes()
         path.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))

@@ -62,7 +62,8 @@ def test_appended_grasps_are_read_back_and_a_line_has_the_documented_columns_wit
             pose=(*np.array([1.0, 2.0, 3.0]), 0.5),
             grasped=np.True_,
             outcome="slipped",
-            sequence_id="tuesday",
+            sequence_id="take 3",
+            session="tuesday",
             time_s=0.25,
         )
     recording = read_recording(tmp_path / "r")
@@ -81,7 +82,8 @@ def test_appended_grasps_are_read_back_and_a_line_has_the_documented_columns_wit
         pose=(1.0, 2.0, 3.0, 0.5),
         grasped=True,
         outcome="slipped",
-        sequence_id="tuesday",
+        sequence_id="take 3",
+        session="tuesday",
         time_s=0.25,
     )
     assert hash(written) == hash(recording.grasps[0])
