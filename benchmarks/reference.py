@@ -85,6 +85,29 @@ parts when it ends.
 
 """
 OTHER_DATA_SETS = """
+## Data that a laboratory can get now
+
+**Not run**: we could not download these. The facts are from their pages, read in November 2026.
+
+**TactileMimic** ([card](https://huggingface.co/datasets/b1o1o1m/TactileMimic); it asks you to accept conditions) has
+two GelSight Minis on a parallel gripper and a camera (RealSense D405) on the wrist, like the rig of the paper: 26
+objects, 369 successful teleoperated episodes (of the bottle only 3), all images 224 x 224. Unpack the .tar file, then
+`retrieve import open-x-tactile pick_place/ --out mimic/ --option camera=right_wrist_camera_rgb`. An episode becomes one
+grasp, so **its photo has light and pose in common with its touch: the photos of a catalogue must come from other
+episodes.** `retrieve evaluate` leaves own photos out; a catalogue of yours must do so, too.
+
+**RCT** (arXiv 2606.31694; 9.2 GB on figshare): a robot pressed three DIGITs on 122 materials; 1,832 presses, 29,279
+frames, a photo of each material, splits by material and by sensor. On held-out materials its authors find the text of a
+touch first in 25.1 % (± 6.1). The options of [`rct`](#rct) name its folders. These are flat materials and one finger,
+not objects in a hand.
+
+**The Feeling of Success**
+([files](https://opara.zih.tu-dresden.de/items/d5c56810-fc26-4b53-8201-acb75ff055ac); older links are dead): 9,269
+grasps of about a hundred objects with two GelSights and a Kinect, in 38 files; [some of
+them](#feeling-of-success) are enough. Protocol `feeling-of-success` of `retrieve evaluate` computes the paper's
+numbers (64.3 % pair accuracy on 18 unseen objects of its own). Objects were grasped one after the other, so [drift can
+identify them](real.md#what-counts-as-touch).
+
 ## Other data sets
 
 [`folder`](#folder) reads these layouts, with the options that the table lists. For other layouts [write a
