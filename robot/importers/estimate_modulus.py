@@ -4,15 +4,15 @@
 
 The folders can also be in `example_data/`. A date is a session, a video a sequence; an object has the same name on each
 day. A video provides `frames` grasps (default 5): the frames that differ most from the first one, in order of time. The
-first frame is their no-contact frame. There are no photos: the gel image itself replaces the photo, so the recording is
-for touch-to-touch search only (`retrieve evaluate --protocol`).
+first frame is their no-contact frame. There are no photos, so the recording is for touch-to-touch search (`retrieve
+evaluate --protocol`).
 """
 
 import re
 from pathlib import Path
 
 from robot.importers.importing import NOT_STATED, DataSet, Progress, numbered_files, subfolders
-from robot.importers.press_videos import NO_PHOTOS, import_presses
+from robot.importers.press_videos import NO_PHOTOS, Press, import_presses
 from robot.recording.folder import Recording, safe_name
 
 DATA_SET = DataSet(
@@ -47,7 +47,7 @@ def import_estimate_modulus(src: Path, out: Path, progress: Progress | None = No
     """
     days = subfolders(src / "example_data" if (src / "example_data").is_dir() else src)
     presses = [
-        (match["object"], safe_name(day.name, match["object"], match["press"]), path)
+        Press(match["object"], safe_name(day.name, match["object"], match["press"]), path, day.name)
         for day in days
         if _DATE.fullmatch(day.name)
         for match, path in numbered_files(day, _VIDEO)

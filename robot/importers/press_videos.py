@@ -7,6 +7,7 @@ their no-contact frame.
 import heapq
 import itertools
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 
@@ -20,11 +21,19 @@ from robot.importers.importing import DataSet, Item, Progress, Skip, import_extr
 from robot.recording.folder import Recording, SharedImage, safe_name
 
 WHAT = "a video"
-NO_PHOTOS = "There are no photos: the gel image itself replaces each photo. Do not train a matcher on it."
+NO_PHOTOS = "There are no photos, so touches are compared with touches: `retrieve evaluate --protocol`."
 
 Frame = NDArray[np.uint8]
-Press = tuple[str, str, Path]
-"""Object, name of the sequence, and video."""
+
+
+@dataclass(frozen=True)
+class Press:
+    """A video of one press of an object; `sequence` is its name, `session` that of its sitting, None if unknown."""
+
+    object_id: str
+    sequence: str
+    video: Path
+    session: str | None
 
 
 def import_presses(
@@ -39,21 +48,31 @@ def import_presses(
     if not presses:
         raise data_set.mismatch_error(src, "it contains no such video")
     import_extra("av", WHAT)
-    items = (item for press in presses for item in _items(*press, frames))
+    items = (item for press in presses for item in _items(press, frames))
     return import_items(
         data_set, items, out, total=len(presses) * frames, progress=progress, source=src, options={"frames": frames}
     )
 
 
-def _items(object_id: str, sequence: str, path: Path, frames: int) -> Iterator[Item | Skip]:
+def _items(press: Press, frames: int) -> Iterator[Item | Skip]:
     left_out: dict[str, int] = {}
-    read = cache(partial(strongest_frames, path, frames, left_out=left_out))  # decoded once, on first use
-    before = SharedImage(safe_name(sequence, "no_contact"), lambda: read()[0])  # type: ignore[arg-type]  # import_items calls it
+    read = cache(partial(strongest_frames, press.video, frames, left_out=left_out))  # decoded once, on first use
+    before = SharedImage(safe_name(press.sequence, "no_contact"), lambda: read()[0])  # type: ignore[arg-type]  # import_items calls it
+    fields = {"sequence_id": press.sequence} | ({"session": press.session} if press.session else {})
     for number in range(1, frames + 1):
-        name = safe_name(sequence, str(number))
-        touch = SharedImage(name, lambda number=number: read()[number])  # type: ignore[arg-type]
-        images = {"photo": touch, "touch_a": touch, "touch_a_before": before}
-        yield Item(name, object_id, images, {"sequence_id": sequence}, left_out)
+        name = safe_name(press.sequence, str(number))
+        images = {"touch_a": lambda number=number: read()[number], "touch_a_before": before}
+        yield Item(name, press.object_id, images, fields, left_out)  # type: ignore[arg-type]
+
+
+def frame_count(path: Path) -> int:
+    """Return the number of frames that the header of a video states; 0 if it cannot be read."""
+    av = import_extra("av", WHAT)
+    try:
+        with av.open(str(path)) as video:
+            return int(video.streams.video[0].frames)
+    except (av.error.FFmpegError, OSError, ValueError, IndexError):
+        return 0
 
 
 def strongest_frames(path: Path, count: int, start: int = 0, left_out: dict[str, int] | None = None) -> list[Frame]:

@@ -18,7 +18,6 @@ _NAMES = ("foam_brick", "golf_ball", "green_ball", "strawberry", "bolt")
 
 def write(folder: Path) -> None:
     for number, (day, (pattern, first, objects)) in enumerate(DAYS.items()):
-        (folder / day).mkdir(parents=True)
         for name in objects:
             for k in range(VIDEOS):
                 frames = physiclear.presses(_NAMES.index(name), k)

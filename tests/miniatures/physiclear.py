@@ -16,7 +16,6 @@ SIZE = (48, 64)
 
 
 def write(folder: Path, parts: tuple[str, ...] = PARTS, videos: int = VIDEOS) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
     for number, part in enumerate(parts):
         for k in range(videos):
             write_video(folder / f"{part}_{k}.mov", presses(number, k))
@@ -34,6 +33,7 @@ def presses(part: int, video: int, frames: int = FRAMES) -> list[np.ndarray]:
 def write_video(path: Path, frames: list[np.ndarray]) -> None:
     import av
 
+    path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as video:
         stream = video.add_stream("mpeg4", rate=25)
         stream.height, stream.width = frames[0].shape[:2]

@@ -10,7 +10,7 @@ from robot.importers.press_videos import strongest_frames
 from tests.miniatures import physiclear
 
 
-def test_a_video_is_a_sequence_of_five_frames_of_its_part_and_the_gel_image_replaces_the_photo(source, tmp_path):
+def test_a_video_is_a_sequence_of_five_frames_of_its_part_without_photos(source, tmp_path):
     """Each video has its own no-contact frame; every frame is stored once."""
     recording = import_physiclear(source, tmp_path / "out")
     found = [(grasp.grasp_id, grasp.object_id, grasp.sequence_id) for grasp in recording.grasps]
@@ -18,7 +18,7 @@ def test_a_video_is_a_sequence_of_five_frames_of_its_part_and_the_gel_image_repl
         ("apple_1-1", "apple", "apple_1")
     ]
     assert {name for _, name, _ in found} == set(physiclear.PARTS)
-    assert all(grasp.photo == grasp.touches["a"] for grasp in recording.grasps)
+    assert {(grasp.photo, grasp.session) for grasp in recording.grasps} == {(None, None)}
     assert any("no photos" in note for note in recording.notes)
     before = {grasp.sequence_id: grasp.touches_before["a"] for grasp in recording.grasps}
     assert len(set(before.values())) == len(before) == 6
@@ -36,6 +36,13 @@ def test_the_frames_of_strongest_contact_are_in_order_of_time_and_the_first_fram
     for place, frame in enumerate((4, 5, 6, 7, 8)):
         assert np.abs(strongest[place].astype(float) - frames[frame]).mean() < 3  # the codec's loss
     assert np.abs(no_contact.astype(float) - frames[0]).mean() < 3
+
+
+def test_the_length_of_a_video_gives_its_session(tmp_path):
+    for number, length in enumerate((50, 126, 80)):
+        physiclear.write_video(tmp_path / "src" / f"pen_{number}.mov", physiclear.presses(0, 0, length))
+    recording = import_physiclear(tmp_path / "src", tmp_path / "out", frames=1)
+    assert [grasp.session for grasp in recording.grasps] == ["50-frames", "126-frames", None]
 
 
 def test_the_folder_of_the_repository_is_found_and_an_option_sets_the_number_of_frames(source, tmp_path):
