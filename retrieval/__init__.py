@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from retrieval.evaluation.protocol import Protocol as Protocol
     from retrieval.frontier.measure import measure_frontier as measure_frontier
     from retrieval.indexing.build import build_index as build_index
+    from retrieval.indexing.enrolled import remove_enrolled as remove_enrolled
     from retrieval.indexing.report import BuildReport as BuildReport
     from retrieval.methods.method import Method as Method
     from retrieval.methods.method import MethodSettings as MethodSettings
@@ -40,11 +41,13 @@ if TYPE_CHECKING:
     from retrieval.model.touch_reader import EncodedTouches as EncodedTouches
     from retrieval.model.towers.tower import Tower as Tower
     from retrieval.report.evaluation import write_report as write_report
+    from retrieval.search.answer import Enrolment as Enrolment
     from retrieval.search.answer import Match as Match
     from retrieval.search.answer import QueryResult as QueryResult
     from retrieval.search.answer import Verification as Verification
     from retrieval.search.embeddings import embed_photos as embed_photos
     from retrieval.search.searcher import Searcher as Searcher
+    from retrieval.search.searcher import enrol as enrol
     from retrieval.serve.client import Client as Client
     from retrieval.training.adapt import Adaptation as Adaptation
     from retrieval.training.adapt import adapt as adapt
@@ -59,6 +62,7 @@ _MODULES = {
     "Checkpoint": "model.checkpoint:Checkpoint",
     "Client": "serve.client:Client",
     "Config": "model.config:Config",
+    "Enrolment": "search.answer:Enrolment",
     "EncodedTouches": "model.touch_reader:EncodedTouches",
     "Loss": "model.losses.loss:Loss",
     "Match": "search.answer:Match",
@@ -76,6 +80,7 @@ _MODULES = {
     "embed_photos": "search.embeddings:embed_photos",
     "encode_photos": "model.encode:encode_photos",
     "encode_touches": "model.encode:encode_touches",
+    "enrol": "search.searcher:enrol",
     "evaluate": "evaluation.evaluate:evaluate",
     "load_checkpoint": "model.checkpoint:load_checkpoint",
     "load_config": "model.config:load_config",
@@ -83,6 +88,7 @@ _MODULES = {
     "make_split": "data.dataset:make_split",
     "measure_frontier": "frontier.measure:measure_frontier",
     "open": "search.searcher:Searcher.open",
+    "remove_enrolled": "indexing.enrolled:remove_enrolled",
     "shipped_model": "model.shipped:shipped_model",
     "train": "training.train:train",
     "write_report": "report.evaluation:write_report",

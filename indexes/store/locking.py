@@ -10,11 +10,12 @@ from indexes.errors import LockedIndex, WriteFailed
 
 
 @contextmanager
-def writer_lock(path: Path) -> Iterator[None]:
+def writer_lock(path: Path, *, wait: bool = False) -> Iterator[None]:
     """Lock a file for this process, or raise `LockedIndex` immediately. The file stays; its content is not changed.
 
     Args:
         path: The file, created with its folder if missing. A link in its place is refused.
+        wait: Wait for another writer in place of raising `LockedIndex`.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -23,7 +24,7 @@ def writer_lock(path: Path) -> Iterator[None]:
         raise WriteFailed(f"{path}: the lock file cannot be opened; {error.strerror}") from error
     try:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError as error:
             raise LockedIndex(f"{path.parent}: another writer is writing this index; wait until it ends") from error
         except OSError as error:

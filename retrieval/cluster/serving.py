@@ -6,6 +6,7 @@ that changed; old deployments are deleted when no client uses them.
 If a shard does not answer in time, the query fails: no result lacks a part of the catalogue.
 """
 
+import hashlib
 import re
 import secrets
 import threading
@@ -21,12 +22,13 @@ from threadpoolctl import threadpool_limits
 
 from indexes.errors import IndexesError
 from indexes.store.generation import check_fingerprint
-from indexes.store.sharded import ShardedManifest, ShardEntry, open_shard
+from indexes.store.manifest import read_manifest
+from indexes.store.sharded import ShardedManifest, ShardEntry
 from retrieval.console.output import say
 from retrieval.errors import IncompleteSearch, RetrievalError
 from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint
-from retrieval.search.opening import checkpoint_of
-from retrieval.search.shard import FolderShard, Shards
+from retrieval.search.opening import checkpoint_of, open_shard_of
+from retrieval.search.shard import Shards
 
 OWNERS = "touch-retrieval"
 APPLICATION = re.compile(r"shard-\d+-of-\d+-[0-9a-f]{16}-([0-9a-f]{8})")
@@ -58,9 +60,9 @@ class OwnerActor:
 class ShardReplica:
     """One shard in a process of Ray Serve."""
 
-    def __init__(self, index: str, entry: ShardEntry, model: str) -> None:
-        generation = open_shard(Path(index), entry)
-        self._shard = FolderShard(generation, checkpoint_of(generation.manifest, model))
+    def __init__(self, index: str, entry: ShardEntry, folders: list[str], model: str) -> None:
+        manifest = read_manifest(Path(index, entry.folder, entry.generation))
+        self._shard = open_shard_of(Path(index), entry, folders, checkpoint_of(manifest, model))
         threadpool_limits(1, "blas")  # for the whole process: idle BLAS threads spin on CPUs that others need
 
     def call(self, method: str, *arguments: Any) -> Any:
@@ -159,7 +161,10 @@ class Deployments:
             RetrievalError: Ray cannot start the shards.
         """
         check_fingerprint(index, manifest.fingerprint, fingerprint(stored))
-        names = {entry.folder: f"{entry.folder}-{entry.sha256[:16]}-{self._owner_id}" for entry in manifest.shards}
+        # The other shards determine which enrolled objects belong to a shard.
+        folders = "".join(manifest.folders)
+        digests = {one.folder: hashlib.sha256(f"{one.sha256}{folders}".encode()).hexdigest() for one in manifest.shards}
+        names = {folder: f"{folder}-{digest[:16]}-{self._owner_id}" for folder, digest in digests.items()}
         self._close_handles()
         with self._lock:
             self._deploy(names, str(Path(index).resolve()), manifest, str(stored.path.resolve()))
@@ -209,7 +214,9 @@ class Deployments:
             graceful_shutdown_timeout_s=10,
         )
         targets = [
-            serve.RunTarget(deployment.bind(index, entry, model), name=names[entry.folder], route_prefix=None)
+            serve.RunTarget(
+                deployment.bind(index, entry, manifest.folders, model), name=names[entry.folder], route_prefix=None
+            )
             for entry in manifest.shards
             if names[entry.folder] not in deployed
         ]

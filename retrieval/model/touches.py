@@ -7,6 +7,7 @@ The nesting of the lists determines which:
     a                  one grasp of a model with one finger
 """
 
+import io
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from retrieval.data.images import check_pixels, decode_rgb, pillow_rgb, read_rgb
+from retrieval.data.images import check_pixels, decode_rgb, pillow_rgb, read_bytes, read_rgb
 from retrieval.data.resize import RgbImage, to_float
 from retrieval.errors import BadInput, ImageError
 
@@ -28,9 +29,11 @@ class GelImage:
 
     Attributes:
         touch: (px, px, 3) float32 RGB in 0..1 for a model whose `touch_px` is px.
+        file: Bytes of its file.
     """
 
     touch: RgbImage
+    file: bytes = b""
 
 
 AnyImage: TypeAlias = str | os.PathLike[str] | bytes | bytearray | memoryview | Image.Image | NDArray[Any] | GelImage
@@ -45,10 +48,11 @@ _NESTING_HINT = "one grasp is a list with an image for each finger, several gras
 
 @dataclass(frozen=True, eq=False)
 class InputImage:
-    """An image that is not read yet, and its name in answers and messages; for a file, the path."""
+    """An image that is not read yet, its name in answers and messages (for a file, the path), and perhaps its file."""
 
     image: AnyImage
     name: str
+    file: bytes = b""
 
 
 def read_image(image: AnyImage, name: str) -> RgbImage:
@@ -79,6 +83,22 @@ def read_image(image: AnyImage, name: str) -> RgbImage:
         )
     check_pixels((image.shape[1], image.shape[0]), name)
     return np.ascontiguousarray(to_float(np.asarray(image)))
+
+
+def with_file(source: InputImage) -> InputImage:
+    """Return an image that is read from its file in `file`: its own, or a PNG file of its pixels. Raises ImageError."""
+    image = source.image
+    if isinstance(image, GelImage):
+        return InputImage(image, source.name, image.file)
+    if isinstance(image, str | os.PathLike):
+        data = read_bytes(os.fspath(image))
+    elif isinstance(image, bytes | bytearray | memoryview):
+        data = bytes(image)
+    else:
+        samples = np.rint(255 * read_image(image, source.name)).astype(np.uint8)
+        Image.fromarray(samples).save(stream := io.BytesIO(), "png")
+        data = stream.getvalue()
+    return InputImage(data, source.name, data)
 
 
 def parse_grasps(touches: AnyTouches, fingers: int, *, noun: str = "touch", of: str = "") -> list[list[InputImage]]:

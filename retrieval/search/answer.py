@@ -1,9 +1,9 @@
 """The result of a query: a verdict and a ranking of objects with probabilities, with the index and the timing."""
 
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from retrieval.errors import BadInput
 from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
@@ -24,17 +24,33 @@ class NearestReference:
     """The reference touch of an object with the largest cosine with one of the grasps.
 
     Attributes:
-        touch: Paths of its gel images in the catalogue.
+        touch: Paths of its gel images in the catalogue; those of an enrolled touch are in the folder of the index.
         digests: SHA-256 of these files in the index.
         cosine: Cosine with the nearest grasp.
         adds: Difference that all references of the object, with their openings, make to the logit of its photos,
             perhaps negative; None for an object without photos.
+        is_enrolled: Whether it is an enrolled touch.
     """
 
     touch: tuple[str, ...]
     digests: tuple[str, ...]
     cosine: float
     adds: float | None
+    is_enrolled: bool = False
+
+
+class Enrolment(NamedTuple):
+    """The result of an enrolment.
+
+    Attributes:
+        object_id: The object, as the index names it.
+        touches: Number of its enrolled touches.
+        added: Number of those that were enrolled now.
+    """
+
+    object_id: str
+    touches: int
+    added: int
 
 
 _MATCH_FIELDS = (
@@ -59,7 +75,8 @@ class Match:
         logit: Match logit, which determines the rank.
         probability: P(object | touches, catalogue), which sums to 1 over all objects and "none of these"; None if the
             model is not calibrated.
-        photo: Path of the best photo in the catalogue.
+        photo: Path of the best photo in the catalogue. An object that was only enrolled has no photo, and this is the
+            path of a gel image in the folder of the index (`photo_is_enrolled`).
         photo_digest: SHA-256 of the photo in the index. The file may have changed since.
         metadata: The user's metadata of the photo.
         photo_path: Absolute path of the photo on the disk.
@@ -83,6 +100,11 @@ class Match:
     photo_path: Path
     reference: NearestReference | None = None
     probability_if_present: float | None = None
+
+    @property
+    def photo_is_enrolled(self) -> bool:
+        """Whether `photo` is a gel image of an enrolled touch."""
+        return self.reference is not None and self.reference.is_enrolled and self.photo == self.reference.touch[0]
 
     def to_dict(self) -> dict[str, Any]:
         """Return a plain dictionary for JSON, without the absolute path: the document names the catalogue once."""
@@ -164,7 +186,8 @@ class QueryResult:
     def from_dict(cls, document: dict[str, Any]) -> "QueryResult":
         """Return the result of a document; the inverse of `to_dict`. Raises BadInput for another document."""
         try:
-            matches = [_match(match, Path(document["index"]["catalogue"])) for match in document["results"]]
+            folders = [Path(document["index"][name]) for name in ("catalogue", "path")]
+            matches = [_match(match, *folders) for match in document["results"]]
             query = {name: document["query"][name] for name in ("touches", "grasps")}
             names = ("index", "timing_ms", "verdict", "none_probability", "posterior", "more_grasps")
             openings = document["query"].get("opening_mm", [None] * len(query["touches"]))
@@ -189,12 +212,13 @@ class QueryResult:
         }
 
 
-def _match(document: dict[str, Any], catalogue: Path) -> Match:
+def _match(document: dict[str, Any], catalogue: Path, index: Path) -> Match:
     own = {name: value for name, value in document.items() if name != "reference"}
     reference = document.get("reference")
     if reference is not None:
         reference = NearestReference(**{**reference, **{name: tuple(reference[name]) for name in ("touch", "digests")}})
-    return Match(**own, photo_path=catalogue / document["photo"], reference=reference)
+    match = Match(**own, photo_path=catalogue / document["photo"], reference=reference)
+    return replace(match, photo_path=index / match.photo) if match.photo_is_enrolled else match
 
 
 def verdict_sentence(result: QueryResult) -> str:

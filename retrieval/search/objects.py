@@ -1,5 +1,8 @@
 """Photos, reference touches and objects of an opened index: object logits from photo logits, and the best objects."""
 
+from bisect import bisect_left
+from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -8,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from _touch_retrieval.documents import typed
+from _touch_retrieval.names import lookup_key
 from indexes.errors import AGAIN, CorruptIndex
 from indexes.store.generation import Generation
 from indexes.store.rows import Row
 from retrieval.data.opening import require_opening
 from retrieval.data.text import is_inside
+from retrieval.indexing.enrolled import EnrolledTouch, codes_of
 from retrieval.model.checkpoint_info import CheckpointInfo
 from retrieval.model.posterior import Posterior
 from retrieval.model.references import (
@@ -35,10 +40,11 @@ class ListedPhoto:
 
     Attributes:
         object_id: The object.
-        path: Path relative to the catalogue, and inside it.
+        path: Path relative to the catalogue, and inside it; of an enrolled touch, relative to the folder of the index.
         metadata: The user's metadata.
         digest: SHA-256 of the file, in hexadecimal.
         is_touch: Whether it is a gel image.
+        is_enrolled: Whether it is a gel image of an enrolled touch.
     """
 
     object_id: str
@@ -46,6 +52,7 @@ class ListedPhoto:
     metadata: dict[str, Any]
     digest: str = ""
     is_touch: bool = False
+    is_enrolled: bool = False
 
 
 def listed_photo(row: Row) -> ListedPhoto:
@@ -75,7 +82,7 @@ class ScoredObjects(NamedTuple):
     Attributes:
         numbers: Their numbers (J,).
         logits: Their logits (J,) float64.
-        rows: Rows (J,) of their best photos.
+        rows: Rows (J,) of their best photos, -1 for objects that only the table of enrolled touches has.
         photo_logits: Logits (J,) from photos only, NaN without photos.
     """
 
@@ -92,6 +99,11 @@ class ScoredObjects(NamedTuple):
         order = np.lexsort((self.numbers[selected], -self.logits[selected]))  # numbers are in the order of names
         return np.asarray(selected[order[:top]])
 
+    def with_others(self, others: "ScoredObjects") -> "ScoredObjects":
+        """Return these objects and others together."""
+        numbers, logits, rows, photo_logits = (np.concatenate(pair) for pair in zip(self, others, strict=True))
+        return ScoredObjects(numbers, logits, rows, photo_logits)
+
 
 @dataclass(frozen=True)
 class _ReferenceTouch:
@@ -101,6 +113,7 @@ class _ReferenceTouch:
     touch: tuple[str, ...]
     digests: tuple[str, ...]
     opening_mm: float | None = None
+    is_enrolled: bool = False
 
 
 @dataclass(frozen=True)
@@ -112,24 +125,27 @@ class _References:
 
 
 class Objects:
-    """The objects of an index, numbered in the order of their names.
+    """The objects of an index and of enrolled touches, numbered in the order of their names.
 
     Args:
         generation: The opened generation.
         stored: Header of the checkpoint that built it.
         columns: Columns of a partial activation with the scaled embedding.
 
+    Attributes:
+        posterior: Calibration of the match logits.
+        count: Number of objects.
+
     Raises:
         CorruptIndex: The list of reference touches is damaged.
     """
 
     def __init__(self, generation: Generation, stored: CheckpointInfo, columns: slice) -> None:
-        rows, documents = generation.rows, generation.documents
+        self._rows, documents = generation.rows, generation.documents
         self.posterior = stored.posterior or Posterior()  # without calibration objects are ranked, too
-        self._of_row, self.count = rows.objects, rows.object_count
-        self._originals = rows.originals
-        self._photos = np.bincount(self._of_row)
-        self._columns, self._calibration, self._opening = columns, stored.references, stored.opening
+        self._originals = generation.rows.originals
+        self._columns, self._stored = columns, stored
+        self._calibration, self._opening = stored.references, stored.opening
         try:
             self._references = typed(documents.get(REFERENCE_ROWS, {"touches": [], "touch_only": []}), _References)
             for one in self._references.touches:
@@ -141,26 +157,83 @@ class Objects:
             raise CorruptIndex(
                 f"{generation.folder}: the list of reference touches is invalid ({error}); {AGAIN}"
             ) from error
-        listed = self._references
-        names = {one.object_id for one in listed.touches}.union(listed.touch_only)
-        number_of = {name: rows.find_object(name) for name in names}
-        numbers = np.array([number_of[one.object_id] for one in listed.touches], dtype=np.int64)
+        partials = documents.get(REFERENCE_PARTIALS, np.empty((0, columns.stop), np.float32))
+        self._catalogue_codes = unit_embeddings(partials, columns)
+        self._places = dict[str, tuple[int, bool]]()
+        self._add(())
+
+    def with_enrolled(self, touches: Sequence[EnrolledTouch]) -> "Objects":
+        """Return the objects of the index and of these enrolled touches, in place of those of earlier ones."""
+        changed = copy(self)
+        for name in ("gel_images", "_sample"):
+            vars(changed).pop(name, None)
+        changed._add(touches)
+        return changed
+
+    def _add(self, enrolled: Sequence[EnrolledTouch]) -> None:
+        """Number all objects, and order the reference touches of catalogue and table by object."""
+        usable, codes = list[EnrolledTouch](), self._catalogue_codes
+        if enrolled and self._calibration:  # else touches cannot be compared, nor without codes of this model
+            usable, partials = codes_of(enrolled, self._stored)
+            codes = np.concatenate([codes, unit_embeddings(partials, self._columns)])
+        touches = [
+            *self._references.touches,
+            *(
+                _ReferenceTouch(one.object_id, one.pictures, one.digests, one.opening_mm, is_enrolled=True)
+                for one in usable
+            ),
+        ]
+        self._enrolled_only = sorted(name for name in {one.object_id for one in usable} if not self._place(name)[1])
+        self._gaps = np.array([self._place(name)[0] for name in self._enrolled_only], dtype=np.int64)
+        self._enrolled_numbers = self._gaps + np.arange(len(self._gaps))
+        self._of_row = self._rows.objects + np.searchsorted(self._gaps, self._rows.objects, "right")
+        self.count = self._rows.object_count + len(self._enrolled_only)
+        self._photos = np.bincount(self._of_row, minlength=self.count)
+
+        numbers = np.array([self.find(one.object_id) for one in touches], dtype=np.int64)
         order = np.argsort(numbers, kind="stable")
         order = order[numbers[order] >= 0]  # an object without a readable photo has no number
-        self._touches = [listed.touches[place] for place in order]
-        partials = documents.get(REFERENCE_PARTIALS, np.empty((0, columns.stop), np.float32))
-        self._codes = unit_embeddings(partials[order], columns)
+        self._touches = [touches[place] for place in order]
+        self._codes = codes[order]
         self._openings_mm = np.array([one.opening_mm for one in self._touches], dtype=np.float64)  # None becomes NaN
         self._owners = numbers[order]
         self._touched, self._starts = np.unique(self._owners, return_index=True)
-        self._touch_only = np.isin(np.arange(self.count), [number_of[name] for name in listed.touch_only])
+        touch_only = [*map(self.find, self._references.touch_only), *self._enrolled_numbers]
+        self._touch_only = np.isin(np.arange(self.count), touch_only)
+
+    def _place(self, name: str) -> tuple[int, bool]:
+        """Return the number of objects of the generation before this name, and whether it has this one."""
+        if name not in self._places:
+            self._places[name] = self._rows.place(name), self._rows.find_object(name) >= 0
+        return self._places[name]
+
+    def find(self, name: str) -> int:
+        """Return the number of the object with exactly this name; -1 if there is none."""
+        place, has_row = self._place(name)
+        if has_row:
+            return place + int(np.searchsorted(self._gaps, place, "right"))
+        at = bisect_left(self._enrolled_only, name)
+        return int(self._enrolled_numbers[at]) if self._enrolled_only[at : at + 1] == [name] else -1
+
+    def names_like(self, name: str) -> list[str]:
+        """Return the objects that a person can mean by this name (`Rows.names_like`)."""
+        if name in self._enrolled_only:
+            return [name]
+        if name in (found := self._rows.names_like(name)):
+            return found
+        return found + [one for one in self._enrolled_only if lookup_key(one) == lookup_key(name)]
+
+    @property
+    def reference_counts(self) -> tuple[int, int]:
+        """Number of reference touches, and of their objects."""
+        return len(self._touches), len(self._touched)
 
     @cached_property
     def gel_images(self) -> dict[str, ListedPhoto]:
-        """The gel images of the reference touches, by path in the catalogue; queries do not need them."""
+        """The gel images of the reference touches, by path; queries do not need them."""
         return {
-            path: ListedPhoto(one.object_id, path, {}, digest, is_touch=True)
-            for one in self._references.touches
+            path: ListedPhoto(one.object_id, path, {}, digest, is_touch=True, is_enrolled=one.is_enrolled)
+            for one in (*self._references.touches, *self._touches)
             for path, digest in zip(one.touch, one.digests, strict=True)
         }
 
@@ -212,6 +285,14 @@ class Objects:
         combined += evidence.openings[numbers] / posterior.slope  # a log ratio, as summed match logits are
         return ScoredObjects(numbers, combined, rows[first], np.where(touch_only, np.nan, from_photos))
 
+    def score_enrolled_only(self, evidence: ReferenceEvidence, grasps: int) -> ScoredObjects:
+        """Return the objects that only the table of enrolled touches has, with their logits."""
+        numbers, calibration, logits = self._enrolled_numbers, self._calibration, np.empty(0)
+        if calibration is not None and len(numbers):
+            ratios = calibration.touch_only.log_ratio(evidence.similarities[numbers], grasps)
+            logits = self.posterior.logit_of(ratios, grasps) + evidence.openings[numbers] / self.posterior.slope
+        return ScoredObjects(numbers, logits, np.full_like(numbers, -1), np.full(len(numbers), np.nan))
+
     def other_rows(self, numbers: Rows, rows: Rows) -> Rows:
         """Return the photos of the objects `numbers` that are not among the sorted `rows`."""
         is_selected = np.zeros(self.count, dtype=bool)
@@ -226,8 +307,8 @@ class Objects:
     @cached_property
     def _sample(self) -> tuple[Rows, Rows]:
         """Rows of the photos of `SAMPLE` random objects (fixed seed), and the objects of these rows."""
-        drawn = np.zeros(self.count, dtype=bool)
-        drawn[np.random.default_rng(0).permutation(self.count)[:SAMPLE]] = True
+        drawn, with_rows = np.zeros(self.count, dtype=bool), np.flatnonzero(self._photos)
+        drawn[np.random.default_rng(0).permutation(with_rows)[:SAMPLE]] = True
         rows = np.flatnonzero(drawn[self._of_row])
         return rows, self._of_row[rows]
 
@@ -247,4 +328,4 @@ class Objects:
         best = int(cosines.argmax())
         adds = float(scored.logits[place] - scored.photo_logits[place])
         nearest, adds_or_none = self._touches[start + best], None if np.isnan(adds) else adds
-        return NearestReference(nearest.touch, nearest.digests, float(cosines[best]), adds_or_none)
+        return NearestReference(nearest.touch, nearest.digests, float(cosines[best]), adds_or_none, nearest.is_enrolled)

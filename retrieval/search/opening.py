@@ -1,6 +1,6 @@
 """Find the checkpoint that built an index, and the default one; open an index folder or a sharded index."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -9,8 +9,16 @@ from indexes.errors import IndexesError
 from indexes.store.folder import IndexStore
 from indexes.store.generation import check_fingerprint
 from indexes.store.manifest import Manifest, read_manifest
-from indexes.store.sharded import ShardedManifest, is_sharded, open_shard, read_sharded_manifest
+from indexes.store.sharded import (
+    ShardedManifest,
+    ShardEntry,
+    is_sharded,
+    open_shard,
+    read_sharded_manifest,
+    shard_folder,
+)
 from retrieval.errors import CheckpointError
+from retrieval.indexing.enrolled import EnrolledTable
 from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_checkpoint_info
 from retrieval.model.fusion_scorer import CELLS
 from retrieval.model.shipped import SHIPPED_NAMES, shipped_model
@@ -101,8 +109,14 @@ def open_index(
     if shards is not None:
         return shards(index, manifest, stored), stored
     check_fingerprint(index, manifest.fingerprint, fingerprint(stored))
-    opened = [FolderShard(open_shard(index, entry), stored) for entry in manifest.shards]
+    opened = [open_shard_of(index, entry, manifest.folders, stored) for entry in manifest.shards]
     return Shards(manifest, opened), stored
+
+
+def open_shard_of(index: Path, entry: ShardEntry, folders: Sequence[str], stored: CheckpointInfo) -> FolderShard:
+    """Open a shard of a sharded index with the enrolled touches of its objects; `folders`: those of all its shards."""
+    enrolled = EnrolledTable(index, lambda name: shard_folder(name, folders) == entry.folder)
+    return FolderShard(open_shard(index, entry), stored, enrolled)
 
 
 def checkpoint_of(manifest: Manifest | ShardedManifest, model: str | Path | None) -> CheckpointInfo:

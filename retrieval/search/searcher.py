@@ -5,16 +5,26 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import asdict
-from itertools import compress
+from itertools import chain, compress
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from _touch_retrieval.names import lookup_key
 from indexes.store.generation import Generation
 from indexes.store.sharded import ShardedManifest
 from retrieval.data.opening import Openings, parse_openings
-from retrieval.errors import BadInput
+from retrieval.data.text import is_utf8
+from retrieval.errors import BadInput, IncompleteSearch
+from retrieval.indexing.enrolled import (
+    EnrolledTable,
+    EnrolledTouch,
+    content_digest,
+    model_key,
+    picture_path,
+    to_code,
+)
 from retrieval.model.checkpoint_info import CheckpointInfo, read_scorer
 from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
 from retrieval.model.onnx_encoder import find_export
@@ -29,19 +39,20 @@ from retrieval.model.touch_reader import (
     TouchReader,
     require_distinct,
 )
-from retrieval.model.touches import AnyImage, AnyTouches, InputImage, parse_grasps
+from retrieval.model.touches import AnyImage, AnyTouches, InputImage, parse_grasps, with_file
 from retrieval.model.verification import MAX_GRASPS, DecisionBounds
 from retrieval.search.answer import (
     CLEAR_PROBABILITY,
     MATCH,
     NONE_OF_THESE,
     UNCALIBRATED,
+    Enrolment,
     Match,
     QueryResult,
     Verification,
 )
-from retrieval.search.objects import Objects
-from retrieval.search.opening import OpenShards, open_index
+from retrieval.search.objects import ListedPhoto, Objects
+from retrieval.search.opening import OpenShards, manifest_of, open_index
 from retrieval.search.shard import FolderShard, ShardResult, Shards, resolve_object
 
 
@@ -261,7 +272,7 @@ class Searcher:
                 model has no error rates.
         """
         opened = self._snapshot()
-        number, bounds, posterior = opened.expected_object(expect, far)
+        name, bounds, posterior = opened.expected_object(expect, far)
         grasps = parse_grasps(touches, opened.reader.fingers)
         names = [[image.name for image in grasp] for grasp in grasps]
         codes, classes = opened._encoded(grasps, background, Stopwatch())
@@ -269,20 +280,21 @@ class Searcher:
             return Verification(expect, fault, names, classes.tolist(), [], None)
         used = classes == CONTACT
         require_distinct(compress(grasps, used), compress(codes.pictures, used))
-        shard, partials = opened.folder_shard, codes.partials[used][:MAX_GRASPS]
-        ratios = [
-            float(posterior.log_ratio(shard.object_logit(number, partials[:count]), count))
-            for count in range(1, len(partials) + 1)
-        ]
+        logits = opened.folder_shard.object_logits(name, codes.partials[used][:MAX_GRASPS])
+        ratios = [float(posterior.log_ratio(logit, count)) for count, logit in enumerate(logits, 1)]
         return Verification(expect, bounds.decide(np.array(ratios)), names, classes.tolist(), ratios, bounds)
+
+    def picture_file(self, photo: ListedPhoto) -> Path:
+        """Return the absolute path of the file of a photo or gel image."""
+        return (self.index if photo.is_enrolled else self.catalogue).absolute() / photo.path
 
     @property
     def can_verify(self) -> bool:
         """Whether the model has error rates for verification, which hold for an index with the model's cells."""
         return self.checkpoint.verification is not None and self.posterior is not None
 
-    def expected_object(self, expect: str, far: float) -> tuple[int, DecisionBounds, Posterior]:
-        """Return the number of the expected object, the bounds of the decision and the posterior; raise as `verify`."""
+    def expected_object(self, expect: str, far: float) -> tuple[str, DecisionBounds, Posterior]:
+        """Return the expected object, the bounds of the decision and the posterior; raise as `verify`."""
         calibration, posterior = self.checkpoint.verification, self.posterior
         if calibration is None or posterior is None:
             raise BadInput(
@@ -291,10 +303,88 @@ class Searcher:
                 "cells"
             )
         bounds = calibration.bounds(far)
-        number = self.generation.rows.find_object(resolve_object(self.shard, expect))
-        if number < 0:
+        name = resolve_object(self.shard, expect)
+        if self.objects.find(name) < 0:
             raise BadInput(f"the catalogue of {self.index} has no object {expect!r}; give the name of its folder")
-        return number, bounds, posterior
+        return name, bounds, posterior
+
+    def enrol(
+        self,
+        object_id: str,
+        touches: AnyTouches,
+        *,
+        opening_mm: Openings = None,
+        background: Sequence[AnyImage] | None = None,
+    ) -> Enrolment:
+        """Remember touches of an object, which queries of this index find at once; every build keeps them.
+
+        The pictures are copied to the folder of the index; the catalogue does not change. An object needs no photo.
+
+        Args:
+            object_id: The object: one of the index, exactly so or the only one with its `lookup_key`; or a new one.
+            touches: As for `query`; each grasp becomes a reference touch.
+            opening_mm: As for `query`.
+            background: As for `query`; the frames are kept with the touches.
+
+        Raises:
+            BadInput: The model cannot compare touches, a grasp shows no contact or no gel, a picture is enrolled
+                already, or the name or an opening is invalid.
+            ImageError: An image cannot be read.
+            IndexesError: The table of enrolled touches is damaged or cannot be written.
+        """
+        opened, stored = self._snapshot(), self.checkpoint
+        if stored.references is None or stored.posterior is None:
+            raise BadInput(
+                f"{stored.path} has no calibration of reference touches, so this index cannot compare touches. "
+                "Use a shipped model, or one of `retrieve adapt` or `retrieve train` (preset relief, with enough "
+                "validation objects), and build the index with it"
+            )
+        name, fingers = opened._enrolled_name(object_id), opened.reader.fingers
+        grasps = [list(map(with_file, grasp)) for grasp in parse_grasps(touches, fingers)]
+        openings = parse_openings(opening_mm, len(grasps))
+        frames = [] if background is None else parse_grasps(background, fingers, noun="background")[0]
+        frames = list(map(with_file, frames))
+        codes, classes = opened._encoded(grasps, [frame.image for frame in frames] or None, Stopwatch())
+        for grasp, shows in zip(grasps, classes, strict=True):
+            if shows != CONTACT:
+                names = " and ".join(image.name for image in grasp)
+                raise BadInput(f"{names}: {shows}; enrol grasps in which the object is pressed into the gels")
+        require_distinct(grasps, codes.pictures)
+
+        new = [
+            EnrolledTouch(
+                name,
+                tuple(picture_path(name, image.file) for image in grasp),
+                tuple(content_digest(image.file) for image in grasp),
+                {model_key(stored): to_code(partial, stored)},
+                None if np.isnan(opening) else float(opening),
+                tuple(picture_path(name, frame.file) for frame in frames),
+            )
+            for grasp, partial, opening in zip(grasps, codes.partials, openings, strict=True)
+        ]
+        files = {picture_path(name, image.file): image.file for image in (*chain.from_iterable(grasps), *frames)}
+        table = EnrolledTable(self.index)
+        with table.lock() as known:
+            owners = {digest: touch.object_id for touch in known for digest in touch.digests}
+            for image in chain.from_iterable(grasps):
+                if owner := owners.get(content_digest(image.file)):
+                    raise BadInput(
+                        f"{image.name} is enrolled already, for {owner}; a picture counts once: give another grasp, or "
+                        f"remove {owner} first"
+                    )
+            if manifest_of(self.index).fingerprint != self.manifest.fingerprint:
+                raise IncompleteSearch(f"{self.index} was built with another model in the meantime; enrol again")
+            table.replace([*known, *new], files)
+        return Enrolment(name, sum(touch.object_id == name for touch in (*known, *new)), len(new))
+
+    def _enrolled_name(self, object_id: str) -> str:
+        """Return the object of the index that a person names, or the name of a new one. Raises BadInput."""
+        like, new = self.shard.names_like(object_id), lookup_key(object_id)
+        if len(like) > 1:
+            raise BadInput(f"{object_id!r} can be {' or '.join(map(repr, like))}; give one of these names exactly")
+        if not like and not (new.isprintable() and new and is_utf8(new)):
+            raise BadInput(f"the name of an object must be printable text, got {object_id!r}")
+        return like[0] if like else new
 
     def _snapshot(self) -> Searcher:
         """Return a copy with references to all resources, so that `close` in another thread cannot break a query."""
@@ -336,12 +426,14 @@ class Searcher:
                 **asdict(posterior),
                 "none_prior": none_prior,
                 "grasps": count,
-                "objects": manifest.objects,
+                "objects": found.mass.objects,
                 "scored_objects": found.objects,
                 "unscored_probability": probabilities.unscored,
             }
-            if (references := manifest.about.get(REFERENCE_ROWS)) and self.checkpoint.references is not None:
-                formula[REFERENCE_ROWS] = {**references, "calibration": asdict(self.checkpoint.references)}
+            if found.references[0] and self.checkpoint.references is not None:
+                counts = dict(zip(("touches", "objects"), found.references, strict=True))
+                built = manifest.about.get(REFERENCE_ROWS, {})
+                formula[REFERENCE_ROWS] = {**built, **counts, "calibration": asdict(self.checkpoint.references)}
             if np.isfinite(openings_mm).any():
                 opening = self.checkpoint.opening
                 formula["opening"] = {
@@ -357,7 +449,7 @@ class Searcher:
                 "generation": manifest.generation,
                 "kind": manifest.kind,
                 "photos": manifest.photos,
-                "objects": manifest.objects,
+                "objects": found.mass.objects if found else manifest.objects,
                 "scored": found.photos if found else 0,
                 **sharding,
                 "encoder": self.encoder.name,
@@ -378,7 +470,7 @@ class Searcher:
                     one.photo.path,
                     one.photo.digest,
                     one.photo.metadata,
-                    self.catalogue.absolute() / one.photo.path,
+                    self.picture_file(one.photo),
                     one.reference,
                     None if probabilities is None else float(probabilities.objects_if_present[place]),
                 )
@@ -387,6 +479,34 @@ class Searcher:
             more_grasps=more_grasps,
             opening_mm=[None if np.isnan(one) else one for one in openings_mm.tolist()],
         )
+
+
+def enrol(
+    index: str | Path,
+    object_id: str,
+    touches: AnyTouches,
+    *,
+    opening_mm: Openings = None,
+    background: Sequence[AnyImage] | None = None,
+    model: str | Path | None = None,
+) -> Enrolment:
+    """Remember touches of an object in an index, as `Searcher.enrol` of an opened one.
+
+    Args:
+        index: Folder of the index.
+        object_id: As for `Searcher.enrol`; so are `touches`, `opening_mm`, `background` and the errors.
+        touches: Grasps.
+        opening_mm: Openings of the jaws.
+        background: No-contact frames.
+        model: Path of the checkpoint, if it was moved.
+
+    >>> retrieval.enrol("index", "spoon", ["a.png", "b.png"], opening_mm=12.5)
+    Enrolment(object_id='spoon', touches=1, added=1)
+    >>> retrieval.remove_enrolled("index", "spoon")
+    ('spoon', 1)
+    """
+    with Searcher.open(index, model=model) as searcher:
+        return searcher.enrol(object_id, touches, opening_mm=opening_mm, background=background)
 
 
 def _fault(classes: Iterable[str]) -> str | None:

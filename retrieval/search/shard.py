@@ -19,12 +19,14 @@ from numpy.typing import NDArray
 from _touch_retrieval.names import lookup_key
 from indexes.store.generation import Generation, check_fingerprint
 from indexes.store.sharded import ShardedManifest
+from retrieval.errors import BadInput
+from retrieval.indexing.enrolled import EnrolledTable
 from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_scorer
 from retrieval.model.fusion_scorer import StoredPartials
 from retrieval.model.posterior import EvidenceMass
 from retrieval.model.touch_reader import EncodedQuery, Stopwatch
 from retrieval.search.answer import NearestReference
-from retrieval.search.objects import ListedPhoto, Objects, ReferenceEvidence, Rows, listed_photo
+from retrieval.search.objects import ListedPhoto, Objects, ReferenceEvidence, Rows, ScoredObjects, listed_photo
 
 DEFAULT_CANDIDATES = 1000
 MIN_COMPLETED_OBJECTS = 20
@@ -52,6 +54,7 @@ class ShardResult:
         best: The best objects, ordered by (-logit, name), at most the requested number.
         mass: Evidence mass of all objects.
         compared_openings: Number of objects whose opening was compared with that of a grasp.
+        references: Number of reference touches, and of their objects.
         timing_ms: Milliseconds by stage; of several shards, those of the slowest.
     """
 
@@ -60,6 +63,7 @@ class ShardResult:
     best: list[RankedObject]
     mass: EvidenceMass
     compared_openings: int
+    references: tuple[int, int]
     timing_ms: Mapping[str, float]
 
 
@@ -78,17 +82,30 @@ class FolderShard:
     Args:
         generation: The opened generation.
         stored: Header of the checkpoint that built it.
+        enrolled: The enrolled touches; None for those of the generation's index folder.
 
     Raises:
         MismatchedIndex: Another checkpoint built it.
         CorruptIndex: The reference touches are damaged.
     """
 
-    def __init__(self, generation: Generation, stored: CheckpointInfo) -> None:
+    def __init__(self, generation: Generation, stored: CheckpointInfo, enrolled: EnrolledTable | None = None) -> None:
         check_fingerprint(generation.folder.parent, generation.manifest.fingerprint, fingerprint(stored))
         self.generation, self.manifest, self.scorer = generation, generation.manifest, read_scorer(stored)
-        self.objects = Objects(generation, stored, self.scorer.cosine_columns)
+        self._enrolled = EnrolledTable(generation.folder.parent) if enrolled is None else enrolled
+        catalogue = Objects(generation, stored, self.scorer.cosine_columns)
+        self._opened: tuple[tuple[int, int, int] | None, Objects, Objects] = None, catalogue, catalogue
         self._has_embeddings = stored.config.has_embeddings
+
+    @property
+    def objects(self) -> Objects:
+        """The objects of the generation and of the touches that are enrolled now: one snapshot for each use."""
+        version = self._enrolled.version()
+        before, catalogue, current = self._opened
+        if version != before:
+            current = catalogue.with_enrolled(self._enrolled.read())
+            self._opened = version, catalogue, current
+        return current
 
     def search(self, query: EncodedQuery, top: int, candidates: int | None) -> ShardResult:
         """Return the best objects for the grasps of a query, and the evidence mass of all objects.
@@ -103,54 +120,69 @@ class FolderShard:
             NumericalError: A logit is not finite.
         """
         clock, objects = Stopwatch(), self.objects
+        grasps = len(query.partials)
         with clock("candidates"):
             measured = self.manifest.about.get("candidates") or {"k": DEFAULT_CANDIDATES}
             limit = max(top, int(measured["k"]) if candidates is None else candidates)
             evidence = objects.compare_references(query.partials, query.openings_mm)
-            rows = self._candidates(query.embeddings, evidence, limit)
+            rows = self._candidates(objects, query.embeddings, evidence, limit)
         with clock("rerank"):
             logits = self._logits(query.partials, rows)
-            scored = objects.score(rows, logits, evidence, len(query.partials))
+            scored = objects.score(rows, logits, evidence, grasps)
             best = scored.numbers[scored.best(max(top, MIN_COMPLETED_OBJECTS))]
             if len(rest := objects.other_rows(best, rows)):
                 rows = np.concatenate([rows, rest])
                 logits = np.concatenate([logits, self._logits(query.partials, rest)])
-                scored = objects.score(rows, logits, evidence, len(query.partials))
-            mass = self._mass(query.partials, scored.numbers, scored.logits, evidence)
-        ranked = [
-            RankedObject(
-                float(scored.logits[place]),
-                listed_photo(self.generation.rows[int(scored.rows[place])]),
-                objects.nearest_reference(scored, place, query.partials),
-            )
-            for place in scored.best(top).tolist()
-        ]
-        return ShardResult(len(rows), len(scored.numbers), ranked, mass, evidence.compared, clock.finish(1))
+                scored = objects.score(rows, logits, evidence, grasps)
+            scored = scored.with_others(objects.score_enrolled_only(evidence, grasps))
+            mass = self._mass(objects, query.partials, scored, evidence)
+        ranked = [self._ranked(objects, scored, place, query.partials) for place in scored.best(top).tolist()]
+        counts = objects.reference_counts
+        return ShardResult(len(rows), len(scored.numbers), ranked, mass, evidence.compared, counts, clock.finish(1))
 
-    def object_logit(self, number: int, partials: Floats) -> float:
-        """Return the logit of an object for grasps, by all its photos and reference touches, without openings.
+    def _ranked(self, objects: Objects, scored: ScoredObjects, place: int, partials: Floats) -> RankedObject:
+        row, nearest = int(scored.rows[place]), objects.nearest_reference(scored, place, partials)
+        if row < 0 and nearest is not None:  # a gel image in place of a photo
+            photo = objects.gel_images[nearest.touch[0]]
+        else:
+            photo = listed_photo(self.generation.rows[row])
+        return RankedObject(float(scored.logits[place]), photo, nearest)
+
+    def object_logits(self, name: str, partials: Floats) -> list[float]:
+        """Return the logits (G,) of an object for the first grasp, the first two, and so on, without openings.
+
+        All its photos and reference touches count. Raises BadInput for an object that was removed.
 
         Args:
-            number: Number of the object (`Rows.find_object`).
+            name: The object.
             partials: (G, touch_partial_width) partial activations of the grasps.
         """
-        rows = self.objects.other_rows(np.array([number]), np.zeros(0, dtype=np.int64))
-        evidence = self.objects.compare_references(partials)
-        scored = self.objects.score(rows, self._logits(partials, rows), evidence, len(partials))
-        return float(scored.logits[0])
+        objects, logits = self.objects, list[float]()
+        if (number := objects.find(name)) < 0:
+            raise BadInput(f"the object {name!r} was removed from the index in the meantime")
+        rows = objects.other_rows(np.array([number]), np.zeros(0, dtype=np.int64))
+        for grasps in range(1, len(partials) + 1):
+            some = partials[:grasps]
+            evidence = objects.compare_references(some)
+            if len(rows):
+                scored = objects.score(rows, self._logits(some, rows), evidence, grasps)
+            else:
+                scored = objects.score_enrolled_only(evidence, grasps)
+            logits += scored.logits[scored.numbers == number].tolist()
+        return logits
 
     def photos(self, paths: Sequence[str]) -> list[ListedPhoto | None]:
         """Return the photo with each path, or a reference touch's gel image; None if missing."""
-        rows, found = self.generation.rows, list[ListedPhoto | None]()
+        rows, images, found = self.generation.rows, self.objects.gel_images, list[ListedPhoto | None]()
         for path in paths:
             # For an object without photos, the index has a gel image as a row, in place of a photo.
-            image, number = self.objects.gel_images.get(path), rows.find(path)
+            image, number = images.get(path), rows.find(path)
             found.append(image if image is not None or number < 0 else listed_photo(rows[number]))
         return found
 
     def names_like(self, name: str) -> list[str]:
         """Return the objects that a person can mean by this name (`Rows.names_like`)."""
-        return self.generation.rows.names_like(name)
+        return self.objects.names_like(name)
 
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
         """Return a page of the photos that contain all words in object, path or metadata.
@@ -178,7 +210,7 @@ class FolderShard:
             for row in self.generation.rows
         ]
 
-    def _candidates(self, embeddings: Floats, evidence: ReferenceEvidence, k: int) -> Rows:
+    def _candidates(self, objects: Objects, embeddings: Floats, evidence: ReferenceEvidence, k: int) -> Rows:
         """Return the rows to score.
 
         These are the k photos nearest to all grasps together, and photos of the k objects that are most likely by
@@ -187,8 +219,8 @@ class FolderShard:
         if not self._has_embeddings or k >= self.generation.count:
             return np.arange(self.generation.count)
         rows = np.sort(self.generation.index.candidates(combined_embedding(embeddings), k)[0])
-        nearest = self.objects.nearest_by_reference(evidence, k)
-        return np.union1d(rows, self.objects.other_rows(nearest, rows)) if len(nearest) else rows
+        nearest = objects.nearest_by_reference(evidence, k)
+        return np.union1d(rows, objects.other_rows(nearest, rows)) if len(nearest) else rows
 
     def _logits(self, partials: Floats, rows: Rows) -> Floats:
         """Return the match logits of the rows, summed over grasps."""
@@ -196,16 +228,15 @@ class FolderShard:
         return self.scorer.logits(partials, StoredPartials(self.generation.arrays), None if every else rows)
 
     def _mass(
-        self, partials: Floats, scored: Rows, logits: NDArray[np.float64], evidence: ReferenceEvidence
+        self, objects: Objects, partials: Floats, scored: ScoredObjects, evidence: ReferenceEvidence
     ) -> EvidenceMass:
-        """Return the evidence mass of all objects, of which those in `scored` have these logits."""
+        """Return the evidence mass of all objects, of which some are scored."""
         # A sample of unscored objects estimates their mass. Without a sample, use the lowest logit of the scored ones,
         # an upper estimate: unscored objects are expected to be worse than candidates.
-        sample = logits.min(keepdims=True)
-        if len(scored) < self.objects.count and len(rows := self.objects.sample_rows_without(scored)):
-            sample = self.objects.score(rows, self._logits(partials, rows), evidence, len(partials)).logits
-        unscored = self.objects.count - len(scored)
-        return self.objects.posterior.mass(logits, len(partials), unscored=unscored, sample=sample)
+        sample, unscored = scored.logits.min(keepdims=True), objects.count - len(scored.numbers)
+        if unscored and len(rows := objects.sample_rows_without(scored.numbers)):
+            sample = objects.score(rows, self._logits(partials, rows), evidence, len(partials)).logits
+        return objects.posterior.mass(scored.logits, len(partials), unscored=unscored, sample=sample)
 
 
 def combined_embedding(embeddings: Floats) -> Floats:
@@ -246,6 +277,7 @@ class Shards:
             sorted(best, key=lambda one: (-one.logit, one.photo.object_id))[:top],
             EvidenceMass.merged([result.mass for result in results]),
             sum(result.compared_openings for result in results),
+            (sum(result.references[0] for result in results), sum(result.references[1] for result in results)),
             {stage: max(result.timing_ms[stage] for result in results) for stage in results[0].timing_ms},
         )
 

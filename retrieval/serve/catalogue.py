@@ -76,7 +76,7 @@ def photo(
     headers = {"etag": f'"{listed.digest}-{px}"', "cache-control": "private, no-cache"}
     if request.headers.get("if-none-match") == headers["etag"]:
         return Response(status_code=304, headers=headers)
-    path = generation.searcher.catalogue / listed.path
+    path = generation.searcher.picture_file(listed)
     try:
         data = read_bytes(path, listed.digest) if px is None else b""
         if not data.startswith(tuple(IMAGE_TYPES)):

@@ -117,7 +117,9 @@ class Decoders:
                 task.add_done_callback(self._ending.discard)
         if "error" in document:
             raise ImageError(document["name"], document["error"])
-        return document["pixels"] if document else GelImage(np.frombuffer(content, np.float32).reshape(px, px, 3))
+        if document:
+            return int(document["pixels"])
+        return GelImage(np.frombuffer(content, np.float32).reshape(px, px, 3), data)
 
 
 class _Process:
