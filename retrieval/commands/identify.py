@@ -126,11 +126,12 @@ class _Run:
 
     def is_enough(self, grasps: Sequence["RecordedGrasp"]) -> bool:
         """Answer from all grasps so far, print the answer, and return whether it is final."""
+        from retrieval.data.opening import believed
         from retrieval.model.gel_check import NOT_A_GEL
         from retrieval.model.verification import ACCEPT, REJECT
 
         self.heights_mm[:] = [grasp.pose[2] for grasp in grasps if grasp.pose is not None]
-        touches, seen = list[list[Path]](), set[bytes]()
+        touches, openings_mm, seen = list[list[Path]](), list[float | None](), set[bytes]()
         for grasp in grasps:
             files = self._files(grasp.touches)
             pictures = {file.read_bytes() for file in files}
@@ -138,10 +139,11 @@ class _Run:
                 say(f"{grasp.grasp_id} repeats a picture of an earlier grasp and does not count; check the gel cameras")
             else:
                 touches.append(files)
+                openings_mm.append(believed(grasp.opening_mm))
             seen |= pictures
         background = self._files(grasps[-1].touches_before) if self.searcher.reader.takes_background else None
         if self.expect is None:
-            self.answer = self.searcher.query(touches, background=background)
+            self.answer = self.searcher.query(touches, opening_mm=openings_mm, background=background)
             none, results = self.answer.none_probability, self.answer.results
             is_final = none is not None and max(none, results[0].probability or 0.0) >= self.confidence
         else:

@@ -46,3 +46,9 @@ def require_opening(value: object, name: str) -> float:
     raise BadInput(
         f"{name} must be the distance between the fingers in millimetres, from {low:g} to {high:g}; got {value!r}{hint}"
     )
+
+
+def believed(opening_mm: float | None) -> float | None:
+    """Return an opening that a gripper measured; None for one outside `RANGE_MM`."""
+    low, high = RANGE_MM
+    return opening_mm if opening_mm is not None and low <= opening_mm <= high else None

@@ -1,6 +1,7 @@
 """Client of the service: `Searcher.query` for an index on another machine."""
 
 import base64
+import math
 import os
 import time
 from collections.abc import Sequence
@@ -13,6 +14,7 @@ import numpy as np
 from PIL import Image
 
 from retrieval.data.images import encode_image, read_bytes
+from retrieval.data.opening import Openings, parse_openings
 from retrieval.errors import BadInput, ImageError, RetrievalError
 from retrieval.model.touches import AnyImage, AnyTouches, GelImage, InputImage, parse_grasps, read_image
 from retrieval.search.answer import Match, QueryResult
@@ -28,7 +30,7 @@ _BAD_INPUT_KINDS = frozenset(
 
 
 class QueryOptions(TypedDict, total=False):
-    """The keyword arguments of `Searcher.query`, with the same meanings and defaults."""
+    """The other keyword arguments of `Searcher.query`, with the same meanings and defaults."""
 
     background: Sequence[AnyImage] | None
     top: int
@@ -71,7 +73,9 @@ class Client:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def query(self, touches: AnyTouches, **options: Unpack[QueryOptions]) -> QueryResult:
+    def query(
+        self, touches: AnyTouches, *, opening_mm: Openings = None, **options: Unpack[QueryOptions]
+    ) -> QueryResult:
         """Run `Searcher.query` on the service; paths of touches refer to this machine.
 
         `Match.photo_path` of the result refers to the other machine; `photo` returns the picture.
@@ -82,18 +86,21 @@ class Client:
             RetrievalError: No answer is available.
         """
         grasps = self._grasps(touches)
-        body: dict[str, Any] = {**options, "touches": [_encoded(grasp) for grasp in grasps]}
-        if (frames := options.get("background")) is not None:
-            body["background"] = _encoded(
-                [InputImage(image, f"background {number}") for number, image in enumerate(frames, start=1)]
-            )
+        body = {**options, **_pictures(grasps, options.get("background"), opening_mm)}
         result = QueryResult.from_dict(_document(self._send("POST", "query", json=body)))
         names = [[image.name for image in grasp] for grasp in grasps]  # those of this machine
         return replace(result, touches=names[: len(result.touches)])
 
-    def query_many(self, objects: Sequence[AnyTouches], **options: Unpack[QueryOptions]) -> list[QueryResult]:
-        """Run `query` for each object."""
-        return [self.query(touches, **options) for touches in objects]
+    def query_many(
+        self,
+        objects: Sequence[AnyTouches],
+        *,
+        opening_mm: Sequence[Openings] | None = None,
+        **options: Unpack[QueryOptions],
+    ) -> list[QueryResult]:
+        """Run `query` for each object, with its openings."""
+        openings = [None] * len(objects) if opening_mm is None else opening_mm
+        return [self.query(touches, opening_mm=one, **options) for touches, one in zip(objects, openings, strict=True)]
 
     def photo(self, match: Match) -> bytes:
         """Return the file of a match's photo.
@@ -147,6 +154,19 @@ def _error(response: httpx.Response) -> RetrievalError:
         name, _, reason = detail.partition(": ")
         return ImageError(name, reason)
     return BadInput(detail) if kind in _BAD_INPUT_KINDS else RetrievalError(detail)
+
+
+def _pictures(
+    grasps: Sequence[Sequence[InputImage]], background: Sequence[AnyImage] | None, opening_mm: Openings
+) -> dict[str, Any]:
+    """Return the part of a body that describes the grasps."""
+    frames = [InputImage(image, f"background {number}") for number, image in enumerate(background or (), start=1)]
+    openings = parse_openings(opening_mm, len(grasps)).tolist()
+    return {
+        "touches": [_encoded(grasp) for grasp in grasps],
+        "background": None if background is None else _encoded(frames),
+        "opening_mm": [None if math.isnan(opening) else opening for opening in openings],
+    }
 
 
 def _encoded(images: Sequence[InputImage]) -> list[str]:

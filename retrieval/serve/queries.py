@@ -92,7 +92,8 @@ async def grasp(
 ) -> dict[str, Any]:
     """Grasp one of the catalogue's objects: the named one, else a random one.
 
-    The rig makes one grasp at a time. touches, background: a PNG file in base64 for each finger; object_id: the object.
+    The rig makes one grasp at a time. touches, background: a PNG file in base64 for each finger; object_id: the object;
+    opening_mm: the opening of the jaws, null if the gripper does not measure it.
     """
     close = parts.rig.grasp
     if close is None:
@@ -108,7 +109,12 @@ async def grasp(
         return [base64.b64encode(data).decode("ascii") for data in images]
 
     background = grasped.background and encoded(grasped.background)
-    return {"object_id": grasped.object_id, "touches": encoded(grasped.touches), "background": background}
+    return {
+        "object_id": grasped.object_id,
+        "touches": encoded(grasped.touches),
+        "background": background,
+        "opening_mm": grasped.opening_mm,
+    }
 
 
 def _object_ids(generation: ServedGeneration, name: str | None) -> list[str]:

@@ -17,6 +17,7 @@ from indexes.errors import IndexesError
 from indexes.store.folder import IndexStore
 from indexes.store.sharded import is_sharded, read_sharded_manifest
 from retrieval.data.images import encode_image
+from retrieval.data.opening import believed
 from retrieval.errors import BadInput
 from retrieval.serve.service import GraspResult, LiveRig
 from robot.devices import TactileSensor
@@ -96,7 +97,9 @@ class _SimulatedGripper:
                     fingers = sorted(self._rig.sensors)
                     self._gels = {finger: grasped[f"touch_{finger}"] for finger in fingers}
                     before = [encode_image(grasped[f"touch_{finger}_before"]) for finger in fingers]
-                    return GraspResult(name, [encode_image(self._gels[finger]) for finger in fingers], before)
+                    touches = [encode_image(self._gels[finger]) for finger in fingers]
+                    opening_mm = believed(self._rig.sim_state.current_scene().pinch.final_opening_mm)
+                    return GraspResult(name, touches, before, opening_mm)
         raise BadInput(f"{_MAX_ATTEMPTS} grasps in a row missed the object. Try again.")
 
     def picture(self, finger: str) -> bytes:

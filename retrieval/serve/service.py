@@ -28,11 +28,13 @@ class GraspResult:
         object_id: Name of the grasped object.
         touches: PNG file of each finger's gel image, in finger order.
         background: PNG file of each finger's no-contact frame; None if the rig has none.
+        opening_mm: Opening of the jaws that the gripper measures; None if it measures none.
     """
 
     object_id: str
     touches: list[bytes]
     background: list[bytes] | None = None
+    opening_mm: float | None = None
 
 
 @dataclass(frozen=True)

@@ -200,11 +200,11 @@ class HistoryStore:
         found = self._read("SELECT query FROM feedback WHERE photo IS NOT NULL ORDER BY time, query")
         return [name for (name,) in found]
 
-    def feedback(self, name: str) -> tuple[str, bytes, list[str]]:
-        """Return the object of a recordable query, its photo, and the gel check of each grasp."""
+    def feedback(self, name: str) -> tuple[str, bytes, dict[str, Any]]:
+        """Return the object of a recordable query, its photo, and the query as its answer describes it."""
         text = "SELECT object_id, photo, answer FROM feedback JOIN queries ON id = query WHERE query = ?"
         ((object_id, photo, answer),) = self._read(text, [name])
-        return object_id, photo, json.loads(answer)["query"]["grasps"]
+        return object_id, photo, json.loads(answer)["query"]
 
 
 _COLUMNS = "id, queries.time, verdict, answer, feedback, object_id"
@@ -265,9 +265,9 @@ class HistoryWriter:
 
     def _record(self, query_id: str) -> None:
         """Record each grasp with contact; the first one last, because `is_recorded` checks only that one."""
-        object_id, photo, gel_checks = self.store.feedback(query_id)
-        pictures = self.store.pictures(query_id)
-        contact_grasps = [number for number, gel_check in enumerate(gel_checks, start=1) if gel_check == CONTACT]
+        object_id, photo, query = self.store.feedback(query_id)
+        pictures, openings = self.store.pictures(query_id), query.get("opening_mm") or [None] * len(query["grasps"])
+        contact_grasps = [number for number, gel_check in enumerate(query["grasps"], start=1) if gel_check == CONTACT]
         for place, number in reversed(list(enumerate(contact_grasps))):
             grasp_id = f"{query_id}-{place:02}"
             if grasp_id in self._recorder.grasp_ids:
@@ -276,7 +276,8 @@ class HistoryWriter:
             for (grasp, finger), data in pictures.items():
                 if grasp in endings:
                     images[f"touch_{finger}{endings[grasp]}"] = as_png_or_jpeg(data)
-            self._recorder.append(grasp_id, object_id, images, grasped=True, sequence_id=query_id)
+            fields = {"grasped": True, "opening_mm": openings[number - 1], "sequence_id": query_id}
+            self._recorder.append(grasp_id, object_id, images, **fields)
 
 
 def as_png_or_jpeg(data: bytes) -> bytes:

@@ -1,7 +1,8 @@
 """Parsing of request bodies, and limits on their size and time. The limits apply before memory is used.
 
-application/json      {"touches": [["<base64>", "<base64>"], ...], "background": [...], "top": 10, ...}
-multipart/form-data   gelsight, once for each image, fingers in their order, grasp after grasp; background; top; ...
+application/json      {"touches": [["<base64>", "<base64>"], ...], "background": [...], "opening_mm": [...], ...}
+multipart/form-data   gelsight, once for each image, fingers in their order, grasp after grasp; background; opening_mm,
+                      once for each grasp; top; ...
 """
 
 import asyncio
@@ -23,17 +24,17 @@ from retrieval.model.touches import GelImage
 from retrieval.serve.errors import HttpProblem, validation_message
 from retrieval.serve.settings import MAX_BODY_BYTES, MAX_PICTURES, MAX_SMALL_BODY_BYTES
 
-PICTURE_PATHS = frozenset({"/v1/query", "/v1/verify"})
+PICTURE_PATHS = re.compile(r"/v1/(query|verify|objects/.+/touches)", re.DOTALL)
 """Routes whose bodies contain pictures: up to `MAX_BODY_BYTES`. All others: up to `MAX_SMALL_BODY_BYTES`."""
 MAX_HELD_BYTES = 60_000_000
 """Maximum total size of the bodies in memory."""
 MAX_JSON_VALUES = 2_000
 """Maximum number of JSON values of a body. A body with `MAX_PICTURES` pictures as data URLs, each in its own lists, and
 with all options is counted with fewer than 1,200."""
-MAX_FIELDS, MAX_FIELD_BYTES = 8, 1024
+MAX_GRASPS = 32
+MAX_FIELDS, MAX_FIELD_BYTES = 8 + MAX_GRASPS, 1024
 """Maximum number of the options in a form, and maximum size of each."""
 Body = TypeVar("Body", bound=BaseModel)
-MAX_GRASPS = 32
 _CLOSE = {"connection": "close"}  # the rest of the body is not read
 
 
@@ -48,7 +49,7 @@ class BodyLimit:
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        max_bytes = MAX_BODY_BYTES if scope["path"] in PICTURE_PATHS else MAX_SMALL_BODY_BYTES
+        max_bytes = MAX_BODY_BYTES if PICTURE_PATHS.fullmatch(scope["path"]) else MAX_SMALL_BODY_BYTES
         announced = Headers(scope=scope).get("content-length", "0")
         if announced.isdecimal() and int(announced[:20]) > max_bytes:
             await too_large(max_bytes).response()(scope, receive, send)
@@ -107,6 +108,10 @@ def _decoded(text: Any) -> bytes:
 _SCHEMA = {"type": "string", "contentEncoding": "base64", "description": "An image file in base64, or its data URL."}
 Base64Image = Annotated[bytes, PlainValidator(_decoded), WithJsonSchema(_SCHEMA)]
 Grasps = Annotated[list[Annotated[list[Base64Image], Field(min_length=1)]], Field(min_length=1, max_length=MAX_GRASPS)]
+Openings = Annotated[
+    list[Annotated[float, Field(gt=0)] | None] | None,
+    Field(max_length=MAX_GRASPS, description="Opening of the jaws in mm for each grasp, null if not measured."),
+]
 
 
 class RequestBody(BaseModel):
@@ -125,6 +130,7 @@ class Options(RequestBody):
     none_prior: float = Field(
         NONE_PRIOR, gt=0, lt=1, description="Prior probability that the catalogue lacks the object."
     )
+    opening_mm: Openings = None
 
 
 class QueryBody(Options):
@@ -254,7 +260,7 @@ def _invalid(error: ValidationError) -> HttpProblem:
 
 async def _read_form(request: Request, fingers: int) -> tuple[RequestPictures, Options]:
     files: dict[str, list[bytes]] = {"gelsight": [], "background": []}
-    fields: dict[str, str] = {}
+    fields: dict[str, Any] = {}
     limits = {"max_files": MAX_PICTURES, "max_fields": MAX_FIELDS, "max_part_size": MAX_FIELD_BYTES}
     async with request.form(**limits) as form:
         for name, value in form.multi_items():
@@ -262,7 +268,9 @@ async def _read_form(request: Request, fingers: int) -> tuple[RequestPictures, O
                 raise HttpProblem(
                     "bad-input", f"{name[:100]!r}: gelsight and background must be files, and all others text."
                 )
-            if isinstance(value, str):
+            if name == "opening_mm":
+                fields.setdefault(name, []).append(value or None)
+            elif isinstance(value, str):
                 fields[name] = value
             else:
                 files[name].append(await value.read())

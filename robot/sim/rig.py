@@ -221,6 +221,7 @@ class SimRig(Rig):
 
         Returns:
             The gel images of each finger, pressed and before (touch_a, touch_a_before, ...); empty if the jaws miss.
+            `sim_state` holds the scene of the grasp.
         """
         self.prepare(object_id, number)
         scene = self.sim_state.current_scene()
@@ -230,7 +231,7 @@ class SimRig(Rig):
         lowest = max(settings.floor_mm, height - settings.reach_mm)
         z = rng.uniform(lowest, max(lowest, height - settings.top_margin_mm))
         pose = Pose(float(x), float(y), float(z), float(rng.uniform(0.0, math.pi)))
-        scene = replace(scene, grip=Grip(pose, float(rng.uniform(*settings.force_n))))
+        self.sim_state.scene = scene = replace(scene, grip=Grip(pose, float(rng.uniform(*settings.force_n))))
         if scene.pinch.miss_reason:
             return {}
         names = [f"touch_{finger}{moment}" for finger in sorted(self.sensors) for moment in ("", "_before")]

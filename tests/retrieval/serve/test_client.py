@@ -50,6 +50,7 @@ def test_the_client_answers_like_the_searcher_for_images_of_every_kind(client, s
         expected = searcher.query(each, top=3)
         assert without_times(found) == without_times(expected)
         assert found.results == expected.results  # photo_path too: both run on one machine
+    assert client.query(two_grasps, opening_mm=[None, 40.5]).opening_mm == [None, 40.5]
     assert client.photo(found.results[0]) == found.results[0].photo_path.read_bytes()
 
 

@@ -68,7 +68,7 @@ def test_the_history_stores_answers_and_gel_images_and_is_paged_from_the_newest_
 def test_feedback_becomes_a_readable_recording(client, touches, folder, catalogue):
     names = sorted(touches)
     for name, grasps in touches.items():
-        query, _ = ask(client, grasps)
+        query, _ = ask(client, grasps, opening_mm=[31.5, None])
         response = add_feedback(client, query, "object", name)
         assert (response.status_code, response.json()["recorded"]) == (201, True)
     recorded = load_grasps(folder / "recording")
@@ -76,6 +76,7 @@ def test_feedback_becomes_a_readable_recording(client, touches, folder, catalogu
     for grasp in recorded:
         place = int(grasp.grasp_id[-2:])
         assert [path.read_bytes() for path in grasp.touches] == touches[grasp.object_id][place]
+        assert grasp.opening_mm == [31.5, None][place]
         assert grasp.photo.read_bytes() in [path.read_bytes() for path in (catalogue / grasp.object_id).iterdir()]
     assert not [found for found in check_recording(folder / "recording") if found.severity == "error"]
 

@@ -34,10 +34,12 @@ def without_times(document):
 
 
 def test_json_and_multipart_give_the_document_of_the_searcher(client, searcher, grasps):
-    for touches in (grasps[:1], grasps):
-        expected = without_times(searcher.query(touches, top=3, none_prior=0.2).to_dict())
-        by_json = client.post("/v1/query", json={"touches": encoded(touches), "top": 3, "none_prior": 0.2})
-        by_form = client.post("/v1/query", **form(touches, top="3", none_prior="0.2"))
+    for touches, openings in ((grasps[:1], None), (grasps, [None, 40.5])):
+        expected = without_times(searcher.query(touches, opening_mm=openings, top=3, none_prior=0.2).to_dict())
+        options = {"opening_mm": openings, "top": 3, "none_prior": 0.2}
+        by_json = client.post("/v1/query", json={"touches": encoded(touches), **options})
+        fields = {"opening_mm": ["", "40.5"]} if openings else {}
+        by_form = client.post("/v1/query", **form(touches, top="3", none_prior="0.2", **fields))
         assert without_times(by_json.json()) == without_times(by_form.json()) == expected
 
 

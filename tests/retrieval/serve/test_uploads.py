@@ -94,7 +94,7 @@ FORM = {"content-type": "multipart/form-data; boundary=x"}
 OPTION = b'\r\n--x\r\ncontent-disposition: form-data; name="top"\r\n\r\n3'
 FILE = b'\r\n--x\r\ncontent-disposition: form-data; name="gelsight"; filename="a"\r\n\r\n3'
 FORMS = {
-    "fields": (OPTION * 300_000 + b"\r\n--x--", 400, "Maximum number of fields is 8"),
+    "fields": (OPTION * 300_000 + b"\r\n--x--", 400, "Maximum number of fields is 40"),
     "files": (FILE * 200_000 + b"\r\n--x--", 400, "Maximum number of files is 128"),
     "headers": (b"--x\r\n" + b"a: b\r\n" * 3_000_000 + OPTION + b"\r\n--x--", 400, "Invalid multipart data"),
     "partial boundaries": (

@@ -4,6 +4,7 @@ import { thumbnailURL } from "./api.js";
 import { h, picture } from "./dom.js";
 import { openDetail } from "./detail.js";
 import { feedbackPanel } from "./feedback.js";
+import { rememberPanel } from "./remember.js";
 import { count, nearness, percent, verdict } from "./wording.js";
 
 const MIN_SHOWN = 0.0005;
@@ -18,6 +19,7 @@ export function answerPanel({ index, answer, id, query, stored = null }) {
     { class: "answer" },
     verdictBlock(answer, query.graspedObject),
     index.stores_history && id && feedbackPanel(answer, id, stored),
+    index.can_enrol && answer.results.length > 0 && rememberPanel(answer, query),
     parts.length > 0 && answer.none_probability !== null && strip(parts),
     parts.length > 0 &&
       h(

@@ -52,8 +52,10 @@ function withParameters(path, parameters) {
 }
 
 /** The form with the pictures and options of a query. */
-function form(touches, background, options) {
+function form(touches, background, openings, options) {
   const body = new FormData();
+  if (openings.some((opening) => opening !== null))
+    openings.forEach((opening) => body.append("opening_mm", opening ?? ""));
   touches.flat().forEach((blob, place) => body.append("gelsight", blob, blob.name ?? `touch-${place}.png`));
   background?.forEach((blob, place) => body.append("background", blob, blob.name ?? `background-${place}.png`));
   Object.entries(options).forEach(([name, value]) => value !== null && body.append(name, String(value)));
@@ -85,8 +87,8 @@ export const blob = async (path) => (await reply(path)).blob();
 export const frame = (name) => blob(`v1/sensors/${encodeURIComponent(name)}/frame`);
 
 /** The answer to touches, and its id in the history, null if no history is stored. */
-export async function query(touches, background, options) {
-  const response = await reply("v1/query", form(touches, background, options));
+export async function query(touches, background, openings, options) {
+  const response = await reply("v1/query", form(touches, background, openings, options));
   return { answer: await response.json(), id: response.headers.get("x-query-id") };
 }
 
@@ -97,6 +99,7 @@ export async function grasp(objectId = null) {
     objectId: result.object_id,
     touches: result.touches.map(decoded),
     background: result.background?.map(decoded) ?? null,
+    opening_mm: result.opening_mm,
   };
 }
 
@@ -109,6 +112,13 @@ async function postTouches(path, touches, background, values) {
 
 export const verify = (expect, touches, background, far) =>
   postTouches("v1/verify", touches, background, { expect, far });
+
+const enrolled = (objectId) => `v1/objects/${encodedPath(objectId)}/touches`;
+/** Remember touches of an object. */
+export const enrol = (objectId, touches, background, opening_mm) =>
+  postTouches(enrolled(objectId), touches, background, { opening_mm });
+export const forget = (objectId, added) =>
+  json(withParameters(enrolled(objectId), { touch: added }), { method: "DELETE" });
 
 export const catalogue = (parameters, signal = null) => json(withParameters("v1/catalogue", parameters), { signal });
 

@@ -98,7 +98,7 @@ export function askView(index) {
       const grasp = await api.grasp(objectId);
       if (!objectId) tray.clear();
       graspedObject = grasp.objectId;
-      tray.addGrasp(grasp.touches);
+      tray.addGrasp(grasp.touches, grasp.opening_mm);
       if (subtracts) grasp.background?.forEach((blob, place) => tray.putBackground(place, blob));
       await ask();
     } catch (error) {
@@ -113,6 +113,7 @@ export function askView(index) {
     asking?.abort();
     const own = (asking = new AbortController());
     const touches = tray.grasps.map((grasp) => [...grasp]);
+    const openings = [...tray.openings];
     const background = tray.noContactFrames;
     const object = expected.value();
     askButton.disabled = true;
@@ -126,7 +127,7 @@ export function askView(index) {
       ),
     );
     try {
-      const asked = object ? verify(object, touches, background) : search(touches, background);
+      const asked = object ? verify(object, touches, background) : search(touches, background, openings);
       const { grasps, panel, text } = await asked;
       if (own.signal.aborted) return;
       tray.marks = grasps;
@@ -143,10 +144,10 @@ export function askView(index) {
     }
   }
 
-  async function search(touches, background) {
+  async function search(touches, background, openings) {
     const { far, ...searchOptions } = options;
-    const { answer, id } = await api.query(touches, background, searchOptions);
-    const query = { touches, background, options: searchOptions, graspedObject };
+    const { answer, id } = await api.query(touches, background, openings, searchOptions);
+    const query = { touches, background, openings, options: searchOptions, graspedObject };
     return { grasps: answer.query.grasps, panel: () => answerPanel({ index, answer, id, query }), text: verdict(answer) };
   }
 
@@ -164,7 +165,8 @@ export function askView(index) {
       const background = subtracts ? await api.noContactFrames(id, touches[0].map((_, place) => finger(place))) : null;
       tray.clear();
       graspedObject = null;
-      touches.forEach((grasp) => tray.addGrasp(grasp));
+      const openings = stored.answer.query.opening_mm ?? touches.map(() => null);
+      touches.forEach((grasp, place) => tray.addGrasp(grasp, openings[place]));
       background?.forEach((blob, place) => tray.putBackground(place, blob));
       tray.marks = stored.answer.query.grasps;
       cards.replaceChildren(...trayCards(tray));
@@ -174,7 +176,7 @@ export function askView(index) {
           index,
           answer: stored.answer,
           id,
-          query: { touches, background, options: { ...options, none_prior }, graspedObject: null },
+          query: { touches, background, openings, options: { ...options, none_prior }, graspedObject: null },
           stored,
         }),
       );
@@ -243,14 +245,28 @@ function optionsPanel(index, tray, options) {
         );
       }),
     );
-  tray.addEventListener("change", showFrames);
-  showFrames();
+  const openings = h("div", { class: "openings" });
+  const showOpenings = () =>
+    openings.replaceChildren(
+      ...tray.openings.map((opening, place) => {
+        const id = `opening-${place + 1}`;
+        const input = h("input", { id, type: "number", min: "0.01", step: "any", value: opening?.toFixed(2) ?? "" });
+        input.addEventListener("change", () => {
+          if (input.reportValidity()) tray.openings[place] = input.value === "" ? null : Number(input.value);
+        });
+        return h("div", { class: "option" }, h("label", { for: id }, `Opening of the jaws in mm, grasp ${place + 1}`), input);
+      }),
+    );
+  const show = () => (showFrames(), showOpenings());
+  tray.addEventListener("change", show);
+  show();
   return h(
     "details",
     { class: "options" },
     h("summary", {}, "Options"),
     h("p", { class: "muted" }, "No-contact frames: pictures of the gels before contact."),
     frames,
+    openings,
     number("top", "Objects to show", { min: "1", max: "100", step: "1" }, Number),
     number("candidates", "Photos to score (empty: the index's own number)", { min: "1", step: "1" }, Number),
     number(

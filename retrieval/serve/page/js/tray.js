@@ -48,6 +48,7 @@ export class Tray extends EventTarget {
     this.fingers = fingers;
     this.background = Array(fingers).fill(null);
     this.grasps = [];
+    this.openings = []; // of the jaws in mm, null where it is not known
     this.marks = [];
     this.rejected = [];
   }
@@ -74,18 +75,19 @@ export class Tray extends EventTarget {
   }
 
   /** Add a grasp; missing pictures can follow. */
-  addGrasp(pictures) {
+  addGrasp(pictures, opening_mm = null) {
     this.rejected = [];
-    this._append(pictures);
+    this._append(pictures, opening_mm);
     this._changed();
   }
 
-  _append(pictures) {
+  _append(pictures, opening_mm = null) {
     if (this.grasps.length === MAX_GRASPS) {
       this.rejected.push(`A query can have at most ${MAX_GRASPS} grasps.`);
       return;
     }
     this.grasps.push(Array.from({ length: this.fingers }, (_, place) => pictures[place] ?? null));
+    this.openings.push(opening_mm);
   }
 
   put(grasp, place, blob) {
@@ -102,12 +104,13 @@ export class Tray extends EventTarget {
   /** Remove a picture, and the grasp if it was the last one. */
   remove(grasp, place) {
     this.grasps[grasp][place] = null;
-    if (!this.grasps[grasp].some(Boolean)) this.grasps.splice(grasp, 1);
-    this._changed();
+    if (this.grasps[grasp].some(Boolean)) this._changed();
+    else this.removeGrasp(grasp);
   }
 
   removeGrasp(grasp) {
     this.grasps.splice(grasp, 1);
+    this.openings.splice(grasp, 1);
     this._changed();
   }
 
@@ -119,6 +122,7 @@ export class Tray extends EventTarget {
 
   clear() {
     this.grasps = [];
+    this.openings = [];
     this.background = Array(this.fingers).fill(null);
     this.rejected = [];
     this._changed();

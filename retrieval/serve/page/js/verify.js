@@ -4,10 +4,17 @@ import * as api from "./api.js";
 import { debounce, h } from "./dom.js";
 import { logRatio, percent, verificationVerdict } from "./wording.js";
 
-/** A text field that suggests objects of the catalogue; empty for a search. */
+/** The text field of the expected object; empty for a search. */
 export function expectedField(onChange) {
-  const suggestions = h("datalist", { id: "catalogue-objects" });
-  const field = h("input", { type: "text", id: "expected-object", list: "catalogue-objects", autocomplete: "off" });
+  const { element, field } = objectField("expected-object", "Expected object (empty: search the catalogue)");
+  field.addEventListener("input", onChange);
+  return { element, value: () => field.value.trim() };
+}
+
+/** A text field with its label that suggests objects of the catalogue. */
+export function objectField(id, text, value = "") {
+  const suggestions = h("datalist", { id: `${id}-names` });
+  const field = h("input", { type: "text", id, value, list: suggestions.id, autocomplete: "off", maxlength: "1000" });
   async function suggest() {
     const words = field.value.trim();
     const found = await api.catalogue({ search: words, limit: 200 }).catch(() => ({ items: [] }));
@@ -16,9 +23,7 @@ export function expectedField(onChange) {
   }
   field.addEventListener("focus", suggest);
   field.addEventListener("input", debounce(suggest));
-  field.addEventListener("input", onChange);
-  const label = h("label", { for: "expected-object" }, "Expected object (empty: search the catalogue)");
-  return { element: h("div", { class: "field expected" }, label, field, suggestions), value: () => field.value.trim() };
+  return { element: h("div", { class: "field expected" }, h("label", { for: id }, text), field, suggestions), field };
 }
 
 /** The panel of a verification: the decision, and its error rates. */
