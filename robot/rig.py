@@ -169,8 +169,19 @@ class Rig:
         self.attempt, self.object_fit = attempt or AttemptSettings(), object_fit
         self.planner = planner or load_planner({})
         self.planner.check(self)
+        self.session: str | None = None
         self._object_on_table: str | None = None
         self._connected = contextlib.ExitStack()
+
+    def begin_session(self, session: str, first_attempts: Mapping[str, int], stride: int) -> None:
+        """Begin a session: a real rig drifts by itself, a simulated one by these values.
+
+        Args:
+            session: Name of the session.
+            first_attempts: Number of attempts in the session before the first one at each object, about.
+            stride: Number of attempts from one at an object to its next, about.
+        """
+        self.session = session
 
     @property
     def devices(self) -> tuple[Device, ...]:

@@ -21,7 +21,7 @@ from robot.recording.folder import UNITS
 from robot.rig import Rig, load_planner
 from robot.settings import TypedSettings
 from robot.sim.camera import PinholeCamera, Placement
-from robot.sim.gel.sensor import draw_sensor
+from robot.sim.gel.sensor import GelSensor, draw_sensor, drift
 from robot.sim.objects.draw import STROKE_MM, SimObject, draw_object
 from robot.sim.objects.shapes import SHAPES
 from robot.sim.scene import PAD_MM, SIDES, Grip, Hand, Scene
@@ -88,6 +88,7 @@ class SimSettings(TypedSettings):
         contact_tolerance: tolerance of the contact solver.
         focal_px: focal length of the camera. Its pictures have 256 x 256 px. At the default of 860 px they show about
             190 mm; a larger object is cut off.
+        session: name of the session, which draws the drift of light, white balance and gels; "" for no drift.
         localisation_mm: range from which the error of the camera's calibration is drawn.
         grasp: the table [grasp], as for a real rig: random grasps (robot.grasping.settings.GraspSettings).
         attempt: the table [attempt]: speeds, waits, retries (robot.grasping.settings.AttemptSettings).
@@ -106,6 +107,7 @@ class SimSettings(TypedSettings):
     contact_grid: tuple[int, int] = (120, 160)
     contact_tolerance: Annotated[float, Meta(ge=1e-12, le=0.999)] = 1e-2
     focal_px: Annotated[float, Meta(ge=300, le=10_000)] = 860.0
+    session: str = ""
     localisation_mm: tuple[float, float] = (5.0, 10.0)
     grasp: Mapping[str, Any] = field(default_factory=dict)
     attempt: Mapping[str, Any] = field(default_factory=dict)
@@ -188,6 +190,8 @@ class SimRig(Rig):
             planner=load_planner(options.planner, "mesh" if self.meshes else "cylinder"),
         )
         self.attempt.grasp.check(self.arm, self.gripper)
+        if options.session:
+            self.begin_session(options.session, {}, 1)
 
     def object_ids(self, count: int) -> list[str]:
         """Return the first `count` objects; raise RobotConfigError if there are fewer meshes."""
@@ -195,8 +199,12 @@ class SimRig(Rig):
             return self.meshes.object_ids(count)
         return [_procedural(self._seed, index, self._families).object_id for index in range(count)]
 
+    def begin_session(self, session: str, first_attempts: Mapping[str, int], stride: int) -> None:
+        """Begin a session with its own drift of the gels; placements of objects do not depend on it."""
+        self.session, self._first_attempts, self._stride = session, first_attempts, stride
+
     def prepare(self, object_id: str, number: int) -> None:
-        """Place the object on the table at a random position and yaw, under new light."""
+        """Place the object on the table at a random position and yaw, under new light, with the gels of this time."""
         obj = self._find_object(object_id)
         name = zlib.crc32(object_id.encode())
         rng = np.random.default_rng([101, self._seed, name, number])
@@ -206,11 +214,18 @@ class SimRig(Rig):
             obj,
             placement,
             self._camera,
-            sensors=self._gels[name % len(self._gels)],
+            sensors=self._drifted(name % len(self._gels), object_id, number),
             hand=self._hand,
             seed=int(rng.integers(2**31)),
         )
         self.sim_state.now_s = number * _ATTEMPT_S
+
+    def _drifted(self, pair: int, object_id: str, number: int) -> dict[str, GelSensor]:
+        if self.session is None:
+            return self._gels[pair]
+        hours = (self._first_attempts.get(object_id, 0) + number * self._stride) * _ATTEMPT_S / 3600
+        seed = self._seed, zlib.crc32(self.session.encode()), pair
+        return {finger: drift(gel, (*seed, ord(finger)), hours) for finger, gel in self._gels[pair].items()}
 
     def labels(self, object_id: str) -> dict[str, float | bool | str]:
         """Return `SimObject.labels` of an object; raise RobotConfigError if the rig has none of this name."""

@@ -59,6 +59,7 @@ class GelSensor:
         blur_px: standard deviation of the camera's point spread.
         noise: camera noise.
         flaws: dust, hairs, grains and roughness, or None.
+        wear: flaws that a session adds, or None.
         markers: printed dots, or None.
         detail: resolution of the camera as a fraction of the picture's; the picture is scaled down and up again.
         jpeg_quality: quality (1 to 100) at which the camera compresses the picture; None: no compression.
@@ -72,6 +73,7 @@ class GelSensor:
     blur_px: float = 0.7
     noise: Noise = _PLAIN_NOISE
     flaws: Flaws | None = None
+    wear: Flaws | None = None
     markers: Markers | None = None
     detail: float = 1.0
     jpeg_quality: int | None = None
@@ -104,16 +106,14 @@ class GelSensor:
 
     def _render_surface(self, surface: Surface) -> Array:
         slope_x, slope_y = surface.slopes
-        darkening: Array | None = None
-        if self.flaws is not None:
-            darkening, right, down = flaw_maps(self.flaws, self.field)
-            slope_x, slope_y = slope_x + right, slope_y + down
+        darkening = np.ones((), np.float32)
+        for flaws in filter(None, (self.flaws, self.wear)):
+            darker, right, down = flaw_maps(flaws, self.field)
+            darkening, slope_x, slope_y = darkening * darker, slope_x + right, slope_y + down
         image = self.optics.colours(surface, (slope_x, slope_y))
         if self.markers is not None:
-            dots = marker_darkening(self.markers, surface)
-            darkening = dots if darkening is None else darkening * dots
-        if darkening is not None:
-            image *= darkening[..., None]
+            darkening = darkening * marker_darkening(self.markers, surface)
+        image *= darkening[..., None]
         image *= np.array(self.tint, np.float32) * np.float32(self.exposure)
         return cv2.GaussianBlur(image, (0, 0), self.blur_px) if self.blur_px > 0 else image
 
@@ -332,6 +332,55 @@ def _draw_backdrop(backdrop: GaussianBackdrop, gain: float, rng: np.random.Gener
         backdrop.width_y * wide_y,
         backdrop.slant_x + slant_x,
         backdrop.slant_y + slant_y,
+    )
+
+
+# Sessions ---------------------------------------------------------------------------------------------------
+
+# Measured on no-contact frames of real sensors, as logarithms of the mean colours of two sessions: EstimateModulus
+# (GelSight Wedge, three days) and PhysiCLeAR (GelSight Mini, two sittings). The change that all channels share has an
+# rms of 0.07 over the four pairs of sessions, that of a channel against the others 0.085, that of an 8 x 6 thumbnail
+# less its mean 2 to 15 grey levels. Within a session the mean colour spreads by 0.01 to 0.02, slowly in PhysiCLeAR.
+_LAMPS, _WHITE_BALANCE, _EXPOSURE = 0.05, 0.05, 0.03
+_WAVE, _PERIODS_H = 0.01, (0.5, 2.0, 8.0)
+
+
+def drift(sensor: GelSensor, seed: tuple[int, ...], hours: float) -> GelSensor:
+    """Return the sensor in a session: other lamps and white balance, a worn and dirty gel, and a slow change of colour.
+
+    Args:
+        sensor: the sensor without drift.
+        seed: seed of this sensor in this session.
+        hours: time since the session began.
+    """
+    rng = np.random.default_rng([*seed, 0xD41F7])
+    sizes, starts = _WAVE * rng.standard_normal((3, len(_PERIODS_H))), rng.uniform(size=(3, len(_PERIODS_H)))
+    slow = np.exp((sizes * np.sin(2 * math.pi * (starts + hours / np.array(_PERIODS_H)))).sum(axis=1))
+    begun = _begin_session(sensor, seed)
+    return replace(begun, tint=tuple((begun.tint * slow).tolist()))
+
+
+@lru_cache(maxsize=64)
+def _begin_session(sensor: GelSensor, seed: tuple[int, ...]) -> GelSensor:
+    rng = np.random.default_rng([*seed, 0x5E5510])
+    tint, exposure = np.exp(_WHITE_BALANCE * rng.standard_normal(3)), np.exp(_EXPOSURE * rng.standard_normal())
+    specks, hairs, grains = rng.poisson((8, 4, 6)).tolist()
+    wear = Flaws(int(rng.integers(1 << 31)), specks, hairs, grains, texture=0.0)
+    optics = sensor.optics
+    if isinstance(optics, LedOptics):  # a fitted sensor has no lamps: tint and exposure are their drift
+        light = np.array(optics.mix) * np.exp(_LAMPS * rng.standard_normal(len(optics.bars)))
+        gains, seed_of = light.sum(axis=1), dict(zip(optics.backdrops, rng.integers(1 << 31, size=3), strict=True))
+        optics = replace(
+            optics,
+            mix=tuple(map(tuple, (light / gains[:, None]).tolist())),
+            backdrops=tuple(  # equal backdrops, as of a grey camera, stay equal
+                _draw_backdrop(backdrop, float(gain), np.random.default_rng(seed_of[backdrop]))
+                for backdrop, gain in zip(optics.backdrops, gains, strict=True)
+            ),
+        )
+    tint *= sensor.tint
+    return replace(
+        sensor, optics=optics, tint=tuple(tint.tolist()), exposure=sensor.exposure * float(exposure), wear=wear
     )
 
 

@@ -103,6 +103,27 @@ def test_several_pairs_of_gels_alternate_over_the_objects():
         assert len(brightnesses) == 3
 
 
+@pytest.mark.parametrize("optics", ["led", "grey", "gelsight_mini"])
+def test_a_session_drifts_slowly_and_differs_from_others_with_and_without_contact(optics):
+    def images(seed=4, number=0, **settings):
+        with SimRig(seed, families=["cylinder"], optics=optics, **settings) as rig:
+            rig.prepare(rig.object_ids(1)[0], number)
+            before = rig.sensors["a"].read().pixels.astype(float)
+            pinch(rig)
+            return before, rig.sensors["a"].read().pixels.astype(float)
+
+    plain, monday, tuesday = images(), images(session="monday"), images(session="tuesday")
+    later = images(number=200, session="monday")  # two hours
+    np.testing.assert_array_equal(images(session=""), plain)
+    np.testing.assert_array_equal(images(session="monday"), monday)
+    colours = [before.mean((0, 1)) for before, _ in (plain, monday, tuesday, later)]
+    for one, two in ((0, 1), (1, 2)):
+        assert 0.01 < np.abs(np.log(colours[one] / colours[two])).max() < 0.4
+    assert 0.001 < np.abs(np.log(colours[1] / colours[3])).max() < 0.06
+    gains = [np.median((drifted + 1) / (still + 1), axis=(0, 1)) for drifted, still in zip(monday, plain, strict=True)]
+    np.testing.assert_allclose(*gains, atol=0.03)  # the press changes a part of the image
+
+
 def test_the_file_sets_force_and_attempts_of_grasps(tmp_path):
     path = tmp_path / "sim.toml"
     path.write_text('rig = "sim"\n[grasp]\nforce_n = [10.0, 11.0]\n[attempt]\nsettle_s = 0.25\noutputs = ["before"]\n')
