@@ -37,6 +37,8 @@ from retrieval.data.text import is_utf8
 from retrieval.errors import BadInput, DatasetError
 
 METADATA_FILE = "metadata.jsonl"
+ENROLLED = "enrolled"
+"""Folder in an index with the pictures of enrolled touches; in a catalogue around the index they are no photos."""
 UNSUPPORTED_EXTENSIONS = frozenset(
     {".arw", ".cr2", ".cr3", ".dng", ".gif", ".jp2", ".jxl", ".nef", ".orf", ".raf", ".rw2", ".svg", ".tga"}
 )
@@ -122,7 +124,8 @@ class Catalogue:
 def require_separate_folders(catalogue: str | Path, index: str | Path) -> None:
     """Raise BadInput if the index folder is the catalogue folder, or a folder below it that contains photos."""
     root, target = Path(catalogue).resolve(), Path(index).resolve()
-    has_photos = root in target.parents and any(path.suffix.lower() in EXTENSIONS for path in target.rglob("*"))
+    inside = (path for path in target.rglob("*") if target / ENROLLED not in path.parents)
+    has_photos = root in target.parents and any(path.suffix.lower() in EXTENSIONS for path in inside)
     if target == root or has_photos:
         raise BadInput(f"the index would be written among the photos in {index}; name another folder with --out")
 
@@ -242,8 +245,11 @@ def _list_files(folder: Path) -> tuple[list[str], list[SkippedPhoto], list[str]]
             entries = sorted(os.scandir(place), key=attrgetter("name"))
         except OSError as error:
             raise DatasetError(f"cannot list the catalogue folder {place}: {error.strerror}") from error
+        is_index = any(entry.name in ("CURRENT", "SHARDS.json") for entry in entries)
         for entry in entries:
             path = prefix + entry.name
+            if is_index and entry.name == ENROLLED:
+                continue
             if is_system_name(entry.name):
                 if not entry.name.startswith("."):
                     system.append(path)

@@ -2,7 +2,8 @@
 
 import hashlib
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from retrieval.data.catalogue import Catalogue, list_catalogue
 from retrieval.data.naming import FOLDER, MAX_EXAMPLES, Naming, naming_warnings
 from retrieval.errors import BadInput
 from retrieval.indexing.candidates import candidates_sentence, kept_measurement, measure_candidates, query_codes
+from retrieval.indexing.codes import encode_enrolled
 from retrieval.indexing.contents import IndexContents, read_contents
 from retrieval.indexing.report import BuildReport
 from retrieval.model.checkpoint import Checkpoint
@@ -80,15 +82,17 @@ def build_index(
     """
     store = IndexStore(out)
     try:
-        before = read_manifest(store.path / store.current()).about
+        current = read_manifest(store.path / store.current())
+        before, previous = current.about, current.fingerprint
     except IndexesError:
-        before = {}
+        before, previous = {}, None
     options, note = build_options(checkpoint, before, objects_from=objects_from, kind=kind, cells=cells, quiet=quiet)
     catalogue = list_catalogue(folder, options.naming)
-    report = build_listed(catalogue, checkpoint, store.path, options)
+    with store.lock(), keep_enrolled(store.path, checkpoint, options, previous) as with_enrolled:
+        report = build_listed(catalogue, checkpoint, store, options)
     store.discard_before(report.generation)
     warnings = [*catalogue_warnings(before, catalogue, options.naming), *report.warnings]
-    return replace(report, warnings=warnings, reason=" ".join(filter(None, (note, report.reason))))
+    return replace(with_enrolled(report), warnings=warnings, reason=" ".join(filter(None, (note, report.reason))))
 
 
 def catalogue_warnings(before: Mapping[str, Any], catalogue: Catalogue, naming: Naming) -> list[str]:
@@ -119,6 +123,29 @@ class BuildOptions:
     kind: str
     cells: bool | None
     quiet: bool
+
+
+@contextmanager
+def keep_enrolled(
+    index: Path, checkpoint: Checkpoint, options: BuildOptions, previous: Mapping[str, str] | None
+) -> Iterator[Callable[[BuildReport], BuildReport]]:
+    """Encode enrolled touches before the block makes a generation current, and those of the meantime after it.
+
+    Args:
+        index: Folder of the index, whose writer lock is held.
+        checkpoint: The model.
+        options: Options of the build.
+        previous: Fingerprint of the generation before; None without one.
+
+    Yields:
+        A function that adds the enrolled touches to the report of the build, after the block.
+    """
+    checkpoint = checkpoint.without_cells() if options.cells is False else checkpoint
+    earlier, _ = encode_enrolled(index, checkpoint)
+    yield lambda report: replace(report, enrolled=enrolled, skipped=[*report.skipped, *skipped])
+    enrolled, skipped = encode_enrolled(index, checkpoint, previous or fingerprint(checkpoint))
+    if enrolled and earlier:
+        enrolled["encoded"] += earlier["encoded"]
 
 
 def build_options(
@@ -153,7 +180,7 @@ def build_options(
     return BuildOptions(naming, kind_name(kind), cells, quiet), note
 
 
-def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, options: BuildOptions) -> BuildReport:
+def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, store: IndexStore, options: BuildOptions) -> BuildReport:
     """Write the next generation of an index of listed photos; as `build_index`, but old generations stay.
 
     Raises:
@@ -162,8 +189,7 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
     if options.cells is False:
         checkpoint = checkpoint.without_cells()
     load_kind(options.kind).require(options.kind, len(catalogue.photos), checkpoint.config.matcher.embedding_dim)
-    store = IndexStore(out)
-    with store.lock(), Cache(out / CACHE) as cache:
+    with store.lock(), Cache(store.path / CACHE) as cache:
         contents = read_contents(catalogue, checkpoint, cache, options.quiet)
         about = {
             "checkpoint": str(checkpoint.path.resolve()),
@@ -187,7 +213,7 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
                 is_written, why = True, f"The existing index is not usable ({error})."
         if current is None or is_written:
             current = _write(store, cache, checkpoint, options, contents, about, current)
-    return _report(out, catalogue, checkpoint, options, contents, current, why, is_written)
+    return _report(store.path, catalogue, checkpoint, options, contents, current, why, is_written)
 
 
 def _current(store: IndexStore, checkpoint: Checkpoint) -> tuple[Manifest | None, str]:

@@ -10,9 +10,10 @@ product on one thread. With its default of several, a product would wait for cor
 import hashlib
 import os
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
@@ -26,13 +27,16 @@ from retrieval.console.progress import Bar
 from retrieval.data.catalogue import Catalogue, SkippedPhoto
 from retrieval.data.images import decode_rgb, read_bytes
 from retrieval.data.loading import map_in_order
-from retrieval.errors import ImageError, NumericalError
+from retrieval.errors import BadInput, ImageError, NumericalError, RetrievalError
+from retrieval.indexing.enrolled import EnrolledTable, EnrolledTouch, codes_of, model_key, to_code
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.checkpoint_info import fingerprint
-from retrieval.model.encode import batches, one_thread, torch_photo_encoder, touch_features
+from retrieval.model.encode import TorchEncoder, batches, one_thread, torch_photo_encoder, touch_features
 from retrieval.model.export import choose_photo_encoder
 from retrieval.model.fusion_scorer import stored_layout, to_stored
 from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
+from retrieval.model.touch_reader import Stopwatch, TouchReader
+from retrieval.model.touches import InputImage
 
 Paths = tuple[str, ...]
 """Files of one photo (one) or of one touch (one for each finger), relative to the catalogue."""
@@ -188,6 +192,57 @@ def touch_encoder(checkpoint: Checkpoint) -> Encoder:
         return records
 
     return Encoder("touches", layout, _model(checkpoint, layout), decode, lambda count: encode)
+
+
+def encode_enrolled(
+    index: Path, checkpoint: Checkpoint, previous: Mapping[str, str] | None = None
+) -> tuple[dict[str, int] | None, list[SkippedPhoto]]:
+    """Add codes of a model to the enrolled touches that have none, from their pictures.
+
+    Args:
+        index: Folder of the index.
+        checkpoint: The model.
+        previous: Fingerprint of the model of the generation before. The codes of all models but these two are deleted;
+            readers may still use the previous one. None to keep all codes.
+
+    Returns:
+        Numbers of touches, of their objects, of touches that were encoded now, and of those that the model can compare
+        (None without touches); and the touches that could not be encoded, which stay in the table.
+    """
+    table, key, usable = EnrolledTable(index), model_key(fingerprint(checkpoint)), 0
+    touches, codes, skipped = table.read(), dict[Paths, bytes](), list[SkippedPhoto]()
+    if not touches:
+        return None, skipped
+    if checkpoint.references is not None and checkpoint.posterior is not None:  # else touches cannot be compared
+        known = {touch.pictures for touch in codes_of(touches, checkpoint)[0]}
+        encode = enrolled_encoder(checkpoint)
+        for touch in touches:
+            if touch.pictures not in known:
+                try:
+                    codes[touch.pictures] = encode(index, touch)
+                except RetrievalError as error:
+                    skipped.append(SkippedPhoto(touch.pictures[0], f"enrolled for {touch.object_id}: {error}"))
+        usable = len(known) + len(codes)
+        table.replace_codes(key, codes, () if previous is None else {key, model_key(previous)})
+    objects = len({touch.object_id for touch in touches})
+    return {"touches": len(touches), "objects": objects, "encoded": len(codes), "usable": usable}, skipped
+
+
+def enrolled_encoder(checkpoint: Checkpoint) -> Callable[[Path, EnrolledTouch], bytes]:
+    """Return the function that encodes an enrolled touch of an index folder; it raises RetrievalError."""
+    takes_frames = checkpoint.config.preprocessing.background != "none"
+    reader = TouchReader(checkpoint.config, TorchEncoder(checkpoint.matcher))
+
+    def encode(index: Path, touch: EnrolledTouch) -> bytes:
+        frames = [str(index / path) for path in touch.background] if takes_frames else []
+        pictures = zip(touch.pictures, touch.digests, strict=True)
+        images = [InputImage(read_bytes(index / path, digest), path) for path, digest in pictures]
+        if len(images) != reader.fingers:
+            raise BadInput(f"it has {len(images)} gel image(s), the model takes {reader.fingers}")
+        encoded = reader.encode([images], reader.no_contact_frames(frames or None), Stopwatch())
+        return to_code(encoded.partials[0], checkpoint)
+
+    return encode
 
 
 def _model(checkpoint: Checkpoint, layout: np.dtype[Any]) -> str:

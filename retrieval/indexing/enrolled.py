@@ -14,7 +14,7 @@ import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 from urllib.parse import quote
 
 import msgspec
@@ -27,15 +27,15 @@ from _touch_retrieval.names import lookup_key
 from indexes.errors import CorruptIndex, UnsupportedFormat, WriteFailed
 from indexes.store.locking import writer_lock
 from retrieval.console.output import abbreviate_list
+from retrieval.data.catalogue import ENROLLED
 from retrieval.data.naming import MAX_EXAMPLES
 from retrieval.data.opening import RANGE_MM
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint
 
-FOLDER = "enrolled"
 FORMAT = 1
 _PICTURE = re.compile(r"[0-9a-f]{20}\.[a-z]+")
-_Path = Annotated[str, Meta(pattern=rf"^{FOLDER}/[^./][^/\0]*/{_PICTURE.pattern}\Z")]
+_Path = Annotated[str, Meta(pattern=rf"^{ENROLLED}/[^./][^/\0]*/{_PICTURE.pattern}\Z")]
 _Digest = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z")]
 
 
@@ -65,9 +65,9 @@ class _Table(Struct):
     touches: Raw
 
 
-def model_key(stored: CheckpointInfo) -> str:
+def model_key(fingerprint: Mapping[str, str]) -> str:
     """Return the key of a model's codes; an index with cells and one without have the same codes."""
-    return "-".join(digest[:16] for digest in fingerprint(stored).values())
+    return "-".join(fingerprint[part][:16] for part in ("checkpoint", "preprocessing"))
 
 
 def to_code(partial: NDArray[np.float32], stored: CheckpointInfo) -> bytes:
@@ -79,7 +79,7 @@ def codes_of(
     touches: Sequence[EnrolledTouch], stored: CheckpointInfo
 ) -> tuple[list[EnrolledTouch], NDArray[np.float16]]:
     """Return the touches that have a code of a model, and their codes (n, pooled_width)."""
-    key, width = model_key(stored), stored.config.matcher.pooled_width
+    key, width = model_key(fingerprint(stored)), stored.config.matcher.pooled_width
     usable = [touch for touch in touches if len(touch.codes.get(key, b"")) == 2 * width]
     return usable, np.frombuffer(b"".join(touch.codes[key] for touch in usable), "<f2").reshape(-1, width)
 
@@ -96,7 +96,7 @@ def picture_path(object_id: str, data: bytes) -> str:
         name = f"_{name[:40]}-{hashlib.sha256(object_id.encode()).hexdigest()[:16]}"
     kinds = {b"\x89PNG": "png", b"\xff\xd8": "jpg"}
     extension = next((kind for magic, kind in kinds.items() if data.startswith(magic)), "picture")
-    return f"{FOLDER}/{name}/{content_digest(data)[:20]}.{extension}"
+    return f"{ENROLLED}/{name}/{content_digest(data)[:20]}.{extension}"
 
 
 class EnrolledTable:
@@ -109,7 +109,7 @@ class EnrolledTable:
 
     def __init__(self, index: Path, owns: Callable[[str], bool] | None = None) -> None:
         self.index, self._owns = index, owns
-        self.path = index / FOLDER / "touches.json"
+        self.path = index / ENROLLED / "touches.json"
 
     def version(self) -> tuple[int, int, int] | None:
         """Return numbers that change with the table; None without one."""
@@ -187,28 +187,32 @@ class EnrolledTable:
                 if len(doomed) == len(files):
                     folder.rmdir()
 
-    def add_codes(self, codes: Mapping[tuple[str, ...], bytes], key: str, keep: Collection[str] | None = None) -> None:
-        """Add codes of a model by the paths of the gel images; with `keep`, delete codes of models that it lacks."""
+    def replace_codes(self, key: str, codes: Mapping[tuple[str, ...], bytes], keep: Collection[str] = ()) -> None:
+        """Add codes under the key of a model, by the gel images' paths; with `keep`, delete those under other keys."""
         with self.lock() as touches:
             changed = []
             for touch in touches:
-                own = {name: code for name, code in touch.codes.items() if keep is None or name in keep}
+                own = {name: code for name, code in touch.codes.items() if not keep or name in keep}
                 if touch.pictures in codes:
-                    own.setdefault(key, codes[touch.pictures])
+                    own[key] = codes[touch.pictures]
                 changed.append(msgspec.structs.replace(touch, codes=own))
             if changed != touches:
                 self.replace(changed)
 
 
-def remove_enrolled(index: str | Path, object_id: str) -> tuple[str, int]:
+class Removal(NamedTuple):
+    """The object whose enrolled touches were deleted, and their number."""
+
+    object_id: str
+    touches: int
+
+
+def remove_enrolled(index: str | Path, object_id: str) -> Removal:
     """Delete all enrolled touches of an object; the photos and touches of the catalogue stay.
 
     Args:
         index: Folder of the index.
         object_id: The object: exactly so, or the only one with its `lookup_key`.
-
-    Returns:
-        The object, and the number of touches that were deleted.
 
     Raises:
         BadInput: No touch of the object is enrolled.
@@ -217,7 +221,7 @@ def remove_enrolled(index: str | Path, object_id: str) -> tuple[str, int]:
     >>> retrieval.enrol("index", "cup", ["a.png", "b.png"]).touches
     1
     >>> retrieval.remove_enrolled("index", "cup")
-    ('cup', 1)
+    Removal(object_id='cup', touches=1)
     """
     table = EnrolledTable(Path(index))
     if table.version() is None:
@@ -233,4 +237,4 @@ def remove_enrolled(index: str | Path, object_id: str) -> tuple[str, int]:
         name = object_id if object_id in names else like[0]
         kept = [touch for touch in touches if touch.object_id != name]
         table.replace(kept)
-    return name, len(touches) - len(kept)
+    return Removal(name, len(touches) - len(kept))

@@ -37,6 +37,8 @@ class BuildReport:
         shards: Shards of a sharded index, as in its manifest (`indexes.store.sharded`); None for an index folder.
         references: Numbers of reference touches (`touches`), their objects (`objects`), objects without photos
             (`touch_only`) and touches that were encoded now (`encoded`); None without references.
+        enrolled: Numbers of enrolled touches (`touches`), their objects (`objects`), touches that were encoded now
+            (`encoded`) and those that queries use (`usable`); None without enrolled touches.
 
     >>> checkpoint = retrieval.load_checkpoint("model.safetensors")
     >>> report = retrieval.build_index("catalog", checkpoint, "new-index", quiet=True)
@@ -65,6 +67,7 @@ class BuildReport:
     cells: bool | None
     shards: list[dict[str, Any]] | None = None
     references: dict[str, Any] | None = None
+    enrolled: dict[str, int] | None = None
 
     def lines(self) -> Iterator[str]:
         """Yield the lines of the printed report."""
@@ -79,6 +82,13 @@ class BuildReport:
             yield (
                 f"{references['touches']} reference touches of {references['objects']} objects, "
                 f"{references['touch_only']} of them without a photo; {references['encoded']} embedded"
+            )
+        if enrolled := self.enrolled:
+            left = enrolled["touches"] - enrolled["usable"]
+            remark = f"; queries ignore {left} of them, which this model cannot compare" if left else ""
+            yield (
+                f"{enrolled['touches']} enrolled touches of {enrolled['objects']} objects are kept; "
+                f"{enrolled['encoded']} embedded{remark}"
             )
         measured = ""
         if self.recall["queries"]:  # else exact by construction

@@ -28,7 +28,7 @@ from indexes.store.sharded import (
 )
 from retrieval.data.catalogue import Catalogue, list_catalogue
 from retrieval.errors import BadInput, NoReadablePhoto
-from retrieval.indexing.build import BuildOptions, build_listed, build_options, catalogue_warnings
+from retrieval.indexing.build import BuildOptions, build_listed, build_options, catalogue_warnings, keep_enrolled
 from retrieval.indexing.contents import no_photo, require_reference_calibration
 from retrieval.indexing.report import BuildReport
 from retrieval.model.checkpoint import Checkpoint
@@ -105,17 +105,18 @@ def build_sharded(
             require_reference_calibration(checkpoint.without_cells() if options.cells is False else checkpoint)
         _delete_old_shards(own, before, shards)
         jobs = [ShardJob(own / name, part, options) for name, part in _split_catalogue(catalogue, shards)]
-        built = list(run(jobs, checkpoint)) if run else [build_shard(job, checkpoint) for job in jobs]
-        reports = sorted((one for one in built if isinstance(one, BuildReport)), key=lambda one: one.index)
-        unreadable = [one for one in built if isinstance(one, NoReadablePhoto)]
-        report = _report(own, catalogue, options, reports, unreadable)
-        manifest = _manifest(own, before, shards, checkpoint, catalogue, report, reports)
-        if written := before is None or manifest.generation != before.generation:
-            write_sharded_manifest(own, manifest)
+        with keep_enrolled(own, checkpoint, options, before.fingerprint if before else None) as with_enrolled:
+            built = list(run(jobs, checkpoint)) if run else [build_shard(job, checkpoint) for job in jobs]
+            reports = sorted((one for one in built if isinstance(one, BuildReport)), key=lambda one: one.index)
+            unreadable = [one for one in built if isinstance(one, NoReadablePhoto)]
+            report = _report(own, catalogue, options, reports, unreadable)
+            manifest = _manifest(own, before, shards, checkpoint, catalogue, report, reports)
+            if written := before is None or manifest.generation != before.generation:
+                write_sharded_manifest(own, manifest)
         for entry in manifest.shards:
             IndexStore(own / entry.folder).discard_before(entry.generation)
     return replace(
-        report,
+        with_enrolled(report),
         generation=manifest.generation,
         written=written,
         warnings=[
@@ -130,7 +131,7 @@ def build_sharded(
 def build_shard(job: ShardJob, checkpoint: Checkpoint) -> ShardBuild:
     """Build one shard. Raises the errors of `build_index`, except for a shard without a readable photo."""
     try:
-        return build_listed(job.catalogue, checkpoint, job.folder, job.options)
+        return build_listed(job.catalogue, checkpoint, IndexStore(job.folder), job.options)
     except NoReadablePhoto as error:
         return error
 

@@ -37,7 +37,8 @@ def query_page(result: QueryResult, catalogue: Path) -> str:
     grasps = tuple(_touch(number, check, paths) for number, (check, paths) in enumerate(touches, start=1))
     blocks.append(Section("Touch", (Cards(grasps),)))
     if result.results:
-        cards = tuple(_match(match, catalogue, answers and match.rank == 1) for match in result.results)
+        folders = catalogue, Path(index["path"])
+        cards = tuple(_match(match, *folders, answers and match.rank == 1) for match in result.results)
         blocks.append(Section("Photos, most likely first", (Cards(cards),)))
     facts = Table(("property", "value"), tuple(_facts(result)), words=frozenset({1}))
     blocks.append(Section("How this was found", (facts, *((Text(CALIBRATED),) if result.posterior else ()))))
@@ -50,14 +51,15 @@ def _touch(number: int, check: str, paths: list[str]) -> Card:
     return Card(tuple((_uri(Path(path)), "gel image") for path in paths), title, fingers)
 
 
-def _match(match: Match, catalogue: Path, is_answer: bool) -> Card:
-    pictures, lines = [(_uri(catalogue / match.photo, match.photo_digest), f"photo of {match.object_id}")], []
+def _match(match: Match, catalogue: Path, index: Path, is_answer: bool) -> Card:
+    folder = index if match.photo_is_enrolled else catalogue
+    pictures, lines = [(_uri(folder / match.photo, match.photo_digest), f"photo of {match.object_id}")], []
     if match.probability is not None and match.probability_if_present is not None:
         lines += [probability(match.probability), f"{probability(match.probability_if_present)} if present"]
     lines += [f"match logit {match.logit:+.2f}", match.photo]
     if nearest := match.reference:
         pictures += [
-            (_uri(catalogue / path, digest), "reference touch")
+            (_uri((index if nearest.is_enrolled else catalogue) / path, digest), "reference touch")
             for path, digest in zip(nearest.touch, nearest.digests, strict=True)
         ]
         added = "no photo: scored by its touches only"

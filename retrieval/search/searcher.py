@@ -25,7 +25,7 @@ from retrieval.indexing.enrolled import (
     picture_path,
     to_code,
 )
-from retrieval.model.checkpoint_info import CheckpointInfo, read_scorer
+from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_scorer
 from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
 from retrieval.model.onnx_encoder import find_export
 from retrieval.model.posterior import NONE_PRIOR, Posterior, require_prior
@@ -356,7 +356,7 @@ class Searcher:
                 name,
                 tuple(picture_path(name, image.file) for image in grasp),
                 tuple(content_digest(image.file) for image in grasp),
-                {model_key(stored): to_code(partial, stored)},
+                {model_key(fingerprint(stored)): to_code(partial, stored)},
                 None if np.isnan(opening) else float(opening),
                 tuple(picture_path(name, frame.file) for frame in frames),
             )
@@ -503,7 +503,7 @@ def enrol(
     >>> retrieval.enrol("index", "spoon", ["a.png", "b.png"], opening_mm=12.5)
     Enrolment(object_id='spoon', touches=1, added=1)
     >>> retrieval.remove_enrolled("index", "spoon")
-    ('spoon', 1)
+    Removal(object_id='spoon', touches=1)
     """
     with Searcher.open(index, model=model) as searcher:
         return searcher.enrol(object_id, touches, opening_mm=opening_mm, background=background)
