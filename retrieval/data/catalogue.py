@@ -12,6 +12,8 @@
 A picture is recognised by its extension, or by its content if it has no extension of a picture. Hidden files and those
 of systems and network drives are left out (`_touch_retrieval.names`). A photo's path in the catalogue, with forward
 slashes, is its stable id.
+
+A recording is a catalogue, too: of the photos and touches of its accepted grasps, with their openings.
 """
 
 import os
@@ -30,6 +32,7 @@ from _touch_retrieval.files import open_regular, parse_json, read_regular
 from _touch_retrieval.names import is_system_name, lookup_key
 from _touch_retrieval.text import decode_text
 from retrieval.console.output import abbreviate_list
+from retrieval.data.dataset import load_grasps
 from retrieval.data.images import EXTENSIONS, is_picture
 from retrieval.data.naming import MAX_EXAMPLES, STEM, Naming
 from retrieval.data.opening import require_opening
@@ -134,7 +137,7 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
     """List the photos and touches below `folder`, sorted by path.
 
     Args:
-        folder: The catalogue folder.
+        folder: The catalogue folder, or a recording, which names its objects itself.
         naming: Rule that names the object of each photo; None for the rule "folder".
 
     Raises:
@@ -145,6 +148,8 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
     if not root.is_dir():
         what = "is a file" if root.exists() else "does not exist"
         raise DatasetError(f"a catalogue must be a folder of photos, but {root} {what}: {_LAYOUT}")
+    if (root / "recording.json").is_file():
+        return _list_recording(root)
     names, skipped, system = _list_files(root)
     by_object, by_photo = _read_metadata(root / METADATA_FILE, naming)
 
@@ -196,6 +201,21 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
     ]
     notes = [f"{METADATA_FILE} names {name}, which is not in the catalogue" for name in unknown]
     return replace(catalogue, notes=(*notes, *_notes_on_files(catalogue, names, system)))
+
+
+def _list_recording(root: Path) -> Catalogue:
+    grasps = load_grasps(root)
+
+    def paths(files: Iterable[Path]) -> tuple[str, ...]:
+        return tuple(file.relative_to(root).as_posix() for file in files)
+
+    photos = {path: CataloguePhoto(path, grasp.object_id) for grasp in grasps for path in paths(grasp.photos)}
+    touches = {CatalogueTouch(grasp.object_id, paths(grasp.touches), opening_mm=grasp.opening_mm) for grasp in grasps}
+    return Catalogue(
+        root,
+        tuple(photos[path] for path in sorted(photos)),
+        touches=tuple(sorted(touches, key=attrgetter("paths"))),
+    )
 
 
 def _has_picture(path: Path, extension: str) -> bool:

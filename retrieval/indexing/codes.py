@@ -178,6 +178,8 @@ def touch_encoder(checkpoint: Checkpoint) -> Encoder:
         if len(paths) != fingers:
             ends = " and ".join(f"_{letter}" for letter in "abcdefghij"[:fingers])
             reason = f"the touch has {len(paths)} gel image(s), the model takes {fingers}: names end in {ends}"
+            if len(paths) == 1:
+                reason += "; for a sensor with one finger give --model shipped-one-finger, or a model of your own"
             raise ImageError(paths[0], reason)
         preprocess = checkpoint.config.preprocessing.touch
         return [preprocess(decode_rgb(content, path), None) for content, path in zip(data, paths, strict=True)]

@@ -104,7 +104,11 @@ class BuildReport:
             yield "no cells are stored (--cells stores them)"
         yield from _list_lines("remark(s)", self.notes)
         yield from _list_lines("file(s) ignored, not images", self.ignored, FEW)
-        yield from _list_lines("photo(s) skipped", [f"{item.path}: {item.reason}" for item in self.skipped])
+        reasons: dict[str, list[str]] = {}
+        for item in self.skipped:
+            reasons.setdefault(item.reason, []).append(item.path)
+        for reason, paths in reasons.items():
+            yield from _list_lines(f"picture(s) left out: {reason}", paths, FEW)
         if count := len(self.without_photo):
             more = f" and {count - SHOWN} more (--json lists them all)" if count > SHOWN else ""
             yield (

@@ -10,6 +10,7 @@ import pytest
 from _touch_retrieval.documents import typed
 from indexes.errors import CorruptIndex
 from indexes.store.folder import IndexStore
+from retrieval.data.dataset import load_grasps
 from retrieval.errors import BadInput
 from retrieval.indexing.build import build_index
 from retrieval.indexing.sharded import build_sharded
@@ -161,6 +162,16 @@ def test_touches_change_only_the_logits_of_their_object_until_they_are_removed(
     for path in (catalogue_copy / NAMES[0]).glob("touch_*"):
         path.unlink()
     assert query() == before
+
+
+def test_a_recording_is_a_catalogue_of_the_photos_and_touches_of_its_grasps(recording, calibrated_model, tmp_path):
+    report = build_index(recording, calibrated_model, tmp_path / "index", quiet=True)
+    assert (report.objects, report.photos) == (12, 36)
+    assert report.references["touches"] == 36
+    grasp = load_grasps(recording)[4]
+    with Searcher.open(tmp_path / "index") as searcher:
+        found = {match.object_id: match for match in searcher.query(grasp.touches).results}[grasp.object_id]
+    assert [recording / path for path in found.reference.touch] == list(grasp.touches)
 
 
 def test_unusable_touches_are_left_out_with_a_reason(catalogue_with_touches, calibrated_model, tmp_path):
