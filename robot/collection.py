@@ -4,12 +4,16 @@ The gate decides whether training uses a grasp. Rejected grasps are recorded too
 logged (robot.recording.attempt_log). An object is complete when it has the required number of accepted grasps; the
 number of attempts is limited. An ungraspable object is skipped, with the reason in recording.json.
 
+A recording may have several sessions, one after the other. In each, every object gets its accepted grasps anew, and a
+named session draws its own order of the objects, so that the order of capture does not identify them across sessions.
+
 One writer writes all grasps in a fixed order, so the recording does not depend on the number of jobs. A collection
 that was stopped or killed continues at the same point when it is started again.
 """
 
 import atexit
 import functools
+import hashlib
 import itertools
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -97,6 +101,7 @@ def collect(
     gate: Gate | None = None,
     gate_name: str | None = None,
     jobs: int = 1,
+    session: str | None = None,
     progress: Callable[[Progress], None] | None = None,
     is_enough: Callable[[Sequence[RecordedGrasp]], bool] | None = None,
 ) -> list[Tally]:
@@ -111,15 +116,18 @@ def collect(
         gate: Decides which grasps are accepted (`robot.grasping.gates`).
         gate_name: Name of the gate; it must be the same when a collection continues.
         jobs: Processes, each with its own rig.
+        session: Name of this session; a new name continues the recording with a new session, possibly with another
+            number of grasps. Default: the rig's.
         progress: Called after each attempt.
-        is_enough: Ends an object early: called with its accepted grasps after each one.
+        is_enough: Ends an object early: called with its accepted grasps of this session after each one.
 
     Returns:
-        The counts of each object.
+        The counts of each object in this session.
 
     Raises:
         RobotConfigError: An argument is out of range.
-        RecordingError: The folder contains other files, or was collected with other settings.
+        RecordingError: The folder contains other files, was collected with other settings, or another session began
+            after this one.
         DeviceError: A device failed too often.
         StorageError: The disk refused a write.
 
@@ -139,22 +147,32 @@ def collect(
     names = rig.object_ids(objects) if isinstance(objects, int) else list(objects)
     for name in names:
         check_name("an object's name", name)
+    if (session := session or rig.session) is not None:
+        check_name("session", session)
     with rig:
         attempt = settings.attempt or rig.attempt
         info = _recording_info(rig, seed, replace(settings, attempt=attempt), gate_name or repr(gate))
-        _check_can_continue(Path(out), info, strict=rig.can_run_jobs)
+        _check_can_continue(Path(out), info, strict=rig.can_run_jobs, new_counts=session is not None)
         attempter = AttemptRunner(rig, seed, attempt)
         with RecordingWriter(out, info) as writer, AttemptLog(Path(out), writer.grasp_ids) as log:
             if known := {name: dict(labels) for name in names if (labels := rig.labels(name))}:
                 writer.update_info(objects=known)
-            collection = _Collection(writer, log, names, settings, gate, progress, is_enough)
-            with WorkerPool(jobs, attempter.run, functools.partial(_make_work, make_rig, seed, attempt)) as workers:
+            collection = _Collection(writer, log, names, session, settings, gate, progress, is_enough)
+            begun = None if session is None else (session, *collection.first_attempts())
+            if begun is not None:
+                rig.begin_session(*begun)
+            make_work = functools.partial(_make_work, make_rig, seed, attempt, begun)
+            with WorkerPool(jobs, attempter.run, make_work) as workers:
                 collection.run(workers)
     return [collection.tallies[name] for name in names]
 
 
-def _make_work(make_rig: RigMaker, seed: int, settings: AttemptSettings) -> Work[GraspAttempt]:
+def _make_work(
+    make_rig: RigMaker, seed: int, settings: AttemptSettings, begun: tuple[str, Mapping[str, int], int] | None
+) -> Work[GraspAttempt]:
     rig = make_rig()
+    if begun is not None:
+        rig.begin_session(*begun)
     rig.connect()
     atexit.register(rig.close)
     return AttemptRunner(rig, seed, settings).run
@@ -172,11 +190,12 @@ def _recording_info(rig: Rig, seed: int, settings: CollectSettings, gate_name: s
     )
 
 
-def _check_can_continue(folder: Path, expected: Mapping[str, Any], strict: bool) -> None:
+def _check_can_continue(folder: Path, expected: Mapping[str, Any], strict: bool, new_counts: bool) -> None:
     """Raise RecordingError if an existing recording was collected with other settings.
 
     With `strict`, the software version and the settings read back from devices must be equal too: simulated attempts
-    depend on them. With a real rig, only the requested settings must be equal.
+    depend on them. With a real rig, only the requested settings must be equal. With `new_counts`, the numbers of
+    grasps and attempts may differ. The session always may: each grasp states its own.
     """
     if not (folder / INFO_FILE).is_file():
         return
@@ -184,7 +203,10 @@ def _check_can_continue(folder: Path, expected: Mapping[str, Any], strict: bool)
     if "collection" not in stored:
         raise RecordingError(f"{folder} contains a recording that was not collected by a rig; give another folder")
     before, now = ({"collection.rounds": False, **_flatten(info)} for info in (stored, expected))
+    free = {"rig_settings.session", *(("collection.grasps", "collection.most_attempts") if new_counts else ())}
     for name, value in now.items():
+        if name in free:
+            continue
         if before.get(name) != value and (strict or not name.startswith(("devices.", "software_version"))):
             what = name.replace("collection.", "").replace("_", " ")
             raise RecordingError(
@@ -209,6 +231,7 @@ class _Collection:
         writer: RecordingWriter,
         log: AttemptLog,
         names: Sequence[str],
+        session: str | None,
         settings: CollectSettings,
         gate: Gate,
         progress: Callable[[Progress], None] | None,
@@ -218,22 +241,42 @@ class _Collection:
             raise RecordingError(
                 f"{log.folder}: attempts.jsonl lacks grasp {min(lost)}; restore it or give a new folder"
             )
-        order = list(tally(log.attempts))
-        if order != list(names[: len(order)]):
+        in_session = [attempt for attempt in log.attempts if attempt.session == session]
+        order, whole = list(tally(in_session)), tally(log.attempts)
+        if session is not None:
+            names = sorted(names, key=lambda name: hashlib.sha256(f"{session}\n{name}".encode()).digest())
+        if order != (list(names[: len(order)]) if session is None else [name for name in names if name in order]):
             raise RecordingError(
                 f"{log.folder} was collected with other objects ({', '.join(order[:3])}, ...); give these objects "
                 "first, in the same order; more may follow"
             )
-        self.writer, self.log, self.names, self.settings, self.gate = writer, log, names, settings, gate
-        self.tallies = {name: Tally(name) for name in names} | tally(log.attempts)
+        self.writer, self.log, self.settings, self.gate = writer, log, settings, gate
+        self.names, self.session = names, session
+        self.tallies = {name: Tally(name) for name in names} | tally(in_session)
+        self._earlier = dict.fromkeys(self.tallies, 0)
+        for name in whole.keys() & self.tallies:
+            self.tallies[name].skipped = whole[name].skipped
+            self._earlier[name] = whole[name].attempts - self.tallies[name].attempts
         self._seconds = log.attempts[-1].ended_s if log.attempts else 0.0
         self._pending: dict[str, deque[Callable[[], GraspAttempt]]] = defaultdict(deque)
         self._progress, self._is_enough = progress, is_enough
         self._accepted: dict[str, list[RecordedGrasp]] = defaultdict(list)
         self._ended: set[str] = set()
         for grasp in read_recording(writer.folder).grasps if is_enough and writer.grasp_ids else ():
-            if grasp.grasped:  # accepted before the collection was stopped
+            if grasp.grasped and grasp.session == session:  # accepted before the collection was stopped
                 self._add_accepted(grasp)
+        last = log.attempts[-1].session if log.attempts else session
+        is_new = session is not None and not in_session
+        if last != session and not is_new and any(self._needs_attempt(name, settings.grasps) for name in names):
+            raise RecordingError(
+                f"{log.folder}: its last attempts are of session {last!r}, and one sitting follows the other: continue "
+                f"that session, or begin one with a new name, got {session!r}"
+            )
+
+    def first_attempts(self) -> tuple[dict[str, int], int]:
+        """Return the arguments `first_attempts` and `stride` of `Rig.begin_session`, as if the gate accepted all."""
+        step, stride = (1, len(self.names)) if self.settings.rounds else (self.settings.grasps, 1)
+        return {name: step * place - stride * self._earlier[name] for place, name in enumerate(self.names)}, stride
 
     def run(self, workers: WorkerPool[GraspAttempt]) -> None:
         """Make and record all attempts in order; workers may work on later attempts that will be needed."""
@@ -258,7 +301,7 @@ class _Collection:
             while self._needs_attempt(object_id, turn_target, ahead=True):
                 if sum(map(len, self._pending.values())) >= workers.window and self._pending[name]:
                     return
-                number = self.tallies[object_id].attempts + len(self._pending[object_id])
+                number = self._earlier[object_id] + self.tallies[object_id].attempts + len(self._pending[object_id])
                 self._pending[object_id].append(workers.submit(object_id, number))
 
     def _needs_attempt(self, name: str, target: int, ahead: bool = False) -> bool:
@@ -276,12 +319,15 @@ class _Collection:
         began, self._seconds = self._seconds, round(self._seconds + attempt.duration_s, 3)
         name, number, outcome = attempt.object_id, attempt.number, attempt.outcome
         if outcome in ("no_plan", "ungraspable"):
-            logged = LoggedAttempt(name, number, outcome, False, self._seconds, reason=attempt.reason)
+            reason, session = attempt.reason, self.session
+            logged = LoggedAttempt(name, number, outcome, False, self._seconds, reason=reason, session=session)
             self.log.append(logged)
         else:
             accepted, score = apply_gate(self.gate, recorded_touches(attempt.images))
             grasp_id = safe_name(name, f"{number:04}")
-            logged = LoggedAttempt(name, number, outcome, accepted, self._seconds, grasp_id, score, attempt.fit)
+            logged = LoggedAttempt(
+                name, number, outcome, accepted, self._seconds, grasp_id, score, attempt.fit, None, self.session
+            )
             self.log.append(logged)
             grasp = self.writer.append(
                 grasp_id,
@@ -291,6 +337,7 @@ class _Collection:
                 grasped=accepted,  # the gate's decision; `outcome` is the gripper's
                 outcome=outcome,
                 sequence_id=grasp_id,
+                session=self.session,
                 time_s=round(began + attempt.touch_time_s, 3),
             )
             if accepted and self._is_enough:

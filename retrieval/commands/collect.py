@@ -30,6 +30,10 @@ def collect(
             help="one accepted grasp of each object, then the next round, so that drift does not identify the object",
         ),
     ] = False,
+    session: Annotated[
+        str | None,
+        typer.Option(help="name of this sitting, such as a day; a new name adds a session to the recording"),
+    ] = None,
     preview: Annotated[bool, typer.Option("--preview", help="write an overview image, OUT-preview.png")] = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="print the motions of one attempt per object; arm and gripper do not move")
@@ -37,7 +41,7 @@ def collect(
 ) -> None:
     """Collect a recording with a rig; stay next to a real rig. Resumes a stopped run."""
     if dry_run:
-        ignored = {"gate": gate, "preview": preview, "rounds": rounds}
+        ignored = {"gate": gate, "preview": preview, "rounds": rounds, "session": session}
         refuse_options("has no effect with --dry-run, which moves and records nothing; leave it out", **ignored)
         _print_motions(rig, objects, seed)
         return
@@ -65,6 +69,7 @@ def collect(
             gate=decide,
             gate_name=gate_name,
             jobs=jobs,
+            session=session,
             progress=lambda now: bar.show(now.grasps_done, now.grasps_target, str(now)),
         )
     for line in acceptance_table(tallies, grasps_target=grasps).splitlines():
@@ -76,6 +81,7 @@ def collect(
     say(
         f"{out}: {accepted} accepted grasps of {len(tallies) - skipped} objects"
         + f", {skipped} skipped" * bool(skipped)
+        + f", in session {session}" * (session is not None)
     )
     if preview:
         from robot.recording.preview import write_preview

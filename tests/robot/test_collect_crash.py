@@ -103,10 +103,11 @@ def test_a_collection_continues_after_a_failure_at_any_step_of_an_attempt(tmp_pa
 
 
 @pytest.mark.slow
-def test_two_jobs_of_the_simulated_rig_give_the_same_bytes_as_one(tmp_path):
+@pytest.mark.parametrize("session", [None, "monday"])
+def test_two_jobs_of_the_simulated_rig_give_the_same_bytes_as_one(tmp_path, session):
     make, settings = functools.partial(load_rig, "sim", seed=0), CollectSettings(grasps=1)
     for jobs in (1, 2):
-        collect(make, tmp_path / str(jobs), objects=2, seed=0, settings=settings, jobs=jobs)
+        collect(make, tmp_path / str(jobs), objects=2, seed=0, settings=settings, jobs=jobs, session=session)
     assert files(tmp_path / "1") == files(tmp_path / "2")
 
 
