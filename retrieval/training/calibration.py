@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from retrieval.data.dataset import Grasp
+from retrieval.data.opening import RANGE_MM
 from retrieval.errors import BadInput
 from retrieval.model import verification
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.fusion import Matcher
+from retrieval.model.opening import OpeningCalibration
 from retrieval.model.posterior import MAX_GRASPS, SLOPE_BOUNDS, Posterior
 from retrieval.model.references import ReferenceCalibration, reference_similarity, unit_embeddings
 from retrieval.model.verification import LEVELS, QUANTILES, VerificationCalibration, supports_calibration
@@ -43,6 +45,8 @@ MAX_REFERENCES = 3
 """Largest number of references of an object in the fit: a typical number if a user records few."""
 WEIGHT_BOUNDS = (0.01, 1000.0)
 """Search range of the weight of C next to photos."""
+MIN_OPENING_WIDTH = 0.005
+"""Smallest width and spread of log openings: grippers state 0.1 mm. Without it, equal openings have no likely width."""
 SEQUENCES = 8
 """Sequences of grasps of each validation object, for verification."""
 MAX_CALIBRATION_GRASPS = 400
@@ -67,6 +71,7 @@ class ScoredTouches:
         touch_embeddings: (T, d) embeddings, for the calibration of reference touches; d is 0 for a model whose logit
             has no cosine.
         photo_embeddings: (N, d') embeddings, for verification.
+        openings_mm: (T,) openings of the jaws, NaN where none was measured; empty if none was at all.
     """
 
     logits: NDArray[np.floating[Any]]
@@ -75,6 +80,7 @@ class ScoredTouches:
     own: NDArray[np.bool_]
     touch_embeddings: Embeddings = field(default_factory=lambda: _NO_EMBEDDINGS)
     photo_embeddings: Embeddings = field(default_factory=lambda: _NO_EMBEDDINGS)
+    openings_mm: Floats = field(default_factory=lambda: np.zeros(0))
 
     @property
     def has_trials(self) -> bool:
@@ -127,7 +133,13 @@ def score_grasps(
     owners = touch_owner, np.array([owner_of[photo] for photo in photos])
     own = np.array([[grasp.photo == photo for photo in photos] for grasp in grasps])
     scored = score_touches(matcher, (touches, torch.stack(list(photos.values()))), owners, own, pooled=pooled)
-    return scored if scored.has_trials else None
+    return dataclasses.replace(scored, openings_mm=measured_openings(grasps)) if scored.has_trials else None
+
+
+def measured_openings(grasps: Sequence[Grasp]) -> Floats:
+    """Return the openings (G,) of grasps in millimetres; NaN where none was measured, or one that is not believed."""
+    openings = np.array([grasp.opening_mm for grasp in grasps], dtype=np.float64)  # None becomes NaN
+    return np.where((openings >= RANGE_MM[0]) & (openings <= RANGE_MM[1]), openings, np.nan)
 
 
 # Posterior -------------------------------------------------------------------------------------------------
@@ -295,27 +307,68 @@ def _reference_trials(part: ScoredTouches, max_references: int) -> tuple[ScoredT
 
     At most `max_references` touches of each object are references. None for too few objects, or without embeddings.
     """
-    of_objects = (np.flatnonzero(part.touch_owner == name) for name in np.unique(part.touch_owner))
-    rows = [mine for mine in of_objects if len(mine) > 1]
-    if len(rows) < MIN_OBJECTS or not part.touch_embeddings.shape[1]:
+    sets = _reference_sets(part.touch_owner, max_references)
+    if len(sets) < MIN_OBJECTS or not part.touch_embeddings.shape[1]:
         return None
-    references = []
-    for mine in rows:
-        shown = mine[: max(len(mine) // 4, min(MAX_REFERENCES, len(mine) // 2))]
-        places = np.linspace(0, len(shown) - 1, min(max_references, len(shown)))  # evenly spaced
-        references.append(shown[places.round().astype(np.int64)])
-    queries = np.concatenate([mine[len(mine) // 2 :] for mine in rows])
-    owner = np.repeat(np.arange(len(rows)), [len(mine) - len(mine) // 2 for mine in rows])
+    references, of_objects = zip(*sets, strict=True)
+    queries, owner = np.concatenate(of_objects), np.repeat(np.arange(len(sets)), [len(some) for some in of_objects])
     cosines = part.touch_embeddings[queries] @ part.touch_embeddings[np.concatenate(references)].T
     near = reference_similarity(cosines, np.cumsum([0, *(len(some) for some in references[:-1])]))
-    number = {int(part.touch_owner[mine[0]]): place for place, mine in enumerate(rows)}
+    number = {int(part.touch_owner[mine[0]]): place for place, (mine, _) in enumerate(sets)}
     known = np.flatnonzero(np.isin(part.photo_owner, list(number)))
     photo_owner = np.array([number[int(name)] for name in part.photo_owner[known]], np.int64)
     shared = np.ix_(queries, known)
     return (
-        ScoredTouches(near, owner, np.arange(len(rows)), np.zeros(near.shape, np.bool_)),
+        ScoredTouches(near, owner, np.arange(len(sets)), np.zeros(near.shape, np.bool_)),
         ScoredTouches(part.logits[shared], owner, photo_owner, part.own[shared]),
     )
+
+
+def _reference_sets(owner: Numbers, max_references: int) -> list[tuple[Numbers, Numbers]]:
+    """Return the touches that are references, and the queries, of each object with several (`fit_references`)."""
+    sets = []
+    for name in np.unique(owner):
+        mine = np.flatnonzero(owner == name)
+        shown = mine[: max(len(mine) // 4, min(MAX_REFERENCES, len(mine) // 2))]
+        places = np.linspace(0, len(shown) - 1, min(max_references, len(shown)))  # evenly spaced
+        if len(mine) > 1:
+            sets.append((shown[places.round().astype(np.int64)], mine[len(mine) // 2 :]))
+    return sets
+
+
+def fit_opening(*parts: ScoredTouches) -> OpeningCalibration | None:
+    """Fit the evidence of openings, on references and queries as in `fit_references`.
+
+    None for fewer than three objects with two openings.
+    """
+    from scipy.optimize import minimize  # slow to import; queries do not need it
+
+    of_objects, queries, references = list[Floats](), list[float](), list[Floats]()
+    for part in parts:
+        measured = np.isfinite(part.openings_mm)
+        logs, owner = np.log(part.openings_mm[measured]), part.touch_owner[: len(measured)][measured]
+        of_objects += [logs[owner == name] for name in np.unique(owner)]
+        for shown, rows in (one for count in (MAX_REFERENCES, 1) for one in _reference_sets(owner, count)):
+            queries += logs[rows].tolist()
+            references += [np.append(logs[shown], np.full(MAX_REFERENCES - len(shown), np.nan))] * len(rows)
+    several = sum(len(one) > 1 for one in of_objects)
+    if several < MIN_OBJECTS:
+        return None
+    every, weights = np.concatenate(of_objects), np.concatenate([np.full(len(one), 1 / len(one)) for one in of_objects])
+    mean = float(np.average(every, weights=weights))
+    spread = max(MIN_OPENING_WIDTH, math.sqrt(np.average((every - mean) ** 2, weights=weights)))
+    asked, known = np.array(queries)[:, None], np.array(references)
+
+    def calibration(parameters: Floats) -> OpeningCalibration:
+        floor, width = float(parameters[0]), math.exp(parameters[1])
+        return OpeningCalibration(mean, spread, width, floor, several, len(queries) // 2)
+
+    def loss(parameters: Floats) -> float:
+        terms = np.where(np.isfinite(known), calibration(parameters).log_density(asked, known), -np.inf)
+        return -float((np.logaddexp.reduce(terms, axis=1) - np.log(np.isfinite(known).sum(1))).mean())
+
+    bounds = [(0.01, 0.99), (math.log(MIN_OPENING_WIDTH), 0.0)]
+    return calibration(minimize(loss, np.array([0.2, -3.0]), method="Nelder-Mead", bounds=bounds).x)
 
 
 def _weight(pairs: Sequence[tuple[ScoredTouches, ScoredTouches]], seed: int) -> float:
@@ -474,6 +527,7 @@ def with_calibrations(
         checkpoint,
         posterior=posterior,
         references=fit_references(*scored, seed=seed),
+        opening=fit_opening(*scored),
         verification=fit_verification(scored if verified is None else verified, posterior, seed),
         pooled_posterior=fit_posterior(*pooled, seed=seed) if pooled else checkpoint.pooled_posterior,
         pooled_references=fit_references(*pooled, seed=seed) if pooled else checkpoint.pooled_references,

@@ -15,6 +15,7 @@ from retrieval.console.output import abbreviate_list
 from retrieval.data.check import appearance
 from retrieval.data.check.drift import check_drift
 from retrieval.data.check.near_copies import nearest_pictures
+from retrieval.data.check.opening import check_openings
 from retrieval.data.check.pictures import Finding, ImageRecords, findings_for, fingers_of, read_pictures
 from retrieval.data.check.split import check_split
 from retrieval.data.dataset import Attempt, Grasp, Split, load_all_attempts, require_accepted
@@ -77,6 +78,7 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
     findings += check_drift(unnamed(used), records)
     # A mirrored image may be a near copy, too.
     findings += _near_copies(unnamed(used, besides=appearance.COLOUR_LAYOUT), records, accepted)
+    findings += check_openings(accepted)
     if split:
         findings += check_split(accepted, split)
     return sorted(findings, key=lambda finding: finding.severity == "note")
