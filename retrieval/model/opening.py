@@ -10,8 +10,8 @@ The sum over grasps is a log likelihood ratio of this object to an object that t
 1 + dependence * (grasps - 1), as match logits are (`retrieval.model.posterior`), and added to the object's log ratio.
 It is 0 for a grasp or an object without an opening.
 
-mean and spread are those of validation objects; width and floor maximise the likelihood of their further grasps. Half
-of the grasps of an object differ by less than 4 %, others touch another side. Therefore the tails are heavy (with normal
+mean and spread are those of recorded objects. width and floor maximise the likelihood of their further grasps. Half of
+the grasps of an object differ by less than 4 %, others touch another side. Therefore the tails are heavy (with normal
 ones fewer unseen simulated objects were found), and in the part `floor` of the grasps the opening says nothing: no
 opening excludes an object.
 """

@@ -46,7 +46,13 @@ from retrieval.model.shipped import is_shipped, shipped_model
 from retrieval.model.towers import TOWER_SEPARATOR
 from retrieval.model.towers.tower import Tower
 from retrieval.model.towers.weights import GEL
-from retrieval.training.calibration import ScoredTouches, score_touches, with_calibrations, with_gel_check
+from retrieval.training.calibration import (
+    ScoredTouches,
+    fit_opening,
+    score_touches,
+    with_calibrations,
+    with_gel_check,
+)
 from retrieval.training.cca import (
     MAX_CALIBRATION_TOUCHES,
     CcaSelection,
@@ -186,6 +192,7 @@ def adapt(
     made.matcher.to(device)
     known = features if kept is None else kept
     source = FrozenFeatures(made.config, features_by_image(grasps, known, device))
+    made = dataclasses.replace(made, opening=fit_opening(grasps))
     store_checkpoint(with_gel_check(made, source, *groups, quiet=quiet), out)
     return Adaptation(load_checkpoint(out), measures, kept is not None)
 

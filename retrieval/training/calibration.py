@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from retrieval.data.dataset import Grasp
-from retrieval.data.opening import RANGE_MM
+from retrieval.data.opening import believed
 from retrieval.errors import BadInput
 from retrieval.model import verification
 from retrieval.model.checkpoint import Checkpoint
@@ -71,7 +71,6 @@ class ScoredTouches:
         touch_embeddings: (T, d) embeddings, for the calibration of reference touches; d is 0 for a model whose logit
             has no cosine.
         photo_embeddings: (N, d') embeddings, for verification.
-        openings_mm: (T,) openings of the jaws, NaN where none was measured; empty if none was at all.
     """
 
     logits: NDArray[np.floating[Any]]
@@ -80,7 +79,6 @@ class ScoredTouches:
     own: NDArray[np.bool_]
     touch_embeddings: Embeddings = field(default_factory=lambda: _NO_EMBEDDINGS)
     photo_embeddings: Embeddings = field(default_factory=lambda: _NO_EMBEDDINGS)
-    openings_mm: Floats = field(default_factory=lambda: np.zeros(0))
 
     @property
     def has_trials(self) -> bool:
@@ -133,13 +131,7 @@ def score_grasps(
     owners = touch_owner, np.array([owner_of[photo] for photo in photos])
     own = np.array([[grasp.photo == photo for photo in photos] for grasp in grasps])
     scored = score_touches(matcher, (touches, torch.stack(list(photos.values()))), owners, own, pooled=pooled)
-    return dataclasses.replace(scored, openings_mm=measured_openings(grasps)) if scored.has_trials else None
-
-
-def measured_openings(grasps: Sequence[Grasp]) -> Floats:
-    """Return the openings (G,) of grasps in millimetres; NaN where none was measured, or one that is not believed."""
-    openings = np.array([grasp.opening_mm for grasp in grasps], dtype=np.float64)  # None becomes NaN
-    return np.where((openings >= RANGE_MM[0]) & (openings <= RANGE_MM[1]), openings, np.nan)
+    return scored if scored.has_trials else None
 
 
 # Posterior -------------------------------------------------------------------------------------------------
@@ -336,36 +328,36 @@ def _reference_sets(owner: Numbers, max_references: int) -> list[tuple[Numbers, 
     return sets
 
 
-def fit_opening(*parts: ScoredTouches) -> OpeningCalibration | None:
-    """Fit the evidence of openings, on references and queries as in `fit_references`.
+def fit_opening(grasps: Sequence[Grasp]) -> OpeningCalibration | None:
+    """Fit the evidence of openings to grasps in the order of capture, with references as in `fit_references`.
 
-    None for fewer than three objects with two openings.
+    The objects may be those that a model was fitted to. None for fewer than three objects with two openings.
     """
     from scipy.optimize import minimize  # slow to import; queries do not need it
 
-    of_objects, queries, references = list[Floats](), list[float](), list[Floats]()
-    for part in parts:
-        measured = np.isfinite(part.openings_mm)
-        logs, owner = np.log(part.openings_mm[measured]), part.touch_owner[: len(measured)][measured]
-        of_objects += [logs[owner == name] for name in np.unique(owner)]
-        for shown, rows in (one for count in (MAX_REFERENCES, 1) for one in _reference_sets(owner, count)):
-            queries += logs[rows].tolist()
-            references += [np.append(logs[shown], np.full(MAX_REFERENCES - len(shown), np.nan))] * len(rows)
-    several = sum(len(one) > 1 for one in of_objects)
-    if several < MIN_OBJECTS:
+    measured = [(grasp.object_id, opening) for grasp in grasps if (opening := believed(grasp.opening_mm)) is not None]
+    if not measured:
         return None
-    every, weights = np.concatenate(of_objects), np.concatenate([np.full(len(one), 1 / len(one)) for one in of_objects])
-    mean = float(np.average(every, weights=weights))
-    spread = max(MIN_OPENING_WIDTH, math.sqrt(np.average((every - mean) ** 2, weights=weights)))
-    asked, known = np.array(queries)[:, None], np.array(references)
+    names, openings = zip(*measured, strict=True)
+    owner, logs = np.unique(names, return_inverse=True)[1], np.log(openings)
+    sets = [(logs[shown], logs[rows]) for count in (MAX_REFERENCES, 1) for shown, rows in _reference_sets(owner, count)]
+    if len(sets) < 2 * MIN_OBJECTS:
+        return None
+    weights = 1 / np.bincount(owner)[owner]
+    mean = float(np.average(logs, weights=weights))
+    spread = max(MIN_OPENING_WIDTH, math.sqrt(np.average((logs - mean) ** 2, weights=weights)))
+    queries = np.concatenate([rows for _, rows in sets])[:, None]
+    padded = [np.append(shown, np.full(MAX_REFERENCES - len(shown), np.nan)) for shown, _ in sets]
+    references = np.repeat(padded, [len(rows) for _, rows in sets], axis=0)
+    is_reference = np.isfinite(references)
 
     def calibration(parameters: Floats) -> OpeningCalibration:
         floor, width = float(parameters[0]), math.exp(parameters[1])
-        return OpeningCalibration(mean, spread, width, floor, several, len(queries) // 2)
+        return OpeningCalibration(mean, spread, width, floor, len(sets) // 2, len(queries) // 2)
 
     def loss(parameters: Floats) -> float:
-        terms = np.where(np.isfinite(known), calibration(parameters).log_density(asked, known), -np.inf)
-        return -float((np.logaddexp.reduce(terms, axis=1) - np.log(np.isfinite(known).sum(1))).mean())
+        terms = np.where(is_reference, calibration(parameters).log_density(queries, references), -np.inf)
+        return -float((np.logaddexp.reduce(terms, axis=1) - np.log(is_reference.sum(1))).mean())
 
     bounds = [(0.01, 0.99), (math.log(MIN_OPENING_WIDTH), 0.0)]
     return calibration(minimize(loss, np.array([0.2, -3.0]), method="Nelder-Mead", bounds=bounds).x)
@@ -506,6 +498,7 @@ def calibrate_checkpoint(
     ]
     if scored:
         checkpoint = with_calibrations(checkpoint, scored[:1], scored[1:], seed=seed)
+    checkpoint = dataclasses.replace(checkpoint, opening=fit_opening([*train, *validation]))
     return with_gel_check(checkpoint, source, train, validation, foreign=foreign, max_grasps=max_grasps, quiet=quiet)
 
 
@@ -527,7 +520,6 @@ def with_calibrations(
         checkpoint,
         posterior=posterior,
         references=fit_references(*scored, seed=seed),
-        opening=fit_opening(*scored),
         verification=fit_verification(scored if verified is None else verified, posterior, seed),
         pooled_posterior=fit_posterior(*pooled, seed=seed) if pooled else checkpoint.pooled_posterior,
         pooled_references=fit_references(*pooled, seed=seed) if pooled else checkpoint.pooled_references,

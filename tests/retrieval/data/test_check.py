@@ -3,15 +3,17 @@
 import json
 import re
 import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from retrieval.commands.main import main
+from retrieval.data.check.opening import check_openings
 from retrieval.data.check.recording import check_gel_layout, check_recording
 from retrieval.data.check.split import check_split
-from retrieval.data.dataset import Split, load_grasps, make_split
+from retrieval.data.dataset import Grasp, Split, load_grasps, make_split
 from tests import synthetic
 
 GELS = ("touch_a", "touch_b", "touch_a_before", "touch_b_before")
@@ -193,6 +195,25 @@ def test_a_sequence_with_swapped_folders_and_exchanged_channels_are_named(broken
         ("warning", "colour-layout", broken.names(COLOURS)),
     }
     assert "throughout the sequence(s) one folder," in found[0].message
+
+
+@pytest.mark.parametrize(
+    ("opening", "message"),
+    [
+        (lambda object_number, grasp: (30 + 9 * object_number + grasp) / 1000, "not between 0.5 and 300.* metres"),
+        (lambda object_number, grasp: 110.0, "110.0 mm in all grasps"),
+        (lambda object_number, grasp: 30.0 + 9 * grasp, "says nothing of the object"),
+        (lambda object_number, grasp: 30.0 + 9 * object_number + grasp, None),
+    ],
+)
+def test_openings_that_no_gripper_measures_or_that_say_nothing_of_the_object_are_doubted(opening, message):
+    grasps = [
+        Grasp(f"{name}-{number}", str(name), None, Path("photo"), (), (), opening_mm=opening(name, number))
+        for name in range(6)
+        for number in range(3)
+    ]
+    found = list(check_openings(grasps))
+    assert [bool(re.search(message, finding.message)) for finding in found] == [True] if message else not found
 
 
 def test_two_grasps_are_too_few_to_find_a_swap(tmp_path):

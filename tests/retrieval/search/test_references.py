@@ -1,5 +1,6 @@
 """Reference touches in an index: encoding, storage, scoring and display next to photos."""
 
+import dataclasses
 import json
 import math
 import re
@@ -14,6 +15,7 @@ from retrieval.data.dataset import load_grasps
 from retrieval.errors import BadInput
 from retrieval.indexing.build import build_index
 from retrieval.indexing.sharded import build_sharded
+from retrieval.model.opening import OpeningCalibration
 from retrieval.model.references import SHARPNESS, ReferenceCalibration, unit_embeddings
 from retrieval.report.query import query_page
 from retrieval.report.terminal import print_table
@@ -132,6 +134,39 @@ def test_the_documented_keys_of_references_are_those_written_and_the_result_read
     assert (references["touches"], references["objects"]) == (8, 4)
     assert typed(references["calibration"], ReferenceCalibration, complete=True) == REFERENCE_CALIBRATION
     assert {"references.json", "touches.npy"} <= {path.name for path in generation.folder.iterdir()}
+
+
+# Openings of the jaws ------------------------------------------------------------------------------------------------
+
+
+OPENING = OpeningCalibration(mean=3.4, spread=0.7, width=0.001, floor=0.001, objects=9, touches=9)
+
+
+def test_the_opening_of_a_reference_adds_its_log_ratio_and_brings_its_object_among_the_candidates(
+    catalogue_with_touches, tmp_path, touches
+):
+    first, last = f"{NAMES[3]}/touch_0_b.png", f"{NAMES[3]}/touch_1_a.png"
+    lines = [{"file_name": first, "opening_mm": 30}, {"object_id": NAMES[0], "opening_mm": 90}]
+    (catalogue_with_touches / "metadata.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    model = write_reference_model(tmp_path / "model.safetensors", opening=OPENING)
+    build_index(catalogue_with_touches, model, tmp_path / "index", quiet=True)
+    files = touches[NAMES[1]][:2]
+    with Searcher.open(tmp_path / "index") as searcher:
+        bare = searcher.query(files, top=8)
+        result = searcher.query(files, top=8, opening_mm=[30, None])
+        few = searcher.query(files, top=1, candidates=1, opening_mm=[30, 30])
+    before, after = ({match.object_id: match.logit for match in some.results} for some in (bare, result))
+    ratios = OPENING.log_ratios([30], [30, math.nan, 90, 90], np.array([0, 2]))[0]
+    expected = {NAMES[3]: before[NAMES[3]] + ratios[0] / 0.9, NAMES[0]: before[NAMES[0]] + ratios[1] / 0.9}
+    assert after == pytest.approx(before | expected, abs=1e-4)
+    assert few.top.object_id == NAMES[3]
+    assert result.posterior["opening"] == {"compared_objects": 2, "calibration": dataclasses.asdict(OPENING)}
+    document = json.loads(json.dumps(result.to_dict()))
+    assert document["query"]["opening_mm"] == [30, None]
+    assert QueryResult.from_dict(document).to_dict() == result.to_dict()
+    (catalogue_with_touches / "metadata.jsonl").write_text(json.dumps({"file_name": last, "opening_mm": 0.03}))
+    with pytest.raises(BadInput, match=rf"opening_mm of {NAMES[3]}/touch_1_a.png must be .*metres"):
+        build_index(catalogue_with_touches, model, tmp_path / "index", quiet=True)
 
 
 # Building again -----------------------------------------------------------------------------------------------------

@@ -4,11 +4,13 @@ import dataclasses
 import json
 import math
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from _touch_retrieval.documents import typed
+from retrieval.data.dataset import Grasp
 from retrieval.errors import BadInput
 from retrieval.model.posterior import SLOPE_BOUNDS, Posterior
 from retrieval.model.references import reference_similarity
@@ -19,6 +21,7 @@ from retrieval.model.verification import (
 )
 from retrieval.training.calibration import (
     ScoredTouches,
+    fit_opening,
     fit_posterior,
     fit_references,
     fit_verification,
@@ -128,6 +131,37 @@ def test_one_reference_and_three_are_both_calibrated():
         confidence = (likelihoods.max(1) / likelihoods.sum(1)).mean()
         accuracy = (ratios.argmax(1) == np.repeat(np.arange(80), 4)).mean()
         assert confidence == pytest.approx(accuracy, abs=0.1)
+
+
+def opened_grasps(objects=60, grasps=4, outliers=0.2, seed=0):
+    """Return grasps with openings: within 1 % of the object's own one, or those of any object."""
+    rng = np.random.default_rng(seed)
+    own, every = (np.exp(rng.normal(3.4, 0.7, shape)) for shape in ((objects, 1), (objects, grasps)))
+    same = own * np.exp(0.01 * rng.standard_cauchy((objects, grasps)).clip(-9, 9))
+    openings = np.where(rng.random(same.shape) < outliers, every, same)
+    return [
+        Grasp(f"{name}-{number}", str(name), None, Path("photo"), (), (), opening_mm=float(opening))
+        for name, row in enumerate(openings)
+        for number, opening in enumerate(row)
+    ]
+
+
+def test_the_fit_of_openings_finds_their_width_and_the_part_that_says_nothing():
+    found = fit_opening(opened_grasps(300))
+    assert (found.mean, found.spread, found.width) == pytest.approx(
+        (3.4, 0.7, 0.02), rel=0.2
+    )  # a reference and a query differ
+    assert found.floor == pytest.approx(1 - 0.8**2, abs=0.1)  # of the reference or of the query
+    assert (found.objects, found.touches) == (300, 600)
+
+
+def test_openings_without_a_fit_or_a_difference_are_no_evidence():
+    grasps = opened_grasps()
+    assert fit_opening(grasps[:8]) is None  # two objects
+    assert fit_opening([dataclasses.replace(grasp, opening_mm=None) for grasp in grasps]) is None
+    assert fit_opening([dataclasses.replace(grasp, opening_mm=0.03) for grasp in grasps]) is None  # metres
+    equal = fit_opening([dataclasses.replace(grasp, opening_mm=110.0) for grasp in grasps])
+    assert equal.log_ratios([110.0], [110.0], np.array([0])) == pytest.approx(0, abs=0.5)
 
 
 # Verification ------------------------------------------------------------------------------------------------
