@@ -122,7 +122,9 @@ def test_the_pooled_posterior_is_fitted_on_the_logits_of_the_matcher_without_cel
     rng = torch.Generator().manual_seed(0)
     photos = {Path(f"{at}.png"): torch.rand(matcher.photo_feature_count, generator=rng) for at in range(12)}
     touches = torch.rand(12, 2 * matcher.touch_tower.output_count, generator=rng)
-    grasps = [SimpleNamespace(object_id=f"object {at // 2}", photo=photo) for at, photo in enumerate(photos)]
+    grasps = [
+        SimpleNamespace(object_id=f"object {at // 2}", photo=photo, opening_mm=None) for at, photo in enumerate(photos)
+    ]
     each, count = pooled.touch_tower.feature_count, pooled.photo_feature_count
     short = {photo: features[:count] for photo, features in photos.items()}
     short_touches = touches.reshape(12, 2, -1)[..., :each].reshape(12, -1)

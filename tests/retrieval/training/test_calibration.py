@@ -147,11 +147,10 @@ def opened_grasps(objects=60, grasps=4, outliers=0.2, seed=0):
 
 
 def test_the_fit_of_openings_finds_their_width_and_the_part_that_says_nothing():
-    found = fit_opening(opened_grasps(300))
-    assert (found.mean, found.spread, found.width) == pytest.approx(
-        (3.4, 0.7, 0.02), rel=0.2
-    )  # a reference and a query differ
-    assert found.floor == pytest.approx(1 - 0.8**2, abs=0.1)  # of the reference or of the query
+    found, plain = fit_opening(opened_grasps(300)), fit_opening(opened_grasps(300, outliers=0))
+    for each in (found, plain):  # reference and query both differ from the object's own opening
+        assert (each.mean, each.spread, each.width) == pytest.approx((3.4, 0.7, 0.02), rel=0.3)
+    assert plain.floor < 0.05 < 0.2 < found.floor < 0.4
     assert (found.objects, found.touches) == (300, 600)
 
 
