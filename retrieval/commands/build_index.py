@@ -22,7 +22,7 @@ PREVIEW_PHOTOS = 16
 def build_index(
     catalogue: Annotated[
         Path,
-        typer.Argument(help="folder with <object>/<photo> or <object>.<ext>"),
+        typer.Argument(help="folder with <object>/<photo> or <object>.<ext>, or a recording"),
     ],
     *,
     objects_from: Annotated[

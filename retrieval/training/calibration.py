@@ -51,7 +51,7 @@ SEQUENCES = 8
 """Sequences of grasps of each validation object, for verification."""
 MAX_CALIBRATION_GRASPS = 400
 """Largest number of grasps from each part of the split."""
-MIN_GRASPS = 40
+MIN_GRASPS = 20
 """Number of validation grasps that the gel check needs; thresholds from fewer grasps would reject too many touches."""
 FOREIGN_COUNT = 700
 """Number of foreign pictures for fitting; half as many others are drawn for validation."""
@@ -536,11 +536,15 @@ def with_gel_check(
     max_grasps: int = MAX_CALIBRATION_GRASPS,
     quiet: bool = False,
 ) -> Checkpoint:
-    """Return the checkpoint with a gel check, if there are `MIN_GRASPS` validation grasps (`calibrate_checkpoint`)."""
+    """Return the checkpoint with a new gel check (`calibrate_checkpoint`).
+
+    With fewer than `MIN_GRASPS` validation grasps it has none: the check of another sensor would refuse these touches.
+    """
     seed, matcher, settings = checkpoint.config.training.seed, checkpoint.matcher, checkpoint.config.preprocessing
     train, validation = (_sample_grasps(part, seed, max_grasps) for part in (train, validation))
     if len(validation) < MIN_GRASPS:
-        return checkpoint
+        matcher.gel_head = None
+        return dataclasses.replace(checkpoint, gel_check=None)
     fitting, test = (
         GelCheckFeatures.of(
             matcher,

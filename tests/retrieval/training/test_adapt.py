@@ -12,7 +12,8 @@ from retrieval.commands.options import training_config
 from retrieval.data.dataset import LICENCES, DataLicence, Split, load_grasps, recording_licence, stored_licences
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
-from retrieval.model.fusion import Matcher
+from retrieval.model.fusion import GelHead, Matcher
+from retrieval.model.gel_check import GelCheck
 from retrieval.model.towers.tower import build_tower
 from retrieval.training.adapt import accuracies, adapt, combined_matcher, draw_folds, fit_folds
 from retrieval.training.calibration import ScoredTouches, fit_posterior, fit_verification, verification_sequences
@@ -215,16 +216,19 @@ def test_a_baseline_that_is_as_good_is_kept_with_new_calibrations(recording, mod
     )
     start, out, path = load_checkpoint(model), tmp_path / "own.safetensors", tmp_path / "start.safetensors"
     provenance = start.provenance | {LICENCES: [dataclasses.asdict(DataLicence("another"))]}
-    start = dataclasses.replace(start, verification=calibration(accept=1.0, reject=-1.0), provenance=provenance)
+    check = GelCheck(-1e6, None, None, {})  # of another sensor: it refuses every touch
+    start.matcher.gel_head = GelHead(start.matcher.touch_tower.feature_count)
+    verification = calibration(accept=1.0, reject=-1.0)
+    start = dataclasses.replace(start, verification=verification, gel_check=check, provenance=provenance)
     store_checkpoint(start, path)
     assert main(["adapt", str(recording), "--out", str(out), "--model", str(path), "--init", "none"]) == 0
     output, made = capsys.readouterr(), load_checkpoint(out)
     assert "unadapted model is used" in output.out
     assert made.config == start.config
-    for name, tensor in start.matcher.state_dict().items():
-        assert torch.equal(tensor, made.matcher.state_dict()[name])
+    for name, tensor in made.matcher.state_dict().items():
+        assert torch.equal(tensor, start.matcher.state_dict()[name])
     assert made.posterior != start.posterior
-    # Those of the start model are for its posterior; 12 objects are too few for new ones
-    assert made.verification is None
+    # Those of the start model are for its posterior and its sensor; 12 objects are too few for new ones
+    assert (made.verification, made.gel_check) == (None, None)
     assert set(made.provenance["adapted_to"]) == {"source", "data_digest"}
     assert stored_licences(made.provenance) == [DataLicence("another"), recording_licence(recording)]
