@@ -2,20 +2,30 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from retrieval.commands.options import COUNT, FRACTION, SEED, Index, IndexModel, Json, resolve_index
+from retrieval.commands.options import (
+    COUNT,
+    FRACTION,
+    SEED,
+    Index,
+    IndexModel,
+    Json,
+    refuse_options,
+    resolve_index,
+)
 from retrieval.console.interruption import resumable
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput, RetrievalError
 
 if TYPE_CHECKING:
+    from retrieval.search.answer import Enrolment
     from retrieval.search.searcher import Searcher
     from robot.recording.grasp import RecordedGrasp
-    from robot.rig import Rig
 
 
 def identify(
@@ -38,7 +48,16 @@ def identify(
         float | None,
         typer.Option(metavar="RATE", parser=FRACTION, help="false-accept rate of --expect (default: 0.01)"),
     ] = None,
-    grasps: Annotated[int, typer.Option(parser=COUNT, help="largest number of accepted grasps")] = 5,
+    enrol: Annotated[
+        str | None,
+        typer.Option(metavar="OBJECT", help="remember the grasps in the index, as touches of this known or new object"),
+    ] = None,
+    grasps: Annotated[
+        int | None,
+        typer.Option(
+            parser=COUNT, help="largest number of accepted grasps (default: 5); with --enrol their number (default: 3)"
+        ),
+    ] = None,
     confidence: Annotated[
         float,
         typer.Option(
@@ -55,8 +74,10 @@ def identify(
     """Grasp the object with a rig until the answer is clear; stay next to a real rig. Resumes a stopped run.
 
     Each further grasp is planned at a height that differs much from those of the earlier grasps. Use another --out for
-    each object.
+    each object. With --enrol, the index remembers the grasps, and finds this object from then on.
     """
+    if enrol is not None:
+        refuse_options("asks for a known object, and --enrol adds one; give one of them", expect=expect)
     if far is not None and expect is None:
         raise BadInput("--far is the false-accept rate of --expect; give both, or neither")
     path = resolve_index(index)
@@ -67,28 +88,30 @@ def identify(
     from robot.rig import load_rig
 
     with Searcher.open(path, model=model) as searcher:
-        run = _Run(searcher, out, expect, 0.01 if far is None else far, confidence, grasps)
+        most = grasps or (5 if enrol is None else 3)
+        run = _Run(searcher, out, expect, 0.01 if far is None else far, confidence, most, enrol is not None)
         if expect is not None:  # refuse it before the rig moves
             searcher.expected_object(expect, run.far)
+        if enrol is not None:
+            searcher.enrolled_name(enrol)
 
-        def make_rig() -> "Rig":
-            made = load_rig(rig, seed=seed)
-            if len(made.sensors) != searcher.reader.fingers:
-                raise BadInput(
-                    f"the model of {path} takes {searcher.reader.fingers} gel image(s) of a grasp, but the rig {rig} "
-                    f"has {len(made.sensors)} sensor(s); give --model, or another rig"
-                )
-            made.planner = SpreadPlanner(made.planner, run.heights_mm)
-            return made
-
+        made = load_rig(rig, seed=seed)
+        if len(made.sensors) != searcher.reader.fingers:
+            raise BadInput(
+                f"the model of {path} takes {searcher.reader.fingers} gel image(s) of a grasp, but the rig {rig} "
+                f"has {len(made.sensors)} sensor(s); give --model, or another rig"
+            )
+        made.planner = SpreadPlanner(made.planner, run.heights_mm)
+        if made.info["rig"] != "sim":  # a simulated rig has names of its own
+            object_id = object_id or enrol
         attempts: set[int] = set()  # total counts of attempts: at the start, then after each new attempt
         with resumable(out):
             (tally,) = collect(
-                make_rig,
+                lambda: made,
                 out,
                 objects=[object_id] if object_id else 1,
                 seed=seed,
-                settings=CollectSettings(grasps=grasps),
+                settings=CollectSettings(grasps=most),
                 progress=lambda now: attempts.add(now.attempts),
                 is_enough=run.is_enough,
             )
@@ -101,6 +124,11 @@ def identify(
                 f"no grasp of {tally.object_id} was accepted; the last attempt: {last.reason or last.outcome} (all "
                 f"attempts are in {out}/attempts.jsonl)"
             )
+        if enrol is not None and run.answer.results:
+            enrolment = run.remember(enrol)
+            if json:
+                print_json(enrolment._asdict())
+            return 0
         if len(attempts) == 1:  # no new attempt: the hand may hold another object now
             raise BadInput(f"{out} holds a finished run: {run.sentence}. Give another --out for the next object")
     if json:
@@ -121,7 +149,11 @@ class _Run:
     far: float
     confidence: float
     grasps: int
+    enrols: bool
     heights_mm: list[float] = field(default_factory=list)
+    touches: list[list[Path]] = field(default_factory=list)
+    openings_mm: list[float | None] = field(default_factory=list)
+    background: list[Path] | None = None
     answer: Any = None
 
     def is_enough(self, grasps: Sequence["RecordedGrasp"]) -> bool:
@@ -131,26 +163,39 @@ class _Run:
         from retrieval.model.verification import ACCEPT, REJECT
 
         self.heights_mm[:] = [grasp.pose[2] for grasp in grasps if grasp.pose is not None]
-        touches, openings_mm, seen = list[list[Path]](), list[float | None](), set[bytes]()
+        self.touches, self.openings_mm, seen = [], [], set[bytes]()
         for grasp in grasps:
             files = self._files(grasp.touches)
             pictures = {file.read_bytes() for file in files}
             if seen & pictures:  # a camera that stands still: a picture counts once
                 say(f"{grasp.grasp_id} repeats a picture of an earlier grasp and does not count; check the gel cameras")
             else:
-                touches.append(files)
-                openings_mm.append(believed(grasp.opening_mm))
+                self.touches.append(files)
+                self.openings_mm.append(believed(grasp.opening_mm))
             seen |= pictures
-        background = self._files(grasps[-1].touches_before) if self.searcher.reader.takes_background else None
+        self.background = self._files(grasps[-1].touches_before) if self.searcher.reader.takes_background else None
         if self.expect is None:
-            self.answer = self.searcher.query(touches, opening_mm=openings_mm, background=background)
+            self.answer = self.searcher.query(self.touches, opening_mm=self.openings_mm, background=self.background)
             none, results = self.answer.none_probability, self.answer.results
-            is_final = none is not None and max(none, results[0].probability or 0.0) >= self.confidence
+            is_sure = none is not None and max(none, results[0].probability or 0.0) >= self.confidence
+            is_final = is_sure and not self.enrols
         else:
-            self.answer = self.searcher.verify(touches, self.expect, far=self.far, background=background)
+            self.answer = self.searcher.verify(self.touches, self.expect, far=self.far, background=self.background)
             is_final = self.answer.decision in (ACCEPT, REJECT)
         say(f"grasp {len(grasps)} of at most {self.grasps}: {self.sentence}")
         return is_final or NOT_A_GEL in self.answer.grasps  # no further grasp would change it
+
+    def remember(self, name: str) -> "Enrolment":
+        """Enrol the grasps with contact, and say so."""
+        from retrieval.model.gel_check import CONTACT
+
+        shows = [check == CONTACT for check in self.answer.grasps]
+        touches, openings_mm = list(compress(self.touches, shows)), list(compress(self.openings_mm, shows))
+        made = self.searcher.enrol(name, touches, opening_mm=openings_mm, background=self.background)
+        left_out = len(shows) - made.added
+        remark = f"; {left_out} without contact left out" if left_out else ""
+        say(f"enrolled {made.added} touch(es) of {made.object_id}, which has {made.touches} now{remark}")
+        return made
 
     @property
     def sentence(self) -> str:

@@ -207,12 +207,13 @@ class Removal(NamedTuple):
     touches: int
 
 
-def remove_enrolled(index: str | Path, object_id: str) -> Removal:
-    """Delete all enrolled touches of an object; the photos and touches of the catalogue stay.
+def remove_enrolled(index: str | Path, object_id: str, *, pictures: Collection[str] | None = None) -> Removal:
+    """Delete enrolled touches of an object; the photos and touches of the catalogue stay.
 
     Args:
         index: Folder of the index.
         object_id: The object: exactly so, or the only one with its `lookup_key`.
+        pictures: SHA-256 of gel images whose touches are deleted. Default: all touches of the object.
 
     Raises:
         BadInput: No touch of the object is enrolled.
@@ -235,6 +236,10 @@ def remove_enrolled(index: str | Path, object_id: str) -> Removal:
                 f"{abbreviate_list(like or names, MAX_EXAMPLES) or 'none'}"
             )
         name = object_id if object_id in names else like[0]
-        kept = [touch for touch in touches if touch.object_id != name]
+        kept = [
+            touch
+            for touch in touches
+            if touch.object_id != name or (pictures is not None and set(pictures).isdisjoint(touch.digests))
+        ]
         table.replace(kept)
     return Removal(name, len(touches) - len(kept))

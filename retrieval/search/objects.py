@@ -237,6 +237,17 @@ class Objects:
             for path, digest in zip(one.touch, one.digests, strict=True)
         }
 
+    @property
+    def enrolled_pictures(self) -> list[ListedPhoto]:
+        """A gel image of each touch of the objects that only the table of enrolled touches has, by object."""
+        is_only = np.isin(self._owners, self._enrolled_numbers)
+        return [self.gel_images[self._touches[place].touch[0]] for place in np.flatnonzero(is_only)]
+
+    @property
+    def enrolled_count(self) -> int:
+        """Number of enrolled touches."""
+        return sum(one.is_enrolled for one in self._touches)
+
     def compare_references(self, partials: Floats, openings_mm: NDArray[np.float64] | None = None) -> ReferenceEvidence:
         """Compare grasps with the reference touches of all objects.
 

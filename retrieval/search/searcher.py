@@ -333,13 +333,7 @@ class Searcher:
             IndexesError: The table of enrolled touches is damaged or cannot be written.
         """
         opened, stored = self._snapshot(), self.checkpoint
-        if stored.references is None or stored.posterior is None:
-            raise BadInput(
-                f"{stored.path} has no calibration of reference touches, so this index cannot compare touches. "
-                "Use a shipped model, or one of `retrieve adapt` or `retrieve train` (preset relief, with enough "
-                "validation objects), and build the index with it"
-            )
-        name, fingers = opened._enrolled_name(object_id), opened.reader.fingers
+        name, fingers = opened.enrolled_name(object_id), opened.reader.fingers
         grasps = [list(map(with_file, grasp)) for grasp in parse_grasps(touches, fingers)]
         openings = parse_openings(opening_mm, len(grasps))
         frames = [] if background is None else parse_grasps(background, fingers, noun="background")[0]
@@ -377,8 +371,19 @@ class Searcher:
             table.replace([*known, *new], files)
         return Enrolment(name, sum(touch.object_id == name for touch in (*known, *new)), len(new))
 
-    def _enrolled_name(self, object_id: str) -> str:
-        """Return the object of the index that a person names, or the name of a new one. Raises BadInput."""
+    @property
+    def can_enrol(self) -> bool:
+        """Whether the model can compare enrolled touches."""
+        return self.checkpoint.references is not None and self.posterior is not None
+
+    def enrolled_name(self, object_id: str) -> str:
+        """Return the object of the index that a person names, or the name of a new one; raise as `enrol`."""
+        if not self.can_enrol:
+            raise BadInput(
+                f"{self.checkpoint.path} has no calibration of reference touches, so this index cannot compare "
+                "touches. Use a shipped model, or one of `retrieve adapt` or `retrieve train` (preset relief, with "
+                "enough validation objects), and build the index with it"
+            )
         like, new = self.shard.names_like(object_id), lookup_key(object_id)
         if len(like) > 1:
             raise BadInput(f"{object_id!r} can be {' or '.join(map(repr, like))}; give one of these names exactly")

@@ -185,7 +185,9 @@ class FolderShard:
         return self.objects.names_like(name)
 
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
-        """Return a page of the photos that contain all words in object, path or metadata.
+        """Return a page of the photos that contain all words in object, path or metadata, in index order.
+
+        The gel images of objects that were only enrolled follow, by object.
 
         Args:
             words: Lower-case words.
@@ -193,20 +195,29 @@ class FolderShard:
             offset: Number of photos to skip.
             limit: Largest number of photos to return.
         """
-        rows = self.generation.rows
+        rows, enrolled = self.generation.rows, self.objects.enrolled_pictures
         found = np.arange(len(rows))
         if object_id is not None:
             found = np.flatnonzero(rows.objects == rows.find_object(object_id))
+            enrolled = [one for one in enrolled if one.object_id == object_id]
         if words:
             texts, keys = self._texts, [lookup_key(word) for word in words]
             found = np.array([row for row in found if all(key in texts[row] for key in keys)], dtype=np.int64)
-        return Page(len(found), [listed_photo(rows[int(row)]) for row in found[offset : offset + limit]])
+            enrolled = [one for one in enrolled if all(key in _searched(one.object_id) for key in keys)]
+        photos = [listed_photo(rows[int(row)]) for row in found[offset : offset + limit]]
+        start = max(0, offset - len(found))
+        return Page(len(found) + len(enrolled), photos + enrolled[start : start + limit - len(photos)])
+
+    def counts(self) -> tuple[int, int]:
+        """Return the number of objects, and of enrolled touches."""
+        objects = self.objects
+        return objects.count, objects.enrolled_count
 
     @cached_property
     def _texts(self) -> list[str]:
         """Searched text of each row: object, path and metadata in lower case."""
         return [
-            lookup_key(" ".join(map(str, (row.object_id, row.path, *row.metadata.values()))).casefold())
+            _searched(" ".join(map(str, (row.object_id, row.path, *row.metadata.values()))))
             for row in self.generation.rows
         ]
 
@@ -237,6 +248,11 @@ class FolderShard:
         if unscored and len(rows := objects.sample_rows_without(scored.numbers)):
             sample = objects.score(rows, self._logits(partials, rows), evidence, len(partials)).logits
         return objects.posterior.mass(scored.logits, len(partials), unscored=unscored, sample=sample)
+
+
+def _searched(text: str) -> str:
+    """Return a text as it is searched."""
+    return lookup_key(text.casefold())
 
 
 def combined_embedding(embeddings: Floats) -> Floats:
@@ -285,6 +301,11 @@ class Shards:
         """As `FolderShard.photos`."""
         found = self.call(self.shards, "photos", list(paths))
         return [next((photo for photo in photos if photo is not None), None) for photos in zip(*found, strict=True)]
+
+    def counts(self) -> tuple[int, int]:
+        """As `FolderShard.counts`."""
+        objects, enrolled = zip(*self.call(self.shards, "counts"), strict=True)
+        return sum(objects), sum(enrolled)
 
     def names_like(self, name: str) -> list[str]:
         """As `FolderShard.names_like`."""

@@ -40,7 +40,7 @@ def catalogue(
         str | None, Query(max_length=1000, alias="object", description="Only photos of this object.")
     ] = None,
 ) -> dict[str, Any]:
-    """Return one page of the index's photos, in index order.
+    """Return one page of the index's photos, in index order, then the gel images of objects that were only enrolled.
 
     total: number of matching photos; next: offset of the next page, null at the end; items: `id`, by which all routes
     name the photo, `object_id`, and the user's own `metadata`.
@@ -105,15 +105,18 @@ def index(parts: Parts) -> dict[str, Any]:
     """Return a description of the index, its model and the service.
 
     sensors: names of live sensors; can_grasp, can_verify: whether POST /v1/grasp and POST /v1/verify work;
-    stores_history: whether queries and feedback are stored.
+    can_enrol: whether touches can be enrolled; stores_history: whether queries and feedback are stored. objects
+    includes those that have enrolled touches only.
     """
     generation = parts.generations.current
     searcher, info = generation.searcher, generation.searcher.manifest
+    objects, enrolled = generation.shard.counts()
     return {
         "generation": generation.name,
         "kind": info.kind,
         "photos": info.photos,
-        "objects": info.objects,
+        "objects": objects,
+        "enrolled_touches": enrolled,
         "model": replace_surrogates(searcher.checkpoint.path.name),
         "trained_on": replace_surrogates(str(searcher.checkpoint.provenance.get("source", "unknown"))),
         "fingers": generation.fingers,
@@ -121,6 +124,7 @@ def index(parts: Parts) -> dict[str, Any]:
         "sensors": sorted(parts.rig.sensors),
         "can_grasp": parts.rig.grasp is not None,
         "can_verify": searcher.can_verify,
+        "can_enrol": searcher.can_enrol and generation.is_writable,
         "stores_history": parts.history_writer is not None,
         "version": __version__,
     }

@@ -17,7 +17,7 @@ from retrieval.data.images import encode_image, read_bytes
 from retrieval.data.opening import Openings, parse_openings
 from retrieval.errors import BadInput, ImageError, RetrievalError
 from retrieval.model.touches import AnyImage, AnyTouches, GelImage, InputImage, parse_grasps, read_image
-from retrieval.search.answer import Match, QueryResult
+from retrieval.search.answer import Enrolment, Match, QueryResult
 
 try:
     import httpx
@@ -101,6 +101,20 @@ class Client:
         """Run `query` for each object, with its openings."""
         openings = [None] * len(objects) if opening_mm is None else opening_mm
         return [self.query(touches, opening_mm=one, **options) for touches, one in zip(objects, openings, strict=True)]
+
+    def enrol(
+        self,
+        object_id: str,
+        touches: AnyTouches,
+        *,
+        opening_mm: Openings = None,
+        background: Sequence[AnyImage] | None = None,
+    ) -> Enrolment:
+        """Run `Searcher.enrol` on the service; raise as `query`."""
+        grasps = self._grasps(touches)
+        path = f"objects/{quote(object_id)}/touches"
+        found = _document(self._send("POST", path, json=_pictures(grasps, background, opening_mm)), "added")
+        return Enrolment(found["object_id"], found["touches"], len(found["added"]))
 
     def photo(self, match: Match) -> bytes:
         """Return the file of a match's photo.

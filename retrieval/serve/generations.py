@@ -7,8 +7,10 @@ released when no request uses it.
 import asyncio
 import gc
 import logging
+import os
 from functools import cached_property
 
+from retrieval.indexing.enrolled import EnrolledTable
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.search.opening import OpenShards, manifest_of
 from retrieval.search.searcher import Searcher
@@ -30,6 +32,12 @@ class ServedGeneration:
     def name(self) -> str:
         """The name of the generation."""
         return self.searcher.manifest.generation
+
+    @property
+    def is_writable(self) -> bool:
+        """Whether the service may write the enrolled touches."""
+        folder = EnrolledTable(self.searcher.index).path.parent
+        return os.access(folder if folder.exists() else self.searcher.index, os.W_OK)
 
     @cached_property
     def checkpoint(self) -> Checkpoint:

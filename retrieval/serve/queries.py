@@ -1,4 +1,4 @@
-"""Routes of queries, of verification, and of a live rig: sensor pictures and grasps."""
+"""Routes of queries, of verification, of enrolment, and of a live rig: sensor pictures and grasps."""
 
 import base64
 from typing import Annotated, Any
@@ -6,14 +6,18 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import Field
 
+from retrieval.errors import BadInput
+from retrieval.indexing.enrolled import content_digest, remove_enrolled
 from retrieval.search.shard import resolve_object
 from retrieval.serve.errors import DocumentResponse, HttpProblem
 from retrieval.serve.generations import ServedGeneration
-from retrieval.serve.service import Parts
+from retrieval.serve.service import Parts, Service
 from retrieval.serve.uploads import (
+    MAX_GRASPS,
     QUERY_BODY,
     Base64Image,
     Grasps,
+    Openings,
     Options,
     RequestBody,
     RequestPictures,
@@ -76,6 +80,69 @@ async def verify(request: Request, parts: Parts) -> DocumentResponse:
         pictures,
     )
     return DocumentResponse(found.to_dict())
+
+
+# Enrolment ------------------------------------------------------------------------------------------------------------
+
+
+class EnrolBody(RequestBody):
+    """Touches of one object."""
+
+    touches: Grasps
+    background: list[Base64Image] | None = None
+    opening_mm: Openings = None
+
+
+@router.post(
+    "/v1/objects/{name:path}/touches",
+    tags=["catalogue"],
+    status_code=201,
+    openapi_extra=json_body(EnrolBody),
+    summary="Remember touches of an object",
+)
+async def enrol(name: str, request: Request, parts: Parts) -> dict[str, Any]:
+    """Enrol touches of an object of the index, or of a new one; the next answer uses them.
+
+    touches: number of the object's enrolled touches; added: an id of each new one, by which DELETE removes it.
+    """
+    parts.queue.require_capacity()
+    _require_writable(parts)
+    body = await read_json(request, EnrolBody)
+    pictures = RequestPictures(body.touches, body.background)
+    found = await parts.queue.submit(
+        lambda generation: generation.searcher.enrol(
+            name, pictures.images, opening_mm=body.opening_mm, background=pictures.frames
+        ),
+        request,
+        pictures,
+    )
+    added = [content_digest(grasp[0]) for grasp in body.touches]
+    return {"object_id": found.object_id, "touches": found.touches, "added": added}
+
+
+@router.delete("/v1/objects/{name:path}/touches", tags=["catalogue"], summary="Forget enrolled touches of an object")
+async def forget(
+    name: str,
+    request: Request,
+    parts: Parts,
+    touch: Annotated[list[str] | None, Query(max_length=MAX_GRASPS, description="Ids of touches; all if none.")] = None,
+) -> dict[str, Any]:
+    """Remove enrolled touches of an object; the photos and reference touches of the catalogue stay."""
+    _require_writable(parts)
+    try:
+        object_id, removed = await parts.queue.submit(
+            lambda generation: remove_enrolled(generation.searcher.index, name, pictures=touch), request
+        )
+    except BadInput as error:
+        raise HttpProblem("unknown", str(error)) from error
+    return {"object_id": object_id, "removed": removed}
+
+
+def _require_writable(parts: Service) -> None:
+    generation = parts.generations.current
+    if not generation.is_writable:
+        folder = generation.searcher.index
+        raise HttpProblem("refused", f"The service may not write to {folder}, so it cannot change enrolled touches.")
 
 
 # Live rig -------------------------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ import pytest
 from retrieval.commands.main import main
 from retrieval.data.dataset import load_grasps
 from retrieval.indexing.build import build_index
+from retrieval.indexing.enrolled import remove_enrolled
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.gel_check import GelCheck
 from retrieval.model.shipped import shipped_model
@@ -106,6 +107,7 @@ def test_an_expected_object_ends_with_a_decision_or_after_all_grasps(identify, i
     [
         (("--expect", "teapot"), "has no object 'teapot'"),
         (("--expect", "{object}", "--far", "1"), "1"),
+        (("--expect", "{object}", "--enrol", "cup"), "--enrol adds one"),
         (("--far", "0.1"), "--far is the false-accept rate of --expect"),
         (("--object", "teapot"), "has no 'teapot'"),
     ],
@@ -124,3 +126,20 @@ def test_a_model_for_one_finger_is_refused_by_a_rig_with_two_sensors(index, tmp_
     build_index(index.parent / "catalog", load_checkpoint(shipped_model(1)), tmp_path / "one-finger", quiet=True)
     assert main(["identify", "--index", str(tmp_path / "one-finger"), "--out", str(tmp_path / "run")]) == 2
     assert "takes 1 gel image(s) of a grasp, but the rig sim has 2 sensor(s)" in capsys.readouterr().err
+
+
+def test_grasps_are_enrolled_once_also_by_a_run_that_was_stopped_before(identify, index, tmp_path, capsys, monkeypatch):
+    options = ("--enrol", "my part", "--grasps", "2")
+    with monkeypatch.context() as stopped:
+        stopped.setattr("retrieval.search.searcher.Searcher.enrol", None)
+        assert identify(*options) == 1
+    assert identify(*options, "--json") == 0
+    output = capsys.readouterr()
+    assert json.loads(output.out) == {"object_id": "my part", "touches": 2, "added": 2}
+    assert "enrolled 2 touch(es) of my part" in output.err
+    grasps = [grasp for grasp in read_recording(tmp_path / "run").grasps if grasp.grasped]
+    table = json.loads((index / "enrolled" / "touches.json").read_text())
+    assert [touch["opening_mm"] for touch in table["touches"]] == [grasp.opening_mm for grasp in grasps]
+    assert identify(*options) == 2
+    assert "enrolled already, for my part" in capsys.readouterr().err
+    remove_enrolled(index, "my part")

@@ -117,8 +117,9 @@ const enrolled = (objectId) => `v1/objects/${encodedPath(objectId)}/touches`;
 /** Remember touches of an object. */
 export const enrol = (objectId, touches, background, opening_mm) =>
   postTouches(enrolled(objectId), touches, background, { opening_mm });
+/** Forget the touches that `enrol` added. */
 export const forget = (objectId, added) =>
-  json(withParameters(enrolled(objectId), { touch: added }), { method: "DELETE" });
+  json(`${enrolled(objectId)}?${new URLSearchParams(added.map((id) => ["touch", id]))}`, { method: "DELETE" });
 
 export const catalogue = (parameters, signal = null) => json(withParameters("v1/catalogue", parameters), { signal });
 

@@ -176,6 +176,7 @@ export function catalogueView(index) {
     focus(to);
   });
   search.addEventListener("input", debounce(start));
+  addEventListener("enrolment", clear);
   addEventListener("scroll", draw, { passive: true });
   new ResizeObserver(draw).observe(grid);
   return { element, show: () => (found === null ? start() : draw()) };

@@ -39,6 +39,7 @@ export function rememberPanel(answer, query) {
       undo.addEventListener("click", () =>
         act(undo, async () => {
           await api.forget(done.object_id, done.added);
+          dispatchEvent(new Event("enrolment"));
           form.hidden = false;
           note.remove();
           field.focus();
@@ -46,6 +47,7 @@ export function rememberPanel(answer, query) {
         }),
       );
       const note = h("p", { class: "remember-note" }, h("strong", {}, "Remembered. "), text, " ", undo);
+      dispatchEvent(new Event("enrolment"));
       form.hidden = true;
       form.after(note);
       undo.focus();
