@@ -98,7 +98,7 @@ class Experiment:
                 "part."
             )
         grasps = thin_grasps(self.of.facts.grasps, self._max_grasps)
-        queries = draw_queries(grasps, self.split, self.draw_seed, protocol.max_grasps)
+        queries = draw_queries(grasps, self.split, self.draw_seed, protocol.max_grasps, protocol.across_sessions)
         method, fit_s = self._fit()
         scores, seconds = score_queries(method, self.features, queries, self.draw_seed, protocol.allows_own_photos)
         details = describe(method, scores, self.features) if protocol.in_depth and not self.is_control else None
@@ -119,7 +119,12 @@ class Experiment:
                 "format": _FORMAT,
                 "protocol": self.of.name,
                 "measures": self.measures,
-                "shown": [protocol.allows_own_photos, protocol.is_by_sequence, self._gallery_of],
+                "shown": [
+                    protocol.allows_own_photos,
+                    protocol.is_by_sequence,
+                    self._gallery_of,
+                    protocol.across_sessions,
+                ],
                 "method": self.row.method,
                 "kind": self.kind,
                 "is_control": self.is_control,
@@ -175,7 +180,11 @@ class Experiment:
         )
         if checkpoint and issubclass(method, LateFusion):
             return method.of_checkpoint(checkpoint, settings), 0.0
-        parts = [self.features.of_objects(part) for part in (self.split.train, self.split.validation)]
+        features = self.features
+        if self.of.protocol.across_sessions:
+            grasps = thin_grasps(self.of.facts.grasps, self._max_grasps)
+            features = features.select(np.flatnonzero([one.session == grasps[0].session for one in grasps]))
+        parts = [features.of_objects(part) for part in (self.split.train, self.split.validation)]
         if is_permuted:
             parts = [permute_touches(part, self.seed) for part in parts]
         fitted = method(settings)

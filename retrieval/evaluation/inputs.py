@@ -28,8 +28,8 @@ INPUTS = {
     "permuted": "touches are randomly assigned to other objects before fitting, so there is nothing to learn",
     "no_contact": "no-contact frames replace the touches, in fitting and in scoring",
     "low_pass": "each gel image is reduced to 8 x 6 pixels, in fitting and in scoring",
-    "order": "the input is the position of the touch in the order of capture, not its image: an upper bound on the "
-    "information in sensor drift",
+    "order": "the input is the position of the touch in the order of capture (of its session), not its image: an upper "
+    "bound on the information in sensor drift",
     "background": "only the margin of each photo is used, an eighth of each side, in fitting and in scoring",
     "touch_to_touch": "the touch of another grasp replaces the photo: how repeatable touches are",
     "photo_to_photo": "the photo of another grasp replaces the touch: how repeatable photos are",
@@ -126,7 +126,7 @@ class TowerEncoder:
             if kind == "permuted":  # the experiment permutes the touches of each part
                 return touches
             if kind == "order":
-                return replace(touches, touch=clock_features(len(touches))[:, None])
+                return replace(touches, touch=_clock_of_sessions(thin_grasps(self.grasps, max_grasps))[:, None])
             if kind == "touch_to_touch":
                 return replace(touches, photo=touches.touch.reshape(len(touches), -1))
             return replace(touches, touch=touches.photo[:, None])
@@ -187,6 +187,13 @@ def thin_grasps(grasps: Sequence[Grasp], max_grasps: int | None) -> list[Grasp]:
         for place in np.linspace(0, len(rows) - 1, min(max_grasps, len(rows))).astype(int)
     ]
     return [grasps[row] for row in sorted(selected)]
+
+
+def _clock_of_sessions(grasps: Sequence[Grasp]) -> NDArray[np.float32]:
+    """Return `clock_features` (G, F) of the place of each grasp in the order of its session."""
+    sessions = np.array([grasp.session or "" for grasp in grasps])
+    rows = [np.flatnonzero(sessions == session) for session in np.unique(sessions)]
+    return np.concatenate([clock_features(len(part)) for part in rows])[np.argsort(np.concatenate(rows))]
 
 
 def clock_features(count: int) -> NDArray[np.float32]:

@@ -36,6 +36,14 @@ class RecordingFacts:
         return data_digest(self.grasps)
 
     @cached_property
+    def sessions(self) -> dict[str | None, set[str]]:
+        """The objects of each session, in the order of the sessions' first grasps."""
+        found: dict[str | None, set[str]] = {}
+        for grasp in self.grasps:
+            found.setdefault(grasp.session, set()).add(grasp.object_id)
+        return found
+
+    @cached_property
     def names(self) -> list[str]:
         """The touched objects, sorted."""
         return sorted({grasp.object_id for grasp in self.grasps})
@@ -88,6 +96,8 @@ class Protocol:
         galleries: Function from recording and split to the gallery of each test object, if there are several galleries.
         choices: Whether the folds are different, overlapping choices of test objects. Values are then means over the
             folds, and intervals cover the choice.
+        across_sessions: Whether touches of test objects are of all sessions but the first, and all other touches and
+            all photos of the first.
         in_depth: Whether single objects, calibrated probabilities and decisions of each row are reported. Then one
             split serves all seeds, which only repeat the training; no method is fitted on validation objects, and rows
             have no low-pass control of their own and no verdict.
@@ -114,6 +124,7 @@ class Protocol:
     published_results: tuple[str, ...] = ()
     galleries: Callable[[RecordingFacts, Split], Mapping[str, str]] | None = None
     choices: bool = False
+    across_sessions: bool = False
     in_depth: bool = False
 
     def gallery_of(self, facts: RecordingFacts, split: Split) -> Mapping[str, str]:

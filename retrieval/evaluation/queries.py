@@ -35,7 +35,7 @@ class Queries:
     Attributes:
         touches: (Q,) rows of the features.
         photos: (P,) rows of the features; a photo file that several grasps share is listed once.
-        own_photo: (Q,) column of the photo that was taken before the grasp.
+        own_photo: (Q,) column of the photo that was taken before the grasp; -1 if it is not among the photos.
         touch_owner: (Q,) object numbers.
         photo_owner: (P,) object numbers.
         objects: Names of all objects of the split, sorted; object numbers are places in it.
@@ -59,7 +59,9 @@ class Queries:
         return np.flatnonzero(np.array(self.part_of, dtype=str)[owner] == part)
 
 
-def draw_queries(grasps: Sequence[Grasp], split: Split, seed: int, max_grasps: Mapping[str, int]) -> Queries:
+def draw_queries(
+    grasps: Sequence[Grasp], split: Split, seed: int, max_grasps: Mapping[str, int], across_sessions: bool = False
+) -> Queries:
     """Draw the queries: all grasps of test objects and some of the others.
 
     Sets of each size in `SET_SIZES` are drawn for test and validation objects, without replacement within a set, if
@@ -67,6 +69,9 @@ def draw_queries(grasps: Sequence[Grasp], split: Split, seed: int, max_grasps: M
     first more often than 1 in K by chance, because a mean of fewer scores varies more.
 
     A part without an entry in `max_grasps`, the maximum number of grasps of one object, has no limit.
+
+    With `across_sessions`, the touches of test objects are those of all sessions but the first, and all other touches
+    and all photos are of the first session.
 
     Raises:
         DatasetError: A part has fewer than two objects.
@@ -80,29 +85,48 @@ def draw_queries(grasps: Sequence[Grasp], split: Split, seed: int, max_grasps: M
                 f"An evaluation needs at least 2 {part} objects, but the recording has {count} of the split's. Record "
                 "more objects, or give your own split."
             )
-    rng, drawn_rows = np.random.default_rng([seed, 11]), []
-    for name, part in zip(objects, parts, strict=True):
-        rows = np.array([row for row, grasp in enumerate(grasps) if grasp.object_id == name])
-        limit = max_grasps.get(part, len(rows))
-        drawn_rows.append(rows if len(rows) <= limit else np.sort(rng.choice(rows, limit, replace=False)))
-    touches = np.concatenate(drawn_rows)
-    owner = np.repeat(np.arange(len(objects)), [len(rows) for rows in drawn_rows])
+    rng = np.random.default_rng([seed, 11])
+
+    def draw(name: str, part: str, is_query: bool) -> Rows:
+        wanted = [one.object_id == name and (not across_sessions or is_later(one) == is_query) for one in grasps]
+        rows, limit = np.flatnonzero(wanted), max_grasps.get(part, len(grasps))
+        return rows if len(rows) <= limit else np.sort(rng.choice(rows, limit, replace=False))
+
+    def is_later(grasp: Grasp) -> bool:
+        return grasp.session != grasps[0].session
+
+    of_touches = [draw(name, part, part == "test") for name, part in zip(objects, parts, strict=True)]
+    of_photos = of_touches
+    if across_sessions:
+        of_photos = [
+            draw(name, part, False) if part == "test" else rows
+            for name, part, rows in zip(objects, parts, of_touches, strict=True)
+        ]
+    touches, with_photo = np.concatenate(of_touches), np.concatenate(of_photos)
+    owner, photo_owner = (np.repeat(np.arange(len(objects)), list(map(len, rows))) for rows in (of_touches, of_photos))
     column: dict[Path, int] = {}
-    own_photo = np.array([column.setdefault(grasps[row].photo, len(column)) for row in touches])
-    first = np.unique(own_photo, return_index=True)[1]
-    touches_of = [np.flatnonzero(owner == place) for place, part in enumerate(parts) if part != "train"]
+    first = np.unique([column.setdefault(grasps[row].photo, len(column)) for row in with_photo], return_index=True)[1]
+    own_photo = np.array([column.get(grasps[row].photo, -1) for row in touches])
     sets = {}
     for size in SET_SIZES:
-        enough = [places for places in touches_of if len(places) >= size + PHOTOS_PER_CANDIDATE]
+        enough = []
+        for place, part in enumerate(parts):
+            own = 0 if across_sessions and part == "test" else size
+            if (
+                part != "train"
+                and size <= len(of_touches[place])
+                and len(of_photos[place]) >= own + PHOTOS_PER_CANDIDATE
+            ):
+                enough.append(np.flatnonzero(owner == place))
         drawn = [rng.choice(places, size, replace=False) for places in enough for _ in range(SETS_OF_AN_OBJECT)]
         if drawn:
             sets[size] = np.array(drawn)
     return Queries(
         touches=touches,
-        photos=touches[first],
+        photos=with_photo[first],
         own_photo=own_photo,
         touch_owner=owner,
-        photo_owner=owner[first],
+        photo_owner=photo_owner[first],
         objects=objects,
         part_of=parts,
         sets=sets,

@@ -5,6 +5,7 @@ the grasp, and the time identifies the object. The measures are leave-one-out ac
 """
 
 from collections.abc import Iterator, Sequence
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +62,22 @@ def check_drift(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Find
         yield Finding("warning", "drift", f"{text}: light or gel drifted, and {_ADVICE}")
     else:
         yield Finding("note", "drift", text)
+
+
+def check_sessions(grasps: Sequence[Grasp]) -> Iterator[Finding]:
+    """Report sessions between which no result can be tested: a single one, or sessions of different objects."""
+    objects_of: dict[str | None, set[str]] = {}
+    for grasp in grasps:
+        objects_of.setdefault(grasp.session, set()).add(grasp.object_id)
+    shared = [one & two for one, two in combinations(objects_of.values(), 2)]
+    remedy = "collect the same objects again after the light or the gel has changed, with `retrieve collect --session`"
+    if not shared:
+        where = "states no session" if None in objects_of else "has one session"
+        text = f"the recording {where}, so no result of it can separate touch from drift: {remedy}"
+        yield Finding("note", "one-session", text)
+    elif not any(shared):
+        text = f"no object is in two of the {len(objects_of)} sessions, so drift may identify the objects: {remedy}"
+        yield Finding("warning", "separate-sessions", text)
 
 
 def _owners(grasps: Sequence[Grasp]) -> NDArray[np.int64]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from retrieval.console.output import abbreviate_list
 from retrieval.data.check import appearance
-from retrieval.data.check.drift import check_drift
+from retrieval.data.check.drift import check_drift, check_sessions
 from retrieval.data.check.near_copies import nearest_pictures
 from retrieval.data.check.opening import check_openings
 from retrieval.data.check.pictures import Finding, ImageRecords, findings_for, fingers_of, read_pictures
@@ -76,6 +76,7 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
     if all(attempt.time_s is not None for attempt in used):
         used.sort(key=lambda attempt: attempt.time_s or 0.0)
     findings += check_drift(unnamed(used), records)
+    findings += check_sessions(accepted)
     # A mirrored image may be a near copy, too.
     findings += _near_copies(unnamed(used, besides=appearance.COLOUR_LAYOUT), records, accepted)
     findings += check_openings(accepted)

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from retrieval.data.check.split import require_fit
 from retrieval.data.dataset import Grasp, Split, make_split
 from retrieval.errors import DatasetError
-from retrieval.evaluation.protocol import Protocol, RecordingFacts
+from retrieval.evaluation.inputs import CONTROL_CCA
+from retrieval.evaluation.protocol import Protocol, RecordingFacts, split_of
 from retrieval.metrics.registry import METRICS
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import TrainingConfig
@@ -41,7 +42,33 @@ def with_split(
             objects of the model.
     """
     split, origin = _split(facts.grasps, settings, model, requested)
-    return dataclasses.replace(UNSEEN_OBJECTS, rule=f"{_RULE}The split is {origin}.", folds=lambda *_: [split])
+    protocol = dataclasses.replace(UNSEEN_OBJECTS, rule=f"{_RULE}The split is {origin}.", folds=lambda *_: [split])
+    return _across_sessions(protocol, facts, split) if len(facts.sessions) > 1 else protocol
+
+
+def _across_sessions(protocol: Protocol, facts: RecordingFacts, split: Split) -> Protocol:
+    """Return the protocol with queries of other sessions than all else, if the sessions share enough objects."""
+    first, *others = facts.sessions
+    known, later = facts.sessions[first], set().union(*(facts.sessions[one] for one in others))
+    parts = [
+        [name for name in names if name in objects]
+        for names, objects in ((split.train, known), (split.validation, known), (split.test, known & later))
+    ]
+    if min(map(len, parts)) < 2:
+        text = " The sessions share too few objects for queries of another session, so drift may identify objects."
+        return dataclasses.replace(protocol, rule=protocol.rule + text)
+    names = ", ".join(one or "unnamed" for one in others)
+    text = (
+        f" Queries are the touches of test objects in session {names}; all other touches and all photos are of session "
+        f"{first or 'unnamed'}."
+    )
+    return dataclasses.replace(
+        protocol,
+        rule=protocol.rule + text,
+        folds=lambda *_: [split_of(split.seed, *parts)],
+        controls={**protocol.controls, "order": CONTROL_CCA},
+        across_sessions=True,
+    )
 
 
 def _split(

@@ -308,6 +308,21 @@ def test_drift_identifies_objects_that_were_touched_one_after_another(broken):
     assert "touch the objects in rounds (each object once, then again)" in drift.message
 
 
+def test_sessions_between_which_no_result_can_be_tested_are_named(broken):
+    def found():
+        kinds = ("one-session", "separate-sessions")
+        return [(one.kind, one.severity) for one in check_recording(broken.folder) if one.kind in kinds]
+
+    rows = range(30)
+    assert found() == [("one-session", "note")]
+    broken.change(rows, lambda row: row.update(session="monday"))
+    assert found() == [("one-session", "note")]
+    broken.change(rows, lambda row: row.update(session=f"of {row['object_id']}"))
+    assert found() == [("separate-sessions", "warning")]
+    broken.change(rows, lambda row: row.update(session=row["grasp_id"][-1]))
+    assert found() == []
+
+
 def test_the_same_drift_does_not_identify_objects_that_were_touched_in_rounds(broken):
     """Times give the order of capture, whatever the order of the lines."""
     rounds = [number for turn in range(5) for number in range(turn, 30, 5)]

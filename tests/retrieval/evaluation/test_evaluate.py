@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 from collections import defaultdict
 
 import numpy as np
@@ -210,6 +211,48 @@ def test_a_second_run_fits_only_new_and_edited_methods_of_a_user(made, run, monk
     }
     write_report(made[1])
     assert "Constant" in (made[1] / "report.md").read_text()
+
+
+def in_sessions(recording, folder, session_of):
+    """Copy a recording, with the session of each row of its metadata."""
+    shutil.copytree(recording, folder)
+    rows = [json.loads(line) for line in (folder / "metadata.jsonl").read_text().splitlines()]
+    lines = [json.dumps(row | {"session": session_of(row)}) for row in rows]
+    (folder / "metadata.jsonl").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def test_with_two_sessions_queries_are_of_the_second_and_all_else_of_the_first(grasped, run, tmp_path, monkeypatch):
+    seen, fit = set(), Constant._fit
+    monkeypatch.setattr(
+        Constant,
+        "_fit",
+        lambda self, *parts: seen.update(*(part.grasp_ids for part in parts)) or fit(self, *parts),
+    )
+
+    def session_of(row):
+        return "monday" if row["grasp_id"].endswith(("0", "1")) else "tuesday"  # two of the four grasps
+
+    recording = in_sessions(grasped, tmp_path / "two", session_of)
+    found = of(run(tmp_path / "report", recording=recording, methods=["cca", CONSTANT]))
+    assert (
+        "Queries are the touches of test objects in session tuesday; all other touches and all photos are of session"
+        in (found.rule)
+    )
+    ((split,),) = found.folds
+    assert len(seen) == 2 * (len(split["train"]) + len(split["validation"]))
+    assert {name[-1] for name in seen} == {"0", "1"}
+    assert list(found.controls) == ["permuted", "no_contact", "low_pass", "order"]
+    summary = found.rows[CONSTANT].measures["topn_k5"]
+    assert (summary.objects, summary.queries) == (6, 12)
+    assert summary.value == pytest.approx(summary.chance, abs=1e-12)
+    again = of(run(tmp_path / "report", recording=grasped, methods=["cca", CONSTANT]))
+    assert again.rows[CONSTANT].measures["topn_k5"].queries == 24  # not the stored ones
+
+    alone = in_sessions(grasped, tmp_path / "alone", lambda row: str(int(row["object_id"][-1]) % 2))
+    found = of(run(tmp_path / "report", recording=alone, methods=[CONSTANT]))
+    assert "share too few objects" in found.rule
+    assert found.rows[CONSTANT].measures["topn_k5"].queries == 24
 
 
 def test_a_control_is_left_out_without_no_contact_frames(run, tmp_path):
