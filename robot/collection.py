@@ -195,7 +195,7 @@ def _check_can_continue(folder: Path, expected: Mapping[str, Any], strict: bool,
 
     With `strict`, the software version and the settings read back from devices must be equal too: simulated attempts
     depend on them. With a real rig, only the requested settings must be equal. With `new_counts`, the numbers of
-    grasps and attempts may differ. The session always may: each grasp states its own.
+    grasps and attempts may differ. The session and the names of objects always may: each grasp states its own.
     """
     if not (folder / INFO_FILE).is_file():
         return
@@ -203,7 +203,11 @@ def _check_can_continue(folder: Path, expected: Mapping[str, Any], strict: bool,
     if "collection" not in stored:
         raise RecordingError(f"{folder} contains a recording that was not collected by a rig; give another folder")
     before, now = ({"collection.rounds": False, **_flatten(info)} for info in (stored, expected))
-    free = {"rig_settings.session", *(("collection.grasps", "collection.most_attempts") if new_counts else ())}
+    free = {
+        "rig_settings.session",
+        "rig_settings.objects",
+        *(("collection.grasps", "collection.most_attempts") if new_counts else ()),
+    }
     for name, value in now.items():
         if name in free:
             continue

@@ -25,7 +25,7 @@ Paths are relative to the working directory.
 """
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -127,6 +127,7 @@ class RealRig(Rig):
         object: Mapping[str, Any] = {},
         gel: Mapping[str, Any] = {},
         planner: Mapping[str, Any] = {},
+        objects: Sequence[str] = (),
         source: str = "real rig",
         sensor: str = "gelsight",
         licence: str = "",
@@ -140,6 +141,7 @@ class RealRig(Rig):
         gels = parse_gel_settings(gel, sensors)
         if not sensors or not sensors.keys() <= {"a", "b"}:
             raise RobotConfigError(f"a rig requires gels: [sensors.a], [sensors.b] or both; got {', '.join(sensors)}")
+        self._names = typed(objects, list[str], "objects", error=RobotConfigError)
         super().__init__(
             load_driver("arm", arm, "[arm]", workspace=workspace, **moving),
             load_driver("gripper", gripper, "[gripper]", **closing),
@@ -155,6 +157,12 @@ class RealRig(Rig):
             object_fit=build(ObjectSettings, object, where="[object]").fit() if object else None,
             planner=load_planner(planner),
         )
+
+    def object_ids(self, count: int) -> list[str]:
+        """Return the first names that the file states, or made-up ones. Raises RobotConfigError if it states fewer."""
+        if self._names and count > (known := len(self._names)):
+            raise RobotConfigError(f"the rig's file names {known} objects, fewer than {count}: give --objects {known}")
+        return self._names[:count] or super().object_ids(count)
 
 
 def load_driver(role: str, table: Mapping[str, Any], where: str, **arguments: Any) -> Any:

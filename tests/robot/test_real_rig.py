@@ -75,6 +75,13 @@ def test_known_values_of_the_gels_are_recorded_and_the_others_are_unknown(load):
     assert rig.info["gels"] == [{"a": {**unknown, "thickness_mm": 4.0}}]
 
 
+def test_a_file_names_the_objects(load):
+    rig = load(**{"": TABLES[""] + '\nobjects = ["nut", "bolt"]'})
+    assert rig.object_ids(1) == ["nut"]
+    with pytest.raises(RobotConfigError, match="names 2 objects, fewer than 3: give --objects 2"):
+        rig.object_ids(3)
+
+
 def test_a_given_object_replaces_the_fit_for_a_camera_without_depth(load):
     fit = load().object_fit
     assert (fit.x_mm, fit.y_mm, fit.height_mm, fit.radius_mm, fit.method) == (0, 5, 100, 30, "given")
