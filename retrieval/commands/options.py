@@ -68,14 +68,6 @@ Background = Annotated[
     ),
 ]
 
-Opening = Annotated[
-    list[float] | None,
-    typer.Option(
-        metavar="MM",
-        help="distance between the fingers, in millimetres; once for each --gelsight, in the same order, or not at all",
-    ),
-]
-
 
 class NumberParser:
     """Parser of an option with a number that an annotation allows, such as `Annotated[int, Meta(ge=1)]`.
@@ -99,6 +91,14 @@ class NumberParser:
 COUNT, SEED, FRACTION = NumberParser(Count), NumberParser(Seed), NumberParser(Fraction)
 WORKERS = NumberParser(Annotated[int, Meta(ge=1, le=1024)])
 SECONDS = NumberParser(Annotated[float, Meta(gt=0, le=86_400)])
+Opening = Annotated[
+    list[float] | None,
+    typer.Option(
+        parser=NumberParser(Annotated[float, Meta(ge=0.5, le=300)]),  # as data.opening.RANGE_MM, which imports numpy
+        metavar="MM",
+        help="distance between the fingers, in millimetres; once for each --gelsight, in the same order, or not at all",
+    ),
+]
 Iterations = Annotated[int | None, typer.Option(parser=COUNT, help="optimiser steps (default: those of the preset)")]
 Jobs = Annotated[int, typer.Option(parser=WORKERS, help="simulated rigs that run in parallel")]
 Objects = Annotated[int, typer.Option(parser=COUNT, help="number of objects")]

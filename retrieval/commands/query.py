@@ -62,5 +62,7 @@ def query(
         from retrieval.report.terminal import print_table
 
         print_table(result)
+    if opening and result.posterior and not result.posterior["opening"]["compared_objects"]:
+        say("openings: not used; no reference touch of the index has one, or the model has no calibration of openings")
     say(verdict_sentence(result))
     return EXIT_CODES[result.verdict]
