@@ -3,16 +3,16 @@
     <object>/touch_*.png     by the pattern `touch`
     <object>/photo_*.jpg     by the pattern `photo`
 
-A pattern is a path with words in braces. `{object}` is the name of the object, `{sequence}` the name of a session.
-`{finger}` is the name of a finger; use it if a touch has one picture per finger. All other words, and the text that
-each `*` matches, distinguish the grasps of an object. So by default `touch_0_a.png` and `touch_0_b.png` are two grasps;
-with `touch={object}/touch_{n}_{finger}` they are the two fingers of one grasp. A word or `*` never matches a "/". The
-suffix of the file name is optional; BMP, TIFF and WebP are stored as PNG, and HEIC and AVIF are named as left out.
-Words that occur in two patterns must have the same value: with
-`touch={object}/{n}_{finger}` and `photo={object}/{n}_photo` each touch gets the photo with its number. If several
-photos match, the first touch gets the first photo, the second touch the second photo, and so on, cyclically.
-`background` is a pattern for the no-contact frames: `rest_{finger}.png` for one per finger, `{object}/rest.png` for one
-per object.
+A pattern is a path with words in braces. `{object}` is the name of the object, `{session}` that of a sitting, such as a
+day, and `{sequence}` that of grasps which a split must keep together. `{finger}` is the name of a finger; use it if a
+touch has one picture per finger. All other words, and the text that each `*` matches, distinguish the grasps of an
+object. So by default `touch_0_a.png` and `touch_0_b.png` are two grasps; with `touch={object}/touch_{n}_{finger}` they
+are the two fingers of one grasp. A word or `*` never matches a "/". The suffix of the file name is optional; BMP, TIFF
+and WebP are stored as PNG, and HEIC and AVIF are named as left out. Words that occur in two patterns must have the same
+value: with `touch={object}/{n}_{finger}` and `photo={object}/{n}_photo` each touch gets the photo with its number. If
+several photos match, the first touch gets the first photo, the second touch the second photo, and so on, cyclically.
+With `photo=` there are touches only. `background` is a pattern for the no-contact frames: `rest_{finger}.png` for one
+per finger, `{object}/rest.png` for one per object. Grasps are in the order of the files' names.
 """
 
 import os
@@ -127,21 +127,21 @@ class _PatternMatches:
         self.src = src
         self._touch, photo_pattern = _Pattern("touch", touch), _Pattern("photo", photo)
         for option, pattern in (("touch", self._touch), ("photo", photo_pattern)):
-            if "object" not in pattern.words:
+            if "object" not in pattern.words and (option == "touch" or photo):
                 raise ImporterError(f"the pattern {option} must contain {{object}}, such as {{object}}/touch_*")
         files = _pictures(src)
         touches = [(path, words) for path in files if (words := self._touch.match(path))]
         if both := next((path for path, _ in touches if photo_pattern.match(path)), None):
             raise ImporterError(f"{both} matches both patterns; change touch or photo so that only one matches")
-        self._photos = _MatchingFiles(photo_pattern, self._touch, files)
+        self._photos = _MatchingFiles(photo_pattern, self._touch, files if photo else ())
         self._frames = _MatchingFiles(_Pattern("background", background), self._touch, files if background else ())
         self.has_background = bool(self._frames.files)
         for option, text, matches in (("touch", touch, touches), ("photo", photo, self._photos.files)):
-            if not matches:
+            if text and not matches:
                 content = f"only others, such as {files[0]}" if files else "no picture at all"
                 raise ImporterError(
                     f"{src} must contain a {option} that matches {text!r}, but contains {content}; "
-                    "change the pattern with --option"
+                    "change the pattern with --option; photo= is for touches without photos"
                 )
         names = sorted({words.get("finger", "") for _, words in touches}, key=natural_sort_key)
         self.fingers = dict(zip(names, ascii_lowercase, strict=False))
@@ -164,16 +164,19 @@ class _PatternMatches:
             photos, group = self._photos.of(words), self._photos.key(words)
             if len(paths) < len(self.fingers):
                 yield Skip("a finger has no picture", name)
-            elif not photos:
+            elif self._photos.files and not photos:
                 yield Skip("no photo matches it", name)
             else:
-                images: dict[str, Path | SharedImage] = {"photo": self._shared(photos[assigned[group] % len(photos)])}
+                images: dict[str, Path | SharedImage] = {}
+                if photos:
+                    images["photo"] = self._shared(photos[assigned[group] % len(photos)])
                 assigned[group] += 1
                 for finger, letter in self.fingers.items():
                     images[f"touch_{letter}"] = self.src / paths[finger]
                     if before := self._frames.of(self._touch.match(paths[finger]) or {}):
                         images[f"touch_{letter}_before"] = self._shared(before[0])
-                yield Item(name, key[0], images, {"sequence_id": words.get("sequence")})
+                fields = {"sequence_id": words.get("sequence"), "session": words.get("session")}
+                yield Item(name, key[0], images, fields)
 
     def _shared(self, path: str) -> SharedImage:
         return SharedImage(sha256(path.encode(errors="surrogateescape")).hexdigest()[:24], self.src / path)

@@ -43,6 +43,17 @@ def test_words_in_both_patterns_must_have_the_same_value(tmp_path):
     assert recording.info["skipped"] == {"no photo matches it": 1}
 
 
+def test_touches_without_photos_are_imported_with_their_sessions_in_the_order_of_their_names(tmp_path):
+    for name in ("monday/1_nut_touch", "monday/2_mug_touch", "tuesday/1_mug_touch"):
+        picture(tmp_path / f"src/{name}.png", len(name))
+    recording = import_folder(tmp_path / "src", tmp_path / "out", touch="{session}/{n}_{object}_touch", photo="")
+    assert [(grasp.object_id, grasp.session, grasp.photo) for grasp in recording.grasps] == [
+        ("nut", "monday", None),
+        ("mug", "monday", None),
+        ("mug", "tuesday", None),
+    ]
+
+
 def test_fingers_are_combined_and_a_grasp_with_a_missing_finger_is_skipped(tmp_path):
     for finger in ("left", "right"):
         picture(tmp_path / f"src/rest_{finger}.png", len(finger))
