@@ -87,6 +87,8 @@ def test_the_shipped_checkpoints_calibrate_references_and_take_no_photo_for_a_ge
     apart, equal = references.touch_only.log_ratio([-0.2, 0.9], 1)
     assert apart < 0 < equal  # a dissimilar touch is evidence against the object
     assert references.weight * references.with_photos.slope > 1
+    same, other = made.opening.log_ratios([30.0], [30.2, 60.0], np.array([0, 1]))[0]
+    assert other < -1 < 2 < same
     with load_rig("sim", seed=990) as rig:
         for name in rig.object_ids(10):
             rig.prepare(name, 0)
