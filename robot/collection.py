@@ -209,9 +209,11 @@ def _check_can_continue(folder: Path, expected: Mapping[str, Any], strict: bool,
         *(("collection.grasps", "collection.most_attempts") if new_counts else ()),
     }
     for name, value in now.items():
-        if name in free:
-            continue
-        if before.get(name) != value and (strict or not name.startswith(("devices.", "software_version"))):
+        if (
+            name not in free
+            and before.get(name) != value
+            and (strict or not name.startswith(("devices.", "software_version")))
+        ):
             what = name.replace("collection.", "").replace("_", " ")
             raise RecordingError(
                 f"{folder} was collected with {what} {before.get(name)!r}, not {value!r}; give another folder, or the "

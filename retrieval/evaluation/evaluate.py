@@ -1,6 +1,5 @@
 """Evaluate methods and models by protocols: from recordings to results.json. Finished experiments are not repeated."""
 
-import itertools
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -183,6 +182,5 @@ def _trained(facts: RecordingFacts, protocol: Protocol, towers: TowerEncoder, ou
     (split,) = protocol.folds(facts, towers.config.training.seed)
     licences = training_licences(facts.folder, towers.config.training)
     path = out / "model.safetensors"
-    is_in_training = [not protocol.across_sessions or one.session == facts.grasps[0].session for one in facts.grasps]
-    grasps = list(itertools.compress(facts.grasps, is_in_training))
+    grasps = [facts.grasps[row] for row in protocol.rows_to_fit(facts.grasps)]
     return Trainer(towers.config, split, grasps, path, facts.source, licences=licences).run_or_reuse(quiet)

@@ -180,10 +180,8 @@ class Experiment:
         )
         if checkpoint and issubclass(method, LateFusion):
             return method.of_checkpoint(checkpoint, settings), 0.0
-        features = self.features
-        if self.of.protocol.across_sessions:
-            grasps = thin_grasps(self.of.facts.grasps, self._max_grasps)
-            features = features.select(np.flatnonzero([one.session == grasps[0].session for one in grasps]))
+        rows = self.of.protocol.rows_to_fit(thin_grasps(self.of.facts.grasps, self._max_grasps))
+        features = self.features.select(rows)
         parts = [features.of_objects(part) for part in (self.split.train, self.split.validation)]
         if is_permuted:
             parts = [permute_touches(part, self.seed) for part in parts]

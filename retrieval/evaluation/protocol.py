@@ -6,6 +6,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from _touch_retrieval.files import read_json
 from retrieval.data.dataset import Grasp, Split, data_digest, load_grasps, object_kinds, recording_source
@@ -132,6 +133,10 @@ class Protocol:
         if self.galleries:
             return self.galleries(facts, split)
         return {name: facts.sequence_of[name] if self.is_by_sequence else "" for name in split.test}
+
+    def rows_to_fit(self, grasps: Sequence[Grasp]) -> NDArray[np.int64]:
+        """Return the rows of the grasps that methods may be fitted on: all, or those of the first session."""
+        return np.flatnonzero([not self.across_sessions or one.session == grasps[0].session for one in grasps])
 
     @property
     def main(self) -> str:

@@ -87,44 +87,36 @@ def draw_queries(
             )
     rng = np.random.default_rng([seed, 11])
 
-    def draw(name: str, part: str, is_query: bool) -> Rows:
-        wanted = [one.object_id == name and (not across_sessions or is_later(one) == is_query) for one in grasps]
-        rows, limit = np.flatnonzero(wanted), max_grasps.get(part, len(grasps))
+    def draw(name: str, part: str, later: bool) -> Rows:
+        of_session = [not across_sessions or (grasp.session != grasps[0].session) == later for grasp in grasps]
+        rows = np.flatnonzero([grasp.object_id == name for grasp in grasps] & np.array(of_session))
+        limit = max_grasps.get(part, len(rows))
         return rows if len(rows) <= limit else np.sort(rng.choice(rows, limit, replace=False))
 
-    def is_later(grasp: Grasp) -> bool:
-        return grasp.session != grasps[0].session
-
     of_touches = [draw(name, part, part == "test") for name, part in zip(objects, parts, strict=True)]
-    of_photos = of_touches
-    if across_sessions:
-        of_photos = [
-            draw(name, part, False) if part == "test" else rows
-            for name, part, rows in zip(objects, parts, of_touches, strict=True)
-        ]
+    of_photos = [
+        draw(name, part, False) if across_sessions and part == "test" else rows
+        for name, part, rows in zip(objects, parts, of_touches, strict=True)
+    ]
     touches, with_photo = np.concatenate(of_touches), np.concatenate(of_photos)
     owner, photo_owner = (np.repeat(np.arange(len(objects)), list(map(len, rows))) for rows in (of_touches, of_photos))
     column: dict[Path, int] = {}
     first = np.unique([column.setdefault(grasps[row].photo, len(column)) for row in with_photo], return_index=True)[1]
-    own_photo = np.array([column.get(grasps[row].photo, -1) for row in touches])
     sets = {}
     for size in SET_SIZES:
-        enough = []
-        for place, part in enumerate(parts):
-            own = 0 if across_sessions and part == "test" else size
-            if (
-                part != "train"
-                and size <= len(of_touches[place])
-                and len(of_photos[place]) >= own + PHOTOS_PER_CANDIDATE
-            ):
-                enough.append(np.flatnonzero(owner == place))
+        enough = [
+            np.flatnonzero(owner == place)
+            for place, (touched, pictured) in enumerate(zip(of_touches, of_photos, strict=True))
+            if parts[place] != "train" and len(touched) >= size
+            if len(pictured) >= PHOTOS_PER_CANDIDATE + (size if pictured is touched else 0)
+        ]
         drawn = [rng.choice(places, size, replace=False) for places in enough for _ in range(SETS_OF_AN_OBJECT)]
         if drawn:
             sets[size] = np.array(drawn)
     return Queries(
         touches=touches,
         photos=with_photo[first],
-        own_photo=own_photo,
+        own_photo=np.array([column.get(grasps[row].photo, -1) for row in touches]),
         touch_owner=owner,
         photo_owner=photo_owner[first],
         objects=objects,

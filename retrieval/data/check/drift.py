@@ -69,15 +69,13 @@ def check_sessions(grasps: Sequence[Grasp]) -> Iterator[Finding]:
     objects_of: dict[str | None, set[str]] = {}
     for grasp in grasps:
         objects_of.setdefault(grasp.session, set()).add(grasp.object_id)
-    shared = [one & two for one, two in combinations(objects_of.values(), 2)]
     remedy = "collect the same objects again after the light or the gel has changed, with `retrieve collect --session`"
-    if not shared:
-        where = "states no session" if None in objects_of else "has one session"
-        text = f"the recording {where}, so no result of it can separate touch from drift: {remedy}"
-        yield Finding("note", "one-session", text)
-    elif not any(shared):
-        text = f"no object is in two of the {len(objects_of)} sessions, so drift may identify the objects: {remedy}"
-        yield Finding("warning", "separate-sessions", text)
+    if len(objects_of) == 1:
+        text = "the recording has one session, or states none, so no result of it can separate touch from drift"
+        yield Finding("note", "one-session", f"{text}: {remedy}")
+    elif not any(one & two for one, two in combinations(objects_of.values(), 2)):
+        text = f"no object is in two of the {len(objects_of)} sessions, so drift may identify the objects"
+        yield Finding("warning", "separate-sessions", f"{text}: {remedy}")
 
 
 def _owners(grasps: Sequence[Grasp]) -> NDArray[np.int64]:

@@ -213,46 +213,27 @@ def test_a_second_run_fits_only_new_and_edited_methods_of_a_user(made, run, monk
     assert "Constant" in (made[1] / "report.md").read_text()
 
 
-def in_sessions(recording, folder, session_of):
-    """Copy a recording, with the session of each row of its metadata."""
-    shutil.copytree(recording, folder)
-    rows = [json.loads(line) for line in (folder / "metadata.jsonl").read_text().splitlines()]
-    lines = [json.dumps(row | {"session": session_of(row)}) for row in rows]
-    (folder / "metadata.jsonl").write_text("\n".join(lines) + "\n")
-    return folder
-
-
 def test_with_two_sessions_queries_are_of_the_second_and_all_else_of_the_first(grasped, run, tmp_path, monkeypatch):
-    seen, fit = set(), Constant._fit
-    monkeypatch.setattr(
-        Constant,
-        "_fit",
-        lambda self, *parts: seen.update(*(part.grasp_ids for part in parts)) or fit(self, *parts),
-    )
+    fitted, fit = set(), Constant._fit
+    monkeypatch.setattr(Constant, "_fit", lambda self, *of: fitted.update(of[0].grasp_ids) or fit(self, *of))
+    lines = [json.loads(line) for line in (grasped / "metadata.jsonl").read_text().splitlines()]
 
-    def session_of(row):
-        return "monday" if row["grasp_id"].endswith(("0", "1")) else "tuesday"  # two of the four grasps
+    def evaluated(name, session_of, wanted):
+        shutil.copytree(grasped, tmp_path / name)
+        sessions = [json.dumps(line | {"session": str(session_of(line))}) for line in lines]
+        (tmp_path / name / "metadata.jsonl").write_text("\n".join(sessions) + "\n")
+        found = of(run(tmp_path / "report", recording=tmp_path / name, methods=[CONSTANT, "cca"]))
+        assert wanted in found.rule
+        measure = found.rows[CONSTANT].measures["topn_k5"]
+        assert measure.value == pytest.approx(measure.chance, abs=1e-12)
+        return found, measure
 
-    recording = in_sessions(grasped, tmp_path / "two", session_of)
-    found = of(run(tmp_path / "report", recording=recording, methods=["cca", CONSTANT]))
-    assert (
-        "Queries are the touches of test objects in session tuesday; all other touches and all photos are of session"
-        in (found.rule)
-    )
-    ((split,),) = found.folds
-    assert len(seen) == 2 * (len(split["train"]) + len(split["validation"]))
-    assert {name[-1] for name in seen} == {"0", "1"}
-    assert list(found.controls) == ["permuted", "no_contact", "low_pass", "order"]
-    summary = found.rows[CONSTANT].measures["topn_k5"]
-    assert (summary.objects, summary.queries) == (6, 12)
-    assert summary.value == pytest.approx(summary.chance, abs=1e-12)
-    again = of(run(tmp_path / "report", recording=grasped, methods=["cca", CONSTANT]))
-    assert again.rows[CONSTANT].measures["topn_k5"].queries == 24  # not the stored ones
-
-    alone = in_sessions(grasped, tmp_path / "alone", lambda row: str(int(row["object_id"][-1]) % 2))
-    found = of(run(tmp_path / "report", recording=alone, methods=[CONSTANT]))
-    assert "share too few objects" in found.rule
-    assert found.rows[CONSTANT].measures["topn_k5"].queries == 24
+    across, measure = evaluated("two", lambda line: line["grasp_id"][-1] > "1", "all photos are of session False")
+    assert {name[-1] for name in fitted} == {"0", "1"}  # two of four grasps
+    assert list(across.controls) == ["permuted", "no_contact", "low_pass", "order"]
+    assert (measure.objects, measure.queries) == (6, 12)
+    _, measure = evaluated("alone", lambda line: int(line["object_id"][-1]) % 2, "share too few objects")
+    assert measure.queries == 24
 
 
 def test_a_control_is_left_out_without_no_contact_frames(run, tmp_path):
