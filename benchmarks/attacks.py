@@ -123,8 +123,13 @@ def png_chunks(target: Target) -> str:
 
 
 def many_pictures(target: Target) -> str:
-    """Queries of 64 grasps of two tiny pictures."""
-    return _post_in_parallel(target, "/v1/query", _query([png_of_zeros(8, 8)] * 128), 8)
+    """Queries of 32 grasps of two tiny pictures."""
+    return _post_in_parallel(target, "/v1/query", _query([png_of_zeros(8, 8)] * 64), 8)
+
+
+def many_enrolments(target: Target) -> str:
+    """Enrolments of 32 grasps of tiny pictures."""
+    return _post_in_parallel(target, "/v1/objects/x/touches", _query([png_of_zeros(8, 8)] * 64), 8)
 
 
 def half_headers(target: Target) -> str:
@@ -199,6 +204,7 @@ ATTACKS: tuple[Attack, ...] = (
     jpeg_markers,
     png_chunks,
     many_pictures,
+    many_enrolments,
     half_headers,
     slow_bodies,
     header_flood,

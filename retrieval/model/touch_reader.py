@@ -19,7 +19,7 @@ from retrieval.model.fork_guard import fork_guard
 from retrieval.model.gel_check import contact_level
 from retrieval.model.touches import AnyImage, GelImage, InputImage, parse_grasps, read_image
 
-BATCH = 32
+BATCH = 8
 """Largest number of grasps whose images are in memory, and in the encoder, at once."""
 DECODERS = 2  # a touch has two images
 Floats = NDArray[np.float32]

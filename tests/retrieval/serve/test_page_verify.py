@@ -77,8 +77,8 @@ def test_the_decision_on_the_expected_object_is_shown_with_its_ratio_and_error_r
 def test_the_expected_object_is_a_suggestion_and_the_false_accept_rate_an_option(served, browser, files, names):
     with address(served(1e3, -1e3)) as url, page(browser, url, 390, color_scheme="dark") as opened:
         opened.get_by_label("Expected object").focus()
-        opened.wait_for_function(f"document.querySelectorAll('#catalogue-objects option').length === {len(names)}")
-        options = opened.locator("#catalogue-objects option")
+        options = opened.locator("#expected-object-names option")
+        options.nth(len(names) - 1).wait_for(state="attached")
         assert sorted(options.evaluate_all("all => all.map((one) => one.value)")) == names
         verify(opened, names[0], files[:2])
         assert serious(opened) == []
