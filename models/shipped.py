@@ -6,8 +6,6 @@
         them in FOLDER
     python -m models.shipped calibrate FOLDER
         calibrate the shipped checkpoints again; keep their weights
-    python -m models.shipped openings FOLDER
-        fit the opening of the jaws again; keep weights and all other calibrations
     python -m models.shipped score FOLDER
         collect other objects into FOLDER/recording, and evaluate the shipped checkpoint on them: FOLDER/report; with
         --fingers 1 that for one finger, in FOLDER/report-one-finger
@@ -39,7 +37,7 @@ from retrieval.model.config import Config, load_config
 from retrieval.model.encode import default_device, one_thread
 from retrieval.model.shipped import SHIPPED, shipped_model
 from retrieval.training import distil
-from retrieval.training.calibration import calibrate_checkpoint, fit_opening, fit_verification, score_grasps
+from retrieval.training.calibration import calibrate_checkpoint, fit_verification, score_grasps
 from retrieval.training.features import Features, FrozenFeatures, encode_recording, features_by_image, recorded_features
 
 RIGS = Path(__file__).parent
@@ -67,8 +65,6 @@ GRASPS, VALIDATED, VERIFIED, GELS = 2, (100, 8), (150, 5), (400, 2)
 """Grasps of each training object; objects that choose the step and calibrate the model, and grasps of each; objects on
 which the bounds of verifications are fitted, and grasps of each; further objects for the check of gel images, and
 grasps of each."""
-CALIBRATION_PARTS = ("validation", "verification", "gels")
-"""Folders of the recordings of the last three."""
 HEAD_STEPS = 1000
 FOREIGN = 8000
 """Number of non-gel pictures for training its check of touches: more than in an ordinary training."""
@@ -88,19 +84,17 @@ def main(argv: list[str] | None = None) -> int:
     make.add_argument("--touches", type=int, default=9_361, help="number of touch-only objects")
     make.add_argument("--steps", type=int, default=2500, help="steps of pretraining each tower on relief")
     calibrate_job = jobs.add_parser("calibrate", help="calibrate the shipped checkpoints again; keep their weights")
-    openings = jobs.add_parser("openings", help="fit the opening of the jaws again; keep everything else")
     score = jobs.add_parser("score", help="evaluate a checkpoint on other objects")
     score.add_argument("--objects", type=int, default=120)
     score.add_argument("--grasps", type=int, default=8)
     score.add_argument("--model", type=Path, help="another checkpoint than the shipped one")
     score.add_argument("--fingers", type=int, choices=tuple(SHIPPED), default=2, help="gel images of a touch")
-    for job in (make, calibrate_job, openings, score):
+    for job in (make, calibrate_job, score):
         job.add_argument("folder", type=Path)
         job.add_argument("--jobs", type=int, default=2)
     arguments = parser.parse_args(argv)
     keep_freed_memory()
-    run = {"make": make_shipped, "calibrate": calibrate_shipped, "openings": fit_openings, "score": score_shipped}
-    return run[arguments.job](arguments)
+    return {"make": make_shipped, "calibrate": calibrate_shipped, "score": score_shipped}[arguments.job](arguments)
 
 
 def make_shipped(arguments: argparse.Namespace) -> int:
@@ -276,7 +270,7 @@ def pretrain_towers(arguments: argparse.Namespace) -> None:
 
 
 def calibrate_shipped(arguments: argparse.Namespace) -> int:
-    """Calibrate both shipped checkpoints again: posterior, gel check, reference touches, bounds of verifications."""
+    """Calibrate both shipped checkpoints again: posterior, gel check, references, openings, bounds of verifications."""
     if code := collect_calibration(arguments):
         return code
     for fingers, name in SHIPPED.items():
@@ -285,20 +279,9 @@ def calibrate_shipped(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def fit_openings(arguments: argparse.Namespace) -> int:
-    """Fit the evidence of openings for both shipped checkpoints."""
-    if code := collect_calibration(arguments):
-        return code
-    folder = arguments.folder
-    opening = fit_opening([one for name in CALIBRATION_PARTS for one in load_grasps(folder / name)])
-    for fingers, name in SHIPPED.items():
-        store(dataclasses.replace(load_checkpoint(shipped_model(fingers)), opening=opening), folder / name)
-    return 0
-
-
 def calibrated(made: Checkpoint, folder: Path, fingers: int) -> Checkpoint:
     """Return a checkpoint with its gel check, posterior, calibration of reference touches and bounds."""
-    parts = [load_grasps(folder / name) for name in CALIBRATION_PARTS]
+    parts = [load_grasps(folder / name) for name in ("validation", "verification", "gels")]
     if fingers == 1:
         parts = [[each_finger(grasp)[0] for grasp in part] for part in parts]
     validation, verification, gels = parts
