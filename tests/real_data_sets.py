@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from tests.miniatures import billets, feeling_of_success, objectfolder, physiclear, rct, vt60
+from tests.miniatures import billets, estimate_modulus, feeling_of_success, objectfolder, physiclear, rct, vt60
 
 CLASSES = ("01_stapler", "02_bottleempty", "03_ball", "04_box", "05_bear", "06_shoe", "07_mug", "09_bowl", "10_can")
 
@@ -26,4 +26,5 @@ def write(folder: Path) -> None:
     split = {"train": names[:12], "val": names[12:14], "test": names[14:]}
     objectfolder.write(folder / "objectfolder", objects=names, split=split)
     physiclear.write(folder / "physiclear")
+    estimate_modulus.write(folder / "estimate-modulus")
     feeling_of_success.write(folder / "feeling-of-success", (120,), of_an_object=4)

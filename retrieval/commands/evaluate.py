@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from retrieval.model.config import Config
 
 ALL = "all"
-DATA_SET_PRESET = "real"
 METHODS_OF_PRESETS = {"adapt": ("cca_towers", "chance")}
 """Default methods of presets that fit only some of the methods."""
 
@@ -39,7 +38,7 @@ def evaluate(
         Path,
         typer.Argument(
             metavar="DATA",
-            help="recording; with --protocol a folder with vt60/, billets/, ..., or with recordings of them",
+            help="recording; with --protocol of a data set a folder with vt60/, billets/, ..., or with recordings",
             show_default=False,
         ),
     ],
@@ -48,8 +47,8 @@ def evaluate(
     protocol: Annotated[
         str | None,
         typer.Option(
-            help="protocols of real data, separated by commas: "
-            f"{', '.join(name for name in PROTOCOLS if name != UNSEEN_OBJECTS)}; {ALL}: each that has data "
+            help="touch-to-touch of a recording, or protocols of real data, separated by commas: "
+            f"{', '.join(name for name in PROTOCOLS if name != UNSEEN_OBJECTS)}; {ALL}: each data set there is "
             "(default: unseen objects of the recording)"
         ),
     ] = None,
@@ -60,7 +59,7 @@ def evaluate(
         str | None,
         typer.Option(
             help=f"a preset, such as tiny, small, mobilenet or relief, or a TOML file (default: {DEFAULT_PRESET}; with "
-            f"--protocol {DATA_SET_PRESET})"
+            "--protocol real, or touches if only touches are compared)"
         ),
     ] = None,
     model: Annotated[Path | None, typer.Option(help="checkpoint to evaluate, instead of fitting one")] = None,
@@ -69,8 +68,8 @@ def evaluate(
         typer.Option(
             parser=OptionValues.parse,
             metavar="NAME=CHOICE...",
-            help="more rows: a checkpoint that scores as it is, or, with touch to touch (physiclear), a preset or TOML "
-            "file of a touch tower",
+            help="more rows: a checkpoint that scores as it is, or, with touch to touch, a preset or TOML file of a "
+            "touch tower",
         ),
     ] = None,
     init: Init = None,
@@ -88,15 +87,16 @@ def evaluate(
     """Compare methods on unseen objects, with controls, and write a report. Resumes a stopped run."""
     import msgspec
 
+    from retrieval.evaluation.evaluate import data_set_preset
     from retrieval.evaluation.evaluate import evaluate as run
     from retrieval.report.evaluation import print_results, write_report
 
     if model and (config or init):
         raise BadInput("--model already defines towers and settings; give either --model or --config and --init")
-    preset = config or (DATA_SET_PRESET if protocol else DEFAULT_PRESET)
     protocols, recordings, skipped = (
         _data_sets(protocol, data, out / "recordings") if protocol else ([], {None: data}, {})
     )
+    preset = config or (data_set_preset(protocols) if protocol else DEFAULT_PRESET)
     results = run(
         recordings,
         out,
@@ -137,14 +137,17 @@ def _data_sets(protocol: str, data: Path, imported: Path) -> tuple[list[str], di
     requested = list(dict.fromkeys(protocol.split(",")))
     if protocol == ALL:
         requested = [name for name in PROTOCOLS.names() if PROTOCOLS.resolve(name).data_set]
-    elif not all(PROTOCOLS.resolve(name).data_set for name in requested):
+    elif UNSEEN_OBJECTS in requested:
         raise BadInput(f"{UNSEEN_OBJECTS} is for one recording; leave --protocol out, and give the recording")
     folders = [path for path in (data, *sorted(data.iterdir())) if (path / "recording.json").is_file()]
     recorded = {recording_source(folder): folder for folder in reversed(folders)}
     recordings: dict[str | None, Path] = {}
     skipped: dict[str, str] = {}
     for name in requested:
-        data_set = str(PROTOCOLS.resolve(name).data_set)
+        data_set = PROTOCOLS.resolve(name).data_set
+        if data_set is None:
+            recordings[None] = data
+            continue
         about = data_set_of(data_set)
         if about.source in recorded:
             recordings[data_set] = recorded[about.source]

@@ -25,7 +25,7 @@ from retrieval.training.initial_weights import training_licences
 from retrieval.training.train import Trainer
 from retrieval.version import __version__
 
-DATA_SET_CONFIG, DATA_SET_METHODS, DATA_SET_SEEDS = "real", ("cca_towers", "cca", "late_fusion", "chance"), 3
+DATA_SET_METHODS, DATA_SET_SEEDS = ("cca_towers", "cca", "late_fusion", "chance"), 3
 """Defaults if protocols are named, which are those of real data sets."""
 
 
@@ -56,7 +56,8 @@ def evaluate(
             of the recording, with which each method is described in depth.
         config: Towers, heads and split, if `model` does not give them: a `Config` (`Config.using` accepts your own
             towers and losses), or an argument of `load_config`. Its seed is the seed of every random draw. Default:
-            "small", with `protocols` "real". Only "unseen-objects" trains towers; other protocols use frozen ones.
+            "small", with `protocols` "real", or "touches" if all compare touches with touches. Only "unseen-objects"
+            trains towers; other protocols use frozen ones.
         preset: Name of the configuration in the report. Default: the configuration's name.
         methods: Names, or your own classes, which the report lists by class name. Default: all, with `protocols` those
             of `DATA_SET_METHODS`.
@@ -99,12 +100,12 @@ def evaluate(
     >>> list(results.protocols["halves"].rows)
     ['cca', 'chance']
     """
-    config, config_name = named_config(config or (DATA_SET_CONFIG if protocols else "small"), preset)
+    selected = dict(map(_named, protocols or [UNSEEN_OBJECTS]))
+    config, config_name = named_config(config or (data_set_preset(protocols) if protocols else "small"), preset)
     names = [METHODS.name_of(method) for method in methods or (DATA_SET_METHODS if protocols else METHODS)]
     count = seeds if seeds is not None else DATA_SET_SEEDS if protocols else 1
     if count < 1:
         raise BadInput(f"An evaluation needs at least 1 seed, got {count}.")
-    selected = dict(map(_named, protocols or [UNSEEN_OBJECTS]))
     _require_use(selected, names, compared, split)
     if not isinstance(recordings, Mapping):
         recordings = dict.fromkeys((protocol.data_set for protocol in selected.values()), recordings)
@@ -148,6 +149,11 @@ def evaluate(
     write_results(out / "results.json", results)
     write_results(out / "timings.json", Timings(os.cpu_count() or 1, times))
     return results
+
+
+def data_set_preset(protocols: Sequence[str | Protocol]) -> str:
+    """Return the default preset of an evaluation by these protocols."""
+    return "touches" if all(isinstance(_named(choice)[1], TouchToTouch) for choice in protocols) else "real"
 
 
 def _named(choice: str | Protocol) -> tuple[str, Protocol]:

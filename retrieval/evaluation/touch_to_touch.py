@@ -1,47 +1,44 @@
-"""Touch to touch: identify an object from other touches of it, leaving out one sequence (such as a press video).
+"""Touch to touch: identify an object from other touches of it, in another session if there are several.
 
-A sequence is one vector: the mean of its touches' tower features, in one of two representations:
+A sequence is one vector: the mean of its touches' tower features, in one of these representations:
 
     difference      features of the touches, minus those of the no-contact frame
     common-frame    features of the contact difference (touch minus no-contact frame) on ONE common no-contact frame
+    plain           features of the touches, if the recording lacks the no-contact frame of each sequence
 
 If objects are touched one after the other, drift makes the no-contact frame of a sequence identify its object. The
-first representation retains part of that leak; the second one removes additive effects in the image. The score of two
-sequences is the cosine of their first principal components; scaling and components are fitted without the query.
+first representation retains part of that leak; the second one removes additive effects in the image. Across sessions
+the first one, or plain, is also compared `centred`: minus its mean over all sequences of the same session.
 """
 
 import dataclasses
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from _touch_retrieval.files import write_atomically
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, Split
 from retrieval.data.images import encode_image, read_rgb
 from retrieval.errors import DatasetError
-from retrieval.evaluation.aggregate import Aggregation, MeasuresByName, protocol_result
+from retrieval.evaluation.aggregate import Aggregation, protocol_result
 from retrieval.evaluation.inputs import TowerEncoder, clock_features, missing_no_contact_reason
 from retrieval.evaluation.protocol import Protocol, RecordingFacts
 from retrieval.evaluation.results import ProtocolResult, RowResult
+from retrieval.evaluation.sequences import Sequences, Sessions, Vectors
 from retrieval.metrics import registry
-from retrieval.metrics.measure import Measure, pooled
-from retrieval.metrics.registry import MethodScoreTables, Metric
-from retrieval.metrics.table import ScoreTable
+from retrieval.metrics.registry import Metric
 
-COMPONENTS = 60
-REPRESENTATIONS = ("difference", "common-frame")
 FROZEN = "frozen"
 """Row name of the configuration's own towers."""
+CENTRED = "-centred"
+"""End of the row name of a representation from which the mean of the session was subtracted."""
 METHOD = "nearest"
 """Method of the rows and controls: the nearest sequence."""
-
-Vectors = NDArray[np.float64]
 
 MEASURES = {
     "recall_1": Metric("top-1", "real", lambda of: registry.recall(of.test, 1)),
@@ -53,9 +50,13 @@ MEASURES = {
 
 @dataclass(frozen=True)
 class TouchToTouch(Protocol):
-    """A protocol without training: each sequence of touches is a query, the other sequences are the gallery.
+    """A protocol without training: sequences of touches are queries, other ones are the gallery.
 
-    It needs a no-contact frame for each touch. Methods are not fitted; a row is a tower with one of `REPRESENTATIONS`.
+    Methods are not fitted; a row is a tower with one of the representations.
+
+    Attributes:
+        sessions: The gallery of a recording with several sessions.
+        left_out: A class whose objects are left out.
     """
 
     folds: Any = lambda facts, seed: []
@@ -63,8 +64,15 @@ class TouchToTouch(Protocol):
     controls: Mapping[str, str] = dataclasses.field(
         default_factory=lambda: dict.fromkeys(("order", "no_contact", "permuted"), METHOD)
     )
+    sessions: Sessions = "across"
+    left_out: str | None = None
 
 
+_NOT_TRAINED = "Nothing is trained: the nearest sequence of touches of the gallery gives the object."
+_VIDEOS = "A sequence is a press video: the mean of its frames of strongest contact."
+
+ACROSS = TouchToTouch(None, "Touch to touch", _NOT_TRAINED)
+WITHIN = dataclasses.replace(ACROSS, title="Touch to touch, within a session", sessions="within")
 PHYSICLEAR = TouchToTouch(
     "physiclear",
     "PhysiCLeAR: touch to touch, one video left out",
@@ -72,84 +80,20 @@ PHYSICLEAR = TouchToTouch(
     "the part. Nothing is trained. A video is the mean of its frames of strongest contact. The videos of a part were "
     "recorded one after the other. The order of capture is that of the file names, part by part, as no times are "
     "published.",
+    sessions="all",
 )
-
-
-def leave_one_out_scores(vectors: Vectors, components: int = COMPONENTS) -> NDArray[np.float32]:
-    """Return the cosines (S, S) of vectors (S, F) after principal components, at most S - 2; 0 on the diagonal.
-
-    Row q uses mean, standard deviation and components of all vectors but q.
-    """
-    count = len(vectors)
-    scores = np.zeros((count, count), np.float32)
-    for row in range(count):
-        others = np.arange(count) != row
-        mean, deviation = vectors[others].mean(0), vectors[others].std(0)
-        scaled = (vectors - mean) / np.where(deviation > 1e-9 * max(1.0, np.abs(mean).max()), deviation, np.inf)
-        # Use the Gram matrix: there are fewer sequences than features.
-        gallery = scaled[others]
-        values, directions = np.linalg.eigh(gallery @ gallery.T)
-        used = np.flatnonzero(values > 1e-9 * max(values[-1], 1e-12))[::-1][: min(components, count - 2)]
-        codes = scaled @ (gallery.T @ (directions[:, used] / np.sqrt(values[used])))
-        norms = np.maximum(np.linalg.norm(codes, axis=1), 1e-12)
-        scores[row, others] = (codes[others] @ codes[row]) / (norms[others] * norms[row])
-    return scores
-
-
-@dataclass(frozen=True, eq=False)
-class Sequences:
-    """The sequences of a recording in the order of capture.
-
-    Attributes:
-        grasps: The grasps.
-        names: Name of each sequence.
-        owner: (S,) object number of each sequence, in the order of the sorted names.
-        rows: Places of the grasps of each.
-    """
-
-    grasps: Sequence[Grasp]
-    names: tuple[str, ...]
-    owner: NDArray[np.int64]
-    rows: tuple[NDArray[np.int64], ...]
-
-    @classmethod
-    def of(cls, grasps: Sequence[Grasp]) -> "Sequences":
-        """Group grasps by object and sequence.
-
-        Raises:
-            DatasetError: There are fewer than two objects, or an object has fewer than two sequences.
-        """
-        places: dict[tuple[str, str], list[int]] = {}
-        for place, grasp in enumerate(grasps):
-            places.setdefault((grasp.object_id, grasp.sequence_id or grasp.grasp_id), []).append(place)
-        objects, owner, counts = np.unique([name for name, _ in places], return_inverse=True, return_counts=True)
-        if len(objects) < 2 or counts.min() < 2:
-            raise DatasetError(
-                f"Touch to touch needs at least 2 objects with 2 sequences each, but the recording has {len(objects)} "
-                f"object(s), and {objects[counts.argmin()]} has {counts.min()} sequence(s)."
-            )
-        rows = tuple(np.array(each, np.int64) for each in places.values())
-        return cls(grasps, tuple(name for _, name in places), owner, rows)
-
-    def mean(self, features: NDArray[np.float32]) -> Vectors:
-        """Return the mean (S, F) of features (G, F) over the grasps of each sequence."""
-        return np.stack([features[rows].mean(0, dtype=np.float64) for rows in self.rows])
-
-    def measures(
-        self, protocol: Protocol, scores: NDArray[np.float32], owners: Sequence[NDArray[np.int64]] = ()
-    ) -> MeasuresByName:
-        """Return the measures of scores (S, S): each sequence is a query, and is not compared with itself.
-
-        There is one measure for each of `owners`, which replace the objects of the sequences; else one for these.
-        """
-        measures: dict[str, list[Measure]] = defaultdict(list)
-        for owner in owners or [self.owner]:
-            table = ScoreTable(scores, owner, owner, np.eye(len(owner), dtype=np.bool_), "sequences")
-            tables = MethodScoreTables(table, table, {}, None, 0)
-            for name, metric in protocol.measures.items():
-                if measure := metric.compute(tables):
-                    measures[name].append(pooled([measure]))
-        return measures
+PHYSICLEAR_SESSIONS = TouchToTouch(
+    "physiclear", "PhysiCLeAR: touch to touch, across sessions", f"{_NOT_TRAINED} {_VIDEOS}"
+)
+ESTIMATE_MODULUS = TouchToTouch(
+    "estimate-modulus", "EstimateModulus: touch to touch, across days", f"{_NOT_TRAINED} {_VIDEOS}"
+)
+VT60 = TouchToTouch(
+    "vt60",
+    "VT60: touch to touch, late touches against early ones",
+    f"{_NOT_TRAINED} 08_bottlefull is left out, because it is 02_bottleempty filled.",
+    left_out="bottlefull",
+)
 
 
 def with_common_frame(grasps: Sequence[Grasp], folder: Path, *, quiet: bool = True) -> list[Grasp]:
@@ -184,15 +128,24 @@ def with_common_frame(grasps: Sequence[Grasp], folder: Path, *, quiet: bool = Tr
 
 
 def _vectors(sequences: Sequences, towers: TowerEncoder, common: Sequence[Grasp], variant: str) -> dict[str, Vectors]:
-    """Return vectors (S, F) of each representation and of the no-contact frame, for "touch" or "low_pass" images."""
-    first = [sequences.grasps[rows[0]] for rows in sequences.rows]
-    frames = [dataclasses.replace(grasp, touches=grasp.backgrounds) for grasp in first]
-    no_contact = towers.touches(frames, variant).astype(np.float64)
-    return {
-        "no_contact": no_contact,
-        "difference": sequences.mean(towers.touches(sequences.grasps, variant)) - no_contact,
-        "common-frame": sequences.mean(towers.touches(common, variant)),
-    }
+    """Return vectors (S, F) of each representation and of the no-contact frame, for "touch" or "low_pass" images.
+
+    `common` are the grasps on one common no-contact frame; none if sequences have no such frames of their own.
+    """
+    found = {"plain": sequences.mean(towers.touches(sequences.grasps, variant))}
+    if common:
+        first = [sequences.grasps[rows[0]] for rows in sequences.rows]
+        frames = [dataclasses.replace(grasp, touches=grasp.backgrounds) for grasp in first]
+        no_contact = towers.touches(frames, variant).astype(np.float64)
+        found = {
+            "difference": found["plain"] - no_contact,
+            "common-frame": sequences.mean(towers.touches(common, variant)),
+            "no_contact": no_contact,
+        }
+    if sequences.is_across_sessions:
+        name, vectors = next(iter(found.items()))
+        found[f"{name}{CENTRED}"] = sequences.centred(vectors)
+    return found
 
 
 def run_touch_to_touch(
@@ -209,36 +162,53 @@ def run_touch_to_touch(
     `folder` gets the images on the common frame.
 
     Raises:
-        DatasetError: No-contact frames or second sequences are missing.
+        DatasetError: Second sequences, or common objects of sessions, are missing.
     """
-    sequences = Sequences.of(facts.grasps)
-    if reason := missing_no_contact_reason(facts.grasps):
-        raise DatasetError(f"Touch to touch needs the no-contact frame of each sequence: {reason}.")
-    common = with_common_frame(facts.grasps, folder / facts.digest[:32], quiet=quiet)
-    order = leave_one_out_scores(clock_features(len(sequences.names)).astype(np.float64))
-    measures = {("", "order"): sequences.measures(protocol, order)}
+    grasps = facts.grasps
+    if protocol.left_out:
+        grasps = [grasp for grasp in grasps if facts.class_of.get(grasp.object_id) != protocol.left_out]
+    sequences = Sequences.of(grasps, protocol.sessions)
+    reason = missing_no_contact_reason(sequences.grasps)
+    folder = folder / facts.digest[:32] / sequences.grasps[0].grasp_id
+    common = [] if reason else with_common_frame(sequences.grasps, folder, quiet=quiet)
+    measured = partial(sequences.measures, protocol.measures)
+    measures = {("", "order"): measured(clock_features(len(sequences.names)).astype(np.float64))}
     rows: dict[str, RowResult] = {}
+    compared: list[tuple[str, str]] = []
+    first = next(iter(towers_of))
     for label, towers in towers_of.items():
         digest = towers.checkpoint.digest if towers.checkpoint else None
         touch, low_pass = (_vectors(sequences, towers, common, variant) for variant in ("touch", "low_pass"))
-        no_contact = sequences.measures(protocol, leave_one_out_scores(touch["no_contact"]))
-        measures.setdefault(("", "no_contact"), no_contact)
-        for each in REPRESENTATIONS:
-            row, scores = f"{label}-{each}", leave_one_out_scores(touch[each])
+        no_contact = {kind: measured(touch.pop(kind)) for kind in ("no_contact",) if kind in touch}
+        for each, vectors in touch.items():
+            row = f"{label}-{each}"
             rows[row] = RowResult(METHOD, digest, best_params=[])
-            measures[row, "touch"] = sequences.measures(protocol, scores)
-            measures[row, "low_pass"] = sequences.measures(protocol, leave_one_out_scores(low_pass[each]))
-            measures[row, "no_contact"] = no_contact
+            measures |= {(row, "touch"): measured(vectors), (row, "low_pass"): measured(low_pass[each])}
+            for kind, found in no_contact.items():
+                measures.setdefault(("", kind), found)
+                measures[row, kind] = found
             if ("", "permuted") not in measures:
-                owners = [np.random.default_rng([seed, 41]).permutation(sequences.owner) for seed in seeds]
-                measures["", "permuted"] = sequences.measures(protocol, scores, owners)
-    first, *others = towers_of
+                measures["", "permuted"] = measured(vectors, seeds)
+            if label != first:
+                compared.append((row, f"{first}-{each}"))
+            if each.endswith(CENTRED):
+                compared.append((row, row.removesuffix(CENTRED)))
+    label = protocol.measures[protocol.main].label
+    parts = {
+        f"{protocol.main}_{number}": Metric(f"{label}, {one.name}", "real", protocol.measures[protocol.main].compute)
+        for number, one in enumerate(sequences.rounds)
+        if len(sequences.rounds) > 1
+    }
+    why = f" Features of the touches themselves are compared: {reason}." if reason else ""
     return protocol_result(
-        protocol,
+        dataclasses.replace(
+            protocol, rule=f"{protocol.rule} {sequences.rule}{why}".strip(), measures={**protocol.measures, **parts}
+        ),
         facts,
-        [[Split(seeds[0], (), (), (name,)) for name in sequences.names]],
+        [[Split(seeds[0], (), (), (sequences.names[row],)) for one in sequences.rounds for row in one.queries]],
         rows,
         measures,
-        [(f"{other}-{each}", f"{first}-{each}") for other in others for each in REPRESENTATIONS],
+        compared,
         Aggregation(seeds[0]),
+        {"no_contact": reason} if reason else {},
     )

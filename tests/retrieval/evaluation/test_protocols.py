@@ -13,6 +13,7 @@ from retrieval.evaluation.aggregate import verdict
 from retrieval.evaluation.inputs import missing_no_contact_reason
 from retrieval.evaluation.protocol import RecordingFacts
 from retrieval.evaluation.results import Verdict
+from retrieval.evaluation.touch_to_touch import TouchToTouch
 from retrieval.metrics.intervals import Difference, Summary
 
 
@@ -45,7 +46,7 @@ RECORDINGS = {
     "rct": facts(dict.fromkeys(f"m{n}" for n in range(60))),
     "feeling-of-success": facts(dict.fromkeys(f"o{n}" for n in range(105))),
 }
-WITHOUT_SPLIT = {"physiclear"}
+WITHOUT_SPLIT = {name for name in PROTOCOLS if isinstance(PROTOCOLS.load(name), TouchToTouch)}
 """Protocols without training; test_touch_to_touch tests them."""
 
 

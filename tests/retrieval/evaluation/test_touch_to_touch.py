@@ -1,5 +1,7 @@
-"""Touch to touch: nothing uses the left-out sequence, the common frame removes the leak, controls are measured."""
+"""Touch to touch: nothing uses the query, sessions are compared with each other, controls are measured."""
 
+import shutil
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 
@@ -11,9 +13,11 @@ from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.data.images import read_rgb
 from retrieval.errors import DatasetError
 from retrieval.evaluation.results import Results, read_results
-from retrieval.evaluation.touch_to_touch import Sequences, leave_one_out_scores, with_common_frame
+from retrieval.evaluation.sequences import MOST_TOUCHES, Sequences, cosines, leave_one_out_scores
+from retrieval.evaluation.touch_to_touch import with_common_frame
+from robot.importers.estimate_modulus import import_estimate_modulus
 from robot.importers.physiclear import import_physiclear
-from tests.miniatures import physiclear
+from tests.miniatures import estimate_modulus, physiclear
 
 # Scores ----------------------------------------------------------------------------------------------------
 
@@ -40,13 +44,21 @@ def test_scores_are_cosines_of_principal_components_without_the_query(components
     np.testing.assert_allclose(leave_one_out_scores(vectors, components), expected, atol=1e-5)
 
 
+def test_scores_across_sessions_depend_on_the_references_and_the_query_only():
+    vectors = np.random.default_rng(5).normal(size=(12, 20)) * np.linspace(0.1, 30, 20) + 5
+    together = cosines(vectors[:8], vectors[8:], vectors[:6])
+    alone = np.concatenate([cosines(vectors[:8], query[None], vectors[:6]) for query in vectors[8:]])
+    np.testing.assert_allclose(together, alone, atol=1e-6)
+    np.testing.assert_allclose(together[0], by_plain_loops(vectors[:9], 7)[8, :6], atol=1e-5)
+
+
 # Sequences -------------------------------------------------------------------------------------------------
 
 
-def grasps(counts):
+def grasps(counts, session=None):
     """Return two frames of each video of an object."""
     return [
-        Grasp(f"{name}-{video}-{frame}", name, f"{name}-{video}", Path("p"), (Path("t"),), (Path("u"),))
+        Grasp(f"{name}-{video}-{frame}", name, f"{name}-{video}", None, (Path("t"),), (Path("u"),), session=session)
         for name, count in counts.items()
         for video in range(count)
         for frame in range(2)
@@ -67,6 +79,45 @@ def test_a_sequence_is_the_mean_of_its_own_grasps():
 def test_one_sequence_of_an_object_or_one_object_is_refused(counts, message):
     with pytest.raises(DatasetError, match=message):
         Sequences.of(grasps(counts))
+
+
+def described(sequences):
+    """Return the names of queries and gallery of each round, and the number of fitted sequences."""
+    names = np.array(sequences.names)
+    return [(" ".join(names[one.queries]), " ".join(names[one.gallery]), len(one.fitted)) for one in sequences.rounds]
+
+
+def test_objects_of_both_sessions_are_compared_in_both_directions():
+    """Scaling and components are those of all references, also of objects without queries."""
+    monday, tuesday = grasps({"a": 1, "b": 2, "c": 1}, "monday"), grasps({"b": 1, "a": 1, "d": 1}, "tuesday")
+    mixed = [monday[0], *tuesday, *monday[1:]]  # as in a folder: one session follows the other in the order of capture
+    sequences = Sequences.of([*mixed, *grasps({"a": 1})], "across")
+    assert described(sequences) == [("b-0 a-0", "a-0 b-0 b-1", 4), ("a-0 b-0 b-1", "b-0 a-0", 3)]
+    assert "tuesday against monday: 2 queries, 3 references of 2 objects" in sequences.rule
+    vectors = sequences.centred(np.arange(7, dtype=np.float64)[:, None])
+    assert vectors.ravel().tolist() == [-1.5, -0.5, 0.5, 1.5, -1, 0, 1]
+    with pytest.raises(DatasetError, match=r"no two of monday, tuesday have them in common.*touch-to-touch-within"):
+        Sequences.of([*monday, *grasps({"b": 1, "d": 1}, "tuesday")], "across")
+
+
+def test_within_a_session_the_gallery_is_the_rest_of_the_session_and_else_the_rest_of_the_recording():
+    both = [*grasps({"a": 2, "b": 2}, "monday"), *grasps({"b": 2, "c": 2}, "tuesday")]
+    within = Sequences.of(both, "within").rounds
+    assert [(one.is_leave_one_out, one.queries.tolist()) for one in within] == [
+        (True, [0, 1, 2, 3]),
+        (True, [4, 5, 6, 7]),
+    ]
+    assert [len(one.gallery) for one in Sequences.of(both).rounds] == [6]  # b-0 of both days is one sequence
+
+
+def test_late_touches_are_compared_with_early_ones_if_every_object_has_one_sequence():
+    long = [replace(grasp, sequence_id=grasp.object_id) for grasp in grasps({"a": 3, "b": 60})]
+    sequences = Sequences.of(long, "across")
+    ((queries, gallery, _),) = described(sequences)
+    assert gallery.split()[:2] == ["a-0-0", "a-0-1"]
+    assert queries.split()[:2] == ["a-2-0", "a-2-1"]
+    assert len(queries.split()) == len(gallery.split()) == 2 + MOST_TOUCHES
+    assert (gallery.split()[-1], queries.split()[2]) == ("b-19-1", "b-40-0")
 
 
 # The common no-contact frame -------------------------------------------------------------------------------
@@ -148,3 +199,39 @@ def test_the_towers_of_other_configurations_are_rows_compared_with_the_first(rec
     same = differences["same-difference", "frozen-difference"]
     assert (same.low, same.value, same.high) == (0, 0, 0)
     assert ("larger-difference", "frozen-difference") in differences
+
+
+@pytest.fixture(scope="module")
+def two_days(tmp_path_factory):
+    """The miniature of EstimateModulus as a recording: two days, which share two objects."""
+    folder = tmp_path_factory.mktemp("days")
+    estimate_modulus.write(folder / "src")
+    return import_estimate_modulus(folder / "src", folder / "recording").folder
+
+
+def run(recording, out, *more):
+    options = ["--config", "tiny", "--seeds", "2", "--out", str(out), *more]
+    assert main(["evaluate", str(recording), "--protocol", "touch-to-touch", *options]) == 0
+    return read_results(out / "results.json", Results).protocols["touch-to-touch"]
+
+
+def test_a_recording_of_two_sessions_is_compared_across_them_with_counts_of_both_directions(two_days, tmp_path):
+    entry = run(two_days, tmp_path / "out")
+    assert set(entry.rows) == {"frozen-difference", "frozen-common-frame", "frozen-difference-centred"}
+    directions = [label for name, label in entry.labels if name.startswith("recall_1_")]
+    assert directions == ["top-1, 2023-12-16 against 2023-12-06", "top-1, 2023-12-06 against 2023-12-16"]
+    measures = entry.rows["frozen-difference-centred"].measures
+    assert (measures["recall_1"].queries, measures["recall_1_0"].queries, measures["recall_1"].objects) == (8, 4, 2)
+    assert measures["recall_1"].value[0] == np.mean([measures[f"recall_1_{number}"].value[0] for number in (0, 1)])
+    assert entry.controls["order"].measures["recall_1"].value[0] == 0.5 == measures["recall_1"].chance[0]
+    assert ("frozen-difference-centred", "frozen-difference") in {(one.a, one.b) for one in entry.comparisons}
+
+
+def test_touches_without_no_contact_frames_are_compared_as_they_are(two_days, tmp_path):
+    without = shutil.copytree(two_days, tmp_path / "recording")
+    lines = (without / "metadata.jsonl").read_text()
+    (without / "metadata.jsonl").write_text(lines.replace("touch_a_before_file_name", "other"))
+    entry = run(without, tmp_path / "out")
+    assert set(entry.rows) == {"frozen-plain", "frozen-plain-centred"}
+    assert entry.controls["no_contact"].reason == "the recording lacks no-contact frames"
+    assert "Features of the touches themselves are compared" in entry.rule
