@@ -159,7 +159,7 @@ class Sequences:
         if self.rounds[0].is_leave_one_out:
             return f"Each sequence is compared with all others{' of its session' * bool(self.rounds[0].name)}."
         how = (
-            "Only objects that both sessions have are compared."
+            "Only objects that both sessions have are compared. The order of capture is that of the whole recording."
             if self.is_across_sessions
             else "Each object has one sequence: touches of its last third are compared with those of its first third, "
             f"at most {MOST_TOUCHES} of each."
