@@ -85,12 +85,8 @@ class Rows:
 
     def find_object(self, name: str) -> int:
         """Return the number of the object with exactly this name; -1 if there is none."""
-        number = self.place(name)
+        number = bisect_left(range(self.object_count), name, key=self.object_name)
         return number if number < self.object_count and self.object_name(number) == name else -1
-
-    def place(self, name: str) -> int:
-        """Return the number of objects whose names are before this one in the order of names."""
-        return bisect_left(range(self.object_count), name, key=self.object_name)
 
     def names_like(self, name: str) -> list[str]:
         """Return the name if an object has exactly this one, else the names of objects with its `lookup_key`."""

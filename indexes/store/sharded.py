@@ -10,7 +10,6 @@ Opening a sharded index reads only this file. Its length depends on the number o
 """
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from hashlib import blake2b
 from pathlib import Path
@@ -75,11 +74,6 @@ class ShardedManifest:
         """Number of objects in all shards; the photos of an object are in one shard."""
         return sum(shard.objects for shard in self.shards)
 
-    @property
-    def folders(self) -> list[str]:
-        """The folders of the shards."""
-        return [shard.folder for shard in self.shards]
-
 
 def is_sharded(folder: Path) -> bool:
     """Whether the folder is a sharded index."""
@@ -92,11 +86,11 @@ def shard_number(object_id: str, shards: int) -> int:
     return int.from_bytes(digest[8:], "little") % shards
 
 
-def shard_folder(object_id: str, folders: Sequence[str]) -> str:
-    """Return the folder of an object's shard, one of `folders`; another shard stands in for one without photos."""
-    of = int(folders[0].rpartition("-")[2])
-    own = f"shard-{shard_number(object_id, of):02d}-of-{of:02d}"
-    return own if own in folders else folders[shard_number(object_id, len(folders))]
+def shard_folder(object_id: str, manifest: ShardedManifest) -> str:
+    """Return the folder of the shard that an object is in, or would be: another one stands in for an empty shard."""
+    folders, own = [shard.folder for shard in manifest.shards], shard_number(object_id, manifest.of)
+    full = [folder for folder in folders if folder.startswith(f"shard-{own:02d}-")]
+    return full[0] if full else folders[own % len(folders)]
 
 
 def write_sharded_manifest(folder: Path, manifest: ShardedManifest) -> None:

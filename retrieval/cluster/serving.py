@@ -22,7 +22,6 @@ from threadpoolctl import threadpool_limits
 
 from indexes.errors import IndexesError
 from indexes.store.generation import check_fingerprint
-from indexes.store.manifest import read_manifest
 from indexes.store.sharded import ShardedManifest, ShardEntry
 from retrieval.console.output import say
 from retrieval.errors import IncompleteSearch, RetrievalError
@@ -60,9 +59,8 @@ class OwnerActor:
 class ShardReplica:
     """One shard in a process of Ray Serve."""
 
-    def __init__(self, index: str, entry: ShardEntry, folders: list[str], model: str) -> None:
-        manifest = read_manifest(Path(index, entry.folder, entry.generation))
-        self._shard = open_shard_of(Path(index), entry, folders, checkpoint_of(manifest, model))
+    def __init__(self, index: str, manifest: ShardedManifest, entry: ShardEntry, model: str) -> None:
+        self._shard = open_shard_of(Path(index), manifest, entry, checkpoint_of(manifest, model))
         threadpool_limits(1, "blas")  # for the whole process: idle BLAS threads spin on CPUs that others need
 
     def call(self, method: str, *arguments: Any) -> Any:
@@ -161,8 +159,8 @@ class Deployments:
             RetrievalError: Ray cannot start the shards.
         """
         check_fingerprint(index, manifest.fingerprint, fingerprint(stored))
-        # The other shards determine which enrolled objects belong to a shard.
-        folders = "".join(manifest.folders)
+        # Which enrolled objects are in a shard depends on the shards that there are.
+        folders = [entry.folder for entry in manifest.shards]
         digests = {one.folder: hashlib.sha256(f"{one.sha256}{folders}".encode()).hexdigest() for one in manifest.shards}
         names = {folder: f"{folder}-{digest[:16]}-{self._owner_id}" for folder, digest in digests.items()}
         self._close_handles()
@@ -214,9 +212,7 @@ class Deployments:
             graceful_shutdown_timeout_s=10,
         )
         targets = [
-            serve.RunTarget(
-                deployment.bind(index, entry, manifest.folders, model), name=names[entry.folder], route_prefix=None
-            )
+            serve.RunTarget(deployment.bind(index, manifest, entry, model), name=names[entry.folder], route_prefix=None)
             for entry in manifest.shards
             if names[entry.folder] not in deployed
         ]

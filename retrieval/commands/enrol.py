@@ -51,11 +51,11 @@ def enrol(
         from retrieval.indexing.enrolled import remove_enrolled
 
         refuse_options("has no effect with --remove", gelsight=gelsight, opening=opening, background=background)
-        removed = remove_enrolled(path, name)
+        removed, count = remove_enrolled(path, name)
         if json:
-            print_json(removed._asdict())
+            print_json({"object_id": removed, "removed": count})
         else:
-            show(f"{removed.object_id}: {removed.touches} enrolled touch(es) removed")
+            show(f"{removed}: {count} enrolled touch(es) removed")
         return 0
     if not gelsight:
         raise BadInput("give the gel images of each grasp with --gelsight, or --remove")

@@ -2,8 +2,7 @@
 
 import hashlib
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -88,11 +87,19 @@ def build_index(
         before, previous = {}, None
     options, note = build_options(checkpoint, before, objects_from=objects_from, kind=kind, cells=cells, quiet=quiet)
     catalogue = list_catalogue(folder, options.naming)
-    with store.lock(), keep_enrolled(store.path, checkpoint, options, previous) as with_enrolled:
+    with store.lock():
+        enrolled = encode_enrolled(store.path, checkpoint, options.cells)
         report = build_listed(catalogue, checkpoint, store, options)
+        encode_enrolled(store.path, checkpoint, options.cells, previous)
     store.discard_before(report.generation)
     warnings = [*catalogue_warnings(before, catalogue, options.naming), *report.warnings]
-    return replace(with_enrolled(report), warnings=warnings, reason=" ".join(filter(None, (note, report.reason))))
+    return replace(
+        report,
+        warnings=warnings,
+        reason=" ".join(filter(None, (note, report.reason))),
+        enrolled=enrolled and enrolled.counts,
+        skipped=[*report.skipped, *(enrolled.skipped if enrolled else ())],
+    )
 
 
 def catalogue_warnings(before: Mapping[str, Any], catalogue: Catalogue, naming: Naming) -> list[str]:
@@ -123,29 +130,6 @@ class BuildOptions:
     kind: str
     cells: bool | None
     quiet: bool
-
-
-@contextmanager
-def keep_enrolled(
-    index: Path, checkpoint: Checkpoint, options: BuildOptions, previous: Mapping[str, str] | None
-) -> Iterator[Callable[[BuildReport], BuildReport]]:
-    """Encode enrolled touches before the block makes a generation current, and those of the meantime after it.
-
-    Args:
-        index: Folder of the index, whose writer lock is held.
-        checkpoint: The model.
-        options: Options of the build.
-        previous: Fingerprint of the generation before; None without one.
-
-    Yields:
-        A function that adds the enrolled touches to the report of the build, after the block.
-    """
-    checkpoint = checkpoint.without_cells() if options.cells is False else checkpoint
-    earlier, _ = encode_enrolled(index, checkpoint)
-    yield lambda report: replace(report, enrolled=enrolled, skipped=[*report.skipped, *skipped])
-    enrolled, skipped = encode_enrolled(index, checkpoint, previous or fingerprint(checkpoint))
-    if enrolled and earlier:
-        enrolled["encoded"] += earlier["encoded"]
 
 
 def build_options(

@@ -27,8 +27,8 @@ from retrieval.console.progress import Bar
 from retrieval.data.catalogue import Catalogue, SkippedPhoto
 from retrieval.data.images import decode_rgb, read_bytes
 from retrieval.data.loading import map_in_order
-from retrieval.errors import BadInput, ImageError, NumericalError, RetrievalError
-from retrieval.indexing.enrolled import EnrolledTable, EnrolledTouch, codes_of, model_key, to_code
+from retrieval.errors import ImageError, NumericalError, RetrievalError
+from retrieval.indexing.enrolled import EnrolledTable, codes_of, model_key, to_code
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.checkpoint_info import fingerprint
 from retrieval.model.encode import TorchEncoder, batches, one_thread, torch_photo_encoder, touch_features
@@ -36,7 +36,7 @@ from retrieval.model.export import choose_photo_encoder
 from retrieval.model.fusion_scorer import stored_layout, to_stored
 from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
 from retrieval.model.touch_reader import Stopwatch, TouchReader
-from retrieval.model.touches import InputImage
+from retrieval.model.touches import parse_grasps
 
 Paths = tuple[str, ...]
 """Files of one photo (one) or of one touch (one for each finger), relative to the catalogue."""
@@ -196,55 +196,55 @@ def touch_encoder(checkpoint: Checkpoint) -> Encoder:
     return Encoder("touches", layout, _model(checkpoint, layout), decode, lambda count: encode)
 
 
+class EnrolledCodes(NamedTuple):
+    """Enrolled touches of a build.
+
+    Attributes:
+        counts: Number of `touches`, of their `objects`, of touches that were `encoded` now, and of those that are
+            `usable` by the model.
+        skipped: Touches that could not be encoded; they stay in the table.
+    """
+
+    counts: dict[str, int]
+    skipped: list[SkippedPhoto]
+
+
 def encode_enrolled(
-    index: Path, checkpoint: Checkpoint, previous: Mapping[str, str] | None = None
-) -> tuple[dict[str, int] | None, list[SkippedPhoto]]:
+    index: Path, checkpoint: Checkpoint, cells: bool | None, previous: Mapping[str, str] | None = None
+) -> EnrolledCodes | None:
     """Add codes of a model to the enrolled touches that have none, from their pictures.
 
     Args:
         index: Folder of the index.
         checkpoint: The model.
-        previous: Fingerprint of the model of the generation before. The codes of all models but these two are deleted;
-            readers may still use the previous one. None to keep all codes.
+        cells: Whether the index has cells.
+        previous: Fingerprint of the generation before. With it, codes of all but these two models are deleted: readers
+            may still use the previous one.
 
     Returns:
-        Numbers of touches, of their objects, of touches that were encoded now, and of those that the model can compare
-        (None without touches); and the touches that could not be encoded, which stay in the table.
+        A report; None without enrolled touches.
     """
-    table, key, usable = EnrolledTable(index), model_key(fingerprint(checkpoint)), 0
-    touches, codes, skipped = table.read(), dict[Paths, bytes](), list[SkippedPhoto]()
-    if not touches:
-        return None, skipped
-    if checkpoint.references is not None and checkpoint.posterior is not None:  # else touches cannot be compared
-        known = {touch.pictures for touch in codes_of(touches, checkpoint)[0]}
-        encode = enrolled_encoder(checkpoint)
-        for touch in touches:
-            if touch.pictures not in known:
-                try:
-                    codes[touch.pictures] = encode(index, touch)
-                except RetrievalError as error:
-                    skipped.append(SkippedPhoto(touch.pictures[0], f"enrolled for {touch.object_id}: {error}"))
-        usable = len(known) + len(codes)
-        table.replace_codes(key, codes, () if previous is None else {key, model_key(previous)})
+    table, codes, skipped = EnrolledTable(index), dict[str, bytes](), list[SkippedPhoto]()
+    if not (touches := table.read()):
+        return None
+    used, usable = checkpoint.without_cells() if cells is False else checkpoint, 0
+    if used.references is not None and used.posterior is not None:  # else touches cannot be compared
+        coded, reader = codes_of(touches, used)[0], TouchReader(used.config, TorchEncoder(used.matcher))
+        takes_frames, done = used.config.preprocessing.background != "none", {touch.path for touch in coded}
+        for touch in (one for one in touches if one.path not in done):
+            try:
+                frames = [str(index / path) for path in touch.background] if takes_frames else []
+                files = [read_bytes(index / path, digest) for path, digest in touch.pictures.items()]
+                grasps, no_contact = parse_grasps(files, reader.fingers), reader.no_contact_frames(frames or None)
+                codes[touch.path] = to_code(reader.encode(grasps, no_contact, Stopwatch()).partials[0], used)
+            except RetrievalError as error:
+                skipped.append(SkippedPhoto(touch.path, f"enrolled for {touch.object_id}: {error}"))
+        key = model_key(fingerprint(used))
+        table.replace_codes(codes, key, previous and {key, model_key(previous)})
+        usable = len(coded) + len(codes)
     objects = len({touch.object_id for touch in touches})
-    return {"touches": len(touches), "objects": objects, "encoded": len(codes), "usable": usable}, skipped
-
-
-def enrolled_encoder(checkpoint: Checkpoint) -> Callable[[Path, EnrolledTouch], bytes]:
-    """Return the function that encodes an enrolled touch of an index folder; it raises RetrievalError."""
-    takes_frames = checkpoint.config.preprocessing.background != "none"
-    reader = TouchReader(checkpoint.config, TorchEncoder(checkpoint.matcher))
-
-    def encode(index: Path, touch: EnrolledTouch) -> bytes:
-        frames = [str(index / path) for path in touch.background] if takes_frames else []
-        pictures = zip(touch.pictures, touch.digests, strict=True)
-        images = [InputImage(read_bytes(index / path, digest), path) for path, digest in pictures]
-        if len(images) != reader.fingers:
-            raise BadInput(f"it has {len(images)} gel image(s), the model takes {reader.fingers}")
-        encoded = reader.encode([images], reader.no_contact_frames(frames or None), Stopwatch())
-        return to_code(encoded.partials[0], checkpoint)
-
-    return encode
+    counts = {"touches": len(touches), "objects": objects, "encoded": len(codes), "usable": usable}
+    return EnrolledCodes(counts, skipped)
 
 
 def _model(checkpoint: Checkpoint, layout: np.dtype[Any]) -> str:

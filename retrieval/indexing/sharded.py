@@ -28,7 +28,8 @@ from indexes.store.sharded import (
 )
 from retrieval.data.catalogue import Catalogue, list_catalogue
 from retrieval.errors import BadInput, NoReadablePhoto
-from retrieval.indexing.build import BuildOptions, build_listed, build_options, catalogue_warnings, keep_enrolled
+from retrieval.indexing.build import BuildOptions, build_listed, build_options, catalogue_warnings
+from retrieval.indexing.codes import encode_enrolled
 from retrieval.indexing.contents import no_photo, require_reference_calibration
 from retrieval.indexing.report import BuildReport
 from retrieval.model.checkpoint import Checkpoint
@@ -105,18 +106,19 @@ def build_sharded(
             require_reference_calibration(checkpoint.without_cells() if options.cells is False else checkpoint)
         _delete_old_shards(own, before, shards)
         jobs = [ShardJob(own / name, part, options) for name, part in _split_catalogue(catalogue, shards)]
-        with keep_enrolled(own, checkpoint, options, before.fingerprint if before else None) as with_enrolled:
-            built = list(run(jobs, checkpoint)) if run else [build_shard(job, checkpoint) for job in jobs]
-            reports = sorted((one for one in built if isinstance(one, BuildReport)), key=lambda one: one.index)
-            unreadable = [one for one in built if isinstance(one, NoReadablePhoto)]
-            report = _report(own, catalogue, options, reports, unreadable)
-            manifest = _manifest(own, before, shards, checkpoint, catalogue, report, reports)
-            if written := before is None or manifest.generation != before.generation:
-                write_sharded_manifest(own, manifest)
+        enrolled = encode_enrolled(own, checkpoint, options.cells)
+        built = list(run(jobs, checkpoint)) if run else [build_shard(job, checkpoint) for job in jobs]
+        reports = sorted((one for one in built if isinstance(one, BuildReport)), key=lambda one: one.index)
+        unreadable = [one for one in built if isinstance(one, NoReadablePhoto)]
+        report = _report(own, catalogue, options, reports, unreadable)
+        manifest = _manifest(own, before, shards, checkpoint, catalogue, report, reports)
+        if written := before is None or manifest.generation != before.generation:
+            write_sharded_manifest(own, manifest)
+        encode_enrolled(own, checkpoint, options.cells, before.fingerprint if before else None)
         for entry in manifest.shards:
             IndexStore(own / entry.folder).discard_before(entry.generation)
     return replace(
-        with_enrolled(report),
+        report,
         generation=manifest.generation,
         written=written,
         warnings=[
@@ -125,6 +127,8 @@ def build_sharded(
         ],
         reason=" ".join(filter(None, (note, unusable, report.reason))),
         shards=[asdict(entry) for entry in manifest.shards],
+        enrolled=enrolled and enrolled.counts,
+        skipped=[*report.skipped, *(enrolled.skipped if enrolled else ())],
     )
 
 

@@ -1,10 +1,9 @@
 """Photos, reference touches and objects of an opened index: object logits from photo logits, and the best objects."""
 
-from bisect import bisect_left
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -116,6 +115,13 @@ class _ReferenceTouch:
     is_enrolled: bool = False
 
 
+def _enrolled_reference(touch: EnrolledTouch) -> _ReferenceTouch:
+    pictures = touch.pictures
+    return _ReferenceTouch(
+        touch.object_id, tuple(pictures), tuple(pictures.values()), touch.opening_mm, is_enrolled=True
+    )
+
+
 @dataclass(frozen=True)
 class _References:
     """The document of reference touches, and the objects without photos."""
@@ -125,7 +131,7 @@ class _References:
 
 
 class Objects:
-    """The objects of an index and of enrolled touches, numbered in the order of their names.
+    """The objects of an index, numbered in the order of their names, and then those that were only enrolled.
 
     Args:
         generation: The opened generation.
@@ -141,9 +147,11 @@ class Objects:
     """
 
     def __init__(self, generation: Generation, stored: CheckpointInfo, columns: slice) -> None:
-        self._rows, documents = generation.rows, generation.documents
+        self._rows = rows = generation.rows
+        documents = generation.documents
         self.posterior = stored.posterior or Posterior()  # without calibration objects are ranked, too
-        self._originals = generation.rows.originals
+        self._of_row, self._originals = rows.objects, rows.originals
+        self._photos = np.bincount(self._of_row)
         self._columns, self._stored = columns, stored
         self._calibration, self._opening = stored.references, stored.opening
         try:
@@ -159,37 +167,26 @@ class Objects:
             ) from error
         partials = documents.get(REFERENCE_PARTIALS, np.empty((0, columns.stop), np.float32))
         self._catalogue_codes = unit_embeddings(partials, columns)
-        self._places = dict[str, tuple[int, bool]]()
+        self._find = cache(rows.find_object)
         self._add(())
 
     def with_enrolled(self, touches: Sequence[EnrolledTouch]) -> "Objects":
         """Return the objects of the index and of these enrolled touches, in place of those of earlier ones."""
         changed = copy(self)
-        for name in ("gel_images", "_sample"):
-            vars(changed).pop(name, None)
+        vars(changed).pop("gel_images", None)
         changed._add(touches)
         return changed
 
     def _add(self, enrolled: Sequence[EnrolledTouch]) -> None:
-        """Number all objects, and order the reference touches of catalogue and table by object."""
-        usable, codes = list[EnrolledTouch](), self._catalogue_codes
+        """Number the objects of enrolled touches, and order all reference touches by object."""
+        touches, codes = self._references.touches, self._catalogue_codes
         if enrolled and self._calibration:  # else touches cannot be compared, nor without codes of this model
             usable, partials = codes_of(enrolled, self._stored)
             codes = np.concatenate([codes, unit_embeddings(partials, self._columns)])
-        touches = [
-            *self._references.touches,
-            *(
-                _ReferenceTouch(one.object_id, one.pictures, one.digests, one.opening_mm, is_enrolled=True)
-                for one in usable
-            ),
-        ]
-        self._enrolled_only = sorted(name for name in {one.object_id for one in usable} if not self._place(name)[1])
-        self._gaps = np.array([self._place(name)[0] for name in self._enrolled_only], dtype=np.int64)
-        self._enrolled_numbers = self._gaps + np.arange(len(self._gaps))
-        self._of_row = self._rows.objects + np.searchsorted(self._gaps, self._rows.objects, "right")
-        self.count = self._rows.object_count + len(self._enrolled_only)
-        self._photos = np.bincount(self._of_row, minlength=self.count)
-
+            touches = [*touches, *map(_enrolled_reference, usable)]
+        names = sorted({one.object_id for one in touches if one.is_enrolled and self._find(one.object_id) < 0})
+        self._enrolled_only = {name: self._rows.object_count + place for place, name in enumerate(names)}
+        self.count = self._rows.object_count + len(names)
         numbers = np.array([self.find(one.object_id) for one in touches], dtype=np.int64)
         order = np.argsort(numbers, kind="stable")
         order = order[numbers[order] >= 0]  # an object without a readable photo has no number
@@ -198,30 +195,17 @@ class Objects:
         self._openings_mm = np.array([one.opening_mm for one in self._touches], dtype=np.float64)  # None becomes NaN
         self._owners = numbers[order]
         self._touched, self._starts = np.unique(self._owners, return_index=True)
-        touch_only = [*map(self.find, self._references.touch_only), *self._enrolled_numbers]
-        self._touch_only = np.isin(np.arange(self.count), touch_only)
-
-    def _place(self, name: str) -> tuple[int, bool]:
-        """Return the number of objects of the generation before this name, and whether it has this one."""
-        if name not in self._places:
-            self._places[name] = self._rows.place(name), self._rows.find_object(name) >= 0
-        return self._places[name]
+        self._touch_only = np.isin(np.arange(self.count), [self.find(name) for name in self._references.touch_only])
 
     def find(self, name: str) -> int:
         """Return the number of the object with exactly this name; -1 if there is none."""
-        place, has_row = self._place(name)
-        if has_row:
-            return place + int(np.searchsorted(self._gaps, place, "right"))
-        at = bisect_left(self._enrolled_only, name)
-        return int(self._enrolled_numbers[at]) if self._enrolled_only[at : at + 1] == [name] else -1
+        return self._enrolled_only.get(name, self._find(name))
 
     def names_like(self, name: str) -> list[str]:
         """Return the objects that a person can mean by this name (`Rows.names_like`)."""
-        if name in self._enrolled_only:
+        if self.find(name) >= 0:
             return [name]
-        if name in (found := self._rows.names_like(name)):
-            return found
-        return found + [one for one in self._enrolled_only if lookup_key(one) == lookup_key(name)]
+        return self._rows.names_like(name) + [one for one in self._enrolled_only if lookup_key(one) == lookup_key(name)]
 
     @property
     def reference_counts(self) -> tuple[int, int]:
@@ -240,8 +224,8 @@ class Objects:
     @property
     def enrolled_pictures(self) -> list[ListedPhoto]:
         """A gel image of each touch of the objects that only the table of enrolled touches has, by object."""
-        is_only = np.isin(self._owners, self._enrolled_numbers)
-        return [self.gel_images[self._touches[place].touch[0]] for place in np.flatnonzero(is_only)]
+        start = np.searchsorted(self._owners, self._rows.object_count)
+        return [self.gel_images[one.touch[0]] for one in self._touches[start:]]
 
     @property
     def enrolled_count(self) -> int:
@@ -298,7 +282,8 @@ class Objects:
 
     def score_enrolled_only(self, evidence: ReferenceEvidence, grasps: int) -> ScoredObjects:
         """Return the objects that only the table of enrolled touches has, with their logits."""
-        numbers, calibration, logits = self._enrolled_numbers, self._calibration, np.empty(0)
+        numbers, logits = np.arange(self._rows.object_count, self.count), np.empty(0)
+        calibration = self._calibration
         if calibration is not None and len(numbers):
             ratios = calibration.touch_only.log_ratio(evidence.similarities[numbers], grasps)
             logits = self.posterior.logit_of(ratios, grasps) + evidence.openings[numbers] / self.posterior.slope
@@ -318,8 +303,8 @@ class Objects:
     @cached_property
     def _sample(self) -> tuple[Rows, Rows]:
         """Rows of the photos of `SAMPLE` random objects (fixed seed), and the objects of these rows."""
-        drawn, with_rows = np.zeros(self.count, dtype=bool), np.flatnonzero(self._photos)
-        drawn[np.random.default_rng(0).permutation(with_rows)[:SAMPLE]] = True
+        drawn = np.zeros(self._rows.object_count, dtype=bool)
+        drawn[np.random.default_rng(0).permutation(len(drawn))[:SAMPLE]] = True
         rows = np.flatnonzero(drawn[self._of_row])
         return rows, self._of_row[rows]
 

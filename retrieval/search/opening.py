@@ -1,6 +1,6 @@
 """Find the checkpoint that built an index, and the default one; open an index folder or a sharded index."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -109,13 +109,13 @@ def open_index(
     if shards is not None:
         return shards(index, manifest, stored), stored
     check_fingerprint(index, manifest.fingerprint, fingerprint(stored))
-    opened = [open_shard_of(index, entry, manifest.folders, stored) for entry in manifest.shards]
+    opened = [open_shard_of(index, manifest, entry, stored) for entry in manifest.shards]
     return Shards(manifest, opened), stored
 
 
-def open_shard_of(index: Path, entry: ShardEntry, folders: Sequence[str], stored: CheckpointInfo) -> FolderShard:
-    """Open a shard of a sharded index with the enrolled touches of its objects; `folders`: those of all its shards."""
-    enrolled = EnrolledTable(index, lambda name: shard_folder(name, folders) == entry.folder)
+def open_shard_of(index: Path, manifest: ShardedManifest, entry: ShardEntry, stored: CheckpointInfo) -> FolderShard:
+    """Open a shard of a sharded index, with the enrolled touches of its objects."""
+    enrolled = EnrolledTable(index, lambda name: shard_folder(name, manifest) == entry.folder)
     return FolderShard(open_shard(index, entry), stored, enrolled)
 
 

@@ -17,14 +17,7 @@ from indexes.store.sharded import ShardedManifest
 from retrieval.data.opening import Openings, parse_openings
 from retrieval.data.text import is_utf8
 from retrieval.errors import BadInput, IncompleteSearch
-from retrieval.indexing.enrolled import (
-    EnrolledTable,
-    EnrolledTouch,
-    content_digest,
-    model_key,
-    picture_path,
-    to_code,
-)
+from retrieval.indexing.enrolled import EnrolledTable, EnrolledTouch, content_digest, model_key, picture_path, to_code
 from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_scorer
 from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
 from retrieval.model.onnx_encoder import find_export
@@ -335,40 +328,40 @@ class Searcher:
         opened, stored = self._snapshot(), self.checkpoint
         name, fingers = opened.enrolled_name(object_id), opened.reader.fingers
         grasps = [list(map(with_file, grasp)) for grasp in parse_grasps(touches, fingers)]
-        openings = parse_openings(opening_mm, len(grasps))
+        openings = parse_openings(opening_mm, len(grasps)).tolist()
         frames = [] if background is None else parse_grasps(background, fingers, noun="background")[0]
         frames = list(map(with_file, frames))
         codes, classes = opened._encoded(grasps, [frame.image for frame in frames] or None, Stopwatch())
         for grasp, shows in zip(grasps, classes, strict=True):
             if shows != CONTACT:
-                names = " and ".join(image.name for image in grasp)
-                raise BadInput(f"{names}: {shows}; enrol grasps in which the object is pressed into the gels")
+                raise BadInput(f"{_names(grasp)}: {shows}; enrol grasps in which the object is pressed into the gels")
         require_distinct(grasps, codes.pictures)
+
+        def files(images: Sequence[InputImage]) -> dict[str, bytes]:
+            return {picture_path(name, image.file): image.file for image in images}
 
         new = [
             EnrolledTouch(
                 name,
-                tuple(picture_path(name, image.file) for image in grasp),
-                tuple(content_digest(image.file) for image in grasp),
+                {path: content_digest(file) for path, file in files(grasp).items()},
                 {model_key(fingerprint(stored)): to_code(partial, stored)},
-                None if np.isnan(opening) else float(opening),
-                tuple(picture_path(name, frame.file) for frame in frames),
+                None if np.isnan(opening) else opening,
+                tuple(files(frames)),
             )
             for grasp, partial, opening in zip(grasps, codes.partials, openings, strict=True)
         ]
-        files = {picture_path(name, image.file): image.file for image in (*chain.from_iterable(grasps), *frames)}
         table = EnrolledTable(self.index)
         with table.lock() as known:
-            owners = {digest: touch.object_id for touch in known for digest in touch.digests}
-            for image in chain.from_iterable(grasps):
-                if owner := owners.get(content_digest(image.file)):
+            owners = {digest: touch.object_id for touch in known for digest in touch.pictures.values()}
+            for touch, grasp in zip(new, grasps, strict=True):
+                if owner := next((owners[one] for one in touch.pictures.values() if one in owners), None):
                     raise BadInput(
-                        f"{image.name} is enrolled already, for {owner}; a picture counts once: give another grasp, or "
-                        f"remove {owner} first"
+                        f"a picture of {_names(grasp)} is enrolled already, for {owner}; it counts once: give another "
+                        f"grasp, or remove {owner} first"
                     )
             if manifest_of(self.index).fingerprint != self.manifest.fingerprint:
                 raise IncompleteSearch(f"{self.index} was built with another model in the meantime; enrol again")
-            table.replace([*known, *new], files)
+            table.replace([*known, *new], files([*chain.from_iterable(grasps), *frames]))
         return Enrolment(name, sum(touch.object_id == name for touch in (*known, *new)), len(new))
 
     @property
@@ -508,7 +501,7 @@ def enrol(
     >>> retrieval.enrol("index", "spoon", ["a.png", "b.png"], opening_mm=12.5)
     Enrolment(object_id='spoon', touches=1, added=1)
     >>> retrieval.remove_enrolled("index", "spoon")
-    Removal(object_id='spoon', touches=1)
+    ('spoon', 1)
     """
     with Searcher.open(index, model=model) as searcher:
         return searcher.enrol(object_id, touches, opening_mm=opening_mm, background=background)
@@ -520,6 +513,10 @@ def _fault(classes: Iterable[str]) -> str | None:
     if NOT_A_GEL in shown:
         return NOT_A_GEL
     return None if CONTACT in shown else NO_CONTACT
+
+
+def _names(grasp: Sequence[InputImage]) -> str:
+    return " and ".join(image.name for image in grasp)
 
 
 def _torch_encoder(stored: CheckpointInfo, threads: int | None) -> TouchEncoder:

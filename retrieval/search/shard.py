@@ -93,19 +93,18 @@ class FolderShard:
         check_fingerprint(generation.folder.parent, generation.manifest.fingerprint, fingerprint(stored))
         self.generation, self.manifest, self.scorer = generation, generation.manifest, read_scorer(stored)
         self._enrolled = EnrolledTable(generation.folder.parent) if enrolled is None else enrolled
-        catalogue = Objects(generation, stored, self.scorer.cosine_columns)
-        self._opened: tuple[tuple[int, int, int] | None, Objects, Objects] = None, catalogue, catalogue
+        self._catalogue = Objects(generation, stored, self.scorer.cosine_columns)
+        self._snapshot: tuple[object, Objects] = None, self._catalogue
         self._has_embeddings = stored.config.has_embeddings
 
     @property
     def objects(self) -> Objects:
         """The objects of the generation and of the touches that are enrolled now: one snapshot for each use."""
-        version = self._enrolled.version()
-        before, catalogue, current = self._opened
-        if version != before:
-            current = catalogue.with_enrolled(self._enrolled.read())
-            self._opened = version, catalogue, current
-        return current
+        version, (known, objects) = self._enrolled.version(), self._snapshot
+        if version != known:
+            objects = self._catalogue.with_enrolled(self._enrolled.read())
+            self._snapshot = version, objects
+        return objects
 
     def search(self, query: EncodedQuery, top: int, candidates: int | None) -> ShardResult:
         """Return the best objects for the grasps of a query, and the evidence mass of all objects.

@@ -58,7 +58,7 @@ def test_a_shard_uses_one_blas_thread_and_returns_its_errors(cluster):
 
     manifest = read_sharded_manifest(cluster)
     with threadpool_limits(2, "blas"):
-        replica = ShardReplica(str(cluster), manifest.shards[0], manifest.folders, manifest.about["checkpoint"])
+        replica = ShardReplica(str(cluster), manifest, manifest.shards[0], manifest.about["checkpoint"])
         assert {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"} == {1}
     assert replica.call("page", [], None, 0, 5).total == manifest.shards[0].photos
 
