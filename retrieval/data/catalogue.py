@@ -35,7 +35,7 @@ from retrieval.console.output import abbreviate_list
 from retrieval.data.dataset import load_grasps
 from retrieval.data.images import EXTENSIONS, is_picture
 from retrieval.data.naming import MAX_EXAMPLES, STEM, Naming
-from retrieval.data.opening import require_opening
+from retrieval.data.opening import believed, require_opening
 from retrieval.data.text import is_utf8
 from retrieval.errors import BadInput, DatasetError
 
@@ -210,7 +210,9 @@ def _list_recording(root: Path) -> Catalogue:
         return tuple(file.relative_to(root).as_posix() for file in files)
 
     photos = {path: CataloguePhoto(path, grasp.object_id) for grasp in grasps for path in paths(grasp.photos)}
-    touches = {CatalogueTouch(grasp.object_id, paths(grasp.touches), opening_mm=grasp.opening_mm) for grasp in grasps}
+    touches = {
+        CatalogueTouch(grasp.object_id, paths(grasp.touches), opening_mm=believed(grasp.opening_mm)) for grasp in grasps
+    }
     return Catalogue(
         root,
         tuple(photos[path] for path in sorted(photos)),

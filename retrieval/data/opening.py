@@ -39,12 +39,13 @@ def parse_openings(openings: Openings, grasps: int, of: str = "") -> NDArray[np.
 def require_opening(value: object, name: str) -> float:
     """Return an opening in millimetres. Raises BadInput with its name if it is not a number in `RANGE_MM`."""
     low, high = RANGE_MM
-    is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    if is_number and low <= (number := float(value)) <= high:  # type: ignore[arg-type]
-        return number
-    hint = "; the value looks like metres" if is_number and 0 < float(value) < low else ""  # type: ignore[arg-type]
+    number = value if isinstance(value, int | float | np.number) and not isinstance(value, bool) else np.nan
+    if low <= number <= high:
+        return float(number)
+    hint = "; the value looks like metres" if 0 < number < low else ""
     raise BadInput(
-        f"{name} must be the distance between the fingers in millimetres, from {low:g} to {high:g}; got {value!r}{hint}"
+        f"{name} must be the distance between the fingers in millimetres, from {low:g} to {high:g}; got {value!r:.40}"
+        f"{hint}"
     )
 
 

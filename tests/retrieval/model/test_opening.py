@@ -37,6 +37,7 @@ def test_ratios_equal_two_plain_loops_and_are_0_where_nothing_was_measured():
         ([math.nan], "got nan"),
         (["41", None], "got '41'"),
         ([True, None], "got True"),
+        ([10**400, None], "got 1000"),
         ([41], r"got 1 opening\(s\) for 2 grasp"),
     ],
 )
