@@ -147,7 +147,7 @@ def collect(
     names = rig.object_ids(objects) if isinstance(objects, int) else list(objects)
     for name in names:
         check_name("an object's name", name)
-    if (session := session or rig.session) is not None:
+    if (session := rig.session if session is None else session) is not None:
         check_name("session", session)
     with rig:
         attempt = settings.attempt or rig.attempt

@@ -43,7 +43,7 @@ _NUMBERS = {"chunk_index": 0, "file_index": 0}
 _CODEC = {"crf": "10", "g": "1", "bf": "0", "preset": "fast"}
 _STEP_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index", "moment")
 _FIELDS = {
-    **dict.fromkeys(("grasp_id", "object_id", "sequence_id", "outcome"), "string"),
+    **dict.fromkeys(("grasp_id", "object_id", "sequence_id", "session", "outcome"), "string"),
     "grasped": "bool_",
     **dict.fromkeys(("force_n", "opening_mm", "touch_skew_s", "time_s", "pose"), "float64"),
 }

@@ -62,7 +62,7 @@ class ScoreTable:
     @cached_property
     def gallery(self) -> str:
         """Description of the searched items."""
-        own = "those of the same grasp left out" if self.own.any() else "those of the same grasp included"
+        own = "those of the same grasp left out" if self.own.any() else "none left out"
         words = f"{len(self.objects)} objects, {len(self.photo_owner)} {self.items}; {own}"
         missing = np.count_nonzero(~self.has_target)
         return words + (f"; {missing} queries left out, which have no other" if missing else "")

@@ -62,7 +62,7 @@ DATA_PATH, EPISODES_PATH = f"data/{_FILE}.parquet", f"meta/episodes/{_FILE}.parq
 VIDEO_PATH = "videos/{video_key}/" + f"{_FILE}.mp4"
 _GEL = re.compile(r"(?<![a-z])(touch|tactile|gels?|gelsight[a-z]*|gelslim|digit|digit360)(?![a-z])", re.IGNORECASE)
 """Whole words in the name of a gel camera: touchscreen, digital and angel are others."""
-_FIELDS = ("force_n", "opening_mm", "touch_skew_s", "time_s", "outcome", "grasped", "pose")
+_FIELDS = ("force_n", "opening_mm", "touch_skew_s", "time_s", "session", "outcome", "grasped", "pose")
 _WHAT = "a LeRobot data set"
 
 _Row = dict[str, Any]

@@ -37,8 +37,8 @@ def source(tmp_path_factory):
             if number == 0:
                 images["touch_a_after"] = images["touch_b_after"] = smooth(24, 32)
             fields = {"force_n": 2.5 + number, "pose": [1.0, 2.0, 3.0, 0.5]} if number else {}
-            grasped = number != 3
-            writer.append(f"g{number}", f"object {number // 2}", images, grasped=grasped, sequence_id="s", **fields)
+            fields |= {"grasped": number != 3, "sequence_id": "s", "session": f"day {number % 2}"}
+            writer.append(f"g{number}", f"object {number // 2}", images, **fields)
     return read_recording(folder)
 
 
@@ -144,7 +144,7 @@ def test_a_photo_of_another_size_is_scaled_into_the_middle_of_black(exported):
 
 def test_an_export_can_be_imported_again(source, exported, tmp_path):
     again = import_lerobot(exported, tmp_path / "back")
-    plain = ("grasp_id", "object_id", "sequence_id", "grasped", "force_n", "pose")
+    plain = ("grasp_id", "object_id", "sequence_id", "session", "grasped", "force_n", "pose")
     assert len(again.grasps) == len(source.grasps)
     for grasp, old in zip(again.grasps, source.grasps, strict=True):
         assert [getattr(grasp, key) for key in plain] == [getattr(old, key) for key in plain]
