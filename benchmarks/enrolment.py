@@ -1,21 +1,26 @@
-"""Objects that were enrolled by touch: top-1 accuracy and "none of these", with photos, reference grasps and openings.
+"""Objects that were enrolled by touch: accuracy and "none of these" with photos, reference grasps and openings.
 
-    python -m benchmarks.enrolment FOLDER [--part grasp] [--jobs 2]
+    python -m benchmarks.enrolment sessions FOLDER
+        three rigs with one pair of gels each and 150 objects. 100 objects are enrolled by one to three grasps of one
+        session. Queries are single grasps of the next session: of these objects, and of the 50 others
+    python -m benchmarks.enrolment grasp FOLDER
+        250 objects, 100 pairs of gels, four grasps of each object: one is enrolled with its photo, in turn, and the
+        others are single queries. Openings are exact, or have the error of a gripper. Accuracies are means over all
+        sets of K objects; for "none of these", catalogues of 100 objects have the query's object or lack it
 
-`--part grasp`: 250 objects with 100 pairs of gels, which no model was trained on. The catalogue has one photo of each
-object and one grasp with its opening; three other grasps are queries, one by one. The openings are exact, or have the
-error of a gripper. K objects are drawn from the catalogue at random; top-1 accuracy is the mean over all such draws.
-For "none of these", each query is asked of catalogues of 100 objects with its object and without it.
-
-Accuracies have 95 % intervals over objects; differences are paired. It writes FOLDER/PART.md. An interrupted collection
-continues. A query that is refused (no contact) counts as a random guess with the verdict "none of these".
+No model was trained on these objects and gels. Intervals are 95 %, over objects; differences are paired. It writes
+FOLDER/sessions.md or FOLDER/grasp.md. An interrupted run continues; FOLDER/answers has its answers. A query that is
+refused (no contact) counts as a random guess with the verdict "none of these".
 """
 
 import argparse
+import json
 import shutil
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,23 +28,33 @@ from numpy.typing import NDArray
 import retrieval
 from models.recognition import interval, top1
 from models.shipped import retrieve
-from retrieval.data.dataset import Grasp, load_grasps
+from retrieval.data.dataset import Grasp, data_digest, load_grasps
+from retrieval.data.opening import RANGE_MM
 from retrieval.evaluation.reject import statistic
 from retrieval.metrics.intervals import compare, summarise
-from retrieval.metrics.measure import Measure, object_means, object_weights, weight_below
+from retrieval.metrics.measure import Measure, object_means, object_weights, pooled, weight_below
 from retrieval.metrics.table import ScoreTable
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
-from retrieval.model.shipped import shipped_model
+from retrieval.model.encode import TorchEncoder
+from retrieval.model.fusion_scorer import StoredPartials
+from retrieval.model.gel_check import CONTACT
+from retrieval.model.touch_reader import Stopwatch, TouchReader
+from retrieval.model.touches import parse_grasps
+from retrieval.search.opening import find_model
 
-SEED, OBJECTS, SPARE, QUERIES, GELS = 530_000, 250, 12, 3, 100
-"""Object set of the part `grasp`: its seed, objects, further ones in place of objects that cannot be grasped, query
-grasps of each, and pairs of gels."""
+SEEDS, ENROLLED, OTHERS, REFERENCES = (531_000, 532_000, 533_000), 100, 50, 3
+"""Rigs of the part `sessions`; enrolled and other objects of each; grasps of each object in a session."""
+SEED, OBJECTS, QUERIES, GELS = 540_000, 250, 3, 100
+"""Rig of the part `grasp`; its objects, query grasps of each, and pairs of gels."""
+SPARE = 12
+"""Further objects, in place of objects that cannot be grasped."""
 CANDIDATES, CATALOGUE, DRAWS = (100, 250), 100, 10
 REFUSED = -50.0
-"""Log likelihood ratio of every object for a query that is refused."""
+"""Log likelihood ratio of every object for a query that is refused, and of an object whose references are refused."""
 
 Floats = NDArray[np.float64]
 Numbers = NDArray[np.int64]
+Grasps = Mapping[str, Sequence[Grasp]]
 
 
 @dataclass(frozen=True)
@@ -56,8 +71,12 @@ class Content:
             parts.append("opening" + f" with an error of {self.error_mm:g} mm" * (self.error_mm > 0))
         return ", ".join(parts)
 
-
-CONTENTS = (Content(True, 0), Content(False, 1), Content(True, 1))
+    def opening_mm(self, grasp: Grasp) -> float | None:
+        """Return the opening of a grasp with the error."""
+        if self.error_mm is None or grasp.opening_mm is None:
+            return None
+        error = np.random.default_rng(zlib.crc32(grasp.grasp_id.encode())).normal(0, self.error_mm)
+        return float(np.clip(grasp.opening_mm + error, *RANGE_MM))
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,31 +91,75 @@ class Ratios:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Collect the grasps, and print the table."""
+    """Collect the grasps, and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("part", choices=("sessions", "grasp"))
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--objects", type=int, default=OBJECTS)
+    parser.add_argument("--model", default="shipped", help="another checkpoint than the shipped one")
     parser.add_argument("--jobs", type=int, default=2)
     arguments = parser.parse_args(argv)
-    folder, objects = arguments.folder, arguments.objects
+    folder, checkpoint = arguments.folder, load_checkpoint(find_model(arguments.model)[0])
     folder.mkdir(parents=True, exist_ok=True)
-    rig = folder / "gels.toml"
-    rig.write_text(f'rig = "sim"\ngels = {GELS}\n')
-    size = ("--objects", objects + SPARE, "--grasps", 1 + QUERIES, "--seed", SEED, "--jobs", arguments.jobs)
-    if code := retrieve("collect", "--rig", rig, *size, "--out", folder / "unseen"):
-        return code
-    every = by_object(load_grasps(folder / "unseen"))
-    grasps = dict([one for one in every.items() if len(one[1]) > QUERIES][:objects])
-    checkpoint = load_checkpoint(shipped_model())
-    references, queries = ({name: part[some] for name, part in grasps.items()} for some in (slice(1), slice(1, None)))
-    found = {
-        str(content): measures(answer(folder, checkpoint, content, references, queries), min(CATALOGUE, objects - 1))
-        for content in CONTENTS
-    }
-    text = table(found, str(CONTENTS[0]))
-    (folder / "grasp.md").write_text(text + "\n")
+    part = sessions if arguments.part == "sessions" else one_grasp
+    text = "\n\n".join(part(folder, checkpoint, arguments.jobs))
+    (folder / f"{arguments.part}.md").write_text(text + "\n")
     print(text)
     return 0
+
+
+def sessions(folder: Path, checkpoint: Checkpoint, jobs: int) -> Iterator[str]:
+    """Yield the tables of enrolled objects in another session."""
+    known, errors = (False, True), (None, 0.0)
+    contents = [Content(photo, grasps, error) for grasps in (1, 2, 3) for error in errors for photo in known]
+    found: dict[Content, list[dict[str, Measure]]] = {content: [] for content in (Content(True, 0), *contents)}
+    for number, seed in enumerate(SEEDS):
+        out = folder / f"rig-{seed}"
+        for session, objects in (("monday", ENROLLED), ("tuesday", ENROLLED + SPARE + OTHERS)):
+            size = ("--objects", objects + SPARE, "--grasps", REFERENCES, "--seed", seed, "--jobs", jobs)
+            retrieve("collect", "--rig", "sim", *size, "--session", session, "--out", out)
+        touched = by_object(load_grasps(out))
+        monday, tuesday = (
+            {name: [grasp for grasp in part if grasp.session == session] for name, part in touched.items()}
+            for session in ("monday", "tuesday")
+        )
+        complete = [name for name, part in tuesday.items() if len(part) == REFERENCES]
+        references = {name: monday[name] for name in complete if len(monday[name]) == REFERENCES}
+        references = dict([*references.items()][:ENROLLED])
+        queries = [*references, *[name for name in complete if not monday[name]][:OTHERS]]
+        encoded = encode(checkpoint, {name: tuesday[name] for name in queries})
+        for content, rigs in found.items():
+            rigs.append(enrolled_measures(answer(out, checkpoint, content, references, encoded), number))
+    joined = {
+        content: {name: pooled([rig[name] for rig in rigs]) for name in rigs[0]} for content, rigs in found.items()
+    }
+    bases = {
+        "touches only": lambda one: Content(False, one.grasps),
+        "no opening": lambda one: replace(one, error_mm=None),
+    }
+    yield from tables(joined, bases | {"one grasp": lambda one: replace(one, grasps=1)})
+
+
+def one_grasp(folder: Path, checkpoint: Checkpoint, jobs: int) -> Iterator[str]:
+    """Yield the tables of one photo and one enrolled grasp."""
+    rig = folder / "gels.toml"
+    rig.write_text(f'rig = "sim"\ngels = {GELS}\n')
+    size = ("--objects", OBJECTS + SPARE, "--grasps", 1 + QUERIES, "--seed", SEED, "--jobs", jobs)
+    retrieve("collect", "--rig", rig, *size, "--out", folder / "unseen")
+    touched = by_object(load_grasps(folder / "unseen"))
+    complete = [(name, part) for name, part in touched.items() if len(part) > QUERIES][:OBJECTS]
+    contents = [Content(True, 0), Content(False, 1), Content(False, 1, 0.0)]
+    contents += [Content(True, 1, error) for error in (None, 0.0, 0.1, 1.0, 3.0)]
+    every, found = encode(checkpoint, dict(complete)), dict[Content, dict[str, Measure]]()
+    for content in contents:
+        turns = []
+        for turn in range(1 + QUERIES):
+            references = {name: part[turn : turn + 1] for name, part in complete}
+            queries = every.select(np.arange(len(every.owner)) % (1 + QUERIES) != turn)
+            turns.append(answer(folder / "unseen", checkpoint, content, references, queries))
+        values, owners = zip(*((ratios.values, ratios.owner) for ratios in turns), strict=True)
+        found[content] = drawn_measures(Ratios(np.concatenate(values), np.concatenate(owners)))
+    bases = {"photo": lambda one: Content(True, 0), "no opening": lambda one: replace(one, error_mm=None)}
+    yield from tables(found, bases)
 
 
 def by_object(grasps: Sequence[Grasp]) -> dict[str, list[Grasp]]:
@@ -107,49 +170,99 @@ def by_object(grasps: Sequence[Grasp]) -> dict[str, list[Grasp]]:
     return found
 
 
-def answer(
-    folder: Path,
-    checkpoint: Checkpoint,
-    content: Content,
-    references: Mapping[str, Sequence[Grasp]],
-    queries: Mapping[str, Sequence[Grasp]],
-) -> Ratios:
-    """Build an index of the references with this content, and return its answers to each query."""
-    catalogue, index = folder / "catalog", folder / "index"
-    shutil.rmtree(catalogue, ignore_errors=True)
+class Queries(NamedTuple):
+    """Single grasps, their objects (Q,), partial activations (Q, P), and whether the gel check accepts them."""
+
+    grasps: list[Grasp]
+    owner: Numbers
+    partials: NDArray[np.float32]
+    accepted: NDArray[np.bool_]
+
+    def select(self, rows: NDArray[np.bool_]) -> "Queries":
+        """Return some of these grasps."""
+        grasps = [grasp for grasp, selected in zip(self.grasps, rows, strict=True) if selected]
+        return Queries(grasps, self.owner[rows], self.partials[rows], self.accepted[rows])
+
+
+def encode(checkpoint: Checkpoint, queries: Grasps) -> Queries:
+    """Encode all grasps; objects are numbered in this order."""
+    grasps = [grasp for part in queries.values() for grasp in part]
+    owner = np.repeat(np.arange(len(queries)), [len(part) for part in queries.values()])
+    reader = TouchReader(checkpoint.config, TorchEncoder(checkpoint.matcher))
+    touches = parse_grasps([list(grasp.touches) for grasp in grasps], reader.fingers)
+    codes = reader.encode(touches, reader.no_contact_frames(None), Stopwatch())
+    if checkpoint.gel_check is None or codes.readings is None:
+        return Queries(grasps, owner, codes.partials, np.ones(len(grasps), bool))
+    return Queries(grasps, owner, codes.partials, np.array(checkpoint.gel_check.classify(codes.readings)) == CONTACT)
+
+
+def answer(recording: Path, checkpoint: Checkpoint, content: Content, references: Grasps, queries: Queries) -> Ratios:
+    """Build an index of the references with this content, and return the ratios of its objects, numbered like these."""
+    of_references = data_digest([grasp for part in references.values() for grasp in part])
+    file = recording.with_name("answers") / f"{checkpoint.digest[:12]}, {of_references[:12]}, {content}.npy"
+    if file.is_file():
+        return Ratios(np.load(file), queries.owner)
+    catalogue, index = (recording.with_name(f"{recording.name}-{what}") for what in ("catalog", "index"))
+    write_catalogue(catalogue, content, references)
+    retrieval.build_index(catalogue, checkpoint, index, quiet=True)
+    values = np.full((len(queries.grasps), len(references)), REFUSED)
+    with retrieval.open(index) as searcher:
+        shard, posterior = searcher.folder_shard, searcher.posterior
+        objects, photos, rows = (
+            shard.objects,
+            StoredPartials(shard.generation.arrays),
+            np.arange(shard.generation.count),
+        )
+        columns = np.array([objects.find(name) for name in references])
+        for row in np.flatnonzero(queries.accepted):
+            opening = np.array([content.opening_mm(queries.grasps[row])], dtype=np.float64)  # None becomes NaN
+            partials = queries.partials[row : row + 1]
+            evidence = objects.compare_references(partials, opening)
+            logits = objects.score(rows, shard.scorer.logits(partials, photos), evidence, 1).logits
+            values[row, columns >= 0] = posterior.log_ratio(logits, 1)[columns[columns >= 0]]
+    file.parent.mkdir(exist_ok=True)
+    np.save(file, values)
+    return Ratios(values, queries.owner)
+
+
+def write_catalogue(folder: Path, content: Content, references: Grasps) -> None:
+    """Write a catalogue folder with this content of each object."""
+    shutil.rmtree(folder, ignore_errors=True)
+    lines = []
     for name, grasps in references.items():
-        (catalogue / name).mkdir(parents=True)
+        (folder / name).mkdir(parents=True)
         if content.photo:
-            shutil.copyfile(grasps[0].photo, catalogue / name / f"photo{grasps[0].photo.suffix}")
+            shutil.copyfile(grasps[0].photo, folder / name / f"photo{grasps[0].photo.suffix}")
         for number, grasp in enumerate(grasps[: content.grasps]):
             for finger, file in zip("ab", grasp.touches, strict=False):
-                shutil.copyfile(file, catalogue / name / f"touch_{number}_{finger}{file.suffix}")
-    retrieval.build_index(catalogue, checkpoint, index, quiet=True)
-    numbers = {name: number for number, name in enumerate([*references, *(queries.keys() - references.keys())])}
-    asked = [(numbers[name], grasp) for name, grasps in queries.items() for grasp in grasps]
-    values = np.full((len(asked), len(references)), REFUSED)
-    with retrieval.open(index) as searcher:
-        results = searcher.query_many([list(grasp.touches) for _, grasp in asked], top=len(references))
-        for row, result in zip(values, results, strict=True):
-            for match in result.results:
-                row[numbers[match.object_id]] = searcher.posterior.log_ratio(match.logit, 1)
-    return Ratios(values, np.array([number for number, _ in asked]))
+                shutil.copyfile(file, folder / name / f"touch_{number}_{finger}{file.suffix}")
+            touch = f"{name}/touch_{number}_a{grasp.touches[0].suffix}"
+            lines.append(json.dumps({"file_name": touch, "opening_mm": content.opening_mm(grasp)}) + "\n")
+    (folder / "metadata.jsonl").write_text("".join(lines))
 
 
-def measures(ratios: Ratios, size: int) -> dict[str, Measure]:
-    """Return top-1 accuracy and "none of these" of queries whose objects are all in the catalogue."""
+def enrolled_measures(ratios: Ratios, rig: int) -> dict[str, Measure]:
+    """Return accuracy and "none of these" of queries of all enrolled objects and of others, for one of several rigs."""
+    values, owner, count = ratios.values, ratios.owner, ratios.values.shape[1]
+    listed = owner < count
+    scores = ScoreTable(values[listed], owner[listed], np.arange(count), np.zeros((listed.sum(), count), bool))
+    parts = values[None, listed], values[None, ~listed], owner[listed], owner[~listed]
+    found = {f"top-1 of {count}": top1(scores, count, 1)} | open_set(*parts)
+    return {name: replace(each, owner=each.owner + 1000 * rig) for name, each in found.items()}
+
+
+def drawn_measures(ratios: Ratios) -> dict[str, Measure]:
+    """Return accuracy and "none of these" in random parts of a catalogue that has the objects of all queries."""
     values, owner, count = ratios.values, ratios.owner, ratios.values.shape[1]
     scores = ScoreTable(values, owner, np.arange(count), np.zeros(values.shape, bool))
-    found = {f"K = {k}": top1(scores, k, 1) for k in CANDIDATES if k <= count}
-    rng, present, absent = np.random.default_rng(0), list[Floats](), list[Floats]()
-    rows = np.arange(len(owner))
+    rng, size, drawn = np.random.default_rng(0), min(CATALOGUE, count - 1), list[Floats]()
     for _ in range(DRAWS):
         keys = rng.random(values.shape)
-        keys[rows, owner] = -1  # the own object is drawn first
-        drawn = np.take_along_axis(values, np.argsort(keys, axis=1)[:, : size + 1], 1)
-        present.append(drawn[:, :-1])
-        absent.append(drawn[:, 1:])
-    return found | open_set(np.array(present), np.array(absent), owner, owner)
+        keys[np.arange(len(owner)), owner] = -1  # the own object is drawn first
+        drawn.append(np.take_along_axis(values, np.argsort(keys, axis=1)[:, : size + 1], 1))
+    every = np.array(drawn)
+    found = {f"top-1 of {k}": top1(scores, k, 1) for k in CANDIDATES if k <= count}
+    return found | open_set(every[..., :-1], every[..., 1:], owner, owner)
 
 
 def open_set(present: Floats, absent: Floats, listed: Numbers, unlisted: Numbers) -> dict[str, Measure]:
@@ -188,19 +301,24 @@ def two_samples(first: Floats, second: Floats, listed: Numbers, unlisted: Number
     return Measure(values[:, None], objects, np.array([0.5]), gallery)
 
 
-def table(found: Mapping[str, Mapping[str, Measure]], base: str) -> str:
-    """Return a Markdown table of all contents, with the paired differences to the content `base`."""
-    names = list(found[base])
-    lines = ["| catalogue | " + " | ".join(f"{name} | difference" for name in names) + " |"]
-    lines.append("|---|" + "---|---|" * len(names))
-    for content, each in found.items():
-        cells = []
-        for name in names:
-            summary, against = summarise([each[name]]), compare([each[name]], [found[base][name]])
-            cells.append(interval(summary.value[0], summary.low[0], summary.high[0]))
-            cells.append("" if content == base else interval(against.value, against.low, against.high))
-        lines.append(f"| {content} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+def tables(
+    found: Mapping[Content, Mapping[str, Measure]], bases: Mapping[str, Callable[[Content], Content]]
+) -> Iterator[str]:
+    """Yield a Markdown table of each measure, with the paired differences to other contents."""
+    for name in next(iter(found.values())):
+        lines = [f"| {name} | value | " + " | ".join(f"difference to {base}" for base in bases) + " |"]
+        lines.append("|---|---|" + "---|" * len(bases))
+        for content, measures in found.items():
+            summary, cells = summarise([measures[name]]), list[str]()
+            for base in (choose(content) for choose in bases.values()):
+                if base == content or base not in found:
+                    cells.append("")
+                    continue
+                against = compare([measures[name]], [found[base][name]])
+                cells.append(interval(against.value, against.low, against.high))
+            value = interval(summary.value[0], summary.low[0], summary.high[0])
+            lines.append(f"| {content} | {value} | {' | '.join(cells)} |")
+        yield "\n".join(lines)
 
 
 if __name__ == "__main__":

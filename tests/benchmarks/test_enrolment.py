@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import retrieval
 from benchmarks import enrolment
 from benchmarks.enrolment import Content, Ratios
 from retrieval.data.dataset import load_grasps
@@ -10,13 +11,24 @@ from retrieval.metrics.intervals import summarise
 from tests.reference_model import write_reference_model
 
 
+def values(measures):
+    return {name: summarise([measure]).value[0] for name, measure in measures.items()}
+
+
 def test_accuracy_and_verdicts_of_a_small_table(monkeypatch):
     monkeypatch.setattr(enrolment, "CANDIDATES", (2, 3))
-    ratios = Ratios(np.array([[9.0, 0.1, 0.0], [0.3, 0.2, 0.1], [0.0, 0.2, 0.5]]), np.arange(3))
-    found = {name: summarise([value]).value[0] for name, value in enrolment.measures(ratios, 2).items()}
+    ratios = np.array([[9.0, 0.1, 0.0], [0.3, 0.2, 0.1], [0.0, 0.2, 0.5]])
+    found = values(enrolment.drawn_measures(Ratios(ratios, np.arange(3))))
     # The second query's object is second of three; of two, it is first next to one of the two others. Only 9 > log 2.
     assert found.pop('"none", AUROC') > 0.9
-    assert found == pytest.approx({"K = 2": 5 / 6, "K = 3": 2 / 3, "false accepts": 0.0, "false rejects": 2 / 3})
+    expected = {"top-1 of 2": 5 / 6, "top-1 of 3": 2 / 3, "false accepts": 0.0, "false rejects": 2 / 3}
+    assert found == pytest.approx(expected)
+
+    # Objects 3 and 4 are not enrolled. log 3 = 1.1: object 4 is taken for an enrolled one, and it exceeds one of three.
+    others = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
+    found = values(enrolment.enrolled_measures(Ratios(np.concatenate([ratios, others]), np.arange(5)), 0))
+    expected = {"top-1 of 3": 2 / 3, '"none", AUROC': 4 / 6, "false accepts": 1 / 2, "false rejects": 2 / 3}
+    assert found == pytest.approx(expected)
 
 
 def test_an_area_under_the_curve_has_the_variance_of_delong():
@@ -31,12 +43,15 @@ def test_queries_are_answered_with_photos_and_reference_grasps(recording, tmp_pa
     checkpoint = write_reference_model(tmp_path / "model.safetensors")
     grasps = enrolment.by_object(load_grasps(recording))
     references = {name: part[:1] for name, part in grasps.items()}
-    queries = {name: part[1:2] for name, part in grasps.items()}
+    queries = enrolment.encode(checkpoint, {name: part[1:2] for name, part in grasps.items()})
+    contents = Content(True, 0), Content(True, 1)
     answered = [
-        enrolment.answer(tmp_path, checkpoint, content, references, queries)
-        for content in (Content(True, 0), Content(True, 1))
+        enrolment.answer(tmp_path / "r", checkpoint, content, references, queries).values for content in contents
     ]
-    assert [each.values.shape for each in answered] == [(len(grasps), len(grasps))] * 2
-    assert not np.allclose(answered[0].values, answered[1].values)
-    text = enrolment.table({str(Content(True, 0)): enrolment.measures(answered[0], 4)}, "photo")
-    assert text.splitlines()[2].startswith("| photo | ")
+    assert [each.shape for each in answered] == [(len(grasps), len(grasps))] * 2
+    assert not np.allclose(*answered)
+    with retrieval.open(tmp_path / "r-index") as searcher:  # of the last content
+        result = searcher.query(list(queries.grasps[0].touches), top=len(grasps))
+    ratios = searcher.posterior.log_ratio([match.logit for match in result.results], 1)
+    np.testing.assert_allclose(sorted(answered[1][0], reverse=True), ratios, atol=1e-4)  # touches in other batches
+    assert (answered[1][0].max() > np.log(len(grasps))) == (result.verdict == "match")
