@@ -48,7 +48,7 @@ def train(
         int | None, typer.Option(parser=WORKERS, help="with --cluster: number of ranks (default: 2)")
     ] = None,
 ) -> None:
-    """Train a matcher, or a grasp-success gate for `collect`."""
+    """Train a matcher, also on touches only, or a grasp-success gate for `collect`."""
     from retrieval.model.checkpoint import require_writable
 
     if (cluster and task != "match") or (workers is not None and not cluster):
@@ -73,6 +73,16 @@ def train(
         )
         accepted = [f"{part} of {whole} {name}" for name, (part, whole) in found["accepted"].items()]
         say(f"accepted: {', '.join(accepted)}")
+        return
+    from retrieval.data.dataset import load_grasps
+
+    if not any(grasp.photos for grasp in load_grasps(recording)):
+        reason = "does not apply to a recording of touches only"
+        refuse_options(reason, config=config, iterations=iterations, cluster=cluster)
+        from retrieval.report.adaptation import print_touch_model
+        from retrieval.training.touches import train_on_touches
+
+        print_touch_model(train_on_touches(recording, out, init=init or "imagenet", split=read_split(split)))
         return
     from retrieval.training import distributed
     from retrieval.training.initial_weights import training_licences

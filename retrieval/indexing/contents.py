@@ -24,6 +24,7 @@ from retrieval.indexing.codes import (
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.gel_check import CONTACT
 from retrieval.model.references import REFERENCE_PARTIALS, REFERENCE_ROWS
+from retrieval.model.towers import NO_TOWER
 
 BLOCK = 1024
 """Codes that are copied from the cache to the index at once."""
@@ -83,8 +84,13 @@ def read_contents(catalogue: Catalogue, checkpoint: Checkpoint, cache: Cache, qu
 
     Raises:
         NoReadablePhoto: No photo can be read.
-        BadInput: The catalogue has touches, and the model cannot compare them.
+        BadInput: The catalogue has touches or photos, and the model cannot compare them.
     """
+    if catalogue.photos and checkpoint.config.matcher.photo_tower == NO_TOWER:
+        raise BadInput(
+            f"this model is fitted to touches only and compares no photos; the catalogue has {len(catalogue.photos)}"
+            f", such as {catalogue.photos[0].path}; take the photos out, or train on a recording with photos"
+        )
     files = CatalogueFiles(catalogue, cache)
     references = _find_references(catalogue, checkpoint, files, cache, quiet)
     photos = sorted([*catalogue.photos, *references.pictures], key=lambda photo: photo.path)

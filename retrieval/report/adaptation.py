@@ -5,6 +5,7 @@ from retrieval.metrics.intervals import compare, summarise
 from retrieval.report.numbers import difference, percent, with_interval
 from retrieval.report.terminal import print_columns
 from retrieval.training.adapt import Adaptation
+from retrieval.training.touches import TouchModel
 
 MEASURES = {"top1": "top-1 accuracy, %", "pair_accuracy": "pair accuracy, %"}
 ROWS = {
@@ -38,4 +39,25 @@ def print_adaptation(result: Adaptation) -> None:
             "check of gel images are fitted."
         )
     touched = measures["held_out_top1"].owner
+    say(f"{result.checkpoint.path}: fitted to {len(set(touched.tolist()))} objects, {len(touched)} touches")
+
+
+def print_touch_model(result: TouchModel) -> None:
+    """Print a table of the accuracies of a model that is fitted to touches only, and a sentence on it."""
+    measures = result.measures
+    galleries = {name: measures[name].gallery for name in ("same", "new")}
+    rows = [
+        [label, *(with_interval(summarise([measures[f"{name}{suffix}"]])) for name in galleries)]
+        for label, suffix in (("fitted model", ""), ("the same with low-pass touches", "_low_pass"))
+    ]
+    rows.append(["chance", *(percent(measures[name].chance[0]) for name in galleries)])
+    title = f"One touch, compared with touches of another {'session' if result.has_sessions else 'sequence'}"
+    print_columns(title, ("top-1 accuracy, %", *galleries.values()), rows, words=(0,))
+    gain = compare([measures["new"]], [measures["new_low_pass"]])
+    show(BETTER if gain.low > 0 else NOT_BETTER)
+    if not result.has_sessions:
+        show(
+            "All touches are of one session, so drift of light and gel can help: record another session to exclude it."
+        )
+    touched = measures["same"].owner
     say(f"{result.checkpoint.path}: fitted to {len(set(touched.tolist()))} objects, {len(touched)} touches")

@@ -71,6 +71,8 @@ class ScoredTouches:
         touch_embeddings: (T, d) embeddings, for the calibration of reference touches; d is 0 for a model whose logit
             has no cosine.
         photo_embeddings: (N, d') embeddings, for verification.
+        touch_group: (T,) number of the session or sequence of each touch, in the order of capture. Then reference
+            touches and queries are of different ones.
     """
 
     logits: NDArray[np.floating[Any]]
@@ -79,6 +81,7 @@ class ScoredTouches:
     own: NDArray[np.bool_]
     touch_embeddings: Embeddings = field(default_factory=lambda: _NO_EMBEDDINGS)
     photo_embeddings: Embeddings = field(default_factory=lambda: _NO_EMBEDDINGS)
+    touch_group: Numbers | None = None
 
     @property
     def has_trials(self) -> bool:
@@ -299,7 +302,7 @@ def _reference_trials(part: ScoredTouches, max_references: int) -> tuple[ScoredT
 
     At most `max_references` touches of each object are references. None for too few objects, or without embeddings.
     """
-    sets = _reference_sets(part.touch_owner, max_references)
+    sets = _reference_sets(part.touch_owner, max_references, part.touch_group)
     if len(sets) < MIN_OBJECTS or not part.touch_embeddings.shape[1]:
         return None
     references, of_objects = zip(*sets, strict=True)
@@ -316,15 +319,24 @@ def _reference_trials(part: ScoredTouches, max_references: int) -> tuple[ScoredT
     )
 
 
-def _reference_sets(owner: Numbers, max_references: int) -> list[tuple[Numbers, Numbers]]:
-    """Return the touches that are references, and the queries, of each object with several (`fit_references`)."""
+def _reference_sets(
+    owner: Numbers, max_references: int, group: Numbers | None = None
+) -> list[tuple[Numbers, Numbers]]:
+    """Return the touches that are references, and the queries, of each object with both (`fit_references`).
+
+    With `group`, the references are from the first half of an object's groups, the queries from the others.
+    """
     sets = []
     for name in np.unique(owner):
         mine = np.flatnonzero(owner == name)
-        shown = mine[: max(len(mine) // 4, min(MAX_REFERENCES, len(mine) // 2))]
+        shown, rows = mine[: max(len(mine) // 4, min(MAX_REFERENCES, len(mine) // 2))], mine[len(mine) // 2 :]
+        if group is not None:
+            groups = np.unique(group[mine])
+            is_first = np.isin(group[mine], groups[: max(1, len(groups) // 2)])
+            shown, rows = mine[is_first], mine[~is_first]
         places = np.linspace(0, len(shown) - 1, min(max_references, len(shown)))  # evenly spaced
-        if len(mine) > 1:
-            sets.append((shown[places.round().astype(np.int64)], mine[len(mine) // 2 :]))
+        if len(shown) and len(rows):
+            sets.append((shown[places.round().astype(np.int64)], rows))
     return sets
 
 

@@ -250,7 +250,7 @@ class CcaProjections(NamedTuple):
         return unit_rows(self.touch(touch)) @ unit_rows(self.photo(photo)).T
 
 
-class _Modality:
+class Modality:
     """One modality of n items, with the features of each of `towers` towers (times fingers) decomposed."""
 
     def __init__(self, x: Array, widths: Sequence[int], max_directions: int, towers: int = 1) -> None:
@@ -290,8 +290,8 @@ class _Reduced:
 
     def __init__(self, features: Features, widths: TowerWidths, settings: Sequence[CcaSettings]) -> None:
         limit, self.owner = max(one.directions for one in settings), features.owner
-        self.touch = _Modality(features.touch_rows, widths.touch, limit, widths.touch_towers)
-        self.photo = _Modality(features.photo, widths.photo, limit)
+        self.touch = Modality(features.touch_rows, widths.touch, limit, widths.touch_towers)
+        self.photo = Modality(features.photo, widths.photo, limit)
 
     def fit(self, rows: Numbers, settings: Sequence[CcaSettings]) -> Iterator[tuple[CcaSettings, CcaProjections]]:
         """Yield the projections of reduced items, fitted on the given rows, for each of the settings."""

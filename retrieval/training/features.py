@@ -199,7 +199,7 @@ class FrozenFeatures:
         self._features |= zip(new, touch, strict=True)
         self._features |= zip(new_photos, photo, strict=True)
         touches = torch.stack([self._features[grasp.grasp_id] for grasp in grasps])
-        return touches, torch.stack([self._features[path] for path in photos])
+        return touches, torch.stack([self._features[path] for path in photos]) if photos else touches[:0]
 
 
 FeatureSource = TrainedFeatures | FrozenFeatures
@@ -228,7 +228,7 @@ def recorded_features(
     photos: dict[Path, Tensor] = {}
     with Bar(f"encode for {what}", len(grasps), "grasps", quiet=quiet) as bar:
         for part in batches(grasps, _CHUNK):
-            files = list(dict.fromkeys(grasp.photo for grasp in part))
+            files = list(dict.fromkeys(path for grasp in part for path in grasp.photos))
             touch, photo = source.eval_features(matcher, part, files)
             touches.append(touch)
             photos |= zip(files, photo, strict=True)
@@ -242,6 +242,8 @@ def recorded_features(
 @dataclass(frozen=True, eq=False)
 class Features:
     """Tower features of G grasps: of touches (G, fingers, F_touch), and of the photos taken before (G, F_photo).
+
+    F_photo is 0 if no grasp has a photo.
 
     Raises:
         NumericalError: A feature is not finite.
@@ -318,7 +320,8 @@ def features_by_image(grasps: Iterable[Grasp], features: Features, device: torch
     touch, photo = (torch.from_numpy(part).to(device) for part in (features.touch_rows, features.photo))
     row_of = {grasp_id: row for row, grasp_id in enumerate(features.grasp_ids)}
     rows = [(grasp, row_of[grasp.grasp_id]) for grasp in grasps]
-    return {grasp.grasp_id: touch[row] for grasp, row in rows} | {grasp.photo: photo[row] for grasp, row in rows}
+    touches: dict[str | Path, Tensor] = {grasp.grasp_id: touch[row] for grasp, row in rows}
+    return touches | {path: photo[row] for grasp, row in rows for path in grasp.photos}
 
 
 def low_pass(image: RgbImage) -> RgbImage:
@@ -401,7 +404,9 @@ def encode_recording(
     images, digest = BatchImages(preprocessing), preprocessing.digest()
     made_by = touch_variant, _tower_digest(matcher.touch_tower), digest
     touch = _encoded_once(cache, made_by, touched, images.touch, partial(touch_features, matcher), images.files, quiet)
-    if photo_features_from is None:
+    if not any(grasp.photos for grasp in grasps):
+        photo = np.zeros((len(grasps), 0), np.float32)
+    elif photo_features_from is None:
         files = {path: row for row, path in enumerate(dict.fromkeys(grasp.photo for grasp in grasps))}
         made_by, encode = (photo_variant, _tower_digest(matcher.photo_tower), digest), partial(photo_features, matcher)
         photo = _encoded_once(cache, made_by, list(files), images.photo, encode, lambda file: (file,), quiet)

@@ -69,7 +69,7 @@ class GelCheckFeatures:
         rows = np.linspace(0, len(grasps) - 1, min(_MAX_PHOTOS, len(grasps))).round().astype(int)
         sample = [grasps[row] for row in rows]
         # Whole photos, not the model's views of them: a photo given instead of a gel image is mostly background.
-        photos = [_small_photo(grasp.photo) for grasp in sample]
+        photos = [_small_photo(path) for grasp in sample for path in grasp.photos]
         gels = [settings.load_touch(grasp.touches[0], *grasp.backgrounds[:1]) for grasp in sample]
         names, drawn = zip(*draw_foreign(count, settings.touch_px, photos, gels, seed), strict=True)
         pooled = matcher.touch_tower.feature_count

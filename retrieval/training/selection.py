@@ -20,12 +20,14 @@ def validation_rows(validation: Features, max_rows: int = MAX_VALIDATION_ROWS) -
     return np.concatenate([part[np.linspace(0, len(part) - 1, min(each, len(part))).astype(int)] for part in parts])
 
 
-def ranking_auc(scores: NDArray[np.floating[Any]], owner: NDArray[np.int64]) -> float:
+def ranking_auc(
+    scores: NDArray[np.floating[Any]], owner: NDArray[np.int64], group: NDArray[np.int64] | None = None
+) -> float:
     """Return how often another photo of the touched object scores above one of another object; ties count half.
 
     The mean is taken over the pairs of a touch, over the touches of an object, and over objects. `scores` (n, n) are of
-    the touch of every grasp with the photo of every grasp, `owner` (n,) is the object of each. The photo of a touch's
-    own grasp is ignored unless its object has no other.
+    the touch of every grasp with the photo of every grasp, `owner` (n,) is the object of each. The photos of a touch's
+    own group (n,), by default its own grasp, are ignored unless its object has no others.
 
     Raises:
         NumericalError: A score is not finite. A NaN would count as the higher one.
@@ -33,10 +35,11 @@ def ranking_auc(scores: NDArray[np.floating[Any]], owner: NDArray[np.int64]) -> 
     bad = np.flatnonzero(~np.isfinite(scores).all(axis=1))
     if len(bad):
         raise NumericalError(f"every score must be finite; touch {bad[0]} has a NaN or infinite one")
+    group = np.arange(len(owner)) if group is None else group
     values = np.empty(len(scores))
     for row, score in enumerate(scores):
         same = owner == owner[row]
-        own = same & (np.arange(len(owner)) != row)
+        own = same & (group != group[row])
         others = score[~same]
         values[row] = weight_below(score[own if own.any() else same], others).mean() / len(others)
     return float(np.mean([values[owner == each].mean() for each in np.unique(owner)]))

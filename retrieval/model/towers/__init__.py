@@ -15,6 +15,7 @@ TOWERS: Registry[Any] = Registry(
     "towers",
     {
         "mobilenet_v2": "retrieval.model.towers.mobilenet:MobileNetV2",
+        "none": "retrieval.model.towers.none:NoTower",
         "resnet18": "retrieval.model.towers.resnet:ResNet18",
         "resnet50": "retrieval.model.towers.resnet:ResNet50",
         "small": "retrieval.model.towers.small:SmallTower",
@@ -23,6 +24,8 @@ TOWERS: Registry[Any] = Registry(
     base="retrieval.model.towers.tower:Tower",
 )
 TOWER_SEPARATOR = "+"
+NO_TOWER = "none"
+"""Photo tower of a model that is fitted to touches only, and compares no photos."""
 
 
 def tower_name(choice: str | type) -> str:

@@ -1,0 +1,383 @@
+"""Fit a model to a recording of touches only: it identifies an object from other touches of it.
+
+Frozen towers encode the touches: the gel tower of the package, and a published tower, pretrained on photos. As in
+`retrieval.training.cca`, the features of each tower are reduced to their widest directions, with equal weight for every
+tower. A linear map then divides them by their spread within the objects (within-class covariance normalisation; Hatch,
+Kajarekar and Stolcke, Interspeech 2006):
+
+    code = (W + ridge * v * I)^(-1/2) x
+
+x: a reduced touch; W: covariance of touches about the mean of their object; v: mean variance of x. Two touches are
+compared by the cosine of their codes. With a large ridge these are principal components. All directions are kept, so
+the map also serves objects that the fit did not see; canonical variates, fewer than the objects, were worse there.
+
+Touches of one session, or without sessions of one sequence, are never compared with each other.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from retrieval.console.progress import Bar
+from retrieval.data.dataset import (
+    LICENCES,
+    AnyRecording,
+    Grasp,
+    Split,
+    data_digest,
+    finger_count,
+    folder_of,
+    linked_objects,
+    load_grasps,
+    object_kinds,
+    recording_source,
+)
+from retrieval.errors import BadInput
+from retrieval.metrics.measure import Measure, pooled
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable, store_checkpoint
+from retrieval.model.config import Config, load_config
+from retrieval.model.encode import default_device, one_thread
+from retrieval.model.fusion import Matcher
+from retrieval.model.references import reference_similarity
+from retrieval.model.towers import NO_TOWER, TOWER_SEPARATOR
+from retrieval.model.towers.weights import GEL
+from retrieval.training.adapt import MIN_OBJECTS, PUBLISHED_TOWER, draw_folds
+from retrieval.training.calibration import ScoredTouches, fit_opening, fit_references, with_gel_check
+from retrieval.training.cca import (
+    MAX_CALIBRATION_TOUCHES,
+    MAX_CHOICE_TOUCHES,
+    AffineMap,
+    Array,
+    CcaSettings,
+    Modality,
+    unit_rows,
+)
+from retrieval.training.features import Features, FrozenFeatures, encode_recording, features_by_image
+from retrieval.training.initial_weights import build_matcher, training_licences
+from retrieval.training.selection import held_out_folds, ranking_auc, validation_rows
+
+Numbers = NDArray[np.int64]
+RIDGES = (0.03, 0.1, 0.3, 1.0, 10.0)
+DIRECTIONS = 256
+"""Directions of each tower's features."""
+TURNS = 3
+"""Parts of a recording without sessions, each of which is compared with the others."""
+
+
+# The fit ---------------------------------------------------------------------------------------------------
+
+
+def fit_maps(
+    features: NDArray[np.float32], widths: Sequence[int], owner: Numbers, ridges: Sequence[float] = RIDGES
+) -> dict[float, AffineMap]:
+    """Return the map to codes for each ridge, given touches (n, F), the widths of towers, and objects (n,)."""
+    reduction, settings = Modality(features, widths, DIRECTIONS), CcaSettings(directions=DIRECTIONS)
+    items = reduction.items(settings)
+    objects, place, counts = np.unique(owner, return_inverse=True, return_counts=True)
+    means = np.eye(len(objects))[:, place] @ items / counts[:, None]
+    within = items - means[place]
+    variances, directions = np.linalg.eigh(within.T @ within / len(items))
+    variance = float((items**2).mean())
+    bias = np.zeros(items.shape[1])
+    # The cosine is the same after a rotation, so the codes stay in the directions of the eigenvectors.
+    return {
+        ridge: reduction.compose(
+            settings, AffineMap(directions / np.sqrt(np.maximum(variances, 0) + ridge * variance), bias)
+        )
+        for ridge in ridges
+    }
+
+
+class Parts(NamedTuple):
+    """Parts of a recording: touches are compared with those of other parts only.
+
+    Attributes:
+        has_sessions: Whether the parts are sessions: at least `MIN_OBJECTS` objects have touches of two.
+        group: (G,) session; without several sessions the sequence, or the grasp itself; numbers in order of capture.
+        turn: (G,) the session, or the number of the group within its object, modulo `TURNS`.
+    """
+
+    has_sessions: bool
+    group: Numbers
+    turn: Numbers
+
+
+def divide(grasps: Sequence[Grasp]) -> Parts:
+    """Divide the touches of a recording. Raises BadInput if fewer than `MIN_OBJECTS` objects have two parts."""
+    for has_sessions in (True, False):
+        names = [(grasp.session if has_sessions else grasp.sequence_id or grasp.grasp_id) or "" for grasp in grasps]
+        numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
+        group = np.array([numbers[name] for name in names])
+        turn, repeated = group.copy(), 0
+        for name in {grasp.object_id for grasp in grasps}:
+            mine = [place for place, grasp in enumerate(grasps) if grasp.object_id == name]
+            found, number = np.unique(group[mine], return_inverse=True)
+            repeated += len(found) > 1
+            if not has_sessions:
+                turn[mine] = number % TURNS
+        if repeated >= MIN_OBJECTS:
+            return Parts(has_sessions, group, turn)
+    raise BadInput(
+        f"a fit to touches needs {MIN_OBJECTS} objects with touches of two sequences; {repeated} object(s) have them: "
+        "touch the objects again, best in another session"
+    )
+
+
+class Touches(NamedTuple):
+    """Encoded touches in the order of capture.
+
+    Attributes:
+        features: Features of G grasps, with those of the touches in place of those of photos.
+        owner: (G,) objects.
+        group: (G,) as in `Parts`.
+        turn: (G,) as in `Parts`.
+    """
+
+    features: Features
+    owner: Numbers
+    group: Numbers
+    turn: Numbers
+
+    def select(self, rows: NDArray[np.int64]) -> "Touches":
+        """Return the touches at `rows`, in that order."""
+        return Touches(self.features.select(rows), self.owner[rows], self.group[rows], self.turn[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class TouchFit:
+    """A map with the ridge that ranks touches of held-out objects best; among ties, the largest.
+
+    Attributes:
+        ridge: The ridge.
+        map: The map, fitted to all touches.
+        held_out: For each fold, its touches by a map that was fitted without its objects: the input of the
+            calibrations. Of each object at most `MAX_CALIBRATION_TOUCHES`, evenly spaced.
+    """
+
+    ridge: float
+    map: AffineMap
+    held_out: list[ScoredTouches]
+
+    def codes(self, touches: Touches) -> Array:
+        """Return the codes (G, k) of touches."""
+        return unit_rows(self.map(touches.features.touch_rows))
+
+
+def fit_touches(
+    touches: Touches, widths: Sequence[int], folds_of: Callable[[Features], Sequence[Sequence[str]]]
+) -> TouchFit:
+    """Fit a map to touches; `folds_of` returns the objects that are held out together to choose the ridge."""
+    aucs: dict[float, list[float]] = {ridge: [] for ridge in RIDGES}
+    parts: list[tuple[Touches, dict[float, Array]]] = []
+    for fold in folds_of(touches.features):
+        is_held_out = np.isin(touches.features.object_ids, fold)
+        others, part = (touches.select(np.flatnonzero(mask)) for mask in (~is_held_out, is_held_out))
+        maps = fit_maps(others.features.touch_rows, widths, others.owner)
+        codes = {ridge: unit_rows(found(part.features.touch_rows)) for ridge, found in maps.items()}
+        some = validation_rows(part.features, MAX_CHOICE_TOUCHES)
+        for ridge, each in codes.items():
+            aucs[ridge].append(ranking_auc(each[some] @ each[some].T, part.owner[some], part.group[some]))
+        parts.append((part, codes))
+    best = max(aucs, key=lambda ridge: (np.mean(aucs[ridge]), ridge))
+    found = fit_maps(touches.features.touch_rows, widths, touches.owner, [best])[best]
+    return TouchFit(best, found, [_scored(part, codes[best]) for part, codes in parts])
+
+
+def _scored(part: Touches, codes: Array) -> ScoredTouches:
+    """Return the touches of a fold for the calibrations."""
+    rows = validation_rows(part.features, MAX_CALIBRATION_TOUCHES * len(set(part.features.object_ids)))
+    none = np.zeros((len(rows), 0))
+    return ScoredTouches(
+        none,
+        part.owner[rows],
+        np.zeros(0, np.int64),
+        none > 0,
+        codes[rows],
+        touch_group=part.group[rows],
+    )
+
+
+# Accuracy ---------------------------------------------------------------------------------------------------
+
+
+def recognition(touches: Touches, fit: Callable[[Numbers], TouchFit], gallery: str) -> Measure:
+    """Return whether the object of each touch is the most similar one, given the touches of the other turns.
+
+    Args:
+        touches: The touches. Objects without touches of another turn are no queries of this turn.
+        fit: Returns a fit, given the rows of the references.
+        gallery: Description of the objects.
+    """
+    parts = []
+    for turn in np.unique(touches.turn):
+        references = np.flatnonzero(touches.turn != turn)
+        references = references[np.argsort(touches.owner[references], kind="stable")]
+        objects, starts = np.unique(touches.owner[references], return_index=True)
+        queries = np.flatnonzero((touches.turn == turn) & np.isin(touches.owner, objects))
+        if len(queries):
+            codes, owner = fit(references).codes(touches), touches.owner[queries]
+            near = reference_similarity(codes[queries] @ codes[references].T, starts)
+            own = np.take_along_axis(near, np.searchsorted(objects, owner)[:, None], 1)
+            values = np.where((near > own).any(1), 0.0, 1 / (near == own).sum(1))
+            parts.append(Measure(values[:, None], owner, np.array([1 / len(objects)]), gallery))
+    return pooled(parts)
+
+
+def _accuracies(
+    touches: Touches,
+    folds: Sequence[Sequence[str]],
+    fit: Callable[[Touches], TouchFit],
+    title: str,
+    quiet: bool,
+) -> Iterator[tuple[str, Measure]]:
+    """Yield the accuracy of "same" objects, which the fit knows from other turns, and of "new" ones."""
+    with Bar(title, len(np.unique(touches.turn)) + len(folds), "fits", quiet=quiet) as bar:
+
+        def fit_to(references: Numbers) -> TouchFit:
+            bar.advance()
+            return fit(touches.select(np.sort(references)))
+
+        yield "same", recognition(touches, fit_to, f"the same {len(np.unique(touches.owner))} objects")
+        parts = []
+        for fold in folds:
+            is_new = np.isin(touches.features.object_ids, fold)
+            part = touches.select(np.flatnonzero(is_new))
+            fitted = fit(touches.select(np.flatnonzero(~is_new)))
+            parts.append(recognition(part, lambda _: fitted, f"about {len(fold)} new objects"))  # noqa: B023
+            bar.advance()
+    yield "new", pooled(parts)
+
+
+# The checkpoint ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class TouchModel:
+    """Result of `train_on_touches`.
+
+    Attributes:
+        checkpoint: The written checkpoint.
+        measures: Accuracy of "same" and "new" objects, and with "_low_pass" touches (8 x 6, the control).
+        has_sessions: Whether references and queries are of different sessions.
+    """
+
+    checkpoint: Checkpoint
+    measures: Mapping[str, Measure]
+    has_sessions: bool
+
+
+def train_on_touches(
+    recording: AnyRecording,
+    out: Path,
+    *,
+    init: str = "imagenet",
+    split: Split | None = None,
+    quiet: bool = False,
+) -> TouchModel:
+    """Fit a model to a recording of touches only, and write the checkpoint `out`.
+
+    Args:
+        recording: A folder, or the object that `robot.read_recording` returns.
+        out: The checkpoint (.safetensors).
+        init: Weights of the published MobileNetV2 that is combined with the gel tower: "imagenet", a file, or "none"
+            to use the gel tower only.
+        split: A split whose test objects are not used at all.
+        quiet: No progress on stderr.
+
+    Raises:
+        DatasetError: The recording cannot be read.
+        BadInput: The recording has fewer than six objects, or no object was touched again.
+        CheckpointError: The weights cannot be read, or `out` cannot be written.
+    """
+    require_writable(out)
+    recording = folder_of(recording)
+    grasps = load_grasps(recording)
+    if split is not None:
+        grasps = [grasp for grasp in grasps if grasp.object_id not in split.test]
+    config = _configuration(finger_count(grasps), init)
+    seed, folds = config.training.seed, draw_folds(grasps, config.training.seed)
+    licences = training_licences(recording, config.training)
+    matcher = build_matcher(config).eval()
+    widths = [part.feature_count for part in matcher.touch_tower.backbones] * config.matcher.fingers
+    folds_of = partial(held_out_folds, kind_of=object_kinds(recording), linked=linked_objects(grasps), seed=seed)
+    parts = divide(grasps)
+    measures, encoded = dict[str, Measure](), dict[str, Touches]()
+    for variant, suffix in (("touch", ""), ("low_pass", "_low_pass")):
+        features = encode_recording(grasps, matcher, config, None, touch_variant=variant, quiet=quiet)
+        features = dataclasses.replace(features, photo=features.touch_rows)
+        encoded[variant] = touches = Touches(features, features.owner, parts.group, parts.turn)
+        with one_thread():
+            fit = partial(fit_touches, widths=widths, folds_of=folds_of)
+            found = _accuracies(touches, folds, fit, f"estimate{suffix}".replace("_", " "), quiet)
+            measures |= {f"{name}{suffix}": measure for name, measure in found}
+    with one_thread():
+        choice = fit_touches(encoded["touch"], widths, folds_of)
+    references = fit_references(*choice.held_out, seed=seed)
+    if references is None:
+        raise BadInput("a calibration needs three objects with touches of two parts in a fold; record more touches")
+    metrics = {f"{name}_top1": float(measure.by_object()[1].mean()) for name, measure in measures.items()}
+    config, matcher = _with_map(config, matcher, choice.map)
+    names, device = sorted({grasp.object_id for grasp in grasps}), default_device()
+    made = Checkpoint(
+        path=out,
+        digest="",
+        config=config,
+        provenance={
+            "step": 0,
+            "source": recording_source(recording),
+            "data_digest": data_digest(grasps),
+            LICENCES: [dataclasses.asdict(licence) for licence in licences],
+            "metrics": metrics | {f"{name}_top1_chance": float(measures[name].chance[0]) for name in ("same", "new")},
+        },
+        matcher=matcher,
+        split=Split(seed, tuple(names), (), ()),
+        posterior=references.touch_only,
+        references=references,
+        opening=fit_opening(grasps),
+    )
+    groups = [[grasp for grasp in grasps if grasp.object_id in names[side::2]] for side in (0, 1)]
+    made.matcher.to(device)
+    source = FrozenFeatures(config, features_by_image(grasps, encoded["touch"].features, device))
+    store_checkpoint(with_gel_check(made, source, *groups, quiet=quiet), out)
+    return TouchModel(load_checkpoint(out), measures, parts.has_sessions)
+
+
+def _configuration(fingers: int, init: str) -> Config:
+    """Return the configuration of the towers; `init` as for `train_on_touches`."""
+    preset, towers = load_config("adapt"), [GEL, *([] if init == "none" else ["init"])]
+    matcher = dataclasses.replace(
+        preset.matcher,
+        tower=TOWER_SEPARATOR.join(PUBLISHED_TOWER for _ in towers),
+        photo_tower=NO_TOWER,
+        fingers=fingers,
+    )
+    training = dataclasses.replace(
+        preset.training, init=init, init_touch=TOWER_SEPARATOR.join(towers), init_photo="random"
+    )
+    preprocessing = dataclasses.replace(preset.preprocessing, photo_px=32, views=("whole",))
+    return Config(matcher, training, preprocessing)
+
+
+@torch.no_grad()
+def _with_map(config: Config, matcher: Matcher, found: AffineMap) -> tuple[Config, Matcher]:
+    """Return the matcher whose embedding of a touch is its code, with the same towers, and its configuration."""
+    settings = dataclasses.replace(config.matcher, embedding_dim=found.weight.shape[1])
+    training = dataclasses.replace(config.training, init="random", init_touch="", init_photo="")
+    made = Matcher(settings).eval()
+    made.touch_tower = matcher.touch_tower
+    for parameter in (*made.head.parameters(), *made.photo_projection.parameters()):
+        parameter.zero_()
+    assert isinstance(made.touch_projection, nn.Linear)  # the configuration has no hidden layer
+    made.touch_projection.weight.copy_(torch.from_numpy(found.weight.T))
+    made.touch_projection.bias.copy_(torch.from_numpy(found.bias))
+    assert made.cosine_scale is not None
+    made.cosine_scale.fill_(1.0)
+    return dataclasses.replace(config, matcher=settings, training=training), made
