@@ -53,7 +53,7 @@ def print_touch_model(result: TouchModel) -> None:
     rows.append(["chance", *(percent(measures[name].chance[0]) for name in galleries)])
     title = f"One touch, compared with touches of another {'session' if result.has_sessions else 'sequence'}"
     print_columns(title, ("top-1 accuracy, %", *galleries.values()), rows, words=(0,))
-    gain = compare([measures["new"]], [measures["new_low_pass"]])
+    gain = compare([measures["same"]], [measures["same_low_pass"]])
     show(BETTER if gain.low > 0 else NOT_BETTER)
     if not result.has_sessions:
         show(

@@ -319,9 +319,7 @@ def _reference_trials(part: ScoredTouches, max_references: int) -> tuple[ScoredT
     )
 
 
-def _reference_sets(
-    owner: Numbers, max_references: int, group: Numbers | None = None
-) -> list[tuple[Numbers, Numbers]]:
+def _reference_sets(owner: Numbers, max_references: int, group: Numbers | None = None) -> list[tuple[Numbers, Numbers]]:
     """Return the touches that are references, and the queries, of each object with both (`fit_references`).
 
     With `group`, the references are from the first half of an object's groups, the queries from the others.

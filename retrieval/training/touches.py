@@ -177,7 +177,7 @@ def fit_touches(
     """Fit a map to touches; `folds_of` returns the objects that are held out together to choose the ridge."""
     aucs: dict[float, list[float]] = {ridge: [] for ridge in RIDGES}
     parts: list[tuple[Touches, dict[float, Array]]] = []
-    for fold in folds_of(touches.features):
+    for fold in (each for each in folds_of(touches.features) if len(each) > 1):
         is_held_out = np.isin(touches.features.object_ids, fold)
         others, part = (touches.select(np.flatnonzero(mask)) for mask in (~is_held_out, is_held_out))
         maps = fit_maps(others.features.touch_rows, widths, others.owner)
@@ -322,7 +322,7 @@ def train_on_touches(
         choice = fit_touches(encoded["touch"], widths, folds_of)
     references = fit_references(*choice.held_out, seed=seed)
     if references is None:
-        raise BadInput("a calibration needs three objects with touches of two parts in a fold; record more touches")
+        raise BadInput("too few objects have touches of two sequences to calibrate the model; touch more objects again")
     metrics = {f"{name}_top1": float(measure.by_object()[1].mean()) for name, measure in measures.items()}
     config, matcher = _with_map(config, matcher, choice.map)
     names, device = sorted({grasp.object_id for grasp in grasps}), default_device()
@@ -375,9 +375,12 @@ def _with_map(config: Config, matcher: Matcher, found: AffineMap) -> tuple[Confi
     made.touch_tower = matcher.touch_tower
     for parameter in (*made.head.parameters(), *made.photo_projection.parameters()):
         parameter.zero_()
-    assert isinstance(made.touch_projection, nn.Linear)  # the configuration has no hidden layer
-    made.touch_projection.weight.copy_(torch.from_numpy(found.weight.T))
-    made.touch_projection.bias.copy_(torch.from_numpy(found.bias))
+    touch, photo = made.touch_projection, made.photo_projection
+    assert isinstance(touch, nn.Linear)  # the configuration has no hidden layer
+    assert isinstance(photo, nn.Linear)
+    touch.weight.copy_(torch.from_numpy(found.weight.T))
+    touch.bias.copy_(torch.from_numpy(found.bias))
+    photo.bias[0] = 1.0  # an index requires unit embeddings, of stand-ins for photos too
     assert made.cosine_scale is not None
     made.cosine_scale.fill_(1.0)
     return dataclasses.replace(config, matcher=settings, training=training), made
