@@ -79,17 +79,6 @@ class Content:
         return float(np.clip(grasp.opening_mm + error, *RANGE_MM))
 
 
-@dataclass(frozen=True, eq=False)
-class Ratios:
-    """Log likelihood ratios (Q, O) of the objects of a catalogue for queries of the objects `owner` (Q,).
-
-    Objects from O on are not in the catalogue.
-    """
-
-    values: Floats
-    owner: Numbers
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Collect the grasps, and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -128,7 +117,8 @@ def sessions(folder: Path, checkpoint: Checkpoint, jobs: int) -> Iterator[str]:
         queries = [*references, *[name for name in complete if not monday[name]][:OTHERS]]
         encoded = encode(checkpoint, {name: tuesday[name] for name in queries})
         for content, rigs in found.items():
-            rigs.append(enrolled_measures(answer(out, checkpoint, content, references, encoded), number))
+            values = answer(out, checkpoint, content, references, encoded)
+            rigs.append(enrolled_measures(values, encoded.owner, rig=number))
     joined = {
         content: {name: pooled([rig[name] for rig in rigs]) for name in rigs[0]} for content, rigs in found.items()
     }
@@ -151,13 +141,14 @@ def one_grasp(folder: Path, checkpoint: Checkpoint, jobs: int) -> Iterator[str]:
     contents += [Content(True, 1, error) for error in (None, 0.0, 0.1, 1.0, 3.0)]
     every, found = encode(checkpoint, dict(complete)), dict[Content, dict[str, Measure]]()
     for content in contents:
-        turns = []
+        values, owners = [], []
         for turn in range(1 + QUERIES):
             references = {name: part[turn : turn + 1] for name, part in complete}
-            queries = every.select(np.arange(len(every.owner)) % (1 + QUERIES) != turn)
-            turns.append(answer(folder / "unseen", checkpoint, content, references, queries))
-        values, owners = zip(*((ratios.values, ratios.owner) for ratios in turns), strict=True)
-        found[content] = drawn_measures(Ratios(np.concatenate(values), np.concatenate(owners)))
+            asked = np.arange(len(every.owner)) % (1 + QUERIES) != turn
+            queries = Queries(*(part[asked] for part in every))
+            values.append(answer(folder / "unseen", checkpoint, content, references, queries))
+            owners.append(queries.owner)
+        found[content] = drawn_measures(np.concatenate(values), np.concatenate(owners))
     bases = {"photo": lambda one: Content(True, 0), "no opening": lambda one: replace(one, error_mm=None)}
     yield from tables(found, bases)
 
@@ -173,15 +164,10 @@ def by_object(grasps: Sequence[Grasp]) -> dict[str, list[Grasp]]:
 class Queries(NamedTuple):
     """Single grasps, their objects (Q,), partial activations (Q, P), and whether the gel check accepts them."""
 
-    grasps: list[Grasp]
+    grasps: NDArray[np.object_]
     owner: Numbers
     partials: NDArray[np.float32]
     accepted: NDArray[np.bool_]
-
-    def select(self, rows: NDArray[np.bool_]) -> "Queries":
-        """Return some of these grasps."""
-        grasps = [grasp for grasp, selected in zip(self.grasps, rows, strict=True) if selected]
-        return Queries(grasps, self.owner[rows], self.partials[rows], self.accepted[rows])
 
 
 def encode(checkpoint: Checkpoint, queries: Grasps) -> Queries:
@@ -191,38 +177,35 @@ def encode(checkpoint: Checkpoint, queries: Grasps) -> Queries:
     reader = TouchReader(checkpoint.config, TorchEncoder(checkpoint.matcher))
     touches = parse_grasps([list(grasp.touches) for grasp in grasps], reader.fingers)
     codes = reader.encode(touches, reader.no_contact_frames(None), Stopwatch())
-    if checkpoint.gel_check is None or codes.readings is None:
-        return Queries(grasps, owner, codes.partials, np.ones(len(grasps), bool))
-    return Queries(grasps, owner, codes.partials, np.array(checkpoint.gel_check.classify(codes.readings)) == CONTACT)
+    check, accepted = checkpoint.gel_check, np.ones(len(grasps), bool)
+    if check is not None and codes.readings is not None:
+        accepted = np.array(check.classify(codes.readings)) == CONTACT
+    return Queries(np.array(grasps, dtype=object), owner, codes.partials, accepted)
 
 
-def answer(recording: Path, checkpoint: Checkpoint, content: Content, references: Grasps, queries: Queries) -> Ratios:
-    """Build an index of the references with this content, and return the ratios of its objects, numbered like these."""
+def answer(recording: Path, checkpoint: Checkpoint, content: Content, references: Grasps, queries: Queries) -> Floats:
+    """Build an index of the references with this content; return log likelihood ratios (Q, O) of its objects."""
     of_references = data_digest([grasp for part in references.values() for grasp in part])
     file = recording.with_name("answers") / f"{checkpoint.digest[:12]}, {of_references[:12]}, {content}.npy"
     if file.is_file():
-        return Ratios(np.load(file), queries.owner)
+        return np.asarray(np.load(file))
     catalogue, index = (recording.with_name(f"{recording.name}-{what}") for what in ("catalog", "index"))
     write_catalogue(catalogue, content, references)
     retrieval.build_index(catalogue, checkpoint, index, quiet=True)
     values = np.full((len(queries.grasps), len(references)), REFUSED)
     with retrieval.open(index) as searcher:
         shard, posterior = searcher.folder_shard, searcher.posterior
-        objects, photos, rows = (
-            shard.objects,
-            StoredPartials(shard.generation.arrays),
-            np.arange(shard.generation.count),
-        )
+        objects, photos = shard.objects, StoredPartials(shard.generation.arrays)
         columns = np.array([objects.find(name) for name in references])
         for row in np.flatnonzero(queries.accepted):
             opening = np.array([content.opening_mm(queries.grasps[row])], dtype=np.float64)  # None becomes NaN
             partials = queries.partials[row : row + 1]
             evidence = objects.compare_references(partials, opening)
-            logits = objects.score(rows, shard.scorer.logits(partials, photos), evidence, 1).logits
+            logits = objects.score(np.arange(len(photos)), shard.scorer.logits(partials, photos), evidence, 1).logits
             values[row, columns >= 0] = posterior.log_ratio(logits, 1)[columns[columns >= 0]]
     file.parent.mkdir(exist_ok=True)
     np.save(file, values)
-    return Ratios(values, queries.owner)
+    return values
 
 
 def write_catalogue(folder: Path, content: Content, references: Grasps) -> None:
@@ -241,19 +224,18 @@ def write_catalogue(folder: Path, content: Content, references: Grasps) -> None:
     (folder / "metadata.jsonl").write_text("".join(lines))
 
 
-def enrolled_measures(ratios: Ratios, rig: int) -> dict[str, Measure]:
-    """Return accuracy and "none of these" of queries of all enrolled objects and of others, for one of several rigs."""
-    values, owner, count = ratios.values, ratios.owner, ratios.values.shape[1]
-    listed = owner < count
+def enrolled_measures(values: Floats, owner: Numbers, rig: int) -> dict[str, Measure]:
+    """Return accuracy and "none of these" of ratios (Q, O), for queries (Q,) of objects 0 to O - 1 and of others."""
+    count, listed = values.shape[1], owner < values.shape[1]
     scores = ScoreTable(values[listed], owner[listed], np.arange(count), np.zeros((listed.sum(), count), bool))
     parts = values[None, listed], values[None, ~listed], owner[listed], owner[~listed]
     found = {f"top-1 of {count}": top1(scores, count, 1)} | open_set(*parts)
     return {name: replace(each, owner=each.owner + 1000 * rig) for name, each in found.items()}
 
 
-def drawn_measures(ratios: Ratios) -> dict[str, Measure]:
-    """Return accuracy and "none of these" in random parts of a catalogue that has the objects of all queries."""
-    values, owner, count = ratios.values, ratios.owner, ratios.values.shape[1]
+def drawn_measures(values: Floats, owner: Numbers) -> dict[str, Measure]:
+    """Return accuracy and "none of these" of ratios (Q, O) in random parts of the catalogue, for queries (Q,)."""
+    count = values.shape[1]
     scores = ScoreTable(values, owner, np.arange(count), np.zeros(values.shape, bool))
     rng, size, drawn = np.random.default_rng(0), min(CATALOGUE, count - 1), list[Floats]()
     for _ in range(DRAWS):
@@ -309,15 +291,14 @@ def tables(
         lines = [f"| {name} | value | " + " | ".join(f"difference to {base}" for base in bases) + " |"]
         lines.append("|---|---|" + "---|" * len(bases))
         for content, measures in found.items():
-            summary, cells = summarise([measures[name]]), list[str]()
+            summary = summarise([measures[name]])
+            cells = [interval(summary.value[0], summary.low[0], summary.high[0])]
             for base in (choose(content) for choose in bases.values()):
-                if base == content or base not in found:
-                    cells.append("")
-                    continue
-                against = compare([measures[name]], [found[base][name]])
-                cells.append(interval(against.value, against.low, against.high))
-            value = interval(summary.value[0], summary.low[0], summary.high[0])
-            lines.append(f"| {content} | {value} | {' | '.join(cells)} |")
+                against = compare([measures[name]], [found.get(base, measures)[name]])
+                cells.append(
+                    interval(against.value, against.low, against.high) if base in found and base != content else ""
+                )
+            lines.append(f"| {content} | {' | '.join(cells)} |")
         yield "\n".join(lines)
 
 

@@ -5,7 +5,7 @@ import pytest
 
 import retrieval
 from benchmarks import enrolment
-from benchmarks.enrolment import Content, Ratios
+from benchmarks.enrolment import Content
 from retrieval.data.dataset import load_grasps
 from retrieval.metrics.intervals import summarise
 from tests.reference_model import write_reference_model
@@ -18,7 +18,7 @@ def values(measures):
 def test_accuracy_and_verdicts_of_a_small_table(monkeypatch):
     monkeypatch.setattr(enrolment, "CANDIDATES", (2, 3))
     ratios = np.array([[9.0, 0.1, 0.0], [0.3, 0.2, 0.1], [0.0, 0.2, 0.5]])
-    found = values(enrolment.drawn_measures(Ratios(ratios, np.arange(3))))
+    found = values(enrolment.drawn_measures(ratios, np.arange(3)))
     # The second query's object is second of three; of two, it is first next to one of the two others. Only 9 > log 2.
     assert found.pop('"none", AUROC') > 0.9
     expected = {"top-1 of 2": 5 / 6, "top-1 of 3": 2 / 3, "false accepts": 0.0, "false rejects": 2 / 3}
@@ -26,7 +26,7 @@ def test_accuracy_and_verdicts_of_a_small_table(monkeypatch):
 
     # Objects 3 and 4 are not enrolled. log 3 = 1.1: object 4 is taken for an enrolled one, and it exceeds one of three.
     others = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
-    found = values(enrolment.enrolled_measures(Ratios(np.concatenate([ratios, others]), np.arange(5)), 0))
+    found = values(enrolment.enrolled_measures(np.concatenate([ratios, others]), np.arange(5), rig=0))
     expected = {"top-1 of 3": 2 / 3, '"none", AUROC': 4 / 6, "false accepts": 1 / 2, "false rejects": 2 / 3}
     assert found == pytest.approx(expected)
 
@@ -45,9 +45,7 @@ def test_queries_are_answered_with_photos_and_reference_grasps(recording, tmp_pa
     references = {name: part[:1] for name, part in grasps.items()}
     queries = enrolment.encode(checkpoint, {name: part[1:2] for name, part in grasps.items()})
     contents = Content(True, 0), Content(True, 1)
-    answered = [
-        enrolment.answer(tmp_path / "r", checkpoint, content, references, queries).values for content in contents
-    ]
+    answered = [enrolment.answer(tmp_path / "r", checkpoint, content, references, queries) for content in contents]
     assert [each.shape for each in answered] == [(len(grasps), len(grasps))] * 2
     assert not np.allclose(*answered)
     with retrieval.open(tmp_path / "r-index") as searcher:  # of the last content
