@@ -3,6 +3,7 @@
 The index maps an id to its file. No text of a request becomes part of a file path.
 """
 
+import os
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
 
+from retrieval.data.catalogue import ENROLLED
 from retrieval.data.images import read_bytes
 from retrieval.data.text import replace_surrogates
 from retrieval.errors import ImageError
@@ -45,12 +47,12 @@ def catalogue(
     total: number of matching photos; next: offset of the next page, null at the end; items: `id`, by which all routes
     name the photo, `object_id`, and the user's own `metadata`.
     """
-    generation = parts.generations.current
-    name = name and resolve_object(generation.shard, name)
-    found = generation.shard.page(search.casefold().split(), name, offset, limit)
+    searcher = parts.generations.current
+    name = name and resolve_object(searcher.shard, name)
+    found = searcher.shard.page(search.casefold().split(), name, offset, limit)
     end = offset + len(found.photos)
     return {
-        "generation": generation.name,
+        "generation": searcher.manifest.generation,
         "total": found.total,
         "offset": offset,
         "next": end if offset < end < found.total else None,
@@ -69,14 +71,14 @@ def photo(
 
     Formats that browsers lack are converted to JPEG.
     """
-    generation = parts.generations.current
-    (listed,) = generation.shard.photos([photo])
+    searcher = parts.generations.current
+    (listed,) = searcher.shard.photos([photo])
     if listed is None:
         raise HttpProblem("unknown", f"The index has no photo {photo!r}. /v1/catalogue lists the photos.")
     headers = {"etag": f'"{listed.digest}-{px}"', "cache-control": "private, no-cache"}
     if request.headers.get("if-none-match") == headers["etag"]:
         return Response(status_code=304, headers=headers)
-    path = generation.searcher.picture_file(listed)
+    path = searcher.picture_file(listed)
     try:
         data = read_bytes(path, listed.digest) if px is None else b""
         if not data.startswith(tuple(IMAGE_TYPES)):
@@ -100,6 +102,12 @@ def image_response(data: bytes, headers: Mapping[str, str] | None = None) -> Res
     return Response(data, media_type=kind, headers=headers)
 
 
+def is_writable(index: Path) -> bool:
+    """Return whether the service may write enrolled touches to this folder."""
+    folder = index / ENROLLED
+    return os.access(folder if folder.exists() else index, os.W_OK)
+
+
 @router.get("/v1/index")
 def index(parts: Parts) -> dict[str, Any]:
     """Return a description of the index, its model and the service.
@@ -108,23 +116,22 @@ def index(parts: Parts) -> dict[str, Any]:
     can_enrol: whether touches can be enrolled; stores_history: whether queries and feedback are stored. objects
     includes those that have enrolled touches only.
     """
-    generation = parts.generations.current
-    searcher, info = generation.searcher, generation.searcher.manifest
-    objects, enrolled = generation.shard.counts()
+    searcher = parts.generations.current
+    info, (objects, enrolled) = searcher.manifest, searcher.shard.counts()
     return {
-        "generation": generation.name,
+        "generation": searcher.manifest.generation,
         "kind": info.kind,
         "photos": info.photos,
         "objects": objects,
         "enrolled_touches": enrolled,
         "model": replace_surrogates(searcher.checkpoint.path.name),
         "trained_on": replace_surrogates(str(searcher.checkpoint.provenance.get("source", "unknown"))),
-        "fingers": generation.fingers,
+        "fingers": searcher.reader.fingers,
         "background": searcher.checkpoint.config.preprocessing.background,
         "sensors": sorted(parts.rig.sensors),
         "can_grasp": parts.rig.grasp is not None,
         "can_verify": searcher.can_verify,
-        "can_enrol": searcher.can_enrol and generation.is_writable,
+        "can_enrol": searcher.can_enrol and is_writable(searcher.index),
         "stores_history": parts.history_writer is not None,
         "version": __version__,
     }

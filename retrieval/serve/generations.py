@@ -7,11 +7,7 @@ released when no request uses it.
 import asyncio
 import gc
 import logging
-import os
-from functools import cached_property
 
-from retrieval.indexing.enrolled import EnrolledTable
-from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.search.opening import OpenShards, manifest_of
 from retrieval.search.searcher import Searcher
 from retrieval.serve.settings import ServiceSettings
@@ -21,34 +17,10 @@ _RETRY_S = 10.0
 """Time after which a generation that failed to open is tried again."""
 
 
-class ServedGeneration:
-    """A served generation: its searcher, and the whole model, which is loaded at the first use."""
-
-    def __init__(self, searcher: Searcher) -> None:
-        self.searcher, self.shard = searcher, searcher.shard
-        self.fingers: int = searcher.checkpoint.config.matcher.fingers
-
-    @property
-    def name(self) -> str:
-        """The name of the generation."""
-        return self.searcher.manifest.generation
-
-    @property
-    def is_writable(self) -> bool:
-        """Whether the service may write the enrolled touches."""
-        folder = EnrolledTable(self.searcher.index).path.parent
-        return os.access(folder if folder.exists() else self.searcher.index, os.W_OK)
-
-    @cached_property
-    def checkpoint(self) -> Checkpoint:
-        """The whole model, including the photo tower, which queries do not need."""
-        return load_checkpoint(self.searcher.checkpoint.path, digest=self.searcher.checkpoint.digest)
-
-
 class Generations:
-    """`current`: the generation of one index that answers, replaced when a new generation appears."""
+    """`current`: the searcher of the generation that answers, replaced when a new generation appears."""
 
-    current: ServedGeneration
+    current: Searcher
 
     def __init__(self, settings: ServiceSettings, shards: OpenShards | None) -> None:
         """Open the newest generation."""
@@ -57,8 +29,8 @@ class Generations:
 
     def _open(self) -> None:
         settings = self._settings
-        self.current = ServedGeneration(
-            Searcher.open(settings.index, model=settings.model, threads=settings.threads, shards=self._shards)
+        self.current = Searcher.open(
+            settings.index, model=settings.model, threads=settings.threads, shards=self._shards
         )
         gc.collect()  # free reference cycles of the previous generation
 
@@ -71,9 +43,11 @@ class Generations:
             try:
                 manifest = await asyncio.to_thread(manifest_of, self._settings.index)
                 # A folder that was deleted and built again counts its generations from 1: compare the contents.
-                if manifest != self.current.searcher.manifest:
+                if manifest != self.current.manifest:
                     await asyncio.to_thread(self._open)
-                    log.warning("Generation %s is now served.", self.current.name)
+                    log.warning("Generation %s is now served.", self.current.manifest.generation)
             except Exception as error:
                 pause_s = _RETRY_S
-                log.warning("A new generation cannot be opened; %s is still served: %s", self.current.name, error)
+                log.warning(
+                    "A new generation cannot be opened; %s is still served: %s", self.current.manifest.generation, error
+                )

@@ -11,10 +11,10 @@ from pydantic import Field
 from retrieval.data.images import read_bytes
 from retrieval.errors import BadInput, ImageError
 from retrieval.search.answer import MATCH, NONE_OF_THESE, UNCALIBRATED
+from retrieval.search.searcher import Searcher
 from retrieval.search.shard import resolve_object
 from retrieval.serve.catalogue import IMAGE_RESPONSES, image_response
 from retrieval.serve.errors import HttpProblem
-from retrieval.serve.generations import ServedGeneration
 from retrieval.serve.service import Parts, Service
 from retrieval.serve.store import NONE, OBJECT, RIGHT, HistoryWriter, StoredQuery
 from retrieval.serve.uploads import RequestBody
@@ -135,7 +135,7 @@ def post_feedback(body: FeedbackBody, parts: Parts, response: Response) -> dict[
 
 
 def _resolve_feedback(
-    body: FeedbackBody, stored: StoredQuery, generation: ServedGeneration
+    body: FeedbackBody, stored: StoredQuery, searcher: Searcher
 ) -> tuple[str, str | None, bytes | None]:
     """Return the feedback to store, its object and the object's photo; raises HttpProblem."""
     results = stored.answer["results"]
@@ -148,31 +148,31 @@ def _resolve_feedback(
             raise HttpProblem(
                 "bad-input", f'The verdict "{stored.verdict}" names no object, so feedback "right" is not possible.'
             )
-        return RIGHT, results[0]["object_id"], _read_photo(generation, results[0]["photo"])
+        return RIGHT, results[0]["object_id"], _read_photo(searcher, results[0]["photo"])
     if body.feedback == NONE:
         return NONE, body.object_id, None
     if body.object_id is None:
         raise HttpProblem("bad-input", 'Feedback "object" requires object_id.')
     shown = next((one["photo"] for one in results if one["object_id"] == body.object_id), None)
     if shown is None:
-        name = resolve_object(generation.shard, body.object_id)
-        photos = generation.shard.page([], name, 0, 1).photos
+        name = resolve_object(searcher.shard, body.object_id)
+        photos = searcher.shard.page([], name, 0, 1).photos
         if not photos:
             detail = f'The index has no object {body.object_id!r}. Send "none" if the catalogue lacks the object.'
             raise HttpProblem("bad-input", detail)
-        return OBJECT, name, _read_photo(generation, photos[0].path)
-    return OBJECT, body.object_id, _read_photo(generation, shown)
+        return OBJECT, name, _read_photo(searcher, photos[0].path)
+    return OBJECT, body.object_id, _read_photo(searcher, shown)
 
 
-def _read_photo(generation: ServedGeneration, photo: str) -> bytes | None:
+def _read_photo(searcher: Searcher, photo: str) -> bytes | None:
     """Return the file of a catalogue photo.
 
     None if the file is gone or has changed, or if the row is a gel image of a reference touch: the feedback is stored,
     not recorded.
     """
-    (found,) = generation.shard.photos([photo])
+    (found,) = searcher.shard.photos([photo])
     if found is None or found.is_touch:
         return None
     with suppress(ImageError):
-        return read_bytes(generation.searcher.catalogue / found.path, found.digest)
+        return read_bytes(searcher.catalogue / found.path, found.digest)
     return None

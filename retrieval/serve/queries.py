@@ -8,9 +8,10 @@ from pydantic import Field
 
 from retrieval.errors import BadInput
 from retrieval.indexing.enrolled import content_digest, remove_enrolled
+from retrieval.search.searcher import Searcher
 from retrieval.search.shard import resolve_object
+from retrieval.serve.catalogue import is_writable
 from retrieval.serve.errors import DocumentResponse, HttpProblem
-from retrieval.serve.generations import ServedGeneration
 from retrieval.serve.service import Parts, Service
 from retrieval.serve.uploads import (
     MAX_GRASPS,
@@ -39,9 +40,9 @@ router = APIRouter()
 async def query(request: Request, parts: Parts) -> DocumentResponse:
     """Return the document of `retrieve query --json` for one or several grasps of one object."""
     parts.queue.require_capacity()
-    pictures, options = await read_query(request, parts.generations.current.fingers)
+    pictures, options = await read_query(request, parts.generations.current.reader.fingers)
     result = await parts.queue.submit(
-        lambda generation: generation.searcher.query(
+        lambda searcher: searcher.query(
             pictures.images, background=pictures.frames, **options.model_dump(include=set(Options.model_fields))
         ),
         request,
@@ -73,9 +74,7 @@ async def verify(request: Request, parts: Parts) -> DocumentResponse:
     body = await read_json(request, VerifyBody)
     pictures = RequestPictures(body.touches, body.background)
     found = await parts.queue.submit(
-        lambda generation: generation.searcher.verify(
-            pictures.images, body.expect, far=body.far, background=pictures.frames
-        ),
+        lambda searcher: searcher.verify(pictures.images, body.expect, far=body.far, background=pictures.frames),
         request,
         pictures,
     )
@@ -110,9 +109,7 @@ async def enrol(name: str, request: Request, parts: Parts) -> dict[str, Any]:
     body = await read_json(request, EnrolBody)
     pictures = RequestPictures(body.touches, body.background)
     found = await parts.queue.submit(
-        lambda generation: generation.searcher.enrol(
-            name, pictures.images, opening_mm=body.opening_mm, background=pictures.frames
-        ),
+        lambda searcher: searcher.enrol(name, pictures.images, opening_mm=body.opening_mm, background=pictures.frames),
         request,
         pictures,
     )
@@ -131,7 +128,7 @@ async def forget(
     _require_writable(parts)
     try:
         object_id, removed = await parts.queue.submit(
-            lambda generation: remove_enrolled(generation.searcher.index, name, pictures=touch), request
+            lambda searcher: remove_enrolled(searcher.index, name, pictures=touch), request
         )
     except BadInput as error:
         raise HttpProblem("unknown", str(error)) from error
@@ -139,9 +136,8 @@ async def forget(
 
 
 def _require_writable(parts: Service) -> None:
-    generation = parts.generations.current
-    if not generation.is_writable:
-        folder = generation.searcher.index
+    folder = parts.settings.index
+    if not is_writable(folder):
         raise HttpProblem("refused", f"The service may not write to {folder}, so it cannot change enrolled touches.")
 
 
@@ -166,7 +162,7 @@ async def grasp(
     if close is None:
         raise HttpProblem("unknown", "No rig can grasp: neither the catalogue nor --rig is that of the simulated rig.")
     try:
-        grasped = await parts.grasps.submit(lambda generation: close(_object_ids(generation, name)), request)
+        grasped = await parts.grasps.submit(lambda searcher: close(_object_ids(searcher, name)), request)
     except HttpProblem:
         raise
     except Exception as error:  # of any rig
@@ -184,9 +180,9 @@ async def grasp(
     }
 
 
-def _object_ids(generation: ServedGeneration, name: str | None) -> list[str]:
+def _object_ids(searcher: Searcher, name: str | None) -> list[str]:
     """Return `[name]` if a name is given, else ids of objects spread over the catalogue; raises HttpProblem."""
-    shard, photos = generation.shard, generation.searcher.manifest.photos
+    shard, photos = searcher.shard, searcher.manifest.photos
     if name is not None:
         name = resolve_object(shard, name)
         if not shard.page([], name, 0, 1).total:

@@ -11,9 +11,10 @@ from typing import Any, TypeVar
 
 from starlette.requests import Request
 
+from retrieval.search.searcher import Searcher
 from retrieval.serve.decoders import Decoders
 from retrieval.serve.errors import HttpProblem
-from retrieval.serve.generations import Generations, ServedGeneration
+from retrieval.serve.generations import Generations
 from retrieval.serve.settings import ServiceSettings
 from retrieval.serve.uploads import RequestPictures
 
@@ -46,7 +47,7 @@ class Queue:
             )
 
     async def submit(
-        self, work: Callable[[ServedGeneration], Result], request: Request, pictures: RequestPictures | None = None
+        self, work: Callable[[Searcher], Result], request: Request, pictures: RequestPictures | None = None
     ) -> Result:
         """Decode `pictures`, then run `work` in a worker thread with the generation that is served when it starts.
 
@@ -78,10 +79,10 @@ class Queue:
             disconnected.cancel()
             answer.cancel()
 
-    async def _answer(self, work: Callable[[ServedGeneration], Result], pictures: RequestPictures | None) -> Result:
+    async def _answer(self, work: Callable[[Searcher], Result], pictures: RequestPictures | None) -> Result:
         """Decode the pictures, then wait for the model; cancelling stops both."""
         if pictures is not None:
-            px = self._generations.current.searcher.checkpoint.config.preprocessing.touch_px
+            px = self._generations.current.checkpoint.config.preprocessing.touch_px
             images = await self._decoders.read(pictures.named_files(), px)
             pictures.set_images(iter(images))
 

@@ -148,7 +148,7 @@ async def ready(parts: Parts) -> dict[str, str]:
     """Return "ok" and the generation if an index is open and the service is not shutting down."""
     if parts.stopping.is_set():
         raise HttpProblem("not-ready", "The service is shutting down.")
-    return {"status": f"ok: {parts.generations.current.name}"}
+    return {"status": f"ok: {parts.generations.current.manifest.generation}"}
 
 
 class SessionBody(RequestBody):

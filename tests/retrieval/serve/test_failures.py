@@ -122,7 +122,7 @@ with RecordingWriter(Path(folder) / "recording", {"source": "s", "sensor": "t"})
     parts = app.state.service
     def on_started(port):
         if where == "query":
-            parts.generations.current.searcher.query = hang
+            parts.generations.current.query = hang
         if where == "write":
             parts.history_writer.store.add_query = hang
         print(port, flush=True)

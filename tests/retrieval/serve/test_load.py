@@ -38,7 +38,7 @@ class BlockingEncoder:
 def blocked_service(index, **settings):
     """Run a service with a blocked encoder; yield its address, the encoder, its parts and a thread pool."""
     with listening(index, **settings) as (url, parts), ThreadPoolExecutor(16) as client_threads:
-        searcher = parts.generations.current.searcher
+        searcher = parts.generations.current
         encoder = searcher.reader.encoder = BlockingEncoder(searcher.reader.encoder)
         try:
             yield url, encoder, parts, client_threads
