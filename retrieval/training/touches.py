@@ -24,9 +24,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
 
-from retrieval.console.progress import Bar
 from retrieval.data.dataset import (
     LICENCES,
     AnyRecording,
@@ -156,13 +154,11 @@ class TouchFit:
     """A map with the ridge that ranks touches of held-out objects best; among ties, the largest.
 
     Attributes:
-        ridge: The ridge.
         map: The map, fitted to all touches.
         held_out: For each fold, its touches by a map that was fitted without its objects: the input of the
             calibrations. Of each object at most `MAX_CALIBRATION_TOUCHES`, evenly spaced.
     """
 
-    ridge: float
     map: AffineMap
     held_out: list[ScoredTouches]
 
@@ -176,33 +172,21 @@ def fit_touches(
 ) -> TouchFit:
     """Fit a map to touches; `folds_of` returns the objects that are held out together to choose the ridge."""
     aucs: dict[float, list[float]] = {ridge: [] for ridge in RIDGES}
-    parts: list[tuple[Touches, dict[float, Array]]] = []
+    scored: dict[float, list[ScoredTouches]] = {ridge: [] for ridge in RIDGES}
     for fold in (each for each in folds_of(touches.features) if len(each) > 1):
         is_held_out = np.isin(touches.features.object_ids, fold)
         others, part = (touches.select(np.flatnonzero(mask)) for mask in (~is_held_out, is_held_out))
         maps = fit_maps(others.features.touch_rows, widths, others.owner)
-        codes = {ridge: unit_rows(found(part.features.touch_rows)) for ridge, found in maps.items()}
         some = validation_rows(part.features, MAX_CHOICE_TOUCHES)
-        for ridge, each in codes.items():
-            aucs[ridge].append(ranking_auc(each[some] @ each[some].T, part.owner[some], part.group[some]))
-        parts.append((part, codes))
+        kept = validation_rows(part.features, MAX_CALIBRATION_TOUCHES * len(fold))
+        no_photos, none = np.zeros((len(kept), 0)), np.zeros(0, np.int64)
+        for ridge, found in maps.items():
+            codes = unit_rows(found(part.features.touch_rows))
+            aucs[ridge].append(ranking_auc(codes[some] @ codes[some].T, part.owner[some], part.group[some]))
+            of_fold = no_photos, part.owner[kept], none, no_photos > 0, codes[kept]
+            scored[ridge].append(ScoredTouches(*of_fold, touch_group=part.group[kept]))
     best = max(aucs, key=lambda ridge: (np.mean(aucs[ridge]), ridge))
-    found = fit_maps(touches.features.touch_rows, widths, touches.owner, [best])[best]
-    return TouchFit(best, found, [_scored(part, codes[best]) for part, codes in parts])
-
-
-def _scored(part: Touches, codes: Array) -> ScoredTouches:
-    """Return the touches of a fold for the calibrations."""
-    rows = validation_rows(part.features, MAX_CALIBRATION_TOUCHES * len(set(part.features.object_ids)))
-    none = np.zeros((len(rows), 0))
-    return ScoredTouches(
-        none,
-        part.owner[rows],
-        np.zeros(0, np.int64),
-        none > 0,
-        codes[rows],
-        touch_group=part.group[rows],
-    )
+    return TouchFit(fit_maps(touches.features.touch_rows, widths, touches.owner, [best])[best], scored[best])
 
 
 # Accuracy ---------------------------------------------------------------------------------------------------
@@ -232,27 +216,17 @@ def recognition(touches: Touches, fit: Callable[[Numbers], TouchFit], gallery: s
 
 
 def _accuracies(
-    touches: Touches,
-    folds: Sequence[Sequence[str]],
-    fit: Callable[[Touches], TouchFit],
-    title: str,
-    quiet: bool,
+    touches: Touches, folds: Sequence[Sequence[str]], fit: Callable[[Touches], TouchFit]
 ) -> Iterator[tuple[str, Measure]]:
     """Yield the accuracy of "same" objects, which the fit knows from other turns, and of "new" ones."""
-    with Bar(title, len(np.unique(touches.turn)) + len(folds), "fits", quiet=quiet) as bar:
-
-        def fit_to(references: Numbers) -> TouchFit:
-            bar.advance()
-            return fit(touches.select(np.sort(references)))
-
-        yield "same", recognition(touches, fit_to, f"the same {len(np.unique(touches.owner))} objects")
-        parts = []
-        for fold in folds:
-            is_new = np.isin(touches.features.object_ids, fold)
-            part = touches.select(np.flatnonzero(is_new))
-            fitted = fit(touches.select(np.flatnonzero(~is_new)))
-            parts.append(recognition(part, lambda _: fitted, f"about {len(fold)} new objects"))  # noqa: B023
-            bar.advance()
+    gallery = f"the same {len(np.unique(touches.owner))} objects"
+    yield "same", recognition(touches, lambda rows: fit(touches.select(np.sort(rows))), gallery)
+    parts = []
+    for fold in folds:
+        is_new = np.isin(touches.features.object_ids, fold)
+        fitted = fit(touches.select(np.flatnonzero(~is_new)))
+        part = touches.select(np.flatnonzero(is_new))
+        parts.append(recognition(part, lambda _: fitted, f"about {len(fold)} new objects"))  # noqa: B023
     yield "new", pooled(parts)
 
 
@@ -308,6 +282,7 @@ def train_on_touches(
     matcher = build_matcher(config).eval()
     widths = [part.feature_count for part in matcher.touch_tower.backbones] * config.matcher.fingers
     folds_of = partial(held_out_folds, kind_of=object_kinds(recording), linked=linked_objects(grasps), seed=seed)
+    fit = partial(fit_touches, widths=widths, folds_of=folds_of)
     parts = divide(grasps)
     measures, encoded = dict[str, Measure](), dict[str, Touches]()
     for variant, suffix in (("touch", ""), ("low_pass", "_low_pass")):
@@ -315,11 +290,9 @@ def train_on_touches(
         features = dataclasses.replace(features, photo=features.touch_rows)
         encoded[variant] = touches = Touches(features, features.owner, parts.group, parts.turn)
         with one_thread():
-            fit = partial(fit_touches, widths=widths, folds_of=folds_of)
-            found = _accuracies(touches, folds, fit, f"estimate{suffix}".replace("_", " "), quiet)
-            measures |= {f"{name}{suffix}": measure for name, measure in found}
+            measures |= {f"{name}{suffix}": measure for name, measure in _accuracies(touches, folds, fit)}
     with one_thread():
-        choice = fit_touches(encoded["touch"], widths, folds_of)
+        choice = fit(encoded["touch"])
     references = fit_references(*choice.held_out, seed=seed)
     if references is None:
         raise BadInput("too few objects have touches of two sequences to calibrate the model; touch more objects again")
@@ -366,21 +339,18 @@ def _configuration(fingers: int, init: str) -> Config:
     return Config(matcher, training, preprocessing)
 
 
-@torch.no_grad()
 def _with_map(config: Config, matcher: Matcher, found: AffineMap) -> tuple[Config, Matcher]:
     """Return the matcher whose embedding of a touch is its code, with the same towers, and its configuration."""
     settings = dataclasses.replace(config.matcher, embedding_dim=found.weight.shape[1])
     training = dataclasses.replace(config.training, init="random", init_touch="", init_photo="")
     made = Matcher(settings).eval()
     made.touch_tower = matcher.touch_tower
-    for parameter in (*made.head.parameters(), *made.photo_projection.parameters()):
-        parameter.zero_()
-    touch, photo = made.touch_projection, made.photo_projection
-    assert isinstance(touch, nn.Linear)  # the configuration has no hidden layer
-    assert isinstance(photo, nn.Linear)
-    touch.weight.copy_(torch.from_numpy(found.weight.T))
-    touch.bias.copy_(torch.from_numpy(found.bias))
-    photo.bias[0] = 1.0  # an index requires unit embeddings, of stand-ins for photos too
-    assert made.cosine_scale is not None
-    made.cosine_scale.fill_(1.0)
+    unused = {name: part for name, part in made.state_dict().items() if name.startswith(("head.", "photo_projection."))}
+    state = {name: torch.zeros_like(part) for name, part in unused.items()} | {
+        "touch_projection.weight": torch.from_numpy(found.weight.T),
+        "touch_projection.bias": torch.from_numpy(found.bias),
+        "photo_projection.bias": torch.eye(settings.embedding_dim)[0],  # an index requires unit embeddings
+        "cosine_scale": torch.tensor(1.0),
+    }
+    made.load_state_dict(state, strict=False)
     return dataclasses.replace(config, matcher=settings, training=training), made
