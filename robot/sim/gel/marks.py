@@ -28,7 +28,7 @@ class Flaws:
     texture: float = 0.012
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=32)
 def flaw_maps(flaws: Flaws, field: Field) -> tuple[Array, Array, Array]:
     """Return the effect of flaws on a picture, (rows, cols) each; their places do not depend on the image's size.
 
