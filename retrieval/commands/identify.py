@@ -1,5 +1,6 @@
 """`retrieve identify`: grasp an object with a rig until its identity is clear."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import compress
@@ -23,7 +24,6 @@ from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput, RetrievalError
 
 if TYPE_CHECKING:
-    from retrieval.search.answer import Enrolment
     from retrieval.search.searcher import Searcher
     from robot.recording.grasp import RecordedGrasp
 
@@ -89,7 +89,8 @@ def identify(
 
     with Searcher.open(path, model=model) as searcher:
         most = grasps or (5 if enrol is None else 3)
-        run = _Run(searcher, out, expect, 0.01 if far is None else far, confidence, most, enrol is not None)
+        enough = confidence if enrol is None else math.inf
+        run = _Run(searcher, out, expect, 0.01 if far is None else far, enough, most)
         if expect is not None:  # refuse it before the rig moves
             searcher.expected_object(expect, run.far)
         if enrol is not None:
@@ -125,9 +126,7 @@ def identify(
                 f"attempts are in {out}/attempts.jsonl)"
             )
         if enrol is not None and run.answer.results:
-            enrolment = run.remember(enrol)
-            if json:
-                print_json(enrolment._asdict())
+            run.remember(enrol, json)
             return 0
         if len(attempts) == 1:  # no new attempt: the hand may hold another object now
             raise BadInput(f"{out} holds a finished run: {run.sentence}. Give another --out for the next object")
@@ -149,7 +148,6 @@ class _Run:
     far: float
     confidence: float
     grasps: int
-    enrols: bool
     heights_mm: list[float] = field(default_factory=list)
     touches: list[list[Path]] = field(default_factory=list)
     openings_mm: list[float | None] = field(default_factory=list)
@@ -177,25 +175,23 @@ class _Run:
         if self.expect is None:
             self.answer = self.searcher.query(self.touches, opening_mm=self.openings_mm, background=self.background)
             none, results = self.answer.none_probability, self.answer.results
-            is_sure = none is not None and max(none, results[0].probability or 0.0) >= self.confidence
-            is_final = is_sure and not self.enrols
+            is_final = none is not None and max(none, results[0].probability or 0.0) >= self.confidence
         else:
             self.answer = self.searcher.verify(self.touches, self.expect, far=self.far, background=self.background)
             is_final = self.answer.decision in (ACCEPT, REJECT)
         say(f"grasp {len(grasps)} of at most {self.grasps}: {self.sentence}")
         return is_final or NOT_A_GEL in self.answer.grasps  # no further grasp would change it
 
-    def remember(self, name: str) -> "Enrolment":
-        """Enrol the grasps with contact, and say so."""
+    def remember(self, name: str, json: bool) -> None:
+        """Enrol the grasps with contact, and print how many."""
         from retrieval.model.gel_check import CONTACT
 
         shows = [check == CONTACT for check in self.answer.grasps]
         touches, openings_mm = list(compress(self.touches, shows)), list(compress(self.openings_mm, shows))
         made = self.searcher.enrol(name, touches, opening_mm=openings_mm, background=self.background)
-        left_out = len(shows) - made.added
-        remark = f"; {left_out} without contact left out" if left_out else ""
-        say(f"enrolled {made.added} touch(es) of {made.object_id}, which has {made.touches} now{remark}")
-        return made
+        say(f"enrolled {made.added} of {len(shows)} grasps as touches of {made.object_id}; it has {made.touches} now")
+        if json:
+            print_json(made._asdict())
 
     @property
     def sentence(self) -> str:

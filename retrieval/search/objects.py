@@ -228,9 +228,9 @@ class Objects:
         return [self.gel_images[one.touch[0]] for one in self._touches[start:]]
 
     @property
-    def enrolled_count(self) -> int:
-        """Number of enrolled touches."""
-        return sum(one.is_enrolled for one in self._touches)
+    def counts(self) -> tuple[int, int]:
+        """Number of objects, and of enrolled touches."""
+        return self.count, sum(one.is_enrolled for one in self._touches)
 
     def compare_references(self, partials: Floats, openings_mm: NDArray[np.float64] | None = None) -> ReferenceEvidence:
         """Compare grasps with the reference touches of all objects.

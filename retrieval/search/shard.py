@@ -209,8 +209,7 @@ class FolderShard:
 
     def counts(self) -> tuple[int, int]:
         """Return the number of objects, and of enrolled touches."""
-        objects = self.objects
-        return objects.count, objects.enrolled_count
+        return self.objects.counts
 
     @cached_property
     def _texts(self) -> list[str]:

@@ -136,7 +136,7 @@ def test_grasps_are_enrolled_once_also_by_a_run_that_was_stopped_before(identify
     assert identify(*options, "--json") == 0
     output = capsys.readouterr()
     assert json.loads(output.out) == {"object_id": "my part", "touches": 2, "added": 2}
-    assert "enrolled 2 touch(es) of my part" in output.err
+    assert "enrolled 2 of 2 grasps as touches of my part" in output.err
     grasps = [grasp for grasp in read_recording(tmp_path / "run").grasps if grasp.grasped]
     table = json.loads((index / "enrolled" / "touches.json").read_text())
     assert [touch["opening_mm"] for touch in table["touches"]] == [grasp.opening_mm for grasp in grasps]
