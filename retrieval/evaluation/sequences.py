@@ -22,7 +22,6 @@ from retrieval.metrics.registry import MethodScoreTables, Metric
 from retrieval.metrics.table import ScoreTable
 
 COMPONENTS = 60
-EARLY, LATE = "early", "late"
 MOST_TOUCHES = 12
 """Early touches, and late ones, of an object at most."""
 
@@ -93,6 +92,7 @@ class Sequences:
         rows: Places of the grasps of each.
         part: (S,) session of each, or "early" and "late"; "" if there is one part.
         rounds: The comparisons; their queries are pooled.
+        is_across_sessions: Whether queries and gallery are from different sessions.
     """
 
     grasps: Sequence[Grasp]
@@ -101,6 +101,7 @@ class Sequences:
     rows: tuple[Rows, ...]
     part: NDArray[np.str_]
     rounds: tuple[Round, ...]
+    is_across_sessions: bool
 
     @classmethod
     def of(cls, grasps: Sequence[Grasp], sessions: Sessions = "all") -> Self:
@@ -115,24 +116,23 @@ class Sequences:
         """
         if sessions == "all" or len({grasp.session for grasp in grasps} - {None}) < 2:
             grasps = [replace(grasp, session="") for grasp in grasps]
-        first = {session: place for place, session in enumerate(dict.fromkeys(grasp.session for grasp in grasps))}
-        grasps = sorted(
-            (grasp for grasp in grasps if grasp.session is not None), key=lambda grasp: first[grasp.session]
-        )
+        order = list(dict.fromkeys(grasp.session for grasp in grasps if grasp.session is not None))
+        grasps = [grasp for session in order for grasp in grasps if grasp.session == session]
         places = _places(grasps)
-        if len(places) == len({name for name, _, _ in places}):
-            grasps = _early_and_late(grasps) or grasps
+        if is_late := len(places) == len({name for name, _, _ in places}) > 1:
+            grasps = _early_and_late(grasps)
             places = _places(grasps)
         objects, owner = np.unique([name for name, _, _ in places], return_inverse=True)
         part = np.array([session for _, session, _ in places])
         rows_of = {name: np.flatnonzero(part == name) for name in dict.fromkeys(part.tolist())}
-        if EARLY in rows_of or (sessions == "across" and len(rows_of) > 1):
-            pairs = [(EARLY, LATE)] if EARLY in rows_of else itertools.permutations(rows_of, 2)
+        if is_late or (sessions == "across" and len(rows_of) > 1):
+            pairs = list(itertools.permutations(rows_of, 2))[: 1 if is_late else None]
             rounds = [one for pair in pairs if len(set(owner[(one := _round(owner, rows_of, *pair)).gallery])) > 1]
             if not rounds:
                 raise DatasetError(
-                    f"Touch to touch across sessions needs at least 2 objects of 2 sessions, but no two of "
-                    f"{', '.join(rows_of)} have them in common. Use --protocol touch-to-touch-within."
+                    "Touch to touch needs at least 2 objects with 3 touches each, of one session, or 2 objects of 2 "
+                    f"sessions, but no two of {', '.join(rows_of) or 'the parts'} have such objects in common. Use "
+                    "--protocol touch-to-touch-within, or record more touches."
                 )
         else:
             rounds = [Round(name, rows, rows, rows) for name, rows in rows_of.items()]
@@ -146,12 +146,8 @@ class Sequences:
                         "sequence(s)."
                     )
         rows = tuple(np.array(each, np.int64) for each in places.values())
-        return cls(grasps, tuple(name for _, _, name in places), owner, rows, part, tuple(rounds))
-
-    @property
-    def is_across_sessions(self) -> bool:
-        """Whether queries and gallery are from different sessions."""
-        return not self.rounds[0].is_leave_one_out and EARLY not in self.part
+        is_across = not (is_late or rounds[0].is_leave_one_out)
+        return cls(grasps, tuple(name for _, _, name in places), owner, rows, part, tuple(rounds), is_across)
 
     @property
     def rule(self) -> str:
@@ -183,21 +179,21 @@ class Sequences:
         return centred
 
     def measures(
-        self, metrics: Mapping[str, Metric], vectors: Vectors, permutations: Sequence[int | None] = ()
+        self, metrics: Mapping[str, Metric], vectors: Vectors, permutations: Sequence[int | None] = (None,)
     ) -> dict[str, list[Measure]]:
-        """Return the measures by the vectors (S, F) of all sequences; the first metric also of each round of several.
+        """Return the measures by the vectors (S, F) of all sequences; the first metric also of each of two rounds.
 
-        `permutations` are seeds: there is one measure for each, with permuted objects of the gallery.
+        There is one measure for each of `permutations`, seeds with which the objects of the gallery are permuted.
         """
         scores = [one.scores(vectors) for one in self.rounds]
         measures: dict[str, list[Measure]] = defaultdict(list)
-        for seed in permutations or [None]:
+        for seed in permutations:
             rng = None if seed is None else np.random.default_rng([seed, 41])
             tables = [self._table(*pair, rng) for pair in zip(self.rounds, scores, strict=True)]
             for name, metric in metrics.items():
                 parts = [part for table in tables if (part := _measure(metric, table))]
                 measures[name].append(pooled(parts))
-                for number, part in enumerate(parts if name == next(iter(metrics)) and len(parts) > 1 else ()):
+                for number, part in enumerate(parts if name == next(iter(metrics)) and len(parts) == 2 else ()):
                     measures[f"{name}_{number}"].append(pooled([part]))
         return measures
 
@@ -234,7 +230,7 @@ def _early_and_late(grasps: Sequence[Grasp]) -> list[Grasp]:
     found = []
     for some in grasps_of.values():
         third = len(some) // 3
-        for part, chosen in ((EARLY, some[:third]), (LATE, some[len(some) - third :])):
+        for part, chosen in (("early", some[:third]), ("late", some[len(some) - third :])):
             found += [replace(grasp, session=part) for grasp in thin_grasps(chosen, MOST_TOUCHES)]
     return found
 

@@ -197,7 +197,7 @@ def run_touch_to_touch(
     parts = {
         f"{protocol.main}_{number}": Metric(f"{label}, {one.name}", "real", protocol.measures[protocol.main].compute)
         for number, one in enumerate(sequences.rounds)
-        if len(sequences.rounds) > 1
+        if len(sequences.rounds) == 2
     }
     why = f" Features of the touches themselves are compared: {reason}." if reason else ""
     return protocol_result(

@@ -89,19 +89,21 @@ def described(sequences):
 
 def test_objects_of_both_sessions_are_compared_in_both_directions():
     """Scaling and components are those of all references, also of objects without queries."""
-    monday, tuesday = grasps({"a": 1, "b": 2, "c": 1}, "monday"), grasps({"b": 1, "a": 1, "d": 1}, "tuesday")
-    mixed = [monday[0], *tuesday, *monday[1:]]  # as in a folder: one session follows the other in the order of capture
+    late, tuesday = grasps({"a": 1, "b": 2, "c": 1}, "late"), grasps({"b": 1, "a": 1, "d": 1}, "tuesday")
+    mixed = [late[0], *tuesday, *late[1:]]  # as in a folder: one session follows the other in the order of capture
     sequences = Sequences.of([*mixed, *grasps({"a": 1})], "across")
     assert described(sequences) == [("b-0 a-0", "a-0 b-0 b-1", 4), ("a-0 b-0 b-1", "b-0 a-0", 3)]
-    assert "tuesday against monday: 2 queries, 3 references of 2 objects" in sequences.rule
+    assert "tuesday against late: 2 queries, 3 references of 2 objects" in sequences.rule
     vectors = sequences.centred(np.arange(7, dtype=np.float64)[:, None])
     assert vectors.ravel().tolist() == [-1.5, -0.5, 0.5, 1.5, -1, 0, 1]
-    with pytest.raises(DatasetError, match=r"no two of monday, tuesday have them in common.*touch-to-touch-within"):
-        Sequences.of([*monday, *grasps({"b": 1, "d": 1}, "tuesday")], "across")
+    with pytest.raises(
+        DatasetError, match=r"no two of late, tuesday have such objects in common.*touch-to-touch-within"
+    ):
+        Sequences.of([*late, *grasps({"b": 1, "d": 1}, "tuesday")], "across")
 
 
 def test_within_a_session_the_gallery_is_the_rest_of_the_session_and_else_the_rest_of_the_recording():
-    both = [*grasps({"a": 2, "b": 2}, "monday"), *grasps({"b": 2, "c": 2}, "tuesday")]
+    both = [*grasps({"a": 2, "b": 2}, "late"), *grasps({"b": 2, "c": 2}, "tuesday")]
     within = Sequences.of(both, "within").rounds
     assert [(one.is_leave_one_out, one.queries.tolist()) for one in within] == [
         (True, [0, 1, 2, 3]),
