@@ -48,7 +48,7 @@ def train(
         int | None, typer.Option(parser=WORKERS, help="with --cluster: number of ranks (default: 2)")
     ] = None,
 ) -> None:
-    """Train a matcher, also on touches only, or a grasp-success gate for `collect`."""
+    """Train a matcher, or a grasp-success gate for `collect`."""
     from retrieval.model.checkpoint import require_writable
 
     if (cluster and task != "match") or (workers is not None and not cluster):
