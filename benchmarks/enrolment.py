@@ -1,7 +1,7 @@
 """Objects that were enrolled by touch: accuracy and "none of these" with photos, reference grasps and openings.
 
     python -m benchmarks.enrolment sessions FOLDER
-        three rigs with one pair of gels each and 150 objects. 100 objects are enrolled by one to three grasps of one
+        two rigs with one pair of gels each and 150 objects. 100 objects are enrolled by one to three grasps of one
         session. Queries are single grasps of the next session: of these objects, and of the 50 others
     python -m benchmarks.enrolment grasp FOLDER
         250 objects, 100 pairs of gels, four grasps of each object: one is enrolled with its photo, in turn, and the
@@ -42,7 +42,7 @@ from retrieval.model.touch_reader import Stopwatch, TouchReader
 from retrieval.model.touches import parse_grasps
 from retrieval.search.opening import find_model
 
-SEEDS, ENROLLED, OTHERS, REFERENCES = (531_000, 532_000, 533_000), 100, 50, 3
+SEEDS, ENROLLED, OTHERS, REFERENCES = (531_000, 532_000), 100, 50, 3
 """Rigs of the part `sessions`; enrolled and other objects of each; grasps of each object in a session."""
 SEED, OBJECTS, QUERIES, GELS = 540_000, 250, 3, 100
 """Rig of the part `grasp`; its objects, query grasps of each, and pairs of gels."""
