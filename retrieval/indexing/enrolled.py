@@ -10,6 +10,7 @@ has one table for all shards.
 """
 
 import hashlib
+import os
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -165,12 +166,13 @@ class EnrolledTable:
     def _delete_unused(self) -> None:
         """Delete pictures that no touch names, empty folders, and the unfinished tables of killed writers."""
         named = {path.casefold() for touch in self.read() for path in (*touch.pictures, *touch.background)}
-        for path in [*self.path.parent.glob("*/*"), *self.path.parent.glob(".touches.json.*.tmp")]:
-            is_named = path.relative_to(self.index).as_posix().casefold() in named  # some disks ignore case
-            if not is_named and (_PICTURE.fullmatch(path.name) or path.name.endswith(".tmp")):
-                path.unlink()
-                with suppress(OSError):  # it has other files
-                    path.parent.rmdir()
+        for folder, _, names in os.walk(self.path.parent):  # much faster than `Path.glob`
+            for name in names:
+                is_named = f"{ENROLLED}/{os.path.basename(folder)}/{name}".casefold() in named  # some disks ignore case
+                if not is_named and (_PICTURE.fullmatch(name) or name.startswith(f".{self.path.name}.")):
+                    os.unlink(os.path.join(folder, name))
+                    with suppress(OSError):  # it has other files
+                        os.rmdir(folder)
 
     def replace_codes(self, codes: Mapping[str, bytes], key: str, keep: Collection[str] | None = None) -> None:
         """Add codes of a model by the path of each touch; with `keep`, delete those under all other keys."""

@@ -46,6 +46,12 @@ class Enrolment(NamedTuple):
         object_id: The object, as the index names it.
         touches: Number of its enrolled touches.
         added: Number of those that were enrolled now.
+
+    >>> with retrieval.open("index") as searcher:
+    ...     searcher.enrol("ladle", ["a.png", "b.png"]).added
+    1
+    >>> retrieval.remove_enrolled("index", "ladle")
+    ('ladle', 1)
     """
 
     object_id: str
