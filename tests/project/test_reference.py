@@ -1,5 +1,6 @@
 """Public names: imports are fast, examples run, and the reference page is up to date."""
 
+import dataclasses
 import doctest
 import inspect
 import shutil
@@ -13,9 +14,10 @@ import robot
 from benchmarks import reference
 from benchmarks.reference import PACKAGES, PAGE
 from retrieval.indexing.build import build_index
-from retrieval.model.checkpoint import load_checkpoint
+from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
 from tests import synthetic
 from tests.project.test_imports import HEAVY, run_blocked
+from tests.reference_model import REFERENCE_CALIBRATION
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +38,8 @@ def folder(catalogue, touch, model, tmp_path_factory):
             images = {"photo": root / "catalog" / name / "1.jpg", "touch_a": root / "a.png", "touch_b": root / "b.png"}
             writer.append(f"{number:06d}", name, images)
     synthetic.write_recording(root / "lab", synthetic.make_objects(12), 2, before=False)
-    shutil.copy(model, root / "model.safetensors")
+    calibrated = dataclasses.replace(load_checkpoint(model), references=REFERENCE_CALIBRATION)
+    store_checkpoint(calibrated, root / "model.safetensors")
     build_index(root / "catalog", load_checkpoint(root / "model.safetensors"), root / "index", quiet=True)
     return root
 
