@@ -23,10 +23,10 @@ def train(
     recording: Recording,
     *,
     task: Annotated[
-        Literal["match", "grasp-success"],
+        Literal["match", "touches", "grasp-success"],
         typer.Option(
-            help="match: classify whether a touch and a photo show the same object; grasp-success: classify whether a "
-            "grasp succeeded"
+            help="match: classify whether a touch and a photo show the same object; touches: find an object by other "
+            "touches of it, as with a recording without photos; grasp-success: classify whether a grasp succeeded"
         ),
     ] = "match",
     out: CheckpointOut,
@@ -76,8 +76,8 @@ def train(
         return
     from retrieval.data.dataset import load_grasps
 
-    if not any(grasp.photos for grasp in load_grasps(recording)):
-        reason = "does not apply to a recording of touches only"
+    if task == "touches" or not any(grasp.photos for grasp in load_grasps(recording)):
+        reason = "does not apply to a fit to touches only"
         refuse_options(reason, config=config, iterations=iterations, cluster=cluster)
         from retrieval.report.adaptation import print_touch_model
         from retrieval.training.touches import train_on_touches

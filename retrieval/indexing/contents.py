@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from numpy.typing import NDArray
@@ -84,13 +84,12 @@ def read_contents(catalogue: Catalogue, checkpoint: Checkpoint, cache: Cache, qu
 
     Raises:
         NoReadablePhoto: No photo can be read.
-        BadInput: The catalogue has touches or photos, and the model cannot compare them.
+        BadInput: The catalogue has touches, and the model cannot compare them.
     """
-    if catalogue.photos and checkpoint.config.matcher.photo_tower == NO_TOWER:
-        raise BadInput(
-            f"this model is fitted to touches only and compares no photos; the catalogue has {len(catalogue.photos)}"
-            f", such as {catalogue.photos[0].path}; take the photos out, or train on a recording with photos"
-        )
+    if checkpoint.config.matcher.photo_tower == NO_TOWER:
+        reason = "the model was fitted to touches only and compares no photos"
+        unused = [SkippedPhoto(photo.path, reason) for photo in catalogue.photos]
+        catalogue = replace(catalogue, photos=(), skipped=(*catalogue.skipped, *unused))
     files = CatalogueFiles(catalogue, cache)
     references = _find_references(catalogue, checkpoint, files, cache, quiet)
     photos = sorted([*catalogue.photos, *references.pictures], key=lambda photo: photo.path)
