@@ -243,7 +243,7 @@ def recorded_features(
 class Features:
     """Tower features of G grasps: of touches (G, fingers, F_touch), and of the photos taken before (G, F_photo).
 
-    F_photo is 0 if no grasp has a photo.
+    F_photo is 0 in a recording of touches only.
 
     Raises:
         NumericalError: A feature is not finite.
@@ -386,7 +386,7 @@ def encode_recording(
         touch_variant: "touch" for gel images, "low_pass" for low-pass ones (8 x 6), "no_contact" for the no-contact
             frames, which every grasp must then have.
         photo_variant: "photo" for whole photos; "margin" for their margin, which rarely shows the object, only with
-            whole touches.
+            whole touches; "none" for a recording of touches only.
         photo_features_from: Features of at least these grasps; their photo features are used without encoding.
         quiet: No progress on stderr.
 
@@ -397,14 +397,14 @@ def encode_recording(
     if touch_variant == "no_contact":
         touched = [dataclasses.replace(grasp, touches=grasp.backgrounds) for grasp in grasps]
     if kind := {"low_pass": _LowPassPreprocessing, "margin": _MarginPreprocessing}.get(
-        touch_variant if photo_variant == "photo" else photo_variant
+        photo_variant if photo_variant == "margin" else touch_variant
     ):
         preprocessing = kind(**preprocessing.to_dict())
     matcher = deepcopy(matcher).to(default_device()).eval()
     images, digest = BatchImages(preprocessing), preprocessing.digest()
     made_by = touch_variant, _tower_digest(matcher.touch_tower), digest
     touch = _encoded_once(cache, made_by, touched, images.touch, partial(touch_features, matcher), images.files, quiet)
-    if not any(grasp.photos for grasp in grasps):
+    if photo_variant == "none":
         photo = np.zeros((len(grasps), 0), np.float32)
     elif photo_features_from is None:
         files = {path: row for row, path in enumerate(dict.fromkeys(grasp.photo for grasp in grasps))}

@@ -286,7 +286,9 @@ def train_on_touches(
     parts = divide(grasps)
     measures, encoded = dict[str, Measure](), dict[str, Touches]()
     for variant, suffix in (("touch", ""), ("low_pass", "_low_pass")):
-        features = encode_recording(grasps, matcher, config, None, touch_variant=variant, quiet=quiet)
+        features = encode_recording(
+            grasps, matcher, config, None, touch_variant=variant, photo_variant="none", quiet=quiet
+        )
         features = dataclasses.replace(features, photo=features.touch_rows)
         encoded[variant] = touches = Touches(features, features.owner, parts.group, parts.turn)
         with one_thread():
