@@ -340,7 +340,7 @@ def _draw_backdrop(backdrop: GaussianBackdrop, gain: float, rng: np.random.Gener
 # Measured on no-contact frames of real sensors, as logarithms of the mean colours of two sessions: EstimateModulus
 # (GelSight Wedge, three days) and PhysiCLeAR (GelSight Mini, two sittings). The change that all channels share has an
 # rms of 0.07 over the four pairs of sessions, that of a channel against the others 0.085, that of an 8 x 6 thumbnail
-# less its mean 2 to 15 grey levels. Within a session the mean colour spreads by 0.01 to 0.02, slowly in PhysiCLeAR.
+# less its mean 1 to 15 grey levels. Within a session the mean colour spreads by 0.01 to 0.02, slowly in PhysiCLeAR.
 _LAMPS, _WHITE_BALANCE, _EXPOSURE = 0.05, 0.05, 0.03
 _WAVE, _PERIODS_H = 0.01, (0.5, 2.0, 8.0)
 
@@ -357,7 +357,10 @@ def drift(sensor: GelSensor, seed: tuple[int, ...], hours: float) -> GelSensor:
     sizes, starts = _WAVE * rng.standard_normal((3, len(_PERIODS_H))), rng.uniform(size=(3, len(_PERIODS_H)))
     slow = np.exp((sizes * np.sin(2 * math.pi * (starts + hours / np.array(_PERIODS_H)))).sum(axis=1))
     begun = _begin_session(sensor, seed)
-    return replace(begun, tint=tuple((begun.tint * slow).tolist()))
+    tint, own = begun.tint * slow, np.array(sensor.tint)
+    if isinstance(sensor.optics, LedOptics) and len(set(sensor.optics.backdrops)) == 1:  # a grey camera: one gain
+        tint = own * (tint / own)[0]
+    return replace(begun, tint=tuple(tint.tolist()))
 
 
 @lru_cache(maxsize=64)
