@@ -1,7 +1,7 @@
 """The result of a query: a verdict and a ranking of objects with probabilities, with the index and the timing."""
 
 import math
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -138,7 +138,7 @@ class QueryResult:
         more_grasps: If the verdict is "none of these" and the ranking is clear (`CLEAR_PROBABILITY`): number of further
             grasps like these after which "match" is expected (`Posterior.more_grasps`). None otherwise, and if too many
             are needed.
-        opening_mm: Opening of the jaws in each grasp, None where none was measured.
+        opening_mm: Opening of the jaws in each grasp, None where none was measured; None if there is no opening at all.
 
     >>> with retrieval.open("index") as searcher:
     ...     answer = searcher.query(["a.png", "b.png"])
@@ -157,7 +157,7 @@ class QueryResult:
     posterior: dict[str, Any] | None
     results: list[Match]
     more_grasps: int | None = None
-    opening_mm: list[float | None] = field(default_factory=list)
+    opening_mm: list[float | None] | None = None
 
     @property
     def top(self) -> Match | None:
@@ -196,14 +196,14 @@ class QueryResult:
             matches = [_match(match, *folders) for match in document["results"]]
             query = {name: document["query"][name] for name in ("touches", "grasps")}
             names = ("index", "timing_ms", "verdict", "none_probability", "posterior", "more_grasps")
-            openings = document["query"].get("opening_mm", [None] * len(query["touches"]))
-            return cls(**query, results=matches, **{name: document[name] for name in names}, opening_mm=openings)
+            query["opening_mm"] = document["query"].get("opening_mm")
+            return cls(**query, results=matches, **{name: document[name] for name in names})
         except (KeyError, TypeError) as error:
             raise BadInput(f"this is not a document of `retrieve query --json`: {error!r}") from error
 
     def to_dict(self) -> dict[str, Any]:
         """Return the document of `retrieve query --json`."""
-        openings = {"opening_mm": self.opening_mm} if any(one is not None for one in self.opening_mm) else {}
+        openings = {} if self.opening_mm is None else {"opening_mm": self.opening_mm}
         return {
             "query": {"touches": self.touches, "grasps": self.grasps, **openings},
             "index": self.index,

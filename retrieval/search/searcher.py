@@ -475,7 +475,9 @@ class Searcher:
                 for place, one in enumerate(found.best if found else ())
             ],
             more_grasps=more_grasps,
-            opening_mm=[None if np.isnan(one) else one for one in openings_mm.tolist()],
+            opening_mm=[None if np.isnan(one) else one for one in openings_mm.tolist()]
+            if np.isfinite(openings_mm).any()
+            else None,
         )
 
 

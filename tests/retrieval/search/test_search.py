@@ -417,7 +417,7 @@ def test_equal_photos_give_the_same_logit_for_any_number_of_them(photos):
     """Their mean equals each of them; rounding in the last bit would put the later of two names first."""
     count = photos + 1
     rows = SimpleNamespace(
-        objects=np.arange(count) // photos, object_count=2, originals=np.arange(count), find_object=None
+        objects=np.arange(count) // photos, object_count=2, originals=np.arange(count), find_object=int
     )
     header = SimpleNamespace(posterior=Posterior(slope=0.9), references=None, opening=None)
     objects = Objects(SimpleNamespace(rows=rows, documents={}), header, slice(0, 4))
