@@ -95,6 +95,9 @@ def _touch_partials(matcher: Matcher, images: list[Any], bfloat16: bool = False)
 
 # Partial activations --------------------------------------------------------------------------------------
 
+STORED = np.float16
+"""Format of partial activations in an index."""
+
 
 def partials(sample: Sample) -> ApproximationResult:
     """Measure formats of stored partial activations: logit errors against float32, and the time of 1,000 photos."""
@@ -103,35 +106,15 @@ def partials(sample: Sample) -> ApproximationResult:
     exact = _logits(sample, queries, whole)
     many = np.tile(whole, (1 + 1000 // len(whole), 1))[:1000]
     points, works = list[Tradeoff](), list[Callable[[], object]]()
-    for name, store, read, is_default in FORMATS:
-        setting = f"{sum(part.nbytes for part in store(many)) // len(many)} bytes a photo"
-        error = float(np.abs(_logits(sample, queries, read(store(whole))) - exact).max())
-        points.append(Tradeoff(name, setting, error, is_default=is_default))
-        works.append(partial(lambda read, stored: sample.logits(queries[0], read(stored)), read, store(many)))
+    for kind in (np.float32, np.float16):
+        stored = many.astype(kind)
+        error = float(np.abs(_logits(sample, queries, whole.astype(kind)) - exact).max())
+        setting = f"{stored[0].nbytes} bytes a photo"
+        points.append(Tradeoff(kind.__name__, setting, error, is_default=kind is STORED))
+        works.append(partial(sample.logits, queries[0], stored))
     return ApproximationResult(
         "Number format of stored partial activations",
-        f"{len(queries)} touches, each with {len(whole)} photos. Arithmetic is in float32 for every format, so a "
-        "smaller one saves memory but no time. An index stores float16: half the bytes, and no answer changes.",
+        f"{len(queries)} touches, each with {len(whole)} photos. Arithmetic is in float32 for both formats. An index "
+        "stores float16: half the bytes, and no answer changes.",
         (_panel(sample, points, works, "partial activations in float32", "scoring 1,000 photos, one thread"),),
     )
-
-
-StoredArrays = tuple[NDArray[Any], ...]
-
-
-def _as_float(kind: type[np.floating[Any]]) -> Callable[[Array], StoredArrays]:
-    return lambda whole: (whole.astype(kind),)
-
-
-def _as_int8(whole: Array) -> StoredArrays:
-    """Return integers in -127..127 and a scale for each photo."""
-    scale = np.abs(whole).max(1, keepdims=True) / 127
-    return np.rint(whole / np.where(scale > 0, scale, 1)).astype(np.int8), scale.astype(np.float32)
-
-
-FORMATS: tuple[tuple[str, Callable[[Array], StoredArrays], Callable[[StoredArrays], NDArray[Any]], bool], ...] = (
-    ("float32", _as_float(np.float32), lambda stored: stored[0], False),
-    ("float16", _as_float(np.float16), lambda stored: stored[0], True),
-    ("int8, a scale for each photo", _as_int8, lambda stored: stored[0] * stored[1], False),
-)
-"""(name, function that stores partial activations, function that reads them, whether an index uses it)."""

@@ -90,7 +90,7 @@ def test_a_silent_realsense_is_an_error_and_can_be_started_again(install):
         rs.silent = False
         eye.recover()
         eye.read()
-    assert rs.stopped == 3
+    assert rs.stopped == 2
 
 
 # Missing packages -------------------------------------------------------------------------------------------
