@@ -47,6 +47,8 @@ WEIGHT_BOUNDS = (0.01, 1000.0)
 """Search range of the weight of C next to photos."""
 MIN_OPENING_WIDTH = 0.005
 """Smallest width and spread of log openings: grippers state 0.1 mm. Without it, equal openings have no likely width."""
+MIN_OPENING_OBJECTS = 10
+"""Smallest number of objects whose openings are fitted: three give a width and a floor at their bounds."""
 SEQUENCES = 8
 """Sequences of grasps of each validation object, for verification."""
 MAX_CALIBRATION_GRASPS = 400
@@ -341,7 +343,8 @@ def _reference_sets(owner: Numbers, max_references: int, group: Numbers | None =
 def fit_opening(grasps: Sequence[Grasp]) -> OpeningCalibration | None:
     """Fit the evidence of openings to grasps in the order of capture, with references as in `fit_references`.
 
-    The objects may be those that a model was fitted to. None for fewer than three objects with two openings.
+    The objects may be those that a model was fitted to. None for fewer than `MIN_OPENING_OBJECTS` objects with two
+    openings, or if all openings are equal, as commanded ones are.
     """
     from scipy.optimize import minimize  # slow to import; queries do not need it
 
@@ -351,11 +354,13 @@ def fit_opening(grasps: Sequence[Grasp]) -> OpeningCalibration | None:
     names, openings = zip(*measured, strict=True)
     owner, logs = np.unique(names, return_inverse=True)[1], np.log(openings)
     sets = [(logs[shown], logs[rows]) for count in (MAX_REFERENCES, 1) for shown, rows in _reference_sets(owner, count)]
-    if len(sets) < 2 * MIN_OBJECTS:
+    if len(sets) < 2 * MIN_OPENING_OBJECTS:
         return None
     weights = 1 / np.bincount(owner)[owner]
     mean = float(np.average(logs, weights=weights))
-    spread = max(MIN_OPENING_WIDTH, math.sqrt(np.average((logs - mean) ** 2, weights=weights)))
+    spread = math.sqrt(np.average((logs - mean) ** 2, weights=weights))
+    if spread < MIN_OPENING_WIDTH:
+        return None
     queries = np.concatenate([rows for _, rows in sets])[:, None]
     padded = [np.append(shown, np.full(MAX_REFERENCES - len(shown), np.nan)) for shown, _ in sets]
     references = np.repeat(padded, [len(rows) for _, rows in sets], axis=0)
@@ -369,7 +374,7 @@ def fit_opening(grasps: Sequence[Grasp]) -> OpeningCalibration | None:
         terms = np.where(is_reference, calibration(parameters).log_density(queries, references), -np.inf)
         return -float((np.logaddexp.reduce(terms, axis=1) - np.log(is_reference.sum(1))).mean())
 
-    bounds = [(0.01, 0.99), (math.log(MIN_OPENING_WIDTH), 0.0)]
+    bounds = [(0.05, 0.99), (math.log(MIN_OPENING_WIDTH), 0.0)]
     return calibration(minimize(loss, np.array([0.2, -3.0]), method="Nelder-Mead", bounds=bounds).x)
 
 

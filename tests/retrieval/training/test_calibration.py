@@ -150,17 +150,16 @@ def test_the_fit_of_openings_finds_their_width_and_the_part_that_says_nothing():
     found, plain = fit_opening(opened_grasps(300)), fit_opening(opened_grasps(300, outliers=0))
     for each in (found, plain):  # reference and query both differ from the object's own opening
         assert (each.mean, each.spread, each.width) == pytest.approx((3.4, 0.7, 0.02), rel=0.3)
-    assert plain.floor < 0.05 < 0.2 < found.floor < 0.4
+    assert plain.floor < 0.06 < 0.2 < found.floor < 0.4
     assert (found.objects, found.touches) == (300, 600)
 
 
 def test_openings_without_a_fit_or_a_difference_are_no_evidence():
     grasps = opened_grasps()
-    assert fit_opening(grasps[:8]) is None  # two objects
+    assert fit_opening(grasps[:36]) is None  # nine objects
     assert fit_opening([dataclasses.replace(grasp, opening_mm=None) for grasp in grasps]) is None
     assert fit_opening([dataclasses.replace(grasp, opening_mm=0.03) for grasp in grasps]) is None  # metres
-    equal = fit_opening([dataclasses.replace(grasp, opening_mm=110.0) for grasp in grasps])
-    assert equal.log_ratios([110.0], [110.0], np.array([0])) == pytest.approx(0, abs=0.5)
+    assert fit_opening([dataclasses.replace(grasp, opening_mm=110.0) for grasp in grasps]) is None
 
 
 # Verification ------------------------------------------------------------------------------------------------
