@@ -206,14 +206,18 @@ def _each(view: ProtocolView, show_row: Callable[[ProtocolView, str, Details], I
 
 
 def _objects(view: ProtocolView, name: str, details: Details) -> Iterator[Block]:
-    if details.per_object.get("all_candidates"):
-        label, words = view.label(name), "red: test, grey: validation, blue: training"
-        yield Picture(
-            view.figure_name(f"objects-{name}"),
-            f"Bars: accuracy of each object, {label}.",
-            f"Top-1 accuracy among five of all objects, for each object, {label}; {words}.",
-            partial(plots.objects, view, name),
-        )
+    label = view.label(name)
+    for key, measure, words in (
+        ("test", "topn_k5", "(a) candidates: test objects only"),
+        ("all", "topn_k5_all_objects", "(b) candidates: all objects (red: test, grey: validation, blue: training)"),
+    ):
+        if details.per_object.get(f"{key}_candidates"):
+            yield Picture(
+                view.figure_name(f"objects-{key}-{name}"),
+                f"Bars: accuracy of each object, {label}, {words}.",
+                f"Top-1 accuracy among five objects for each object, {label}; {words}.",
+                partial(plots.objects, view, name, f"{key}_candidates", measure),
+            )
 
 
 # Decisions -----------------------------------------------------------------------------------------
@@ -234,7 +238,13 @@ def _reliability(view: ProtocolView, name: str, details: Details) -> Iterator[Bl
 def _reject(view: ProtocolView) -> Blocks:
     found = {name: details.reject for name, details in view.details.items() if details.reject}
     if found:
-        yield Text("Each query is used twice: with its object in the gallery, and without it.")
+        yield Picture(
+            view.figure_name("reject"),
+            "ROC curves; the table below has the areas under them.",
+            "Each query is used twice: with its object in the gallery, and without it. ROC curve of the decision that "
+            "the gallery contains the object; the grey line marks 95 % true accepts.",
+            lambda: plots.reject(view),
+        )
         yield tables.rejects(view, found)
     elif view.details:
         yield Text(TOO_FEW)

@@ -97,16 +97,16 @@ def grasps(view: ProtocolView) -> Figure:
     return figure
 
 
-def objects(view: ProtocolView, row: str) -> Figure:
-    """Plot the top-1 accuracy of five for each object, coloured by part, and chance."""
-    accuracies, split = view.details[row].per_object["all_candidates"], view.result.folds[0][0]
+def objects(view: ProtocolView, row: str, candidates: str, measure: str) -> Figure:
+    """Plot the top-1 accuracy of five for each object, coloured by part, and the chance of `measure`."""
+    accuracies, split = view.details[row].per_object[candidates], view.result.folds[0][0]
     ranked = sorted(accuracies, key=lambda name: (-accuracies[name], name))
     bars = [(name, colour) for part, colour in PART_COLOURS.items() for name in ranked if name in split[part]]
     figure = canvas(13, 3.8)
     panel = figure.subplots()
     heights, colours = [100 * accuracies[name] for name, _ in bars], [colour for _, colour in bars]
     panel.bar(range(len(bars)), heights, 0.78, color=colours)
-    if summary := view.summary(row, "topn_k5_all_objects"):
+    if summary := view.summary(row, measure):
         panel.axhline(100 * summary.chance[0], color="#333333", ls="--", lw=1.2)
         panel.text(len(bars) - 0.4, 100 * summary.chance[0], " chance", va="center", fontsize=8)
     if len(bars) <= _LABELLED_OBJECTS:
@@ -145,6 +145,25 @@ def reliability(view: ProtocolView, row: str) -> Figure:
         panel.set_title(f"{RELIABILITIES[kind]}\nECE {percent(diagrams[kind]['ece'])} %", fontsize=9)
         panel.set(xlim=(-2, 102), xlabel="stated probability, %")
     percent_axis(panels[0], "right answers, %")
+    return figure
+
+
+def reject(view: ProtocolView) -> Figure:
+    """Plot the ROC curve of "the catalogue contains the object"."""
+    figure = canvas(6.5, 4.4)
+    panel = figure.subplots()
+    rejections = {name: details.reject for name, details in view.details.items() if details.reject}
+    for name, rejection in reversed(rejections.items()):
+        points, style = 100 * np.array(rejection.roc), style_of(name)
+        panel.plot(*points.T, color=style.colour, ls=style.line)
+        step = max(1, len(points) // 6)  # a curve of many corners, with a few markers
+        panel.plot(*points[step:-1:step].T, style.marker, color=style.colour, ms=5)
+    panel.plot([0, 100], [0, 100], color=MUTED_COLOUR, ls="--", lw=1.2)
+    panel.axhline(95, color=MUTED_COLOUR, lw=0.8)
+    panel.set(xlabel="accepted, object absent (false accepts), %", ylabel="accepted, object present, %")
+    panel.set(xlim=(-1, 101), ylim=(-1, 101))
+    panel.set_aspect("equal", adjustable="box")
+    _legend(figure, view, rejections)
     return figure
 
 

@@ -57,9 +57,9 @@ def test_returned_files_exist_and_every_figure_opens(report):
     files, out = report
     assert files[:2] == [out / "report.md", out / "report.html"]
     assert set(files[2:]) == set((out / "figures").iterdir())
-    expected = {f"{name}.png" for name in ("overview", "guess-curves", "grasps", "time")}
+    expected = {f"{name}.png" for name in ("overview", "guess-curves", "grasps", "time", "reject")}
     for method in ("late_fusion", "cca", "brand-new_method"):
-        expected |= {f"objects-{method}.png", f"reliability-{method}.png"}
+        expected |= {f"objects-test-{method}.png", f"objects-all-{method}.png", f"reliability-{method}.png"}
     assert {path.name for path in files[2:]} == expected
     for path in files[2:]:
         with Image.open(path) as image:
@@ -161,7 +161,7 @@ def test_what_was_not_measured_is_left_out_or_explained(remake):
 
     _, text, figures = remake(without_posterior)
     assert "at least three validation objects" in text
-    assert not [name for name in figures if name.startswith("reliability")]
+    assert not [name for name in figures if name.startswith(("reject", "reliability"))]
     _, text, figures = remake(nearly_empty)
     assert figures == ["overview.png"]
     assert re.findall("^## (.*)$", text, re.M) == ["Comparison of methods", "Recording", "Settings"]
