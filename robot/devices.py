@@ -146,7 +146,7 @@ class Actuator(Device):
 
     Attributes:
         max_speed_mm_s: Upper limit of the commanded speed.
-        may_move: Whether connecting may move it (homing).
+        may_move: Whether connecting may move it (homing) or enable its motors.
     """
 
     may_move: bool = True

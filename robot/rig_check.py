@@ -1,8 +1,8 @@
 """`retrieve rig check`: connect one device of a rig after another, move it a little, and report measurements.
 
 All devices are checked, also after one has failed. Nothing is grasped. The jaws move by `JAW_MM`, the arm moves up by
-`ARM_MM` (down, at the top of the workspace), and both return. A gripper that has lost its
-reference may be homed: its jaws then move over the whole stroke. With motion=False, nothing moves.
+`ARM_MM` (down, at the top of the workspace), and both return. Connecting may enable the motors of an arm. A gripper
+that has lost its reference may be homed: its jaws then move over the whole stroke. With motion=False, nothing moves.
 """
 
 import contextlib

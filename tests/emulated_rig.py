@@ -110,7 +110,7 @@ class EmulatedRig(Rig):
 
     def __init__(self, url, shared, paths):
         self.shared = shared
-        quick = {"timeout_s": 0.25, "acknowledge_faults": True, "max_speed_mm_s": 400.0}
+        quick = {"timeout_s": 0.25, "reconnect_s": 0.02, "acknowledge_faults": True, "max_speed_mm_s": 400.0}
         gel = {"warmup_s": 0.0, "timeout_s": 1.0, "frozen_s": 0.2}
         super().__init__(
             EmulatedArm(shared),

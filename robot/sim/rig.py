@@ -36,8 +36,6 @@ FORCE_N = (5.0, 80.0)
 _MESH_UNITS = UNITS | {"pose": f"{UNITS['pose']}; then its tilt in radian, where it does not point straight down"}
 _ATTEMPT_S = 40.0
 _WORKSPACE = Region((-150.0, -150.0, 0.5 * PAD_MM[0]), (150.0, 150.0, 500.0))
-_LOCALISATION_MM = (5.0, 10.0)
-"""Range from which the error of the camera's calibration is drawn."""
 _TABLE_MM = 15.0
 """Largest distance of objects from the centre of the workspace, in x and in y."""
 
@@ -87,9 +85,11 @@ class SimSettings(TypedSettings):
         families: shape families to draw from; all if empty.
         meshes: folder of STL, OBJ or PLY files to use instead of procedural objects (needs the extra `mesh`).
         contact_grid: rows and columns of the contact solver.
+        contact_tolerance: tolerance of the contact solver.
         focal_px: focal length of the camera. Its pictures have 256 x 256 px. At the default of 860 px they show about
             190 mm; a larger object is cut off.
         session: name of the session, which draws the drift of light, white balance and gels; "" for no drift.
+        localisation_mm: range from which the error of the camera's calibration is drawn.
         grasp: the table [grasp], as for a real rig: random grasps (robot.grasping.settings.GraspSettings).
         attempt: the table [attempt]: speeds, waits, retries (robot.grasping.settings.AttemptSettings).
         planner: the table [planner]: the grasp planner (robot.rig; "mesh" by default for meshes).
@@ -105,8 +105,10 @@ class SimSettings(TypedSettings):
     families: tuple[str, ...] = ()
     meshes: str = ""
     contact_grid: tuple[int, int] = (120, 160)
+    contact_tolerance: Annotated[float, Meta(ge=1e-12, le=0.999)] = 1e-2
     focal_px: Annotated[float, Meta(ge=300, le=10_000)] = 860.0
     session: str = ""
+    localisation_mm: tuple[float, float] = (5.0, 10.0)
     grasp: Mapping[str, Any] = field(default_factory=dict)
     attempt: Mapping[str, Any] = field(default_factory=dict)
     planner: Mapping[str, Any] = field(default_factory=dict)
@@ -122,6 +124,10 @@ class SimSettings(TypedSettings):
         if not 3 <= rows <= columns <= 2000 or 4 * rows != 3 * columns:
             raise RobotConfigError(
                 f"contact_grid must have 3 to 2000 rows and columns in the ratio 3 to 4, got {rows}, {columns}"
+            )
+        if not 0 <= self.localisation_mm[0] <= self.localisation_mm[1]:
+            raise RobotConfigError(
+                f"localisation_mm must be two lengths, the smaller first, got {self.localisation_mm}"
             )
 
 
@@ -151,7 +157,9 @@ class SimRig(Rig):
             from robot.sim import meshes  # slow to import
 
             self.meshes = meshes.MeshFolder(options.meshes, seed, attempt.grasp)
-        self._hand = Hand(grid=options.contact_grid, turns_about_grip=self.meshes is not None)
+        self._hand = Hand(
+            grid=options.contact_grid, tolerance=options.contact_tolerance, turns_about_grip=self.meshes is not None
+        )
         drawn = np.random.default_rng([103, seed]).integers(2**31, size=options.gels)
         fingers, known = options.fingers, parse_gel_settings(options.gel, options.fingers)
         self._gels = [
@@ -160,7 +168,7 @@ class SimRig(Rig):
         ]
         self._camera = PinholeCamera(focal_px=options.focal_px)
         rng = np.random.default_rng([102, seed])
-        turn, size = rng.uniform(0.0, 2.0 * math.pi), rng.uniform(*_LOCALISATION_MM)
+        turn, size = rng.uniform(0.0, 2.0 * math.pi), rng.uniform(*options.localisation_mm)
         self.error_mm = np.array([size * math.cos(turn), size * math.sin(turn), 0.0])
         self.sim_state = SimState()
         super().__init__(

@@ -63,6 +63,7 @@ COLLISION = (f"{_LIMB}collision_detection_state", "intera_core_msgs/CollisionDet
 JOINT_COMMAND = (f"{_LIMB}joint_command", "intera_core_msgs/JointCommand")
 SPEED_RATIO = (f"{_LIMB}set_speed_ratio", "std_msgs/Float64")
 COMMAND_TIMEOUT = (f"{_LIMB}joint_command_timeout", "std_msgs/Float64")
+ENABLE = ("/robot/set_super_enable", "std_msgs/Bool")
 IK_SERVICE = "/ExternalTools/right/PositionKinematicsNode/IKService"
 
 _SEED_AUTO, _SEED_USER = 0, 1
@@ -72,6 +73,8 @@ _IK_FAILURES = {
     -3: "the robot has no such tip",
 }
 COLLIDED = "the robot reports a collision and the arm holds: find the contact and free the arm by hand first"
+_BUTTON = {0: "not pressed", 1: "pressed", 2: "in an unknown state", 3: "released, but the stop is still active"}
+_SOURCE = {0: "nobody", 1: "the red button", 2: "an unknown source", 3: "a motor controller", 4: "the robot's engine"}
 _MAX_LEAN_RAD = math.radians(10.0)
 
 _Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
@@ -129,19 +132,23 @@ class RobotState(msgspec.Struct, frozen=True):
     enabled: bool
     stopped: bool
     error: bool
+    estop_button: int
+    estop_source: int
 
     @property
     def blocking_reason(self) -> str | None:
         """Reason why the arm may not move, with the action for a person; None if it may move."""
         if self.stopped:
+            source = _SOURCE.get(self.estop_source, "an unknown source")
+            button = _BUTTON.get(self.estop_button, "in an unknown state")
             return (
-                "the robot is stopped: find the reason, clear the workspace, turn the red button to release it and "
-                "enable the robot by hand; this program never resets an emergency stop"
+                f"the robot is stopped by {source}, its button is {button}: find the reason, clear the workspace, turn "
+                "the button to release it and enable the robot by hand; this program never resets an emergency stop"
             )
         if self.error:
             return "the robot reports an error of one of its parts: read its screen, then reset and enable it by hand"
         if not self.enabled:
-            return "the robot is not enabled: clear the workspace and enable it by hand"
+            return "the robot is not enabled: clear the workspace and enable it by hand, or set enable = true"
         return None
 
 

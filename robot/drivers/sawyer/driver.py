@@ -9,7 +9,7 @@ detection), so the workspace must be free.
 At every step the joint state must be fresh (`max_state_age_s`), the robot enabled, no collision reported and the arm
 near its commands; else the arm holds its position. /robot/state and the collision state are slower: they may be 2 s
 old. If commands stop (the program or the network failed), the robot ends the motion after _COMMAND_TIMEOUT_S. This
-driver neither enables the motors nor resets an emergency stop.
+driver never resets an emergency stop.
 
 The link uses `websockets`, because roslibpy sends a message that was published during a connection loss seconds later,
 without an error, and drops rosbridge's errors. Here nothing is sent twice and nothing is queued: a lost connection
@@ -226,6 +226,8 @@ _TICK_S, _COMMAND_TIMEOUT_S = 0.01, 0.2
 """Time between two commands; time without commands after which the robot ends the motion."""
 _ARRIVAL_RAD, _SETTLE_S = 0.01, 5.0
 """Tolerance of every joint at the goal, and time to arrive after the last command."""
+_BACK_OFF_S, _LONGEST_BACK_OFF_S = 0.25, 5.0
+"""First and longest wait between two tries to connect; without the limit, doubling 20 times would take days."""
 _MARGIN_MM = 20.0
 """A motion may begin this far outside the workspace, after a stop or a push."""
 
@@ -242,6 +244,7 @@ class SawyerSettings(TypedSettings):
         base_yaw_deg: Yaw of the rig's frame in the robot's base frame.
         tool_mm: Distance from the origin of `tip` along its z axis to the point between the fingertips.
         tool_yaw_deg: Angle about z from the tip's x axis to the closing direction of finger a.
+        enable: Whether this driver may enable the motors (never during an emergency stop).
         max_state_age_s: An older joint state stops the arm; an older robot or collision state too, but only above 2 s.
     """
 
@@ -255,6 +258,8 @@ class SawyerSettings(TypedSettings):
     speed_ratio: Annotated[float, Meta(ge=0.01, le=1)] = 0.3
     joint_speed_rad_s: Annotated[float, Meta(ge=0.01, le=1.5)] = 0.5
     timeout_s: Annotated[float, Meta(ge=0.05, le=60)] = 2.0
+    reconnect_tries: Annotated[int, Meta(ge=1, le=20)] = 5
+    enable: bool = False
     max_speed_mm_s: float = 200.0
     max_state_age_s: Annotated[float, Meta(ge=0.02, le=5)] = 0.5
 
@@ -274,7 +279,7 @@ class Sawyer(Arm):
 
     def _connect(self) -> None:
         self._open_link()
-        self._check_free()
+        self._make_ready()
 
     def _open_link(self) -> None:
         """Open a new link and wait for each state once."""
@@ -303,6 +308,18 @@ class Sawyer(Arm):
         if abs(found - value) > 1e-6:
             self.refused[name] = f"requested {value:g}, has {found:g}"
 
+    def _make_ready(self) -> None:
+        """Enable the motors if allowed and sufficient; raise DeviceError if the arm may not move."""
+        state = self._robot_state()
+        if self._options.enable and self.may_move and not (state.enabled or state.stopped or state.error):
+            _LOG.warning("%s: enabling the motors", self.name)
+            self._link.advertise(*codec.ENABLE)
+            self._link.publish(codec.ENABLE[0], {"data": True})
+            deadline = self.clock() + self._options.timeout_s
+            while not self._robot_state().enabled and self.clock() < deadline:
+                time.sleep(_TICK_S)
+        self._check_free()
+
     def _close(self) -> None:
         """Close the link; the robot ends a motion of another thread after _COMMAND_TIMEOUT_S."""
         self._link.close()
@@ -320,19 +337,26 @@ class Sawyer(Arm):
         return codec.parse(arrivals[-1].message, codec.Float).data if arrivals else None
 
     def _recover(self) -> None:
-        """Connect again if the link or a state is lost; raise DeviceError if a person must act."""
-        try:
-            self._link.check()
-            self._fresh_joints()
-            self._robot_state()
-            self._collisions()
-        except DeviceError as error:
-            _LOG.warning("%s: %s; connecting again", self.name, error)
-            self._link.close()
-            self._open_link()
+        """Connect again with back-off if the link or a state is lost; raise DeviceError if a person must act."""
+        tries = self._options.reconnect_tries
+        for number in range(tries + 1):
+            try:
+                if number:
+                    self._open_link()
+                self._link.check()
+                self._fresh_joints()
+                self._robot_state()
+                self._collisions()
+                break
+            except DeviceError as error:
+                self._link.close()
+                if number == tries:
+                    raise
+                _LOG.warning("%s: %s; connecting again, try %d of %d", self.name, error, number + 1, tries)
+            time.sleep(min(_BACK_OFF_S * 2**number, _LONGEST_BACK_OFF_S) if number else 0.0)
         if self._has_collided_since(-math.inf, newest=True):
             raise DeviceError(f"{self.name}: recovery is refused: {codec.COLLIDED}")
-        self._check_free()
+        self._make_ready()
 
     def _pose(self) -> Pose:
         return self._pose_since(self.clock() - self._options.max_state_age_s)

@@ -286,8 +286,8 @@ _HOMING_S = 30.0
 _SLACK_S = 2.0
 """Extra time of a motion, for acceleration and the link."""
 _POLL_S = 0.01
-_RETRY_S = 0.2
-"""Wait between two tries to open a lost port."""
+_LONGEST_WAIT_S = 5.0
+"""Longest wait between two tries to connect; doubling 20 times would take days."""
 _ROUNDING = 1e-6
 """Accepted relative excess of the force limit, a rounding error of 32-bit numbers."""
 _ACTION = (
@@ -310,6 +310,8 @@ class WSG50Settings(TypedSettings):
         min_part_mm: A smaller opening means that the fingers touch each other and hold no part.
         opening_speed_mm_s: Speed of opening and pre-positioning.
         finger_share: Fraction of the gripper's force on each finger; see `to_finger_force`.
+        reconnect_tries: Number of tries to open a lost port again.
+        reconnect_s: First wait between two tries, which doubles up to 5 s.
         max_force_n: Upper limit of forces.
         max_speed_mm_s: Upper limit of speeds.
         max_state_age_s: The jaws are stopped if no state arrives for this long during a motion.
@@ -325,6 +327,8 @@ class WSG50Settings(TypedSettings):
     min_part_mm: Annotated[float, Meta(ge=0, le=1000)] = 1.0
     opening_speed_mm_s: Annotated[float, Meta(ge=1e-3, le=1e4)] = 80.0
     finger_share: Annotated[float, Meta(ge=0.1, le=1.0)] = 0.5
+    reconnect_tries: Annotated[int, Meta(ge=1, le=20)] = 5
+    reconnect_s: Annotated[float, Meta(ge=0, le=5)] = 0.2
     max_force_n: Annotated[float, Meta(ge=1e-3, le=1e4)] = 40.0
     max_speed_mm_s: Annotated[float, Meta(ge=1e-3, le=1e4)] = 420.0
     max_state_age_s: Annotated[float, Meta(ge=0.04, le=60)] = 0.5
@@ -412,18 +416,25 @@ class WSG50(Gripper):
         }
 
     def _recover(self) -> None:
-        """Open a lost link again, then restore reference and settings as on connecting."""
+        """Open a lost link again, with increasing waits, then restore reference and settings as on connecting."""
         with self._moving("cannot recover"):
-            try:
-                self._connect()
-            except (LinkLost, NoEcho) as error:
-                _log.warning("%s: no connection (%s); trying again", self.name, error)
-                self._link.close()
-                self._connect()
+            tries = self._options.reconnect_tries
+            for number in range(tries):
+                try:
+                    self._connect()
+                    return
+                except (LinkLost, NoEcho) as error:
+                    self._link.close()
+                    if number == tries - 1:
+                        raise DeviceError(f"{self.name} cannot be reached after {tries} tries: {error}") from error
+                    wait_s = min(self._options.reconnect_s * 2**number, _LONGEST_WAIT_S)
+                    _log.warning("%s: no connection (%s); trying again in %.2g s", self.name, error, wait_s)
+                time.sleep(wait_s)
 
     def _stop(self) -> None:
-        """Stop the jaws; after a motion, open a lost link again first."""
-        for tries_left in reversed(range(_TRIES if self._may_be_moving else 1)):
+        """Stop the jaws; after a motion, open a lost link again first. The waits do not grow: the jaws may move."""
+        tries = self._options.reconnect_tries if self._may_be_moving else 1
+        for tries_left in reversed(range(tries)):
             try:
                 self._link.open()
                 self._stop_over_link()
@@ -432,7 +443,7 @@ class WSG50(Gripper):
                 if not tries_left:
                     raise
             _log.warning("%s: lost the link during a possible motion: opening it again to stop the jaws", self.name)
-            time.sleep(_RETRY_S)
+            time.sleep(self._options.reconnect_s)
 
     def _state(self) -> GripperState:
         return self._as_state(self._read())
@@ -539,8 +550,11 @@ class WSG50(Gripper):
                 break
             self._check_updates(now)
             system, grasping = (link.updates[command][0] for command in _UPDATED)
-            reading = GripperReading(codec.system_state(system), codec.grasping_state(grasping))
-            if reading.is_moving or status is Status.CMD_PENDING:
+            try:
+                is_moving = GripperReading(codec.system_state(system), codec.grasping_state(grasping)).is_moving
+            except WireError:
+                is_moving = True  # unknown: read again
+            if is_moving or status is Status.CMD_PENDING:
                 still_since = now
             if now - still_since > link.timeout_s:
                 break
@@ -552,7 +566,11 @@ class WSG50(Gripper):
 
     def _check_updates(self, now: float) -> None:
         """Watchdog: send FAST STOP and raise DeviceError if updates are missing."""
-        limit_s, age = self._options.max_state_age_s, now - self._link.updates[CommandId.SYSTEM_STATE][1]
+        limit_s = self._options.max_state_age_s
+        if now - self._link.updates[CommandId.SYSTEM_STATE][1] <= limit_s:
+            return
+        self._link.pump(0.0)  # this program may have been suspended: process the updates that have arrived
+        age = time.monotonic() - self._link.updates[CommandId.SYSTEM_STATE][1]
         if age <= limit_s:
             return
         error = DeviceError(

@@ -25,6 +25,7 @@ class SawyerModel:
     def __init__(self):
         self.joints, self.velocity = np.array(READY), np.zeros(7)
         self.enabled, self.stopped, self.error, self.has_collided = True, False, False, False
+        self.estop_button = self.estop_source = 0
         self.speed_ratio, self.command_timeout_s = 0.3, 0.2
         self._target, self._command_age_s = None, 0.0
 

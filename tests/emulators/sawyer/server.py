@@ -60,11 +60,13 @@ class EmulatedSawyer:
     def press_estop(self):
         with self._lock:
             self.model.stopped, self.model.enabled = True, False
+            self.model.estop_button, self.model.estop_source = 1, 1
 
     def release_estop(self):
         """Release the button and reset the robot."""
         with self._lock:
             self.model.stopped, self.model.enabled = False, True
+            self.model.estop_button = self.model.estop_source = 0
 
     def drop_connections(self):
         """Cut all connections without a closing handshake."""
@@ -120,6 +122,8 @@ class EmulatedSawyer:
                 "enabled": model.enabled,
                 "stopped": model.stopped,
                 "error": model.error,
+                "estop_button": model.estop_button,
+                "estop_source": model.estop_source,
             },
             LIMB + "tip_states": {"names": [TIP], "states": [{"pose": pose}]},
             LIMB + "collision_detection_state": {"collision_state": model.has_collided},
@@ -155,6 +159,8 @@ class EmulatedSawyer:
             self.model.speed_ratio = min(1.0, max(0.0, float(message["data"])))
         elif topic == LIMB + "joint_command_timeout":
             self.model.command_timeout_s = float(message["data"])
+        elif topic == "/robot/set_super_enable":
+            self.model.enabled = bool(message["data"]) and not self.model.stopped
         self._latched[topic] = message
         self._publish_to_all(topic, message)
 

@@ -38,6 +38,7 @@ class EmulatedWSG50:
         ignores_stop: STOP is answered, but the jaws go on.
         silent: It receives commands and sends nothing.
         mute_updates: It sends no automatic updates.
+        unknown_states: Number of times that it reports an unknown grasping state during a motion.
         next_status: Status by id that answers the next command of this id instead of its execution.
         received: Ids of the commands.
         grasping: Grasping state of the protocol.
@@ -47,6 +48,7 @@ class EmulatedWSG50:
         self._lock = threading.RLock()
         self.object_mm, self.speed_up = object_mm, speed_up
         self.jammed = self.ignores_stop = self.silent = self.mute_updates = False
+        self.unknown_states = 0
         self.next_status, self.received, self.keeps_force_n, self.force_limit_n = {}, [], None, 40.0
         self.grasping, self._bits = IDLE, {REFERENCED_BIT} if referenced else set()
         self._opening_mm, self._target_mm, self._speed_mm_s, self._blocked = opening_mm, None, 0.0, 0
@@ -175,6 +177,9 @@ class EmulatedWSG50:
             bits = self._bits | ({MOVING_BIT} if self._target_mm is not None else set())
             return struct.pack("<I", sum(1 << bit for bit in bits))
         if command == 0x41:
+            if self.unknown_states and self._target_mm is not None:
+                self.unknown_states -= 1
+                return b"\x09"
             return bytes([self.grasping])
         force = self.force_limit_n if self.grasping == HOLDING else 0.0
         return struct.pack("<f", self._opening_mm if command == 0x43 else force)

@@ -138,13 +138,13 @@ def test_joints_are_read_by_name_and_other_joints_are_ignored():
 @pytest.mark.parametrize(
     ("fields", "text"),
     [
-        ({"stopped": True}, "turn the red button"),
+        ({"stopped": True, "estop_button": 3, "estop_source": 1}, "released, but the stop is still active"),
         ({"error": True}, "error of one of its parts"),
         ({"enabled": False}, "is not enabled"),
     ],
 )
 def test_the_blocking_reason_names_the_action_for_a_person(fields, text):
-    message = {"enabled": True, "stopped": False, "error": False}
+    message = {"enabled": True, "stopped": False, "error": False, "estop_button": 0, "estop_source": 0}
     assert messages.parse(message, messages.RobotState).blocking_reason is None
     assert text in messages.parse(message | fields, messages.RobotState).blocking_reason
 
@@ -195,7 +195,8 @@ def test_an_emergency_stop_ends_the_motion_and_the_driver_never_resets_it():
     with connected() as (emulator, arm):
         with while_it_moves(emulator, emulator.press_estop), pytest.raises(DeviceError) as caught:
             arm.move_to(FAR, 50.0)
-        assert "turn the red button" in str(caught.value)
+        assert "stopped by the red button" in str(caught.value)
+        assert "turn the button" in str(caught.value)
         for use in (arm.recover, lambda: arm.move_to(FAR, 50.0)):
             with pytest.raises(DeviceError, match="never resets an emergency stop"):
                 use()
@@ -275,15 +276,16 @@ def test_a_broken_connection_stops_the_arm_and_recovery_connects_again(caplog):
         assert offset(arm.move_to(target, 100.0), target)[0] < 1
 
 
-def test_a_robot_that_is_away_is_an_error_of_recovery(caplog):
+def test_the_tries_to_reconnect_are_limited(monkeypatch, caplog):
+    monkeypatch.setattr("robot.drivers.sawyer.driver._BACK_OFF_S", 0.001)
     with contextlib.ExitStack() as robot:
-        arm = arm_at(robot.enter_context(serve(EmulatedSawyer())), timeout_s=5.0)
+        arm = arm_at(robot.enter_context(serve(EmulatedSawyer())), reconnect_tries=3, timeout_s=5.0)
         arm.connect()
         robot.close()
         wait_until(lambda: arm._link._closed_reason)
         with caplog.at_level(logging.WARNING), pytest.raises(DeviceError, match="rosbridge must answer at"):
             arm.recover()
-        assert caplog.text.count("connecting again") == 1
+        assert caplog.text.count("try ") == 3
         with pytest.raises(DeviceError):
             arm.pose()
         arm.close()
@@ -343,7 +345,7 @@ def test_a_blocked_arm_ends_the_motion(monkeypatch):
         arm.move_to(Pose(0.0, 0.0, 45.0, 0.0), 200.0)
 
 
-def test_a_robot_that_may_not_move_is_not_connected():
+def test_motors_are_enabled_only_if_allowed_and_a_robot_that_may_not_move_is_not_connected(caplog):
     def emulated(prepare):
         emulator = EmulatedSawyer()
         prepare(emulator)
@@ -352,13 +354,16 @@ def test_a_robot_that_may_not_move_is_not_connected():
     def disable(emulator):
         emulator.model.enabled = False
 
-    for prepare in (EmulatedSawyer.press_estop, disable):
+    for prepare, enable in ((EmulatedSawyer.press_estop, True), (disable, False)):
         with serve(emulated(prepare)) as url:
-            arm = arm_at(url)
+            arm = arm_at(url, enable=enable)
             with pytest.raises(DeviceError, match="by hand"):
                 arm.connect()
             assert not arm.is_connected
             assert arm._link._closed_reason
+    with caplog.at_level(logging.WARNING), connected(emulated(disable), enable=True) as (emulator, _):
+        assert emulator.model.enabled
+        assert "enabling the motors" in caplog.text
 
 
 def test_a_silent_topic_and_an_unknown_tip_are_named():

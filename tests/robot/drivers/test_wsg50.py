@@ -7,6 +7,7 @@ import signal
 import socket
 import struct
 import threading
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -23,7 +24,7 @@ from tests.emulators.wsg50.server import serve_pty, serve_tcp
 from tests.waiting import wait_until
 
 SERVE = {"tcp": serve_tcp, "pty": serve_pty}
-QUICK = {"timeout_s": 0.3, "max_state_age_s": 0.5, "opening_speed_mm_s": 400.0}
+QUICK = {"timeout_s": 0.3, "reconnect_s": 0.01, "max_state_age_s": 0.5, "opening_speed_mm_s": 400.0}
 DISCONNECT, HOME, STOP, FAST_STOP, ACK, GRASP, RELEASE = 0x07, 0x20, 0x22, 0x23, 0x24, 0x25, 0x26
 PORTS = pytest.mark.parametrize("port", SERVE)
 
@@ -216,6 +217,15 @@ def test_missing_state_updates_stop_the_motion():
         assert not emulator.moves
 
 
+def test_an_unknown_state_during_a_motion_is_read_again_and_does_not_end_it():
+    emulator = slow(object_mm=60.0)
+    with gripper_with_emulator(emulator=emulator) as (gripper, _):
+        emulator.unknown_states = 1
+        assert gripper.grasp(10.0, 400.0).status == "holding"
+        assert emulator.unknown_states == 0
+        assert STOP not in emulator.received
+
+
 def test_a_fault_during_a_motion_is_named():
     emulator = slow()
     with gripper_with_emulator(emulator=emulator) as (gripper, _):
@@ -304,7 +314,7 @@ def test_closing_stops_moving_jaws_and_is_not_announced_while_they_may_move():
     ],
 )
 def test_no_call_waits_for_ever_for_a_silent_gripper(use):
-    with gripper_with_emulator(timeout_s=0.02) as (gripper, emulator):
+    with gripper_with_emulator(timeout_s=0.02, reconnect_tries=2) as (gripper, emulator):
         emulator.silent = True
         with pytest.raises(DeviceError):
             use(gripper)
@@ -318,6 +328,17 @@ def test_connecting_without_a_gripper_is_a_device_error_and_leaves_nothing_open(
         with pytest.raises(LinkLost, match="it is closed"):
             gripper._link.sync()
         assert set(emulator.received) <= {0x06}  # echoes and nothing else
+
+
+def test_recovery_raises_after_its_last_try_and_waits_seconds_at_most(monkeypatch):
+    """Without a limit, the last of twenty doubled waits would take more than a day."""
+    waits = []
+    monkeypatch.setattr(wsg50, "time", SimpleNamespace(sleep=waits.append, monotonic=time.monotonic))
+    gripper = WSG50(port="/nowhere/tty", reconnect_tries=20, reconnect_s=0.2)
+    gripper.is_connected = True  # as if the cable were unplugged
+    with pytest.raises(DeviceError, match="after 20 tries"):
+        gripper.recover()
+    assert (len(waits), waits[0], max(waits)) == (19, 0.2, 5.0)
 
 
 # Lost, doubled and damaged packets ---------------------------------------------------------------------------
@@ -343,7 +364,7 @@ def test_jaws_that_could_not_be_stopped_are_stopped_on_closing_or_closing_raises
     def no_cable():
         raise LinkLost("no cable")
 
-    with gripper_with_emulator("pty", faults=script, emulator=emulator) as (gripper, _):
+    with gripper_with_emulator("pty", faults=script, emulator=emulator, reconnect_tries=2) as (gripper, _):
         for is_plugged_in in (True, False):
             script.tell({(GRASP, 2): "disconnect"})
             with monkeypatch.context() as cable:
