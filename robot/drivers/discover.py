@@ -3,12 +3,16 @@
 Cameras: /dev/v4l/by-id contains a link for each, named by maker, model and serial number, independent of the socket;
 by-path names the socket, for cameras without a name of their own. "-video-index0" gives the pictures, higher numbers
 only metadata. /sys/class/video4linux/*/name is the camera's own name. Serial ports: those that pyserial lists.
+RealSense cameras are listed by their package if it is installed.
 """
 
+import logging
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Literal
 
+log = logging.getLogger(__name__)
 DEV, SYS = Path("/dev"), Path("/sys")
 _GEL_SENSORS = {"digit": "digit", "gelsight mini": "gelsight_mini", "gelsight": "gelsight"}
 """Words in a camera's name and the driver for it; the first match is used."""
@@ -18,7 +22,7 @@ _GEL_SENSORS = {"digit": "digit", "gelsight mini": "gelsight_mini", "gelsight": 
 class DiscoveredDevice:
     """A connected device: its stable name, its own name, and the lines for its table in a rig's file."""
 
-    kind: Literal["camera", "serial port"]
+    kind: Literal["camera", "serial port", "realsense"]
     device: str
     label: str
     toml: str
@@ -26,7 +30,7 @@ class DiscoveredDevice:
 
 def discover(dev: Path = DEV, sys: Path = SYS) -> list[DiscoveredDevice]:
     """Return all connected devices, cameras first; `dev` and `sys` are the system's device folders."""
-    return [*find_cameras(dev, sys), *find_serial_ports(dev)]
+    return [*find_cameras(dev, sys), *find_serial_ports(dev), *_find_realsenses()]
 
 
 def camera_names(dev: Path = DEV) -> list[str]:
@@ -65,6 +69,23 @@ def find_serial_ports(dev: Path = DEV) -> list[DiscoveredDevice]:
     ports = [port for port in list_ports.comports() if port.hwid != "n/a"]  # a ttyS0 without hardware is left out
     names = [(stable.get(Path(port.device).resolve(), port.device), port.description) for port in ports]
     return [DiscoveredDevice("serial port", name, label, f'driver = "wsg50"\nport = "{name}"') for name, label in names]
+
+
+def _find_realsenses() -> list[DiscoveredDevice]:
+    """List the cameras with the maker's package, if it is installed; log a warning if it fails."""
+    try:
+        rs = import_module("pyrealsense2")
+        info = rs.camera_info
+        names = [(each.get_info(info.serial_number), each.get_info(info.name)) for each in rs.context().query_devices()]
+    except ModuleNotFoundError:
+        return []
+    except Exception as error:  # a failing package must not hide the other devices
+        log.warning("RealSense cameras could not be listed: %s", error)
+        return []
+    return [
+        DiscoveredDevice("realsense", serial, name, f'driver = "realsense"\nserial = "{serial}"')
+        for serial, name in names
+    ]
 
 
 def _text(path: Path) -> str:

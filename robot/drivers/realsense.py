@@ -5,6 +5,7 @@ colour stream's pixels. Pixel coordinates count from the centre of the first pix
 the distortion model of the colour stream. Automatic exposure settles within about 30 pictures.
 """
 
+import contextlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -116,15 +117,23 @@ class RealSense(Camera):
                 pipeline.stop()
 
     def _recover(self) -> None:
-        """Stop the camera and start it again."""
-        self._close()
-        self._connect()
+        """Close the camera despite errors, then connect completely or not at all."""
+        with contextlib.suppress(DeviceError, OSError):
+            self._close()
+        try:
+            self._connect()
+        except BaseException:
+            with contextlib.suppress(DeviceError, OSError):
+                self._close()
+            raise
 
     def _wait(self) -> Any:
         return self._pipeline.wait_for_frames(round(1000 * self._options.timeout_s))
 
     def _read(self, depth: bool) -> RGBD:
         with package_errors("realsense returned no picture; is it plugged into USB 3?"):
+            if self._pipeline is None:
+                raise DeviceError("realsense was stopped by a failed recovery; call recover() again")
             self._pipeline.poll_for_frames()  # drops frames taken before this call
             frames = self._wait()
             time_s = self.clock()

@@ -34,6 +34,9 @@ _MIN_EXTENT_MM = 25.0
 """Points of a smaller extent are in metres, centimetres or inches, or too near to each other for a rotation."""
 _UNIT_RATIO = 5.0
 """If one extent exceeds the other by this factor, the smaller one has another unit: a motion keeps distances."""
+_SAME_MM = 10.0
+"""Points within this distance are one point that was measured again."""
+_MAX_CLOCK_ERROR = timedelta(days=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +59,7 @@ def fit_hand_eye(camera_mm: npt.ArrayLike, rig_mm: npt.ArrayLike, *, written: da
     """Fit the rotation and translation from camera points to rig points, by least squares.
 
     Args:
-        camera_mm: (N, 3) points in the camera frame, at least 4 that do not lie on one line.
+        camera_mm: (N, 3) points in the camera frame, at least 4 different ones that do not lie on one line.
         rig_mm: (N, 3) the same points in the rig's frame.
         written: Time of the calibration; now by default.
 
@@ -77,8 +80,11 @@ def fit_hand_eye(camera_mm: npt.ArrayLike, rig_mm: npt.ArrayLike, *, written: da
                 f"{other:.3g}; if they are in metres, multiply them by 1000 (centimetres: 10, inches: 25.4), else "
                 "measure points that are farther apart"
             )
-    if len(camera) < 4:
-        raise RobotConfigError(f"a calibration requires at least 4 points, got {len(camera)}; measure more")
+    distinct = min(map(_distinct, (camera, rig)))
+    if distinct < 4:
+        raise RobotConfigError(
+            f"a calibration requires at least 4 different points, got {distinct}; measure more, {_SAME_MM:g} mm apart"
+        )
     for name, arm in zip(("camera", "rig"), arms, strict=True):
         along, across, _ = np.linalg.svd(arm, compute_uv=False)
         if across < MIN_SPREAD * along:
@@ -91,6 +97,14 @@ def fit_hand_eye(camera_mm: npt.ArrayLike, rig_mm: npt.ArrayLike, *, written: da
     rigid[:3, 3] = rig.mean(0) - rotation.apply(camera.mean(0))
     residuals = np.linalg.norm(rotation.apply(arms[0]) - arms[1], axis=1)
     return HandEye(rigid, residuals, (written or datetime.now(UTC)).replace(microsecond=0))
+
+
+def _distinct(points: Points) -> int:
+    kept: list[Points] = []
+    for point in points:
+        if all(np.linalg.norm(point - other) > _SAME_MM for other in kept):
+            kept.append(point)
+    return len(kept)
 
 
 def read_pairs(path: Path) -> tuple[Points, Points]:
@@ -123,9 +137,14 @@ def load_hand_eye(path: Path, max_age_days: float) -> Points:
             f"{path} is not a hand-eye calibration: {error}; make it again with `retrieve rig calibrate`"
         ) from error
     age = datetime.now(UTC) - document.written.astimezone(UTC)
+    if age < -_MAX_CLOCK_ERROR:
+        raise RobotConfigError(f"{path} was written {-age.days} days in the future; set the clock, or calibrate again")
     if age > timedelta(days=max_age_days):
         raise RobotConfigError(
             f"{path} must be at most {max_age_days:g} days old, got {age / timedelta(days=1):.0f}; calibrate again, or "
             "allow more days"
         )
-    return np.array(document.rigid)
+    rigid = np.array(document.rigid)
+    if (far := float(np.linalg.norm(rigid[:3, 3]))) < _SAME_MM:
+        raise RobotConfigError(f"{path}: its translation must be in mm, got {far:.3g}; multiply one in metres by 1000")
+    return rigid

@@ -8,8 +8,9 @@ detection), so the workspace must be free.
 
 At every step the joint state must be fresh (`max_state_age_s`), the robot enabled, no collision reported and the arm
 near its commands; else the arm holds its position. /robot/state and the collision state are slower: they may be 2 s
-old. If commands stop (the program or the network failed), the robot ends the motion after _COMMAND_TIMEOUT_S. This
-driver never resets an emergency stop.
+old. A robot without a collision state can be used; `refused` then reports that collisions are not detected. If
+commands stop (the program or the network failed), the robot ends the motion after _COMMAND_TIMEOUT_S. This driver
+never resets an emergency stop.
 
 The link uses `websockets`, because roslibpy sends a message that was published during a connection loss seconds later,
 without an error, and drops rosbridge's errors. Here nothing is sent twice and nothing is queued: a lost connection
@@ -214,6 +215,7 @@ def _shorten(text: object) -> str:
 _STATE_TOPICS = (codec.JOINT_STATES, codec.ROBOT_STATE, codec.TIP_STATES, codec.COLLISION)
 _SLOW_STATE_AGE_S = 2.0
 """Oldest accepted /robot/state and collision state, which are slower than the joint states."""
+_COLLISIONS = "collision state"
 _MAX_LAG_RAD = 0.35
 """An arm this far behind its commands is blocked; a lag of half a second at 0.5 rad/s is 0.25 rad."""
 _MAX_TURN_RAD = 0.5
@@ -278,17 +280,26 @@ class Sawyer(Arm):
         self._url = f"ws://{options.host}:{options.port}"
 
     def _connect(self) -> None:
+        self._sees_collisions = False
         self._open_link()
+        self.refused.pop(_COLLISIONS, None)
+        try:
+            self._link.wait_for(codec.COLLISION[0])
+            self._sees_collisions = True
+        except DeviceError:
+            self._link.check()
+            self.refused[_COLLISIONS] = "no messages: collisions are not detected"
+            _LOG.warning("%s: no messages on %s: collisions are not detected", self.name, codec.COLLISION[0])
         self._make_ready()
 
     def _open_link(self) -> None:
-        """Open a new link and wait for each state once."""
+        """Open a new link and wait for each state once, also the collision state if it was available on connecting."""
         self._link = RosbridgeLink(self._url, timeout_s=self._options.timeout_s, clock=self.clock)
         self._link.open()
         for topic, kind in (*_STATE_TOPICS, codec.SPEED_RATIO, codec.COMMAND_TIMEOUT):
             self._link.subscribe(topic, kind)
         self._link.advertise(*codec.JOINT_COMMAND)
-        for topic, _ in _STATE_TOPICS:
+        for topic, _ in _STATE_TOPICS if self._sees_collisions else _STATE_TOPICS[:-1]:
             self._link.wait_for(topic)
         self._set("speed_ratio", codec.SPEED_RATIO, self._options.speed_ratio)
         self._set("command_timeout_s", codec.COMMAND_TIMEOUT, _COMMAND_TIMEOUT_S)
@@ -500,8 +511,10 @@ class Sawyer(Arm):
         return codec.parse(arrivals[-1].message, codec.RobotState)
 
     def _collisions(self) -> Sequence[ReceivedMessage]:
+        """Return the collision states; empty only if there was none on connecting either."""
         arrivals = self._link.history(codec.COLLISION[0])
-        self._check_arrives(codec.COLLISION[0], arrivals, "a collision")
+        if arrivals or self._sees_collisions:
+            self._check_arrives(codec.COLLISION[0], arrivals, "a collision")
         return arrivals
 
     def _check_arrives(self, topic: str, arrivals: Sequence[ReceivedMessage], event: str) -> None:

@@ -87,6 +87,8 @@ def test_a_silent_realsense_is_an_error_and_can_be_started_again(install):
             eye.read()
         with pytest.raises(DeviceError, match="cannot be started"):
             eye.recover()
+        with pytest.raises(DeviceError, match=r"call recover\(\) again"):
+            eye.read()
         rs.silent = False
         eye.recover()
         eye.read()

@@ -8,11 +8,12 @@ import pytest
 
 from robot.drivers import discover
 from robot.drivers.discover import DiscoveredDevice
+from tests.fake_video import FakeRealSense
 
 
 @pytest.fixture(autouse=True)
 def _nothing_installed(monkeypatch):
-    for name in ("serial", "serial.tools"):
+    for name in ("pyrealsense2", "serial", "serial.tools"):
         monkeypatch.setitem(sys.modules, name, None)
 
 
@@ -87,3 +88,19 @@ def test_serial_ports_with_hardware_are_found_by_their_stable_names(roots, monke
     tools = SimpleNamespace(list_ports=SimpleNamespace(comports=lambda: ports))
     monkeypatch.setitem(sys.modules, "serial.tools", tools)
     assert [each.device for each in discover.find_serial_ports(roots[0])] == [str(link), "/dev/ttyACM7"]
+
+
+def test_depth_cameras_are_listed_by_their_installed_packages(roots, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyrealsense2", FakeRealSense(serials=("8", "9")))
+    found = discover.discover(*roots)
+    assert [(each.kind, each.device) for each in found] == [("realsense", "8"), ("realsense", "9")]
+    assert tomllib.loads(found[1].toml) == {"driver": "realsense", "serial": "9"}
+
+
+def test_a_failing_package_gives_a_warning_and_hides_nothing_else(roots, monkeypatch, caplog):
+    broken = FakeRealSense()
+    broken.context = lambda: (_ for _ in ()).throw(RuntimeError("no udev rules"))
+    monkeypatch.setitem(sys.modules, "pyrealsense2", broken)
+    plug_camera(roots, "usb-Maker_Webcam_12-video-index0", 0, "Webcam")
+    assert [each.kind for each in discover.discover(*roots)] == ["camera"]
+    assert "RealSense cameras could not be listed: no udev rules" in caplog.text

@@ -261,6 +261,15 @@ def test_a_motion_ends_if_a_topic_falls_silent(topic, message, monkeypatch):
         assert offset(arm.pose(), FAR)[0] > 50
 
 
+def test_a_robot_without_collision_state_can_be_used_with_a_warning(caplog):
+    emulator = EmulatedSawyer()
+    emulator.silent.add(messages.COLLISION[0])
+    with caplog.at_level(logging.WARNING), connected(emulator, timeout_s=0.5) as (_, arm):
+        assert arm.refused == {"collision state": "no messages: collisions are not detected"}
+        assert "collisions are not detected" in caplog.text
+        arm.move_to(HOME, 200.0)
+
+
 def test_a_broken_connection_stops_the_arm_and_recovery_connects_again(caplog):
     with connected() as (emulator, arm):
         with while_it_moves(emulator, emulator.drop_connections), pytest.raises(DeviceError, match="closed") as caught:
