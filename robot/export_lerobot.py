@@ -126,9 +126,11 @@ def export_lerobot(recording: Recording, out: Path, progress: Progress | None = 
             stats[camera.key] = _stats(camera.summaries, len(camera.summaries) * math.prod(camera.size))
         for name, document in (("stats", stats), ("info", _info(recording, moments, cameras, len(tasks)))):
             (folder / "meta" / f"{name}.json").write_text(json.dumps(document, indent=4) + "\n", "utf-8")
+    recorded = {f"frames {moment} the touch": each for moment, each in recorded.items()}
+    recorded["photos"] = [grasp.photo is not None for grasp in grasps]
     return tuple(
-        f"the frames {moment} the touch are left out because some grasps do not have them"
-        for moment, each in recorded.items()
+        f"the {what} are left out because some grasps do not have them"
+        for what, each in recorded.items()
         if any(each) and not all(each)
     )
 

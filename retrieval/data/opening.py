@@ -27,7 +27,11 @@ def parse_openings(openings: Openings, grasps: int, of: str = "") -> NDArray[np.
     """
     if openings is None:
         return np.full(grasps, np.nan)
-    given: Sequence[object] = openings if isinstance(openings, Sequence | np.ndarray) else [openings]
+    given: Sequence[object] = (
+        openings
+        if isinstance(openings, Sequence | np.ndarray) and not isinstance(openings, str | bytes)
+        else [openings]
+    )
     if len(given) != grasps:
         raise BadInput(
             f"{of}give one opening for each grasp, or none: got {len(given)} opening(s) for {grasps} grasp(s); None "

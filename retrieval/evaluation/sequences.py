@@ -93,6 +93,7 @@ class Sequences:
         part: (S,) session of each, or "early" and "late"; "" if there is one part.
         rounds: The comparisons; their queries are pooled.
         is_across_sessions: Whether queries and gallery are from different sessions.
+        remark: What became of grasps that name no session.
     """
 
     grasps: Sequence[Grasp]
@@ -102,6 +103,7 @@ class Sequences:
     part: NDArray[np.str_]
     rounds: tuple[Round, ...]
     is_across_sessions: bool
+    remark: str = ""
 
     @classmethod
     def of(cls, grasps: Sequence[Grasp], sessions: Sessions = "all") -> Self:
@@ -114,7 +116,13 @@ class Sequences:
             DatasetError: There are fewer than two objects, or one has fewer than two sequences; or sessions have fewer
                 than two objects in common.
         """
-        if sessions == "all" or len({grasp.session for grasp in grasps} - {None}) < 2:
+        named = {grasp.session for grasp in grasps} - {None}
+        unnamed, remark = sum(grasp.session is None for grasp in grasps), ""
+        if sessions != "all" and named and unnamed:
+            remark = f" {unnamed} grasps name no session and are left out."
+            if len(named) == 1:
+                remark = f" Sessions are not compared: {unnamed} grasps name none, all others the same one."
+        if sessions == "all" or len(named) < 2:
             grasps = [replace(grasp, session="") for grasp in grasps]
         order = list(dict.fromkeys(grasp.session for grasp in grasps if grasp.session is not None))
         grasps = [grasp for session in order for grasp in grasps if grasp.session == session]
@@ -147,13 +155,14 @@ class Sequences:
                     )
         rows = tuple(np.array(each, np.int64) for each in places.values())
         is_across = not (is_late or rounds[0].is_leave_one_out)
-        return cls(grasps, tuple(name for _, _, name in places), owner, rows, part, tuple(rounds), is_across)
+        return cls(grasps, tuple(name for _, _, name in places), owner, rows, part, tuple(rounds), is_across, remark)
 
     @property
     def rule(self) -> str:
         """What is compared, in sentences with counts."""
         if self.rounds[0].is_leave_one_out:
-            return f"Each sequence is compared with all others{' of its session' * bool(self.rounds[0].name)}."
+            where = " of its session" * bool(self.rounds[0].name)
+            return f"Each sequence is compared with all others{where}.{self.remark}"
         how = (
             "Only objects that both sessions have are compared. The order of capture is that of the whole recording."
             if self.is_across_sessions
@@ -165,7 +174,7 @@ class Sequences:
             f"{len(set(self.owner[one.gallery].tolist()))} objects"
             for one in self.rounds
         )
-        return f"{how} {'; '.join(counts)}."
+        return f"{how} {'; '.join(counts)}.{self.remark}"
 
     def mean(self, features: NDArray[np.float32]) -> Vectors:
         """Return the mean (S, F) of features (G, F) over the grasps of each sequence."""

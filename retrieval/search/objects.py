@@ -115,11 +115,9 @@ class _ReferenceTouch:
     is_enrolled: bool = False
 
 
-def _enrolled_reference(touch: EnrolledTouch) -> _ReferenceTouch:
+def _enrolled_reference(touch: EnrolledTouch, object_id: str) -> _ReferenceTouch:
     pictures = touch.pictures
-    return _ReferenceTouch(
-        touch.object_id, tuple(pictures), tuple(pictures.values()), touch.opening_mm, is_enrolled=True
-    )
+    return _ReferenceTouch(object_id, tuple(pictures), tuple(pictures.values()), touch.opening_mm, is_enrolled=True)
 
 
 @dataclass(frozen=True)
@@ -183,7 +181,9 @@ class Objects:
         if enrolled and self._calibration:  # else touches cannot be compared, nor without codes of this model
             usable, partials = codes_of(enrolled, self._stored)
             codes = np.concatenate([codes, unit_embeddings(partials, self._columns)])
-            touches = [*touches, *map(_enrolled_reference, usable)]
+            like = {name: self._rows.names_like(name) for name in {one.object_id for one in usable}}
+            spelled = {name: found[0] if len(found) == 1 else name for name, found in like.items()}  # by the catalogue
+            touches = [*touches, *(_enrolled_reference(one, spelled[one.object_id]) for one in usable)]
         names = sorted({one.object_id for one in touches if one.is_enrolled and self._find(one.object_id) < 0})
         self._enrolled_only = {name: self._rows.object_count + place for place, name in enumerate(names)}
         self.count = self._rows.object_count + len(names)

@@ -60,7 +60,7 @@ from retrieval.training.cca import (
 )
 from retrieval.training.features import Features, FrozenFeatures, encode_recording, features_by_image
 from retrieval.training.initial_weights import build_matcher, training_licences
-from retrieval.training.selection import held_out_folds, ranking_auc, validation_rows
+from retrieval.training.selection import MIN_OBJECTS_FOR_FOUR_FOLDS, held_out_folds, ranking_auc, validation_rows
 
 Numbers = NDArray[np.int64]
 RIDGES = (0.03, 0.1, 0.3, 1.0, 10.0)
@@ -98,7 +98,7 @@ class Parts(NamedTuple):
     """Parts of a recording: touches are compared with those of other parts only.
 
     Attributes:
-        has_sessions: Whether the parts are sessions: at least `MIN_OBJECTS` objects have touches of two.
+        has_sessions: Whether the parts are sessions: half of the objects, or 12, have touches of two.
         group: (G,) session; without several sessions the sequence, or the grasp itself; numbers in order of capture.
         turn: (G,) the session, or the number of the group within its object, modulo `TURNS`.
     """
@@ -110,18 +110,20 @@ class Parts(NamedTuple):
 
 def divide(grasps: Sequence[Grasp]) -> Parts:
     """Divide the touches of a recording. Raises BadInput if fewer than `MIN_OBJECTS` objects have two parts."""
+    objects = {grasp.object_id for grasp in grasps}
     for has_sessions in (True, False):
         names = [(grasp.session if has_sessions else grasp.sequence_id or grasp.grasp_id) or "" for grasp in grasps]
         numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
         group = np.array([numbers[name] for name in names])
         turn, repeated = group.copy(), 0
-        for name in {grasp.object_id for grasp in grasps}:
+        for name in objects:
             mine = [place for place, grasp in enumerate(grasps) if grasp.object_id == name]
             found, number = np.unique(group[mine], return_inverse=True)
             repeated += len(found) > 1
             if not has_sessions:
                 turn[mine] = number % TURNS
-        if repeated >= MIN_OBJECTS:
+        needed = min(MIN_OBJECTS_FOR_FOUR_FOLDS, len(objects) / 2) if has_sessions else 0
+        if repeated >= max(MIN_OBJECTS, needed):  # fewer would calibrate the model alone
             return Parts(has_sessions, group, turn)
     raise BadInput(
         f"a fit to touches needs {MIN_OBJECTS} objects with touches of two sequences; {repeated} object(s) have them: "

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import av
 import cv2
@@ -71,6 +72,9 @@ def test_an_export_appears_when_it_is_complete_and_a_stopped_one_leaves_nothing(
     notes = export_lerobot(source, out, lambda *counts: calls.append((*counts, any(out.iterdir()))))
     assert calls == [(done, 6, False) for done in range(1, 7)]
     assert notes == ("the frames after the touch are left out because some grasps do not have them",)
+    first = replace(source.grasps[0], photo=None)
+    (_, note) = export_lerobot(replace(source, grasps=(first, *source.grasps[1:])), tmp_path / "without")
+    assert note == "the photos are left out because some grasps do not have them"
 
 
 def test_an_error_names_a_damaged_picture_and_nothing_is_written(source, tmp_path):

@@ -94,6 +94,9 @@ def test_objects_of_both_sessions_are_compared_in_both_directions():
     sequences = Sequences.of([*mixed, *grasps({"a": 1})], "across")
     assert described(sequences) == [("b-0 a-0", "a-0 b-0 b-1", 4), ("a-0 b-0 b-1", "b-0 a-0", 3)]
     assert "tuesday against late: 2 queries, 3 references of 2 objects" in sequences.rule
+    assert sequences.rule.endswith(" 2 grasps name no session and are left out.")
+    one = Sequences.of([*grasps({"a": 2, "b": 2}, "late"), *grasps({"a": 3, "b": 3})], "across")
+    assert "not compared: 12 grasps name none, all others the same one." in one.rule
     vectors = sequences.centred(np.arange(7, dtype=np.float64)[:, None])
     assert vectors.ravel().tolist() == [-1.5, -0.5, 0.5, 1.5, -1, 0, 1]
     with pytest.raises(

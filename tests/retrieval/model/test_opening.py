@@ -44,5 +44,7 @@ def test_ratios_equal_two_plain_loops_and_are_0_where_nothing_was_measured():
 def test_an_opening_that_is_no_distance_in_millimetres_is_refused(openings, problem):
     with pytest.raises(BadInput, match=problem):
         parse_openings(openings, 2 if "grasp" in problem else len(openings))
+    with pytest.raises(BadInput, match="got '41'"):
+        parse_openings("41", 1)  # type: ignore[arg-type]
     np.testing.assert_array_equal(parse_openings(None, 2), [np.nan, np.nan])
     np.testing.assert_array_equal(parse_openings([41, None], 2), [41.0, np.nan])

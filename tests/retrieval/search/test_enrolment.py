@@ -57,6 +57,27 @@ def test_an_opened_searcher_finds_an_object_that_was_enrolled_in_the_meantime(in
         assert not cup.photo_path.exists()
 
 
+def test_an_enrolled_object_is_one_object_with_a_folder_that_macos_names(catalogue_copy, model, tmp_path, touches):
+    build_index(catalogue_copy, model, tmp_path / "index", quiet=True)
+    retrieval.enrol(tmp_path / "index", "T\u00fclle", touches[NAMES[0]][0])
+    (catalogue_copy / NAMES[0]).rename(catalogue_copy / "Tu\u0308lle")
+    build_index(catalogue_copy, model, tmp_path / "index", quiet=True)
+    with Searcher.open(tmp_path / "index") as searcher:
+        found = searcher.query(touches[NAMES[0]][0], top=99).results
+    assert [(one.object_id, one.reference.is_enrolled) for one in found if one.reference] == [("Tu\u0308lle", True)]
+
+
+def test_a_picture_that_the_table_names_is_not_opened_for_writing_again(index, touches):
+    """As the no-contact frame of several touches: a full disk would leave half of it."""
+    retrieval.enrol(index, "cup", touches[NAMES[0]][0])
+    table = EnrolledTable(index)
+    with table.lock() as known:
+        picture = index / known[0].path
+        before = picture.stat().st_mtime_ns
+        table.replace(known, {known[0].path: picture.read_bytes()})
+    assert picture.stat().st_mtime_ns == before
+
+
 @pytest.mark.parametrize("shards", [None, 16])
 def test_enrolled_touches_count_like_the_same_touches_in_the_catalogue(
     catalogue_copy, model, tmp_path, touches, shards

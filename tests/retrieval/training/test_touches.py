@@ -38,6 +38,8 @@ def test_touches_are_divided_by_session_else_by_sequence_else_one_by_one():
     sequences = divide([grasp(n, name, f"{name}{n % 4 // 2}") for n, name in enumerate(names)])
     assert (sequences.has_sessions, sequences.turn.tolist()) == (False, [0, 0, 1, 1] * 6)
     assert divide([grasp(n, name) for n, name in enumerate(names)]).turn.tolist() == [0, 1, 2, 0] * 6
+    few = divide([grasp(n, f"{n % 44}", session="y" if n % 44 < 11 and n > 87 else "x") for n in range(132)])
+    assert not few.has_sessions  # 11 of 44 objects would calibrate the model alone
     with pytest.raises(BadInput, match=r"6 objects with touches of two sequences; 5 object\(s\) have them"):
         divide([grasp(n, name, "f" if name == "f" else None) for n, name in enumerate(names)])
 
