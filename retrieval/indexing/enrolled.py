@@ -129,7 +129,7 @@ class EnrolledTable:
         except (OSError, ValueError, RecursionError) as error:
             raise CorruptIndex(
                 f"{self.path}: the table of enrolled touches is damaged ({error}); restore it from a backup, or "
-                f"delete it and enrol again from the pictures in {self.path.parent}"
+                f"rename the folder {self.path.parent} and enrol again from its pictures"
             ) from error
         return touches if self._owns is None else [touch for touch in touches if self._owns(touch.object_id)]
 

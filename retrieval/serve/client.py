@@ -112,7 +112,8 @@ class Client:
     ) -> Enrolment:
         """Run `Searcher.enrol` on the service; raise as `query`."""
         grasps = self._grasps(touches)
-        path = f"objects/{quote(object_id)}/touches"
+        name = quote(object_id, safe="").replace(".", "%2E")  # else "a/../b" would become "b"
+        path = f"objects/{name}/touches"
         found = _document(self._send("POST", path, json=_pictures(grasps, background, opening_mm)), "added")
         return Enrolment(found["object_id"], found["touches"], len(found["added"]))
 

@@ -142,7 +142,7 @@ def test_a_build_with_another_model_encodes_again_and_keeps_a_touch_that_it_cann
     (index / "enrolled" / "touches.json").write_text("{}")
     assert main(["enrol", usable.object_id, "--remove", "--index", str(index)]) == 2
     assert "the table of enrolled touches is damaged" in capsys.readouterr().err
-    with pytest.raises(CorruptIndex, match="restore it from a backup"):
+    with pytest.raises(CorruptIndex, match="restore it from a backup, or rename the folder"):
         Searcher.open(index).query(touches[NAMES[1]][0])
 
 
