@@ -62,10 +62,11 @@ def command(*options, **popen):
         output, listening = [], threading.Event()
 
         def listen():
-            for text in process.stderr:
-                output.append(text)
-                if "listening on" in text:
-                    listening.set()
+            with suppress(ValueError):  # the killed process's pipe was closed in the meantime
+                for text in process.stderr:
+                    output.append(text)
+                    if "listening on" in text:
+                        listening.set()
             listening.set()
 
         threading.Thread(target=listen, daemon=True).start()
