@@ -7,7 +7,6 @@ The nesting of the lists determines which:
     a                  one grasp of a model with one finger
 """
 
-import io
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from retrieval.data.images import check_pixels, decode_rgb, pillow_rgb, read_bytes, read_rgb
+from retrieval.data.images import check_pixels, decode_rgb, encode_image, pillow_rgb, read_bytes, read_rgb
 from retrieval.data.resize import RgbImage, to_float
 from retrieval.errors import BadInput, ImageError
 
@@ -85,20 +84,23 @@ def read_image(image: AnyImage, name: str) -> RgbImage:
     return np.ascontiguousarray(to_float(np.asarray(image)))
 
 
-def with_file(source: InputImage) -> InputImage:
-    """Return an image that is read from its file in `file`: its own, or a PNG file of its pixels. Raises ImageError."""
+def image_file(source: InputImage) -> bytes:
+    """Return the file of an image: its own, or a PNG file of its pixels. Raises ImageError."""
     image = source.image
     if isinstance(image, GelImage):
-        return InputImage(image, source.name, image.file)
+        assert image.file, "a gel image that another process read must have its file"
+        return image.file
     if isinstance(image, str | os.PathLike):
-        data = read_bytes(os.fspath(image))
-    elif isinstance(image, bytes | bytearray | memoryview):
-        data = bytes(image)
-    else:
-        samples = np.rint(255 * read_image(image, source.name)).astype(np.uint8)
-        Image.fromarray(samples).save(stream := io.BytesIO(), "png")
-        data = stream.getvalue()
-    return InputImage(data, source.name, data)
+        return read_bytes(os.fspath(image))
+    if isinstance(image, bytes | bytearray | memoryview):
+        return bytes(image)
+    return encode_image(np.rint(255 * read_image(image, source.name)).astype(np.uint8))
+
+
+def with_file(source: InputImage) -> InputImage:
+    """Return an image that is read from its file, with this file in `file`. Raises ImageError."""
+    file = image_file(source)
+    return InputImage(source.image if isinstance(source.image, GelImage) else file, source.name, file)
 
 
 def parse_grasps(touches: AnyTouches, fingers: int, *, noun: str = "touch", of: str = "") -> list[list[InputImage]]:

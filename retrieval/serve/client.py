@@ -2,7 +2,6 @@
 
 import base64
 import math
-import os
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -10,13 +9,9 @@ from dataclasses import replace
 from typing import Any, Self, TypedDict, Unpack
 from urllib.parse import quote
 
-import numpy as np
-from PIL import Image
-
-from retrieval.data.images import encode_image, read_bytes
 from retrieval.data.opening import Openings, parse_openings
 from retrieval.errors import BadInput, ImageError, RetrievalError
-from retrieval.model.touches import AnyImage, AnyTouches, GelImage, InputImage, parse_grasps, read_image
+from retrieval.model.touches import AnyImage, AnyTouches, InputImage, image_file, parse_grasps
 from retrieval.search.answer import Enrolment, Match, QueryResult
 
 try:
@@ -185,15 +180,4 @@ def _pictures(
 
 
 def _encoded(images: Sequence[InputImage]) -> list[str]:
-    return [base64.b64encode(_file(image)).decode("ascii") for image in images]
-
-
-def _file(source: InputImage) -> bytes:
-    """Return an image file that decodes to the same samples, or raise ImageError."""
-    image = source.image
-    if isinstance(image, bytes | bytearray | memoryview):
-        return bytes(image)
-    if isinstance(image, Image.Image | np.ndarray):
-        return encode_image(np.rint(255 * read_image(source.image, source.name)).astype(np.uint8))
-    assert not isinstance(image, GelImage), "only the service reads gel images in advance"
-    return read_bytes(os.fspath(image))
+    return [base64.b64encode(image_file(image)).decode("ascii") for image in images]
