@@ -329,18 +329,16 @@ def train_on_touches(
 
 def _configuration(fingers: int, init: str) -> Config:
     """Return the configuration of the towers; `init` as for `train_on_touches`."""
-    preset, towers = load_config("adapt"), [GEL, *([] if init == "none" else ["init"])]
-    matcher = dataclasses.replace(
-        preset.matcher,
-        tower=TOWER_SEPARATOR.join(PUBLISHED_TOWER for _ in towers),
-        photo_tower=NO_TOWER,
-        fingers=fingers,
+    preset, towers = load_config("touches"), [GEL, *([] if init == "none" else ["init"])]
+    tower = TOWER_SEPARATOR.join(PUBLISHED_TOWER for _ in towers)
+    return dataclasses.replace(
+        preset,
+        matcher=dataclasses.replace(preset.matcher, tower=tower, photo_tower=NO_TOWER, fingers=fingers),
+        training=dataclasses.replace(
+            preset.training, init=init, init_touch=TOWER_SEPARATOR.join(towers), init_photo="random"
+        ),
+        preprocessing=dataclasses.replace(preset.preprocessing, photo_px=32),
     )
-    training = dataclasses.replace(
-        preset.training, init=init, init_touch=TOWER_SEPARATOR.join(towers), init_photo="random"
-    )
-    preprocessing = dataclasses.replace(preset.preprocessing, photo_px=32, views=("whole",))
-    return Config(matcher, training, preprocessing)
 
 
 def _with_map(config: Config, matcher: Matcher, found: AffineMap) -> tuple[Config, Matcher]:
