@@ -40,26 +40,20 @@ from retrieval.metrics.measure import Measure, pooled
 from retrieval.metrics.pairs import fit_calibration
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable, store_checkpoint
 from retrieval.model.config import Config, load_config
-from retrieval.model.encode import default_device, one_thread
+from retrieval.model.encode import one_thread
 from retrieval.model.fusion import Matcher
 from retrieval.model.shipped import is_shipped, shipped_model
 from retrieval.model.towers import TOWER_SEPARATOR
 from retrieval.model.towers.tower import Tower
 from retrieval.model.towers.weights import GEL
-from retrieval.training.calibration import (
-    ScoredTouches,
-    fit_opening,
-    score_touches,
-    with_calibrations,
-    with_gel_check,
-)
+from retrieval.training.calibration import ScoredTouches, score_touches, with_calibrations, with_sensor_calibrations
 from retrieval.training.cca import (
     MAX_CALIBRATION_TOUCHES,
     CcaSelection,
     select_settings,
     tower_widths,
 )
-from retrieval.training.features import Features, FrozenFeatures, encode_recording, features_by_image
+from retrieval.training.features import Features, encode_recording
 from retrieval.training.initial_weights import checkpoint_licences
 from retrieval.training.selection import held_out_folds
 
@@ -186,14 +180,8 @@ def adapt(
         )
         # The projections are overfitted to the fitted objects: calibrate on those that were held out.
         made = with_calibrations(made, install_projections(matcher, choice))
-    # The gel check is fitted on half of the objects, with thresholds from the others.
-    names, device = sorted(set(features.object_ids)), default_device()
-    groups = [[grasp for grasp in grasps if grasp.object_id in names[side::2]] for side in (0, 1)]
-    made.matcher.to(device)
-    known = features if kept is None else kept
-    source = FrozenFeatures(made.config, features_by_image(grasps, known, device))
-    made = dataclasses.replace(made, opening=fit_opening(grasps))
-    store_checkpoint(with_gel_check(made, source, *groups, quiet=quiet), out)
+    made = with_sensor_calibrations(made, grasps, features if kept is None else kept, quiet=quiet)
+    store_checkpoint(made, out)
     return Adaptation(load_checkpoint(out), measures, kept is not None)
 
 

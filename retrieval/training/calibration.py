@@ -20,12 +20,13 @@ from retrieval.data.opening import believed
 from retrieval.errors import BadInput
 from retrieval.model import verification
 from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.encode import default_device
 from retrieval.model.fusion import Matcher
 from retrieval.model.opening import OpeningCalibration
 from retrieval.model.posterior import MAX_GRASPS, SLOPE_BOUNDS, Posterior
 from retrieval.model.references import ReferenceCalibration, reference_similarity, unit_embeddings
 from retrieval.model.verification import LEVELS, QUANTILES, VerificationCalibration, supports_calibration
-from retrieval.training.features import FeatureSource, recorded_features
+from retrieval.training.features import Features, FeatureSource, FrozenFeatures, features_by_image, recorded_features
 from retrieval.training.gel_check import (
     PENALTY,
     GelCheckFeatures,
@@ -574,6 +575,20 @@ def with_gel_check(
     matcher.gel_head = fit_gel_head(fitting, PENALTY * FOREIGN_COUNT / foreign)
     check = fit_gel_check(matcher.gel_head, test, contact_levels(validation))
     return dataclasses.replace(checkpoint, gel_check=check)
+
+
+def with_sensor_calibrations(
+    checkpoint: Checkpoint, grasps: Sequence[Grasp], features: Features, *, quiet: bool = False
+) -> Checkpoint:
+    """Return the checkpoint with a gel check and the evidence of openings, from all grasps of a recording.
+
+    The gel check is fitted on half of the objects, with thresholds from the others. `features` are those of the grasps.
+    """
+    names, device = sorted({grasp.object_id for grasp in grasps}), default_device()
+    halves = [[grasp for grasp in grasps if grasp.object_id in names[side::2]] for side in (0, 1)]
+    checkpoint.matcher.to(device)
+    source = FrozenFeatures(checkpoint.config, features_by_image(grasps, features, device))
+    return with_gel_check(dataclasses.replace(checkpoint, opening=fit_opening(grasps)), source, *halves, quiet=quiet)
 
 
 def _sample_grasps(grasps: Sequence[Grasp], seed: int, count: int) -> list[Grasp]:

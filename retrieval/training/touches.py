@@ -42,13 +42,13 @@ from retrieval.errors import BadInput
 from retrieval.metrics.measure import Measure, pooled
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable, store_checkpoint
 from retrieval.model.config import Config, load_config
-from retrieval.model.encode import default_device, one_thread
+from retrieval.model.encode import one_thread
 from retrieval.model.fusion import Matcher
 from retrieval.model.references import reference_similarity
 from retrieval.model.towers import NO_TOWER, TOWER_SEPARATOR
 from retrieval.model.towers.weights import GEL
 from retrieval.training.adapt import MIN_OBJECTS, PUBLISHED_TOWER, draw_folds
-from retrieval.training.calibration import ScoredTouches, fit_opening, fit_references, with_gel_check
+from retrieval.training.calibration import ScoredTouches, fit_references, with_sensor_calibrations
 from retrieval.training.cca import (
     MAX_CALIBRATION_TOUCHES,
     MAX_CHOICE_TOUCHES,
@@ -58,7 +58,7 @@ from retrieval.training.cca import (
     Modality,
     unit_rows,
 )
-from retrieval.training.features import Features, FrozenFeatures, encode_recording, features_by_image
+from retrieval.training.features import Features, encode_recording
 from retrieval.training.initial_weights import build_matcher, training_licences
 from retrieval.training.selection import MIN_OBJECTS_FOR_FOUR_FOLDS, held_out_folds, ranking_auc, validation_rows
 
@@ -302,7 +302,6 @@ def train_on_touches(
         raise BadInput("too few objects have touches of two sequences to calibrate the model; touch more objects again")
     metrics = {f"{name}_top1": float(measure.by_object()[1].mean()) for name, measure in measures.items()}
     config, matcher = _with_map(config, matcher, choice.map)
-    names, device = sorted({grasp.object_id for grasp in grasps}), default_device()
     made = Checkpoint(
         path=out,
         digest="",
@@ -315,15 +314,12 @@ def train_on_touches(
             "metrics": metrics | {f"{name}_top1_chance": float(measures[name].chance[0]) for name in ("same", "new")},
         },
         matcher=matcher,
-        split=Split(seed, tuple(names), (), ()),
+        split=Split(seed, tuple(sorted({grasp.object_id for grasp in grasps})), (), ()),
         posterior=references.touch_only,
         references=references,
-        opening=fit_opening(grasps),
     )
-    groups = [[grasp for grasp in grasps if grasp.object_id in names[side::2]] for side in (0, 1)]
-    made.matcher.to(device)
-    source = FrozenFeatures(config, features_by_image(grasps, encoded["touch"].features, device))
-    store_checkpoint(with_gel_check(made, source, *groups, quiet=quiet), out)
+    made = with_sensor_calibrations(made, grasps, encoded["touch"].features, quiet=quiet)
+    store_checkpoint(made, out)
     return TouchModel(load_checkpoint(out), measures, parts.has_sessions)
 
 
