@@ -28,7 +28,7 @@ from retrieval.data.catalogue import Catalogue, SkippedPhoto
 from retrieval.data.images import decode_rgb, read_bytes
 from retrieval.data.loading import map_in_order
 from retrieval.errors import ImageError, NumericalError, RetrievalError
-from retrieval.indexing.enrolled import EnrolledTable, codes_of, model_key, to_code
+from retrieval.indexing.enrolled import EnrolledTable, EnrolledTouch, codes_of, model_key, to_code
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.checkpoint_info import fingerprint
 from retrieval.model.encode import TorchEncoder, batches, one_thread, torch_photo_encoder, touch_features
@@ -224,27 +224,37 @@ def encode_enrolled(
     Returns:
         A report; None without enrolled touches.
     """
-    table, codes, skipped = EnrolledTable(index), dict[str, bytes](), list[SkippedPhoto]()
+    table, codes, skipped, usable = EnrolledTable(index), dict[str, bytes](), list[SkippedPhoto](), 0
     if not (touches := table.read()):
         return None
-    used, usable = checkpoint.without_cells() if cells is False else checkpoint, 0
+    used = checkpoint.without_cells() if cells is False else checkpoint
     if used.references is not None and used.posterior is not None:  # else touches cannot be compared
-        coded, reader = codes_of(touches, used)[0], TouchReader(used.config, TorchEncoder(used.matcher))
-        takes_frames, done = used.config.preprocessing.background != "none", {touch.path for touch in coded}
-        for touch in (one for one in touches if one.path not in done):
-            try:
-                frames = [str(index / path) for path in touch.background] if takes_frames else []
-                files = [read_bytes(index / path, digest) for path, digest in touch.pictures.items()]
-                grasps, no_contact = parse_grasps(files, reader.fingers), reader.no_contact_frames(frames or None)
-                codes[touch.path] = to_code(reader.encode(grasps, no_contact, Stopwatch()).partials[0], used)
-            except RetrievalError as error:
-                skipped.append(SkippedPhoto(touch.path, f"enrolled for {touch.object_id}: {error}"))
+        coded = {touch.path for touch in codes_of(touches, used)[0]}
+        if missing := [touch for touch in touches if touch.path not in coded]:
+            codes, skipped = _encode_pictures(index, missing, used)
         key = model_key(fingerprint(used))
         table.replace_codes(codes, key, previous and {key, model_key(previous)})
         usable = len(coded) + len(codes)
     objects = len({touch.object_id for touch in touches})
     counts = {"touches": len(touches), "objects": objects, "encoded": len(codes), "usable": usable}
     return EnrolledCodes(counts, skipped)
+
+
+def _encode_pictures(
+    index: Path, touches: Sequence[EnrolledTouch], checkpoint: Checkpoint
+) -> tuple[dict[str, bytes], list[SkippedPhoto]]:
+    """Return the codes of enrolled touches by path, and the touches that could not be encoded."""
+    reader, codes, skipped = TouchReader(checkpoint.config, TorchEncoder(checkpoint.matcher)), {}, list[SkippedPhoto]()
+    takes_frames = checkpoint.config.preprocessing.background != "none"
+    for touch in touches:
+        try:
+            frames = [str(index / path) for path in touch.background] if takes_frames else []
+            files = [read_bytes(index / path, digest) for path, digest in touch.pictures.items()]
+            grasps, no_contact = parse_grasps(files, reader.fingers), reader.no_contact_frames(frames or None)
+            codes[touch.path] = to_code(reader.encode(grasps, no_contact, Stopwatch()).partials[0], checkpoint)
+        except RetrievalError as error:
+            skipped.append(SkippedPhoto(touch.path, f"enrolled for {touch.object_id}: {error}"))
+    return codes, skipped
 
 
 def _model(checkpoint: Checkpoint, layout: np.dtype[Any]) -> str:

@@ -52,8 +52,7 @@ def _touch(number: int, check: str, paths: list[str]) -> Card:
 
 
 def _match(match: Match, catalogue: Path, index: Path, is_answer: bool) -> Card:
-    folder = index if match.photo_is_enrolled else catalogue
-    pictures, lines = [(_uri(folder / match.photo, match.photo_digest), f"photo of {match.object_id}")], []
+    pictures, lines = [(_uri(match.photo_path, match.photo_digest), f"photo of {match.object_id}")], []
     if match.probability is not None and match.probability_if_present is not None:
         lines += [probability(match.probability), f"{probability(match.probability_if_present)} if present"]
     lines += [f"match logit {match.logit:+.2f}", match.photo]
