@@ -99,6 +99,8 @@ def train_loop(
 ) -> BestStep:
     """Minimise the loss of batches, one batch a step, and leave the weights of the best step in `module`.
 
+    The weights before the first step are validated, too: a run that starts from good weights never makes them worse.
+
     With a state file the run continues from it, and the first Ctrl-C ends the run after the current step. All ranks
     (`retrieval.training.distributed`) must then call this function together.
 
@@ -128,6 +130,8 @@ def train_loop(
         interruption() if state else nullcontext(threading.Event()) as stop,
         Bar(title, plan.steps, "steps", done=done, quiet=quiet) as bar,
     ):
+        if validate and not done:
+            best, best_weights = BestStep(0, validate()), _copied(module)
         for batch in batches(range(done, plan.steps)):
             for group in optimizer.param_groups:
                 group["lr"] = plan.learning_rate * group.get(RATE, 1.0) * SCHEDULES[plan.schedule](done, plan.steps)
@@ -152,7 +156,7 @@ def train_loop(
                 if not reached.metrics:
                     best = reached
                 elif not best.metrics or next(iter(reached.metrics.values())) > next(iter(best.metrics.values())):
-                    best, best_weights = reached, {name: each.clone() for name, each in module.state_dict().items()}
+                    best, best_weights = reached, _copied(module)
                 if state:
                     if not distributed.rank():
                         _save(state, module, optimizer, done, best, best_weights)
@@ -168,6 +172,10 @@ def train_loop(
             best,
         )
     return best
+
+
+def _copied(module: nn.Module) -> dict[str, Tensor]:
+    return {name: tensor.clone() for name, tensor in module.state_dict().items()}
 
 
 def freeze_batch_norm(module: nn.Module) -> None:

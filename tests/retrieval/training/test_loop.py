@@ -54,24 +54,30 @@ def test_a_loss_that_is_not_finite_stops_before_the_step_and_names_the_remedy():
 
 
 def test_the_weights_of_the_best_step_are_restored_not_the_last():
-    """Validation follows every second step and the last one; among equal scores the first step is the best."""
+    """Validation precedes the first step and follows every second one and the last; among equals the first is best."""
     module = one_weight()
-    scores, validated = iter([0.6, 0.9, 0.9, 0.3]), []
+    scores, validated = iter([0.2, 0.6, 0.9, 0.9, 0.3]), []
 
     def validate():
         validated.append(module[0].item())
         return {"score": next(scores), "other": 1.0 - len(validated)}
 
     weights, best = descend(Plan(7, 0.1, validate_every=2), module=module, validate=validate)
-    assert validated == [weights[1], weights[3], weights[5], weights[6]]
-    assert (best.step, best.metrics) == (4, {"score": 0.9, "other": -1.0})
-    assert module[0].item() == validated[1] != validated[3]
+    assert validated == [0, weights[1], weights[3], weights[5], weights[6]]
+    assert (best.step, best.metrics) == (4, {"score": 0.9, "other": -2.0})
+    assert module[0].item() == validated[2] != validated[4]
 
 
-def run(path, at=None, validations=3, **identity):
-    """Train, with a power cut in step `at`; the last `validations` of three validations are left."""
+def test_a_run_keeps_the_weights_that_it_starts_from_if_no_step_is_better():
+    module, scores = one_weight(), iter([0.9, 0.6, 0.8])
+    best = descend(Plan(2, 0.1), module=module, validate=lambda: {"score": next(scores)})[1]
+    assert (best.step, best.metrics, module[0].item()) == (0, {"score": 0.9}, 0)
+
+
+def run(path, at=None, validations=4, **identity):
+    """Train, with a power cut in step `at`; the last `validations` of four validations are left."""
     module = one_weight()
-    scores = iter([0.6, 0.9, 0.1][3 - validations :])
+    scores = iter([0.2, 0.6, 0.9, 0.1][4 - validations :])
     weights, best = descend(
         Plan(6, 0.1, validate_every=2),
         lambda step, _: (1 / 0 if step == at else 1) * module[0].square().sum() - module[0].sum(),
