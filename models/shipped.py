@@ -290,7 +290,7 @@ def calibrated(made: Checkpoint, folder: Path, fingers: int) -> Checkpoint:
     source = FrozenFeatures(made.config, features_by_image(every, features, device))
     known = [*verification, *gels]
     made = calibrate_checkpoint(made, source, known, validation, foreign=FOREIGN, max_grasps=len(every))
-    touches, photos = recorded_features(made.matcher, source, verification, what="verification")
+    touches, photos = recorded_features(made.matcher, source, verification)
     trials = score_grasps(made.matcher, verification, touches, photos)
     assert trials is not None
     assert made.posterior is not None

@@ -59,7 +59,7 @@ def collect(
         from retrieval.model.gate import load_gate
 
         decide, gate_name = load_gate(gate), f"learned, sha256 {file_digest(gate)}"
-    with resumable(out), Bar("collect", 0, "grasps") as bar:
+    with resumable(out), Bar("collecting", 0, "grasps") as bar:
         tallies = collect_grasps(
             partial(load_rig, rig, seed=seed),
             out,

@@ -20,7 +20,7 @@ def export_recording(
     from robot.recording.folder import read_recording
 
     source = read_recording(recording)
-    with Bar("export", 0, "grasps") as bar:
+    with Bar("exporting", 0, "grasps") as bar:
         notes = export_lerobot(source, out, bar.show)
     for note in (*source.notes, *notes):
         say(note)

@@ -62,5 +62,5 @@ def run_importer(name: str, source: Path, out: Path, **options: Any) -> "Recordi
     """Import a data set from the folder `source` into the recording `out`, with a progress bar on stderr."""
     from robot.importers import load_importer
 
-    with Bar(f"import {name}", 0, "grasps") as bar:
+    with Bar(f"importing {name}", 0, "grasps") as bar:
         return load_importer(name)(source, out, bar.show, **options)

@@ -19,7 +19,7 @@ import typer
 from retrieval.commands.options import Command
 from retrieval.console.interruption import record_interrupts
 from retrieval.console.memory import keep_freed_memory
-from retrieval.console.output import checked_stdout, discard_stdout, prepare_streams, printable, say, show
+from retrieval.console.output import checked_stdout, discard_stdout, prepare_streams, printable, say, set_verbose, show
 from retrieval.version import __version__
 
 MAX_MESSAGE, MESSAGE_TAIL = 500, 150
@@ -72,8 +72,10 @@ def retrieve(
         typer.Option("--version", callback=_print_version, is_eager=True, help="show the version and exit"),
     ] = False,
     debug: Annotated[bool, typer.Option("--debug", help="show the traceback of an error")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", help="show the steps and figures of all work")] = False,
 ) -> None:
     """From the gel images of a grasp, find the catalogue photo of the object in the hand."""
+    set_verbose(verbose)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

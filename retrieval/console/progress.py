@@ -1,33 +1,47 @@
-"""Progress of long work on stderr: a bar with the remaining time on a terminal, else a line every 15 s."""
+"""Progress on stderr: one line for each stage of a command, and the time left of a long one.
+
+A stage within another one, and the figures of a stage, are shown with `--verbose` only.
+"""
 
 import sys
 import time
-from typing import Any
+from typing import Any, ClassVar, Self
 
-from retrieval.console.output import printable, say
+from retrieval.console.output import is_verbose, printable, say
 
 _LINE_EVERY_S = 15.0
+_SHORT_S = 2.0
+"""A stage that ends sooner prints no line without `--verbose`."""
 
 
 class Bar:
-    """A progress bar, used as a context manager.
+    """A stage of work, used as a context manager: a bar on a terminal while it runs, and a line at its end.
 
     Args:
-        title: Name of the work.
+        title: What the stage does, such as "embedding".
         total: Number of units of work; 0 if the first `show` states it.
         unit: Name of the units.
         done: Number of finished units; above 0 if work resumes.
         quiet: Whether to print nothing.
     """
 
+    _shown: ClassVar[int] = 0
+    """Number of stages that are running and shown."""
+
     def __init__(self, title: str, total: int, unit: str, *, done: int = 0, quiet: bool = False) -> None:
-        self.title, self.total, self.unit, self.done = title, total, unit, done
+        self.title, self.total, self.unit, self.done, self.note = title, total, unit, done, ""
         self._first, self._start, self._last_line = done, time.monotonic(), time.monotonic()
         self._rich: Any = None
         self._quiet = quiet
 
-    def __enter__(self) -> "Bar":
-        if self.total and not self._quiet and sys.stderr.isatty():
+    def __enter__(self) -> Self:
+        self._is_shown = not self._quiet and (is_verbose() or not Bar._shown)
+        Bar._shown += self._is_shown
+        self._begin()
+        return self
+
+    def _begin(self) -> None:
+        if self.total and self._is_shown and not is_verbose() and sys.stderr.isatty():
             from rich.console import Console
             from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
             from rich.table import Column
@@ -37,34 +51,44 @@ class Bar:
                 TextColumn("{task.description}", markup=False),
                 BarColumn(),
                 MofNCompleteColumn(table_column=Column(no_wrap=True)),
-                TextColumn(f"{self.unit}  {{task.fields[note]}}", markup=False),
+                TextColumn(self.unit, markup=False),
                 TimeRemainingColumn(table_column=Column(no_wrap=True)),
                 console=Console(stderr=True),
+                transient=True,
             )
             self._rich.start()
-            self._task = self._rich.add_task(self.title, total=self.total, completed=self.done, note="")
-        return self
+            self._task = self._rich.add_task(printable(self.title), total=self.total, completed=self.done)
 
     def advance(self, count: int = 1, note: str = "") -> None:
-        """Add `count` finished units; `note` shows the latest figures."""
-        self.done += count
+        """Add `count` finished units; `note` has the latest figures."""
+        self.done, self.note, now = self.done + count, note, time.monotonic()
         if self._rich:
-            self._rich.update(self._task, advance=count, note=printable(note))
-        elif not self._quiet and (time.monotonic() - self._last_line > _LINE_EVERY_S or self.done == self.total):
-            self._last_line = time.monotonic()
-            rate = (self.done - self._first) / max(time.monotonic() - self._start, 1e-9)
-            left_s = (self.total - self.done) / rate if rate else float("nan")
-            text = f"{self.title}: {self.done}/{self.total} {self.unit}, {rate:.1f} per second, {left_s:.0f} s left"
-            say(f"{text}  {note}".rstrip())
+            self._rich.update(self._task, advance=count)
+        elif now - self._last_line > _LINE_EVERY_S and self.done < self.total:
+            self._last_line, finished = now, self.done - self._first
+            left_s = (now - self._start) * (self.total - self.done) / max(finished, 1)
+            self._say(f"{self.done} of {self.total} {self.unit}" + f", {_duration(left_s)} left" * bool(finished))
 
     def show(self, done: int, total: int, note: str = "") -> None:
         """Show `done` of `total` units; the bar begins at the first call."""
         if not self.total:
             self.total, self.done, self._first = total, done, done
             self._start = self._last_line = time.monotonic()
-            self.__enter__()
+            self._begin()
         self.advance(done - self.done, note)
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
+        Bar._shown -= self._is_shown
         if self._rich:
             self._rich.stop()
+        took_s = time.monotonic() - self._start
+        if error is None and self.done > self._first and (took_s >= _SHORT_S or is_verbose()):
+            self._say(f"{self.done - self._first} {self.unit} in {_duration(took_s)}")
+
+    def _say(self, text: str) -> None:
+        if self._is_shown:
+            say(f"{self.title}: {text}" + f" ({self.note})" * bool(self.note and is_verbose()))
+
+
+def _duration(seconds: float) -> str:
+    return f"{max(seconds, 1):.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"

@@ -278,7 +278,7 @@ class ProtocolRun:
                 jobs["", kind] = self._experiments(Row(kind, method, towers), kind, is_control=True)
         outcomes: dict[Job, list[list[Outcome]]] = {}
         count = sum(len(by_fold) for by_seed in jobs.values() for by_fold in by_seed)
-        with Bar(self.name, count, "fits", quiet=self.quiet or protocol.in_depth) as bar:
+        with Bar(f"evaluating {self.name}", count, "fits", quiet=self.quiet or protocol.in_depth) as bar:
             for job, by_seed in jobs.items():
                 outcomes[job] = [[] for _ in by_seed]
                 for found, experiments in zip(outcomes[job], by_seed, strict=True):

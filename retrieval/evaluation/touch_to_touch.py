@@ -107,7 +107,7 @@ def with_common_frame(grasps: Sequence[Grasp], folder: Path, *, quiet: bool = Tr
     common = [read_rgb(path) for path in grasps[0].backgrounds]
     folder.mkdir(parents=True, exist_ok=True)
     found = []
-    with Bar("one common frame", len(grasps), "grasps", quiet=quiet) as bar:
+    with Bar("taking differences to one no-contact frame", len(grasps), "grasps", quiet=quiet) as bar:
         for grasp in grasps:
             files = []
             for finger, (touch, before) in enumerate(zip(grasp.touches, grasp.backgrounds, strict=True)):

@@ -162,7 +162,7 @@ class Sample:
 
     def _find_exhaustive_top1(self) -> list[int]:
         partials, found = self.queries["partial"], list[int]()
-        with Bar("exhaustive rerank", len(partials), "queries", quiet=self.quiet) as bar:
+        with Bar("ranking all photos exactly", len(partials), "queries", quiet=self.quiet) as bar:
             for touch_partial in partials:
                 found.append(int(self.logits(touch_partial, self.catalogue["partial"]).argmax()))
                 bar.advance()

@@ -58,7 +58,7 @@ def measure_candidates(
         return None
     scorer, (touches, queries) = checkpoint.matcher.head.scorer, stored
     top1, taken = [], []
-    with Bar("measure", len(queries), "touches", quiet=quiet) as bar:
+    with Bar("measuring the candidate search", len(queries), "touches", quiet=quiet) as bar:
         for touch in touches:
             start = time.perf_counter()
             top1.append(int(scorer.logits(touch[None], partials).argmax()))

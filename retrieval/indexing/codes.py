@@ -310,7 +310,7 @@ def find_codes(items: Sequence[Paths], encoder: Encoder, files: CatalogueFiles, 
         return {key: code.tobytes() for key, code in zip(new, codes, strict=True)}
 
     with (
-        Bar("embed", len(unread), encoder.what, quiet=quiet) as bar,
+        Bar("embedding", len(unread), encoder.what, quiet=quiet) as bar,
         ThreadPoolExecutor(threads := torch.get_num_threads()) as pool,
         one_thread(),
     ):

@@ -100,7 +100,7 @@ class ContrastiveEmbedding(Method):
                 Plan(min(config.training.iterations, MAX_STEPS), LEARNING_RATE, validate_every=VALIDATE_EVERY),
                 lambda steps: steps,
                 loss,
-                title=f"fit contrastive, {place + 1} of {len(REGULARISATIONS)}",
+                title=f"fitting contrastive, regularisation {place + 1} of {len(REGULARISATIONS)}",
                 quiet=self.settings.quiet,
                 validate=validate,
             )

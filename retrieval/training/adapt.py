@@ -143,7 +143,7 @@ def adapt(
     with one_thread():
         measures = dict[str, Measure]()
         for suffix, each in (("", features), ("_low_pass", low_pass)):
-            fits = fit_folds(each, folds, fit, f"estimate{suffix}".replace("_", " "), quiet)
+            fits = fit_folds(each, folds, fit, f"measuring accuracy{suffix}".replace("_", " "), quiet)
             parts = [each.of_objects(fold) for fold in folds]
             cosines = [
                 one.projections.cosines(part.touch_rows, part.photo) for one, part in zip(fits, parts, strict=True)

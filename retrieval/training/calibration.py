@@ -506,7 +506,7 @@ def calibrate_checkpoint(
     grasps = _sample_grasps(validation, seed, max_grasps)
     if not train or not grasps:
         return checkpoint
-    touches, photos = recorded_features(matcher, source, grasps, what="posterior", quiet=quiet)
+    touches, photos = recorded_features(matcher, source, grasps, quiet=quiet)
     scored = [
         each
         for pooled in ((False, True) if matcher.config.cell_dim else (False,))
@@ -566,7 +566,7 @@ def with_gel_check(
             matcher,
             settings,
             grasps,
-            recorded_features(matcher, source, grasps, what="gel check", quiet=quiet)[0],
+            recorded_features(matcher, source, grasps, quiet=quiet)[0],
             count,
             seed + number,
         )

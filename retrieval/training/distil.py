@@ -94,7 +94,7 @@ def distil(
         Plan(steps, LEARNING_RATE, validate_every=steps),
         lambda left: left,
         loss,
-        title="distil candidate encoder",
+        title="fitting the candidate encoder",
         quiet=quiet,
     )
     candidate_encoder.fold_statistics(touch_statistics, photo_statistics)
@@ -230,7 +230,7 @@ def add_candidate_encoder(
     for grasps in filter(None, (train, validation)):
         order = torch.randperm(len(grasps), generator=torch.Generator().manual_seed(config.training.seed))[:MAX_GRASPS]
         sample = [grasps[row] for row in order.tolist()]
-        touches, photos = recorded_features(matcher, source, sample, what="candidate encoder", quiet=quiet)
+        touches, photos = recorded_features(matcher, source, sample, quiet=quiet)
         with torch.inference_mode():
             photo_partials = matcher.photo_encoding(torch.stack(list(photos.values()))).partial
             partials.append((matcher.touch_encoding(touches).partial, photo_partials))

@@ -218,15 +218,12 @@ def _encoded(
 
 @torch.inference_mode()
 def recorded_features(
-    matcher: Matcher, source: FeatureSource, grasps: Sequence[Grasp], *, what: str, quiet: bool = False
+    matcher: Matcher, source: FeatureSource, grasps: Sequence[Grasp], *, quiet: bool = False
 ) -> tuple[Tensor, dict[Path, Tensor]]:
-    """Return features of the touches of grasps (G, fingers * F) and of each of their photo files (F,).
-
-    `what` names their purpose, for the progress bar.
-    """
+    """Return features of the touches of grasps (G, fingers * F) and of each of their photo files (F,)."""
     touches: list[Tensor] = []
     photos: dict[Path, Tensor] = {}
-    with Bar(f"encode for {what}", len(grasps), "grasps", quiet=quiet) as bar:
+    with Bar("encoding", len(grasps), "grasps", quiet=quiet) as bar:
         for part in batches(grasps, _CHUNK):
             files = list(dict.fromkeys(path for grasp in part for path in grasp.photos))
             touch, photo = source.eval_features(matcher, part, files)
@@ -426,6 +423,16 @@ def _tower_digest(tower: Tower) -> str:
     return tensors_digest(tower.state_dict(), f"{type(tower).__name__} {tower.output} {tower.cells}")
 
 
+_UNITS = {
+    "touch": "touches",
+    "low_pass": "low-pass touches",
+    "no_contact": "no-contact frames",
+    "photo": "photos",
+    "margin": "margins of photos",
+}
+"""What progress calls the images of each variant."""
+
+
 def _encoded_once(
     cache: Path | None,
     made_by: tuple[str, ...],
@@ -440,9 +447,8 @@ def _encoded_once(
     `made_by` are variant, tower and preprocessing. `load` returns the image (or images) of an item, `encode` the
     features (B, F) of a list of images, `files` the files of an item. Raises DatasetError if one cannot be read.
     """
-    unit = "photos" if made_by[0] in ("photo", "margin") else "grasps"
     with (
-        Bar(f"encode {made_by[0]}", len(items), unit, quiet=quiet) as bar,
+        Bar("encoding", len(items), _UNITS[made_by[0]], quiet=quiet) as bar,
         worker_pool() as pool,
         Cache(cache / "cache.sqlite") if cache else nullcontext() as store,
     ):

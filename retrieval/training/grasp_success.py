@@ -106,7 +106,7 @@ def train_gate(
     logits: list[float] = []  # each grasp's highest logit
     with one_thread():
         gate = GraspSuccessGate(_train_net(train, differences, iterations, seed, quiet), settings)
-        with Bar("validate", len(validation), "grasps", quiet=quiet) as bar:
+        with Bar("validating", len(validation), "grasps", quiet=quiet) as bar:
             for part in batches(validation, BATCH):
                 logits += map(max, gate.score(differences(part)))
                 bar.advance(len(part))
@@ -170,7 +170,7 @@ def _train_net(attempts: list[Attempt], differences: Differences, iterations: in
         return gate_loss(net(images), torch.tensor([float(attempt.held) for attempt in batch]))
 
     optimizer, plan = torch.optim.Adam(net.parameters()), Plan(iterations, LEARNING_RATE, "halving")
-    train_loop(net, optimizer, plan, lambda steps: steps, loss, title="train", quiet=quiet)
+    train_loop(net, optimizer, plan, lambda steps: steps, loss, title="training", quiet=quiet)
     return net
 
 

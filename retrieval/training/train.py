@@ -211,7 +211,7 @@ class Trainer:
                     self.matcher, ((step, self.sampler.batch(step, touches)) for step in steps)
                 ),
                 distributed.averaging_gradients(self.modules, self.loss),
-                title="train",
+                title="training",
                 quiet=quiet,
                 validate=self.validate,
                 state=state,

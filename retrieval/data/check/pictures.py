@@ -106,7 +106,7 @@ def read_pictures(
 
     found: dict[Path, ImageRecord | str] = {}
     paths = sorted(files)
-    with ThreadPoolExecutor(2) as pool, Bar("check", len(paths), "images") as bar:
+    with ThreadPoolExecutor(2) as pool, Bar("checking", len(paths), "images") as bar:
         for path, record in zip(paths, pool.map(read, paths), strict=True):
             found[path] = record
             bar.advance()

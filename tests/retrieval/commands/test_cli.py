@@ -138,6 +138,13 @@ def test_an_unexpected_error_has_a_traceback_only_with_debug(workplace, monkeypa
         main(["--debug", *QUERY, "--index", "index"])
 
 
+def test_verbose_shows_short_steps_too(workplace, capsys):
+    assert main(["--verbose", "build-index", "catalog/"]) == 0
+    assert re.search(r"^embedding: \d+ photos in ", capsys.readouterr().err, re.MULTILINE)
+    assert main(["build-index", "catalog/"]) == 0
+    assert "embedding" not in capsys.readouterr().err
+
+
 def numeric_options(command, words=()):
     """Yield the words of each command with a value for its required parameters, and each of its numeric options."""
     for name, inner in getattr(command, "commands", {}).items():

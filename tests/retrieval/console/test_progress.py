@@ -1,10 +1,11 @@
-"""The progress of long work: lines in a pipe, a bar on a terminal."""
+"""The progress of long work: a line for each stage, and a bar on a terminal."""
 
 from contextlib import suppress
 
 import pytest
 
 from retrieval.console import progress
+from retrieval.console.output import set_verbose
 from retrieval.console.progress import Bar
 
 
@@ -16,42 +17,77 @@ def clock(monkeypatch):
     return now
 
 
-def test_a_line_comes_every_fifteen_seconds_and_at_the_end(clock, capsys):
-    with Bar("train", 40, "steps") as bar:
-        for _ in range(40):
+@pytest.fixture
+def verbose():
+    set_verbose(True)
+    yield
+    set_verbose(False)
+
+
+def work(clock, seconds=40):
+    """Train for some seconds, with a stage within it."""
+    with Bar("training", seconds, "steps") as bar:
+        for _ in range(seconds):
             clock[0] += 1.0
             bar.advance(note="loss 0.5")
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.splitlines() == [
-        "train: 16/40 steps, 1.0 per second, 24 s left  loss 0.5",
-        "train: 32/40 steps, 1.0 per second, 8 s left  loss 0.5",
-        "train: 40/40 steps, 1.0 per second, 0 s left  loss 0.5",
+        with Bar("encoding", 4, "photos") as inner:
+            clock[0] += 5.0
+            inner.advance(4)
+
+
+def test_a_long_stage_prints_a_line_every_fifteen_seconds_and_at_its_end(clock, capsys):
+    work(clock)
+    assert capsys.readouterr() == (
+        "",
+        "training: 16 of 40 steps, 24 s left\ntraining: 32 of 40 steps, 8 s left\ntraining: 40 steps in 45 s\n",
+    )
+
+
+def test_a_verbose_command_shows_figures_and_the_stages_within_a_stage(clock, capsys, verbose):
+    work(clock)
+    assert capsys.readouterr().err.splitlines() == [
+        "training: 16 of 40 steps, 24 s left (loss 0.5)",
+        "training: 32 of 40 steps, 8 s left (loss 0.5)",
+        "encoding: 4 photos in 5 s",
+        "training: 40 steps in 45 s (loss 0.5)",
     ]
 
 
-def test_resumed_work_is_counted_in_full_and_timed_from_its_resumption(clock, capsys):
-    with Bar("embed", 100, "photos", done=60) as bar:
+def test_a_short_stage_prints_nothing(clock, capsys):
+    with Bar("encoding", 4, "photos") as bar:
+        clock[0] += 1.9
+        bar.advance(4)
+    assert capsys.readouterr().err == ""
+
+
+def test_the_time_left_is_shown_once_it_is_known(clock, capsys):
+    with Bar("embedding", 100, "photos", done=60) as bar:
         clock[0] += 20.0
+        bar.advance(0)
+        clock[0] += 180.0
         bar.advance(10)
-    assert capsys.readouterr().err == "embed: 70/100 photos, 0.5 per second, 60 s left\n"
+    assert capsys.readouterr().err.splitlines() == [
+        "embedding: 60 of 100 photos",
+        "embedding: 70 of 100 photos, 10 min left",
+        "embedding: 10 photos in 3 min",
+    ]
 
 
 def test_the_first_call_of_show_states_the_total(clock, capsys):
-    with Bar("collect", 0, "grasps") as bar:
+    with Bar("collecting", 0, "grasps") as bar:
         clock[0] += 60.0  # what comes before the first call is not counted
         bar.show(2, 4)
         clock[0] += 4.0
-        bar.show(4, 4, "held")
-    assert capsys.readouterr().err == "collect: 4/4 grasps, 0.5 per second, 0 s left  held\n"
+        bar.show(4, 4)
+    assert capsys.readouterr().err == "collecting: 2 grasps in 4 s\n"
 
 
 def test_a_terminal_shows_a_bar_that_stops_even_after_an_error(monkeypatch, capsys):
     monkeypatch.setattr(progress.sys.stderr, "isatty", lambda: True, raising=False)
-    with suppress(KeyError), Bar("train", 5, "steps", done=2) as bar:
-        bar.advance(note="loss 0.25")
+    with suppress(KeyError), Bar("training", 5, "steps", done=2) as bar:
+        bar.advance()
         raise KeyError
     out, err = capsys.readouterr()
     assert out == ""
-    assert all(words in err for words in ("train", "3/5", "loss 0.25"))
+    assert all(words in err for words in ("training", "3/5"))
     assert not bar._rich.live.is_started
