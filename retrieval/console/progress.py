@@ -25,8 +25,8 @@ class Bar:
         quiet: Whether to print nothing.
     """
 
-    _shown: ClassVar[int] = 0
-    """Number of stages that are running and shown."""
+    _running: ClassVar["Bar | None"] = None
+    """The innermost stage that is shown."""
 
     def __init__(self, title: str, total: int, unit: str, *, done: int = 0, quiet: bool = False) -> None:
         self.title, self.total, self.unit, self.done, self.note = title, total, unit, done, ""
@@ -35,8 +35,10 @@ class Bar:
         self._quiet = quiet
 
     def __enter__(self) -> Self:
-        self._is_shown = not self._quiet and (is_verbose() or not Bar._shown)
-        Bar._shown += self._is_shown
+        self._outer = Bar._running
+        self._is_shown = not self._quiet and (is_verbose() or not self._outer)
+        if self._is_shown:
+            Bar._running = self
         self._begin()
         return self
 
@@ -55,6 +57,7 @@ class Bar:
                 TimeRemainingColumn(table_column=Column(no_wrap=True)),
                 console=Console(stderr=True),
                 transient=True,
+                refresh_per_second=2,  # commands measure times meanwhile
             )
             self._rich.start()
             self._task = self._rich.add_task(printable(self.title), total=self.total, completed=self.done)
@@ -62,7 +65,9 @@ class Bar:
     def advance(self, count: int = 1, note: str = "") -> None:
         """Add `count` finished units; `note` has the latest figures."""
         self.done, self.note, now = self.done + count, note, time.monotonic()
-        if self._rich:
+        if self._outer and not self._is_shown:
+            self._outer.advance(0, self._outer.note)
+        elif self._rich:
             self._rich.update(self._task, advance=count)
         elif now - self._last_line > _LINE_EVERY_S and self.done < self.total:
             self._last_line, finished = now, self.done - self._first
@@ -78,7 +83,7 @@ class Bar:
         self.advance(done - self.done, note)
 
     def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
-        Bar._shown -= self._is_shown
+        Bar._running = self._outer
         if self._rich:
             self._rich.stop()
         took_s = time.monotonic() - self._start

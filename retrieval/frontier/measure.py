@@ -100,7 +100,7 @@ def _row(
 
     def make() -> Any:
         if not sample.quiet:
-            say(f"frontier: measuring {name}")
+            say(f"measuring {name}")
         return msgspec.to_builtins(work(sample))
 
     key = cache_key("frontier", name, FORMAT, __version__, here, msgspec.to_builtins(sample.scale), *digests)

@@ -53,6 +53,17 @@ def test_a_verbose_command_shows_figures_and_the_stages_within_a_stage(clock, ca
     ]
 
 
+def test_a_stage_shows_its_progress_during_the_stages_within_it(clock, capsys):
+    with Bar("evaluating", 3, "fits") as bar:
+        clock[0] += 10.0
+        bar.advance()
+        with Bar("training", 2, "steps") as inner:
+            clock[0] += 10.0
+            inner.advance()
+        bar.advance(2)
+    assert capsys.readouterr().err == "evaluating: 1 of 3 fits, 40 s left\nevaluating: 3 fits in 20 s\n"
+
+
 def test_a_short_stage_prints_nothing(clock, capsys):
     with Bar("encoding", 4, "photos") as bar:
         clock[0] += 1.9
