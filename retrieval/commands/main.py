@@ -19,7 +19,8 @@ import typer
 from retrieval.commands.options import Command
 from retrieval.console.interruption import record_interrupts
 from retrieval.console.memory import keep_freed_memory
-from retrieval.console.output import checked_stdout, discard_stdout, prepare_streams, printable, say, set_verbose, show
+from retrieval.console.output import checked_stdout, discard_stdout, prepare_streams, printable, say, show
+from retrieval.console.progress import Bar
 from retrieval.version import __version__
 
 MAX_MESSAGE, MESSAGE_TAIL = 500, 150
@@ -75,7 +76,7 @@ def retrieve(
     verbose: Annotated[bool, typer.Option("--verbose", help="show the steps and figures of all work")] = False,
 ) -> None:
     """From the gel images of a grasp, find the catalogue photo of the object in the hand."""
-    set_verbose(verbose)
+    Bar.is_verbose = verbose
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -50,16 +50,6 @@ def say(text: str) -> None:
         print(printable(text), file=sys.stderr, flush=True)
 
 
-def set_verbose(is_verbose: bool) -> None:
-    """Set whether `is_verbose`: the level of the logger "retrieval"."""
-    logging.getLogger("retrieval").setLevel(logging.INFO if is_verbose else logging.WARNING)
-
-
-def is_verbose() -> bool:
-    """Return whether details of the work are printed too: the logger "retrieval" has level INFO."""
-    return logging.getLogger("retrieval").isEnabledFor(logging.INFO)
-
-
 def printable(text: str) -> str:
     """Return `text` on one line, with escapes for unprintable characters."""
     return "".join(

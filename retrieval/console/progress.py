@@ -1,13 +1,13 @@
 """Progress on stderr: one line for each stage of a command, and the time left of a long one.
 
-A stage within another one, and the figures of a stage, are shown with `--verbose` only.
+A stage within another one, and the figures of a stage, are shown with `--verbose` (`Bar.is_verbose`) only.
 """
 
 import sys
 import time
 from typing import Any, ClassVar, Self
 
-from retrieval.console.output import is_verbose, printable, say
+from retrieval.console.output import printable, say
 
 _LINE_EVERY_S = 15.0
 _SHORT_S = 2.0
@@ -25,6 +25,8 @@ class Bar:
         quiet: Whether to print nothing.
     """
 
+    is_verbose: ClassVar[bool] = False
+    """Whether every stage prints its lines and figures; there is then no bar."""
     _running: ClassVar["Bar | None"] = None
     """The innermost stage that is shown."""
 
@@ -32,18 +34,12 @@ class Bar:
         self.title, self.total, self.unit, self.done, self.note = title, total, unit, done, ""
         self._first, self._start, self._last_line = done, time.monotonic(), time.monotonic()
         self._rich: Any = None
-        self._quiet = quiet
+        self._outer = Bar._running
+        self._is_shown = not quiet and (self.is_verbose or not self._outer)
 
     def __enter__(self) -> Self:
-        self._outer = Bar._running
-        self._is_shown = not self._quiet and (is_verbose() or not self._outer)
-        if self._is_shown:
-            Bar._running = self
-        self._begin()
-        return self
-
-    def _begin(self) -> None:
-        if self.total and self._is_shown and not is_verbose() and sys.stderr.isatty():
+        Bar._running = self if self._is_shown else self._outer
+        if self.total and self._is_shown and not self.is_verbose and sys.stderr.isatty():
             from rich.console import Console
             from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
             from rich.table import Column
@@ -61,6 +57,7 @@ class Bar:
             )
             self._rich.start()
             self._task = self._rich.add_task(printable(self.title), total=self.total, completed=self.done)
+        return self
 
     def advance(self, count: int = 1, note: str = "") -> None:
         """Add `count` finished units; `note` has the latest figures."""
@@ -69,7 +66,7 @@ class Bar:
             self._outer.advance(0, self._outer.note)
         elif self._rich:
             self._rich.update(self._task, advance=count)
-        elif now - self._last_line > _LINE_EVERY_S and self.done < self.total:
+        elif self._is_shown and now - self._last_line > _LINE_EVERY_S and self.done < self.total:
             self._last_line, finished = now, self.done - self._first
             left_s = (now - self._start) * (self.total - self.done) / max(finished, 1)
             self._say(f"{self.done} of {self.total} {self.unit}" + f", {_duration(left_s)} left" * bool(finished))
@@ -79,7 +76,7 @@ class Bar:
         if not self.total:
             self.total, self.done, self._first = total, done, done
             self._start = self._last_line = time.monotonic()
-            self._begin()
+            self.__enter__()
         self.advance(done - self.done, note)
 
     def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
@@ -87,12 +84,11 @@ class Bar:
         if self._rich:
             self._rich.stop()
         took_s = time.monotonic() - self._start
-        if error is None and self.done > self._first and (took_s >= _SHORT_S or is_verbose()):
+        if (took_s >= _SHORT_S or self.is_verbose) and self._is_shown and not error and self.done > self._first:
             self._say(f"{self.done - self._first} {self.unit} in {_duration(took_s)}")
 
     def _say(self, text: str) -> None:
-        if self._is_shown:
-            say(f"{self.title}: {text}" + f" ({self.note})" * bool(self.note and is_verbose()))
+        say(f"{self.title}: {text}" + f" ({self.note})" * bool(self.note and self.is_verbose))
 
 
 def _duration(seconds: float) -> str:

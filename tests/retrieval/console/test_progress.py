@@ -5,7 +5,6 @@ from contextlib import suppress
 import pytest
 
 from retrieval.console import progress
-from retrieval.console.output import set_verbose
 from retrieval.console.progress import Bar
 
 
@@ -18,10 +17,8 @@ def clock(monkeypatch):
 
 
 @pytest.fixture
-def verbose():
-    set_verbose(True)
-    yield
-    set_verbose(False)
+def verbose(monkeypatch):
+    monkeypatch.setattr(Bar, "is_verbose", True)
 
 
 def work(clock, seconds=40):
