@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from models.pictures import FAMILIES, SIZES, ObjectLabels
 from retrieval.data.pairs import PairBatch
-from retrieval.training.train import Trainer
+from retrieval.training.trainer import Trainer
 
 SMOOTHING, DROPOUT = 0.05, 0.2
 LABEL_WEIGHT = 0.5

@@ -49,14 +49,12 @@ if TYPE_CHECKING:
     from retrieval.search.searcher import Searcher as Searcher
     from retrieval.search.searcher import enrol as enrol
     from retrieval.serve.client import Client as Client
-    from retrieval.training.adapt import Adaptation as Adaptation
-    from retrieval.training.adapt import adapt as adapt
+    from retrieval.training.recipes import Recipe as Recipe
     from retrieval.training.train import train as train
 
     open = Searcher.open
 
 _MODULES = {
-    "Adaptation": "training.adapt:Adaptation",
     "BadInput": "errors:BadInput",
     "BuildReport": "indexing.report:BuildReport",
     "Checkpoint": "model.checkpoint:Checkpoint",
@@ -69,12 +67,12 @@ _MODULES = {
     "Method": "methods.method:Method",
     "Protocol": "evaluation.protocol:Protocol",
     "QueryResult": "search.answer:QueryResult",
+    "Recipe": "training.recipes:Recipe",
     "RetrievalError": "errors:RetrievalError",
     "Searcher": "search.searcher:Searcher",
     "MethodSettings": "methods.method:MethodSettings",
     "Tower": "model.towers.tower:Tower",
     "Verification": "search.answer:Verification",
-    "adapt": "training.adapt:adapt",
     "build_index": "indexing.build:build_index",
     "check_recording": "data.check.recording:check_recording",
     "embed_photos": "search.embeddings:embed_photos",

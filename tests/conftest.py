@@ -124,10 +124,10 @@ def touch(two_grasps: list[tuple[Path, ...]]) -> tuple[Path, ...]:
 @pytest.fixture(scope="session")
 def model(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A checkpoint after six training steps: it works like any other, but its scores are nearly random."""
-    from retrieval.training.train import train
+    from retrieval.training.trainer import train_matcher
 
     out = tmp_path_factory.mktemp("model") / "tiny.safetensors"
-    train(recording, out, TINY, quiet=True)
+    train_matcher(recording, out, TINY, quiet=True)
     return out
 
 

@@ -15,7 +15,7 @@ from retrieval.frontier.sample import Sample
 from retrieval.model.encode import autocast, has_fast_bfloat16, to_batch, touch_batch
 from retrieval.model.fusion import Matcher
 from retrieval.training.features import BatchImages
-from retrieval.training.train import WeightedLosses, batch_loss, set_training_mode
+from retrieval.training.trainer import WeightedLosses, batch_loss, set_training_mode
 
 TOLERANCE = 0.1
 """Tolerance of 1 - cosine: a tenth of the value for two batches, whose gradients have little in common."""

@@ -14,7 +14,7 @@ from retrieval.data.dataset import Split
 from retrieval.errors import JobInterrupted, RetrievalError
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable
 from retrieval.model.config import Config
-from retrieval.training.train import train
+from retrieval.training.trainer import train_matcher
 
 MAX_RESTARTS = 3
 """Largest number of restarts after a rank was lost."""
@@ -23,13 +23,13 @@ MAX_RESTARTS = 3
 def train_on_ray(
     recording: Path, out: Path, config: Config, *, split: Split | None = None, workers: int = 2
 ) -> Checkpoint:
-    """Train on several ranks, each with a GPU if the cluster has enough; as `retrieval.training.train.train`.
+    """Train on several ranks, each with a GPU if the cluster has enough; as `retrieval.training.trainer.train_matcher`.
 
     Args:
-        recording: As for `train`.
-        out: As for `train`.
-        config: As for `train`.
-        split: As for `train`.
+        recording: As for `train_matcher`.
+        out: As for `train_matcher`.
+        config: As for `train_matcher`.
+        split: As for `train_matcher`.
         workers: Number of ranks.
 
     Raises:
@@ -65,7 +65,7 @@ def train_on_ray(
 
 def _rank(settings: dict[str, Any]) -> None:
     """Train in a process of Ray Train, which has joined the ranks."""
-    train(**settings)
+    train_matcher(**settings)
 
 
 def _error_of_rank(error: BaseException) -> RetrievalError | None:

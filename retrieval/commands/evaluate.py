@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from retrieval.model.config import Config
 
 ALL = "all"
-METHODS_OF_PRESETS = {"adapt": ("cca_towers", "chance")}
+METHODS_OF_PRESETS = {"linear": ("cca_towers", "chance")}
 """Default methods of presets that fit only some of the methods."""
 
 
@@ -59,7 +59,7 @@ def evaluate(
         str | None,
         typer.Option(
             help=f"a preset, such as tiny, small, mobilenet or relief, or a TOML file (default: {DEFAULT_PRESET}; with "
-            "--protocol real, or touches if only touches are compared)"
+            "--protocol real, or linear if only touches are compared)"
         ),
     ] = None,
     model: Annotated[Path | None, typer.Option(help="checkpoint to evaluate, instead of fitting one")] = None,

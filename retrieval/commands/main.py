@@ -34,10 +34,10 @@ _BAD_PATH_ERRNOS = {
 
 GROUPS = ("rig",)
 COMMANDS = (
-    *("demo", "collect", "import", "export-recording", "check", "train", "adapt", "build-index", "enrol", "query"),
+    *("demo", "collect", "import", "export-recording", "check", "train", "build-index", "enrol", "query"),
     *("verify", "identify", "export", "evaluate", "frontier", "serve", *GROUPS),
 )
-KEEP_FREED_MEMORY = {"train", "adapt", "build-index", "evaluate"}
+KEEP_FREED_MEMORY = {"train", "build-index", "evaluate"}
 """Commands that compute with large tensors until they end."""
 
 

@@ -1,6 +1,7 @@
 """`retrieve train`: train a matcher, or a gate for `retrieve collect`."""
 
-from typing import Annotated, Any, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -17,6 +18,10 @@ from retrieval.commands.options import (
 )
 from retrieval.console.output import say
 from retrieval.errors import BadInput
+from retrieval.training import RECIPES
+
+if TYPE_CHECKING:
+    from retrieval.model.config import Config
 
 
 def train(
@@ -25,14 +30,20 @@ def train(
     task: Annotated[
         Literal["match", "touches", "grasp-success"],
         typer.Option(
-            help="match: classify whether a touch and a photo show the same object; touches: find an object by other "
-            "touches of it, as with a recording without photos; grasp-success: classify whether a grasp succeeded"
+            help="match: identify the photo of a touched object; touches: find an object by other touches of it, as "
+            "with a recording without photos; grasp-success: classify whether a grasp succeeded"
         ),
     ] = "match",
     out: CheckpointOut,
-    config: Annotated[
+    recipe: Annotated[
         str | None,
-        typer.Option(help="a preset, such as small, mobilenet, relief or paper, or a TOML file (default: small)"),
+        typer.Option(help=f"train by this recipe: {', '.join(RECIPES)} (default: the best one on held-out objects)"),
+    ] = None,
+    model: Annotated[
+        Path | None, typer.Option(help="start model of the recipes (default: the shipped one for as many fingers)")
+    ] = None,
+    config: Annotated[
+        str | None, typer.Option(help="train with these settings instead: a preset, such as paper, or a TOML file")
     ] = None,
     init: Init = None,
     iterations: Iterations = None,
@@ -48,57 +59,71 @@ def train(
         int | None, typer.Option(parser=WORKERS, help="with --cluster: number of ranks (default: 2)")
     ] = None,
 ) -> None:
-    """Train a matcher, or a grasp-success gate for `collect`."""
+    """Train a matcher by the best of several recipes, or a grasp-success gate for `collect`."""
     from retrieval.model.checkpoint import require_writable
 
-    if (cluster and task != "match") or (workers is not None and not cluster):
-        raise BadInput("--cluster needs --task match, and --workers needs --cluster")
+    if (cluster and config is None) or (workers is not None and not cluster):
+        raise BadInput("--cluster needs --config, and --workers needs --cluster")
     require_writable(out)
     if task == "grasp-success":
-        others = {"config": config, "split": split, "init": init}
+        others = {"recipe": recipe, "model": model, "config": config, "split": split, "init": init}
         refuse_options("does not apply to --task grasp-success, which takes --iterations", **others)
-        from retrieval.data.dataset import recording_licence
-        from retrieval.training.grasp_success import train_gate
-
-        licence = recording_licence(recording)
-        say(f"licence of {licence.source}: {licence}")
-        steps: dict[str, Any] = {} if iterations is None else {"iterations": iterations}
-        found = train_gate(recording, out, **steps)
-        trained = f"trained on {found['train_grasps']} grasps, {found['train_held']} of them held"
-        say(f"{out}: uses the frame {found['frame']} the grasp; {trained}")
-        say(
-            f"accuracy {found['accuracy']:.3f} (95 %: {found['interval'][0]:.3f} to {found['interval'][1]:.3f}) on "
-            f"{found['validation_grasps']} grasps of {found['validation_objects']} other objects; always predicting "
-            f"the more frequent class: {found['chance']:.3f}"
-        )
-        accepted = [f"{part} of {whole} {name}" for name, (part, whole) in found["accepted"].items()]
-        say(f"accepted: {', '.join(accepted)}")
-        return
-    from retrieval.data.dataset import load_grasps
-
-    if task == "touches" or not any(grasp.photos for grasp in load_grasps(recording)):
-        reason = "does not apply to a fit to touches only"
-        refuse_options(reason, config=config, iterations=iterations, cluster=cluster)
-        from retrieval.report.adaptation import print_touch_model
+        _train_gate(recording, out, iterations)
+    elif config is not None:
+        refuse_options("does not apply with --config", recipe=recipe, model=model, task=task != "match")
+        _train_with_config(recording, out, training_config(config, iterations, init=init), split, cluster, workers or 2)
+    else:
+        refuse_options("needs --config", iterations=iterations)
+        from retrieval.data.check.recording import check_gel_layout
+        from retrieval.report.training import print_comparison
         from retrieval.training.touches import train_on_touches
+        from retrieval.training.train import train as train_best
 
-        print_touch_model(train_on_touches(recording, out, init=init or "imagenet", split=read_split(split)))
-        return
+        for finding in check_gel_layout(recording):
+            say(f"{finding.severity}: {finding.message}")
+        weights, objects = init or "imagenet", read_split(split)
+        if task == "touches":
+            refuse_options("does not apply to --task touches", recipe=recipe, model=model)
+            print_comparison(train_on_touches(recording, out, init=weights, split=objects))
+        else:
+            print_comparison(train_best(recording, out, recipe=recipe, model=model, init=weights, split=objects))
+
+
+def _train_gate(recording: Path, out: Path, iterations: int | None) -> None:
+    from retrieval.data.dataset import recording_licence
+    from retrieval.training.grasp_success import train_gate
+
+    licence = recording_licence(recording)
+    say(f"licence of {licence.source}: {licence}")
+    steps: dict[str, Any] = {} if iterations is None else {"iterations": iterations}
+    found = train_gate(recording, out, **steps)
+    trained = f"trained on {found['train_grasps']} grasps, {found['train_held']} of them held"
+    say(f"{out}: uses the frame {found['frame']} the grasp; {trained}")
+    say(
+        f"accuracy {found['accuracy']:.3f} (95 %: {found['interval'][0]:.3f} to {found['interval'][1]:.3f}) on "
+        f"{found['validation_grasps']} grasps of {found['validation_objects']} other objects; always predicting "
+        f"the more frequent class: {found['chance']:.3f}"
+    )
+    accepted = [f"{part} of {whole} {name}" for name, (part, whole) in found["accepted"].items()]
+    say(f"accepted: {', '.join(accepted)}")
+
+
+def _train_with_config(
+    recording: Path, out: Path, settings: "Config", split: Path | None, cluster: bool, workers: int
+) -> None:
     from retrieval.training import distributed
     from retrieval.training.initial_weights import training_licences
-    from retrieval.training.train import train as train_matcher
+    from retrieval.training.trainer import train_matcher
 
     try:
-        settings = training_config(config, iterations, init=init)
         for licence in training_licences(recording, settings.training):
             say(f"licence of {licence.source}: {licence}")
-        objects = read_split(split)
         if cluster:
             from retrieval.cluster.training import train_on_ray
 
-            checkpoint = train_on_ray(recording, out, settings, workers=workers or 2, split=objects)
+            checkpoint = train_on_ray(recording, out, settings, workers=workers, split=read_split(split))
         else:
-            checkpoint = train_matcher(recording, out, settings, split=objects)
+            checkpoint = train_matcher(recording, out, settings, split=read_split(split))
         if distributed.rank():
             return
     finally:

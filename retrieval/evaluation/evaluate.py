@@ -22,7 +22,7 @@ from retrieval.methods.method import Method
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.config import Config, named_config
 from retrieval.training.initial_weights import training_licences
-from retrieval.training.train import Trainer
+from retrieval.training.trainer import Trainer
 from retrieval.version import __version__
 
 DATA_SET_METHODS, DATA_SET_SEEDS = ("cca_towers", "cca", "late_fusion", "chance"), 3
@@ -56,7 +56,7 @@ def evaluate(
             of the recording, with which each method is described in depth.
         config: Towers, heads and split, if `model` does not give them: a `Config` (`Config.using` accepts your own
             towers and losses), or an argument of `load_config`. Its seed is the seed of every random draw. Default:
-            "small", with `protocols` "real", or "touches" if all compare touches with touches. Only "unseen-objects"
+            "small", with `protocols` "real", or "linear" if all compare touches with touches. Only "unseen-objects"
             trains towers; other protocols use frozen ones.
         preset: Name of the configuration in the report. Default: the configuration's name.
         methods: Names, or your own classes, which the report lists by class name. Default: all, with `protocols` those
@@ -153,7 +153,7 @@ def evaluate(
 
 def data_set_preset(protocols: Sequence[str | Protocol]) -> str:
     """Return the default preset of an evaluation by these protocols."""
-    return "touches" if all(isinstance(_named(choice)[1], TouchToTouch) for choice in protocols) else "real"
+    return "linear" if all(isinstance(_named(choice)[1], TouchToTouch) for choice in protocols) else "real"
 
 
 def _named(choice: str | Protocol) -> tuple[str, Protocol]:

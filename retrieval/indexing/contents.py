@@ -160,8 +160,7 @@ def require_reference_calibration(checkpoint: Checkpoint) -> None:
     if checkpoint.references is None or checkpoint.posterior is None:
         raise BadInput(
             "the catalogue has touches (touch_* files next to photos), but this model has no calibration of reference "
-            "touches. Use a shipped model, or one of `retrieve adapt` or `retrieve train` (preset relief, with enough "
-            "validation objects), or rename the files"
+            "touches. Use a shipped model, or one of `retrieve train`, or rename the files"
         )
     if checkpoint.config.preprocessing.background != "none":
         raise BadInput(

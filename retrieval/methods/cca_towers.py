@@ -1,4 +1,4 @@
-"""CCA of concatenated towers (`retrieval.training.cca`), as `retrieve adapt` fits it."""
+"""CCA of concatenated towers (`retrieval.training.cca`), as `retrieve train` fits it."""
 
 from contextlib import suppress
 from dataclasses import asdict

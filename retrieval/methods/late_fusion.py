@@ -16,7 +16,7 @@ from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
 from retrieval.training.features import Features
 from retrieval.training.initial_weights import build_matcher
-from retrieval.training.train import Trainer
+from retrieval.training.trainer import Trainer
 
 SOURCE = "features of a recording"
 """Training source in the checkpoint's provenance."""

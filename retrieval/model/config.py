@@ -307,7 +307,7 @@ def load_config(name_or_path: str) -> Config:
     True
     >>> retrieval.load_config("huge")
     Traceback (most recent call last):
-    retrieval.errors.ConfigError: --config must be one of adapt, ...
+    retrieval.errors.ConfigError: --config must be one of linear, ...
     """
     file = Path(name_or_path)
     if name_or_path in preset_names():

@@ -134,7 +134,7 @@ class VerificationCalibration:
             raise BadInput(
                 f"a false-accept rate of {far:g} needs {needed:,} validation objects; the model has {self.objects}, "
                 f"enough for {math.ceil(supported / step) * step:.2g}: give a larger rate, or fit the model "
-                "with more such objects (`retrieve train`: validation objects; `retrieve adapt`: recorded objects)"
+                "with more such objects"
             )
         accept = float(np.interp(math.log(far), np.log(LEVELS), self.impostors))
         rejects = _fraction_below(accept, self.genuine[-1])

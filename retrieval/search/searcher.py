@@ -374,8 +374,7 @@ class Searcher:
         if not self.can_enrol:
             raise BadInput(
                 f"{self.checkpoint.path} has no calibration of reference touches, so this index cannot compare "
-                "touches. Use a shipped model, or one of `retrieve adapt` or `retrieve train` (preset relief, with "
-                "enough validation objects), and build the index with it"
+                "touches. Use a shipped model, or one of `retrieve train`, and build the index with it"
             )
         like, new = self.shard.names_like(object_id), lookup_key(object_id)
         if len(like) > 1:

@@ -4,7 +4,7 @@ A ridge makes it a strong baseline: with fewer grasps than features the plain an
 The fit is in float64, from the singular value decomposition of the centred data. Only `leading_svd` uses X'X, which
 squares the condition number.
 
-For few objects and concatenated towers (`retrieve adapt`), the features of each tower are first reduced to their widest
+For few objects and concatenated towers (`retrieve train`), the features of each tower are first reduced to their widest
 directions, with equal weight for every tower. On a few dozen objects nothing with more freedom was better
 (docs/measurements/adaptation.md). The maps of each modality compose to one affine map, so the result is stored as the
 projections of an ordinary matcher. Settings are chosen from `GRID` on held-out training objects (`select_settings`),

@@ -1,4 +1,4 @@
-"""Choice of settings by ranking on held-out objects, never on the objects of the fit."""
+"""Choice by ranking on held-out objects, never on the objects of the fit, and the accuracies that led to it."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -6,11 +6,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.errors import NumericalError
-from retrieval.metrics.measure import weight_below
+from retrieval.errors import BadInput, NumericalError
+from retrieval.metrics.intervals import bootstrap_interval
+from retrieval.metrics.measure import Measure, weight_below
 from retrieval.training.features import Features
 
 MAX_VALIDATION_ROWS = 512
+GALLERY, MAX_FOLDS = 9, 5
+"""Smallest usual number of objects of a fold, and largest number of folds."""
+MIN_OBJECTS = 6
+"""Minimum number of objects: two folds of three."""
+LOW_PASS = "low-pass control"
+COMPARED = "compared"
+"""Key of `comparison_table` in a checkpoint's provenance."""
 
 
 def validation_rows(validation: Features, max_rows: int = MAX_VALIDATION_ROWS) -> NDArray[np.int64]:
@@ -43,6 +51,21 @@ def ranking_auc(
         others = score[~same]
         values[row] = weight_below(score[own if own.any() else same], others).mean() / len(others)
     return float(np.mean([values[owner == each].mean() for each in np.unique(owner)]))
+
+
+def draw_folds(linked: Sequence[Sequence[str]], seed: int = 0) -> list[tuple[str, ...]]:
+    """Draw folds of objects, each left out once; the objects of a group stay together.
+
+    Raises:
+        BadInput: There are fewer than `MIN_OBJECTS` objects.
+    """
+    total = sum(map(len, linked))
+    if total < MIN_OBJECTS:
+        raise BadInput(f"A fit needs a recording of at least {MIN_OBJECTS} objects, got {total}. Record more.")
+    folds: list[list[str]] = [[] for _ in range(min(max(round(total / GALLERY), 2), total // 3, MAX_FOLDS))]
+    for place in np.random.default_rng([seed, 7]).permutation(len(linked)):
+        min(folds, key=len).extend(linked[place])
+    return [tuple(sorted(fold)) for fold in folds]
 
 
 MIN_OBJECTS_FOR_FOUR_FOLDS = 12
@@ -96,3 +119,31 @@ def appearance_order(features: Features) -> list[str]:
     scaled = (means - means.mean(0))[:, spread > 0] / spread[spread > 0]
     scaled = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1e-12)
     return [names[place] for place in leaves_list(linkage(scaled, "average", optimal_ordering=True))]
+
+
+def accuracy_row(measure: Measure) -> list[float]:
+    """Return an accuracy, both ends of its 95 % interval, and chance."""
+    means = measure.by_object()[1]
+    return [float(number[0]) for number in (means.mean(0), *bootstrap_interval(means), measure.chance)]
+
+
+def comparison_table(
+    gallery: str, rows: Mapping[str, Sequence[float]], result: Measure, low_pass: Measure
+) -> dict[str, Any]:
+    """Return accuracies on held-out objects in JSON types, as a checkpoint stores them.
+
+    Args:
+        gallery: What a touch is compared with.
+        rows: `accuracy_row` by label.
+        result: The accuracy of the model.
+        low_pass: That of the control; `gain` is the difference, by object.
+    """
+    gain = result.by_object()[1] - low_pass.by_object()[1]
+    ends = (float(end[0]) for end in bootstrap_interval(gain))
+    return {
+        "gallery": gallery,
+        "rows": rows,
+        "gain": [float(gain.mean()), *ends],
+        "objects": len(gain),
+        "touches": len(low_pass.owner),
+    }

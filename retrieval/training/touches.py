@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -38,16 +38,15 @@ from retrieval.data.dataset import (
     object_kinds,
     recording_source,
 )
+from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import BadInput
 from retrieval.metrics.measure import Measure, pooled
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable, store_checkpoint
-from retrieval.model.config import Config, load_config
+from retrieval.model.config import Config
 from retrieval.model.encode import one_thread
 from retrieval.model.fusion import Matcher
 from retrieval.model.references import reference_similarity
-from retrieval.model.towers import NO_TOWER, TOWER_SEPARATOR
-from retrieval.model.towers.weights import GEL
-from retrieval.training.adapt import MIN_OBJECTS, PUBLISHED_TOWER, draw_folds
+from retrieval.model.towers import NO_TOWER
 from retrieval.training.calibration import ScoredTouches, fit_references, with_sensor_calibrations
 from retrieval.training.cca import (
     MAX_CALIBRATION_TOUCHES,
@@ -60,7 +59,19 @@ from retrieval.training.cca import (
 )
 from retrieval.training.features import Features, encode_recording
 from retrieval.training.initial_weights import build_matcher, training_licences
-from retrieval.training.selection import MIN_OBJECTS_FOR_FOUR_FOLDS, held_out_folds, ranking_auc, validation_rows
+from retrieval.training.linear import available_weights, linear_config
+from retrieval.training.selection import (
+    COMPARED,
+    LOW_PASS,
+    MIN_OBJECTS,
+    MIN_OBJECTS_FOR_FOUR_FOLDS,
+    accuracy_row,
+    comparison_table,
+    draw_folds,
+    held_out_folds,
+    ranking_auc,
+    validation_rows,
+)
 
 Numbers = NDArray[np.int64]
 RIDGES = (0.03, 0.1, 0.3, 1.0, 10.0)
@@ -235,21 +246,6 @@ def _accuracies(
 # The checkpoint ---------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class TouchModel:
-    """Result of `train_on_touches`.
-
-    Attributes:
-        checkpoint: The written checkpoint.
-        measures: Accuracy of "same" and "new" objects, and with "_low_pass" touches (8 x 6, the control).
-        has_sessions: Whether references and queries are of different sessions.
-    """
-
-    checkpoint: Checkpoint
-    measures: Mapping[str, Measure]
-    has_sessions: bool
-
-
 def train_on_touches(
     recording: AnyRecording,
     out: Path,
@@ -257,16 +253,8 @@ def train_on_touches(
     init: str = "imagenet",
     split: Split | None = None,
     quiet: bool = False,
-) -> TouchModel:
-    """Fit a model to a recording of touches only, and write the checkpoint `out`.
-
-    Args:
-        recording: A folder, or the object that `robot.read_recording` returns.
-        out: The checkpoint (.safetensors).
-        init: Weights of the published MobileNetV2 that is combined with the gel tower: "imagenet", a file, or "none"
-            to use the gel tower only.
-        split: A split whose test objects are not used at all.
-        quiet: No progress on stderr.
+) -> Checkpoint:
+    """Fit a model to the touches of a recording, and write the checkpoint `out`; arguments as for `retrieval.train`.
 
     Raises:
         DatasetError: The recording cannot be read.
@@ -278,12 +266,12 @@ def train_on_touches(
     grasps = load_grasps(recording)
     if split is not None:
         grasps = [grasp for grasp in grasps if grasp.object_id not in split.test]
-    config = _configuration(finger_count(grasps), init)
-    seed, folds = config.training.seed, draw_folds(grasps, config.training.seed)
+    config, linked = _configuration(finger_count(grasps), init), linked_objects(grasps)
+    seed, folds = config.training.seed, draw_folds(linked)
     licences = training_licences(recording, config.training)
     matcher = build_matcher(config).eval()
     widths = [part.feature_count for part in matcher.touch_tower.backbones] * config.matcher.fingers
-    folds_of = partial(held_out_folds, kind_of=object_kinds(recording), linked=linked_objects(grasps), seed=seed)
+    folds_of = partial(held_out_folds, kind_of=object_kinds(recording), linked=linked, seed=seed)
     fit = partial(fit_touches, widths=widths, folds_of=folds_of)
     parts = divide(grasps)
     measures, encoded = dict[str, Measure](), dict[str, Touches]()
@@ -300,7 +288,6 @@ def train_on_touches(
     references = fit_references(*choice.held_out, seed=seed)
     if references is None:
         raise BadInput("too few objects have touches of two sequences to calibrate the model; touch more objects again")
-    metrics = {f"{name}_top1": float(measure.by_object()[1].mean()) for name, measure in measures.items()}
     config, matcher = _with_map(config, matcher, choice.map)
     made = Checkpoint(
         path=out,
@@ -311,7 +298,8 @@ def train_on_touches(
             "source": recording_source(recording),
             "data_digest": data_digest(grasps),
             LICENCES: [dataclasses.asdict(licence) for licence in licences],
-            "metrics": metrics | {f"{name}_top1_chance": float(measures[name].chance[0]) for name in ("same", "new")},
+            COMPARED: _table(measures, parts.has_sessions),
+            "metrics": {f"{name}_top1": float(measure.by_object()[1].mean()) for name, measure in measures.items()},
         },
         matcher=matcher,
         split=Split(seed, tuple(sorted({grasp.object_id for grasp in grasps})), (), ()),
@@ -320,20 +308,28 @@ def train_on_touches(
     )
     made = with_sensor_calibrations(made, grasps, encoded["touch"].features, quiet=quiet)
     store_checkpoint(made, out)
-    return TouchModel(load_checkpoint(out), measures, parts.has_sessions)
+    return load_checkpoint(out)
+
+
+def _table(measures: Mapping[str, Measure], has_sessions: bool) -> dict[str, Any]:
+    """Return the accuracies for `retrieval.training.selection.COMPARED`."""
+    rows = {
+        f"{measures[name].gallery}{suffix}": accuracy_row(measures[f"{name}{variant}"])
+        for name in ("same", "new")
+        for suffix, variant in (("", ""), (f", {LOW_PASS}", "_low_pass"))
+    }
+    same, low_pass = (measures[name] for name in ("same", "same_low_pass"))
+    title = f"one touch, compared with touches of another {'session' if has_sessions else 'sequence'}"
+    return comparison_table(title, rows, same, low_pass)
 
 
 def _configuration(fingers: int, init: str) -> Config:
-    """Return the configuration of the towers; `init` as for `train_on_touches`."""
-    preset, towers = load_config("touches"), [GEL, *([] if init == "none" else ["init"])]
-    tower = TOWER_SEPARATOR.join(PUBLISHED_TOWER for _ in towers)
-    return dataclasses.replace(
-        preset,
-        matcher=dataclasses.replace(preset.matcher, tower=tower, photo_tower=NO_TOWER, fingers=fingers),
-        training=dataclasses.replace(
-            preset.training, init=init, init_touch=TOWER_SEPARATOR.join(towers), init_photo="random"
-        ),
-        preprocessing=dataclasses.replace(preset.preprocessing, photo_px=32),
+    """Return the configuration of the touch towers of the linear fit; `init` as for `retrieval.train`."""
+    config = linear_config(fingers, available_weights(init))
+    return Config(
+        dataclasses.replace(config.matcher, photo_tower=NO_TOWER),
+        dataclasses.replace(config.training, init_photo="random"),
+        Preprocessing(touch_px=config.preprocessing.touch_px, photo_px=32, background="none"),
     )
 
 

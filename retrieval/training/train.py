@@ -1,351 +1,71 @@
-"""Train a matcher: from a recording to a checkpoint.
+"""Train a model from a recording: by the best recipe, by a configuration, or from touches only."""
 
-recording -> grasps -> split -> images or cached features -> `train_loop` -> candidate encoder, calibrations -> file
-"""
-
-import dataclasses
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-import torch
-from torch import Tensor, nn
-
-from _touch_retrieval.registry import code_digest
-from retrieval.console.interruption import interruption
-from retrieval.data.check.split import require_fit
-from retrieval.data.dataset import (
-    LICENCES,
-    AnyRecording,
-    DataLicence,
-    Grasp,
-    Split,
-    data_digest,
-    finger_count,
-    folder_of,
-    load_grasps,
-    make_split,
-    recording_source,
-)
-from retrieval.data.pairs import PairBatch, PairSampler
-from retrieval.errors import JobInterrupted
-from retrieval.metrics.pairs import negative_log_likelihood, pair_accuracy, pair_auc
-from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable, store_checkpoint
-from retrieval.model.config import Config, TrainingConfig, named_config
-from retrieval.model.encode import default_device
-from retrieval.model.fusion import Matcher
-from retrieval.model.losses import LOSSES
-from retrieval.model.losses.loss import EncodedBatch, Loss, match_loss
-from retrieval.model.towers.tower import Tower
-from retrieval.training import distributed
-from retrieval.training.calibration import calibrate_checkpoint
-from retrieval.training.distil import add_candidate_encoder
-from retrieval.training.features import (
-    Features,
-    FeatureSource,
-    FrozenFeatures,
-    LoadedBatch,
-    TrainedFeatures,
-    features_by_image,
-)
-from retrieval.training.initial_weights import TOWER_WEIGHTS, build_matcher, training_licences
-from retrieval.training.loop import (
-    RATE,
-    Plan,
-    StateFile,
-    TrainingInterrupted,
-    freeze_batch_norm,
-    state_path,
-    train_loop,
-)
+from retrieval.data.dataset import AnyRecording, Split, folder_of, load_grasps
+from retrieval.errors import BadInput
+from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.config import Config
+from retrieval.training.choice import train_best
+from retrieval.training.recipes import Recipe
+from retrieval.training.touches import train_on_touches
+from retrieval.training.trainer import train_matcher
 
 
 def train(
     recording: AnyRecording,
     out: Path,
-    config: Config | str = "small",
+    config: Config | str | None = None,
     *,
+    recipe: str | type[Recipe] | None = None,
+    model: str | Path | Checkpoint | None = None,
+    init: str = "imagenet",
     split: Split | None = None,
     quiet: bool = False,
 ) -> Checkpoint:
-    """Train on a recording and write the checkpoint with the best validation score to `out`.
+    """Train a model on a recording and write the checkpoint `out`.
 
-    An unfinished run of `out` continues from the state file next to it. Ctrl-C ends after the current step with a
-    usable checkpoint; a second Ctrl-C stops immediately.
+    Without `config` the recipes of `retrieval.training.recipes.RECIPES` are compared on objects that they were not
+    fitted to, and the best one is taken; `provenance["compared"]` has the accuracies. A recording without photos gives
+    a model that compares touches with touches. Ctrl-C ends an unfinished training, which continues if it is repeated.
 
     Args:
         recording: A folder, or the result of `robot.read_recording`. It decides the number of fingers.
         out: The checkpoint (.safetensors).
-        config: A `Config` (`Config.using` accepts your own towers and losses), or an argument of `load_config`.
-        split: Objects of each part. Default: a random split as the configuration sets it.
+        config: A `Config` (`Config.using` accepts your own towers and losses), or an argument of `load_config`: train
+            with these settings, without a comparison.
+        recipe: The only recipe: a name, or your own class.
+        model: The start model. Default: the shipped model for as many fingers.
+        init: Weights of the published MobileNetV2 of the linear fit: "imagenet", which are downloaded once, a file, or
+            "random" to do without.
+        split: A split whose test objects are not used at all; with `config`, also the training and validation objects.
         quiet: No progress on stderr.
 
     Raises:
-        DatasetError, ConfigError, CheckpointError: Training is not possible with the data or settings, or the state
-            file next to `out` belongs to another run.
+        DatasetError: The recording cannot be read.
+        BadInput: The recording has fewer than six objects, or too few touches of them.
+        ConfigError: The configuration or the recipe is unknown, or does not fit.
+        CheckpointError: The start model or the weights cannot be read, or `out` cannot be written.
         JobInterrupted: After Ctrl-C.
 
-    >>> import dataclasses
     >>> from pathlib import Path
+    >>> made = retrieval.train("lab", Path("own.safetensors"), model="model.safetensors", init="random", quiet=True)
+    >>> made.provenance["recipe"] in ("start", "linear", "head")
+    True
+
+    With settings of your own:
+
+    >>> import dataclasses
     >>> config = retrieval.load_config("tiny").using(losses={"contrastive": 1.0, "listwise": 0.1})
-    >>> config = dataclasses.replace(config, training=config.training.with_iterations(2))  # preset small: 500 steps
+    >>> config = dataclasses.replace(config, training=config.training.with_iterations(2))  # preset paper: 26,000
     >>> made = retrieval.train("lab", Path("lab.safetensors"), config, quiet=True)
-    >>> made.provenance["step"], len(made.split.train)
-    (2, 7)
+    >>> made.provenance["step"] <= 2, len(made.split.train)
+    (True, 7)
     """
-    recording, (config, _) = folder_of(recording), named_config(config)
-    require_writable(out)
-    distributed.start()
-    grasps = load_grasps(recording)
-    config = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, fingers=finger_count(grasps)))
-    settings = config.training
-    if split is None:
-        split = make_split(
-            grasps, validation=settings.validation_fraction, test=settings.test_fraction, seed=settings.seed
-        )
-    else:
-        require_fit(split, grasps)
-    source, licences = recording_source(recording), training_licences(recording, settings)
-    return Trainer(config, split, grasps, out, source, licences=licences).run(quiet)
-
-
-_DATA_AND_CODE = ("data_digest", "code")
-
-
-class Trainer:
-    """One training run of a matcher.
-
-    Attributes:
-        matcher: The model.
-        modules: All that is trained: the matcher and the losses.
-        sampler: The pairs of each step.
-        features: Source of the features of images.
-        out: The checkpoint.
-    """
-
-    def __init__(
-        self,
-        config: Config,
-        split: Split,
-        grasps: list[Grasp],
-        out: Path,
-        source: str,
-        known: Features | None = None,
-        licences: Sequence[DataLicence] = (),
-    ) -> None:
-        """Prepare a run.
-
-        `known`: features of all grasps. They replace the images if the towers are frozen. `licences`: licences of the
-        data.
-        """
-        settings = config.training
-        self.config, self.split, self.out = config, split, out
-        self.device = default_device()
-        torch.manual_seed(settings.seed)
-        self.has_images = known is None
-        self.matcher = build_matcher(config.without_candidate_encoder()).to(self.device)
-        self.sampler = self._sampler(split.select(grasps, "train"))
-        self.losses = WeightedLosses(settings.weights, self.matcher, len(self.sampler.grasps)).to(self.device)
-        self.modules = nn.ModuleDict({"matcher": self.matcher, "losses": self.losses})
-        groups: list[dict[str, Any]] = [{"params": []}, {"params": [], RATE: settings.tower_rate}]
-        for name, parameter in self.matcher.named_parameters():
-            if parameter.requires_grad:
-                groups[name.startswith(TOWER_WEIGHTS)]["params"].append(parameter)
-        groups[0]["params"] += self.losses.parameters()
-        # On a CPU, PyTorch's default optimizer reads every tensor eight times. The fused optimizer reads it once. On
-        # CUDA the default optimizer is fast.
-        self.optimizer = torch.optim.Adam(groups, lr=settings.learning_rate, fused=self.device.type == "cpu")
-        clamps = [term.clamp for term in self.losses.modules() if isinstance(term, Loss)]
-        for clamp in (self.matcher.clamp_scale, *clamps):
-            self.optimizer.register_step_post_hook(lambda *_, clamp=clamp: clamp())
-        held_out = split.select(grasps, "validation")
-        self.validation = self._sampler(held_out).evaluation_pairs() if split.validation else None
-        self.features: FeatureSource = (
-            FrozenFeatures(config, features_by_image(grasps, known, self.device) if known else {})
-            if settings.freeze_towers
-            else TrainedFeatures(config, self.device)
-        )
-        set_training_mode(self.matcher, settings)
-        for tower in (self.matcher.touch_tower, self.matcher.photo_tower):
-            distributed.synchronise_batch_norm(tower, self.device)
-        towers = [module for module in self.matcher.modules() if isinstance(module, Tower)]
-        self.provenance = {
-            "source": source,
-            LICENCES: [dataclasses.asdict(licence) for licence in licences],
-            "data_digest": known.digest if known else data_digest(grasps),
-            **code_digest(*map(type, (*self.losses.terms, *towers))),
-        }
-
-    def _sampler(self, chosen: list[Grasp]) -> PairSampler:
-        settings = self.config.training
-        # Frozen towers have cached features: negatives from all objects cost nothing.
-        shared = not settings.freeze_towers if settings.negatives == "auto" else settings.negatives == "batch"
-        return PairSampler(
-            chosen,
-            seed=settings.seed,
-            positives=settings.positives_per_touch,
-            negatives=settings.negatives_per_touch,
-            share_photos=shared,
-        )
-
-    def run(self, quiet: bool = False, *, replace: bool = False) -> Checkpoint:
-        """Train from the first step, or from that of the state file, to the last; write the checkpoint and return it.
-
-        `replace`: replace the state of another run, which is else an error.
-
-        Raises:
-            CheckpointError: The state file belongs to another run.
-            JobInterrupted: After Ctrl-C.
-        """
-        settings, touches = self.config.training, self.config.training.touches_per_batch
-        quiet = quiet or distributed.rank() > 0
-        made_from = {name: self.provenance.get(name) for name in _DATA_AND_CODE}
-        identity = {"config": self.config.to_dict(), "split": self.split.to_dict(), **made_from}
-        state, interrupted = StateFile(state_path(self.out), identity, is_replaceable=replace), None
-        try:
-            best = train_loop(
-                self.modules,
-                self.optimizer,
-                Plan(settings.iterations, settings.learning_rate, settings.schedule, settings.validate_every),
-                lambda steps: self.features.batches(
-                    self.matcher, ((step, self.sampler.batch(step, touches)) for step in steps)
-                ),
-                distributed.averaging_gradients(self.modules, self.loss),
-                title="training",
-                quiet=quiet,
-                validate=self.validate,
-                state=state,
-                step_context=self.features.step_context,
-            )
-        except TrainingInterrupted as stopped:
-            best, interrupted = stopped.best, f"{stopped} {self.out} can already rank photos."
-        if not distributed.rank():
-            made = Checkpoint(
-                self.out,
-                digest="",
-                config=self.config.without_candidate_encoder(),
-                provenance={"step": best.step, **self.provenance, "metrics": best.metrics},
-                matcher=self.matcher.eval(),
-                split=self.split,
-            )
-            try:
-                store_checkpoint(made, self.out)
-                if not interrupted:
-                    store_checkpoint(self._completed(made, quiet), self.out)
-                    state.path.unlink()
-            except KeyboardInterrupt:
-                interrupted = (
-                    f"Stopped before the last parts were fitted. {self.out} can already rank photos; run the same "
-                    "command to add these parts."
-                )
-        with interruption():
-            is_interrupted = distributed.any_rank(bool(interrupted), self.device)  # wait until the files exist
-        if is_interrupted:
-            raise JobInterrupted(interrupted or "Stopped by another rank; run the same command to continue.")
-        return load_checkpoint(self.out)
-
-    def run_or_reuse(self, quiet: bool) -> Checkpoint:
-        """Return the finished checkpoint of this run, or run; files of another run are replaced.
-
-        Raises:
-            JobInterrupted: After Ctrl-C; the next call continues.
-        """
-        if self.out.is_file() and not state_path(self.out).exists():
-            stored = load_checkpoint(self.out)
-            same = all(stored.provenance.get(name) == self.provenance.get(name) for name in _DATA_AND_CODE)
-            if same and (stored.config, stored.split) == (self.config, self.split):
-                return stored
-        return self.run(quiet, replace=True)
-
-    def loss(self, step: int, loaded: LoadedBatch) -> Tensor:
-        """Return the loss of a step and its prepared batch."""
-        settings = self.config.training
-        torch.manual_seed(settings.seed * 1_000_003 + step)  # the dropout mask, the same on every rank
-        touch, photo = self.features.train_features(self.matcher, loaded)
-        if settings.shuffle_fingers:
-            touch = shuffle_fingers(touch, self.matcher.config.fingers)
-        return self.feature_loss(loaded.batch, touch, photo)
-
-    def feature_loss(self, batch: PairBatch, touch: Tensor, photo: Tensor) -> Tensor:
-        """Return the loss of a batch and the features of its touches and photos (`Matcher.touch_features`)."""
-        return batch_loss(self.matcher, self.losses, batch, touch, photo)
-
-    @torch.inference_mode()
-    def validate(self) -> dict[str, float]:
-        """Return the metrics of the fixed validation pairs; empty without validation objects."""
-        pairs, matcher = self.validation, self.matcher
-        if pairs is None:
-            return {}
-        matcher.eval()
-        features = self.features.eval_features(matcher, pairs.grasps, pairs.photos)
-        with self.features.step_context():
-            touch, photo = matcher.touch_encoding(features[0]), matcher.photo_encoding(features[1])
-            logits = matcher.head(touch.partial[pairs.touch_index], photo.partial[pairs.photo_index]).cpu().numpy()
-        set_training_mode(matcher, self.config.training)
-        return {
-            "validation_auc": pair_auc(logits, pairs.labels),
-            "validation_pair_accuracy": pair_accuracy(logits, pairs.labels),
-            "validation_nll": negative_log_likelihood(logits, pairs.labels),
-        }
-
-    def _completed(self, made: Checkpoint, quiet: bool) -> Checkpoint:
-        """Add the parts that are fitted after training: candidate encoder, calibrations and gel check."""
-        train = [grasp for part in self.sampler.grasps for grasp in part]
-        held_out = self.validation.grasps if self.validation else []
-        if self.config.matcher.candidate_width:
-            made = add_candidate_encoder(made, self.config, self.features, train, held_out, quiet=quiet)
-        return calibrate_checkpoint(made, self.features, train, held_out, quiet=quiet) if self.has_images else made
-
-
-def set_training_mode(matcher: Matcher, settings: TrainingConfig) -> None:
-    """Put the matcher into training mode; frozen parts stay in evaluation mode, so their running statistics are fixed.
-
-    Frozen towers never enter training mode, not even for a moment, because another thread may encode with them.
-    """
-    towers = (matcher.touch_tower, matcher.photo_tower)
-    for part in matcher.children():
-        part.train(not (settings.freeze_towers and part in towers))
-    if settings.freeze_stem:
-        for tower in towers:
-            tower.stem_layers().eval()
-    if settings.freeze_batch_norm:
-        freeze_batch_norm(matcher)
-
-
-# The loss --------------------------------------------------------------------------------------------------
-
-
-class WeightedLosses(nn.Module):
-    """The losses of a training run whose weight is above 0, with their own parameters."""
-
-    def __init__(self, weights: Mapping[str, float], matcher: Matcher, objects: int) -> None:
-        """Create the losses by name, to train `matcher` on this number of objects.
-
-        Raises:
-            ConfigError: A name is unknown.
-        """
-        super().__init__()
-        self.weights = {name: weight for name, weight in weights.items() if weight > 0}
-        dim = matcher.config.embedding_dim
-        self.terms = nn.ModuleList(LOSSES.load(name)(dim, objects) for name in self.weights)
-
-
-def batch_loss(
-    matcher: Matcher, losses: WeightedLosses, batch: PairBatch, touch_features: Tensor, photo_features: Tensor
-) -> Tensor:
-    """Return the loss (scalar) of a batch, from features of its distinct touches and photos."""
-    arrays = batch.touch_index, batch.photo_index, batch.labels, batch.touch_objects, batch.photo_objects
-    touch_index, photo_index, labels, *objects = (torch.from_numpy(array).to(touch_features.device) for array in arrays)
-    touch, photo = matcher.touch_encoding(touch_features), matcher.photo_encoding(photo_features)
-    encoded = EncodedBatch(matcher, touch, photo, *objects)
-    loss = match_loss(matcher.head(touch.partial[touch_index], photo.partial[photo_index]), labels)
-    for weight, term in zip(losses.weights.values(), losses.terms, strict=True):
-        loss = loss + weight * term(encoded)
-    return loss
-
-
-def shuffle_fingers(touch_features: Tensor, fingers: int) -> Tensor:
-    """Return features (B, fingers * F) with the fingers of each touch permuted, drawn by PyTorch's CPU generator."""
-    each = touch_features.view(len(touch_features), fingers, -1)
-    order = torch.rand(len(each), fingers).argsort(dim=1).to(each.device)
-    return torch.take_along_dim(each, order[..., None], dim=1).flatten(1)
+    if config is not None:
+        if recipe is not None or model is not None:
+            raise BadInput("A configuration trains without recipe and start model; leave out either.")
+        return train_matcher(recording, out, config, split=split, quiet=quiet)
+    if not any(grasp.photos for grasp in load_grasps(folder_of(recording))):
+        return train_on_touches(recording, out, init=init, split=split, quiet=quiet)
+    return train_best(recording, out, recipe=recipe, model=model, init=init, split=split, quiet=quiet)

@@ -12,7 +12,7 @@ from retrieval.commands.main import main
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.training.loop import state_path
-from retrieval.training.train import train
+from retrieval.training.trainer import train_matcher
 from tests import ray_processes
 from tests.conftest import TINY
 from tests.retrieval.training.test_train import with_training
@@ -33,7 +33,7 @@ def train_on_ray(*words, **how):
 @pytest.mark.slow
 def test_two_ranks_on_ray_train_the_same_model_as_one_process(recording, tmp_path):
     config = with_training(TINY, freeze_towers=True)  # see tests/retrieval/training/test_ranks.py
-    one = train(recording, tmp_path / "one.safetensors", config, quiet=True)
+    one = train_matcher(recording, tmp_path / "one.safetensors", config, quiet=True)
     two = train_on_ray(recording, tmp_path / "two.safetensors", config, workers=2)
     assert two.provenance["step"] == one.provenance["step"]
     assert two.provenance["metrics"] == pytest.approx(one.provenance["metrics"], abs=1e-3)
@@ -44,7 +44,7 @@ def test_two_ranks_on_ray_train_the_same_model_as_one_process(recording, tmp_pat
 def test_a_rank_that_is_killed_costs_the_steps_since_the_last_state(recording, tmp_path):
     out, done = tmp_path / "m.safetensors", {}
     config = with_training(TINY, freeze_towers=True, iterations=600, validate_every=50)
-    expected = train(recording, tmp_path / "calm.safetensors", config, quiet=True)
+    expected = train_matcher(recording, tmp_path / "calm.safetensors", config, quiet=True)
 
     def work():
         done["checkpoint"] = train_on_ray(recording, out, config, workers=2)

@@ -24,7 +24,7 @@ from retrieval.methods.method import Method
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.report.evaluation import write_report
 from retrieval.training.features import Features
-from retrieval.training.train import Trainer, train
+from retrieval.training.trainer import Trainer, train_matcher
 from tests import synthetic
 from tests.conftest import TINY
 
@@ -262,7 +262,7 @@ def test_ceilings_compare_touches_with_touches_and_photos_with_photos(tmp_path):
 @pytest.fixture(scope="module")
 def model(grasped, tmp_path_factory):
     """A checkpoint with trained towers."""
-    return train(grasped, tmp_path_factory.mktemp("m") / "m.safetensors", TRAINED_TOWERS, quiet=True)
+    return train_matcher(grasped, tmp_path_factory.mktemp("m") / "m.safetensors", TRAINED_TOWERS, quiet=True)
 
 
 def test_a_checkpoint_is_evaluated_on_its_unseen_objects(model, run, tmp_path, monkeypatch):

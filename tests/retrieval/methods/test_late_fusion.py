@@ -14,7 +14,7 @@ from retrieval.methods.retrieve_rerank import RetrieveRerank, merge_scores
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.training.features import encode_recording
 from retrieval.training.initial_weights import build_matcher
-from retrieval.training.train import Trainer, train
+from retrieval.training.trainer import Trainer, train_matcher
 from tests.conftest import TINY
 
 FROZEN = dataclasses.replace(TINY, training=dataclasses.replace(TINY.training, freeze_towers=True))
@@ -66,7 +66,7 @@ def test_scores_are_the_match_logits_of_every_pair(fitted, parts):
 
 def test_the_method_trains_the_same_model_as_the_command_line(recording, split, fitted, tmp_path):
     ours = load_checkpoint(fitted.settings.folder / "late_fusion-0.safetensors")
-    theirs = train(recording, tmp_path / "m.safetensors", FROZEN, split=split, quiet=True)
+    theirs = train_matcher(recording, tmp_path / "m.safetensors", FROZEN, split=split, quiet=True)
     assert (ours.provenance["step"], ours.config) == (theirs.provenance["step"], theirs.config)
     for name, weight in theirs.matcher.state_dict().items():
         # The same steps, on features from batches of another size.

@@ -10,7 +10,7 @@ from retrieval.data.preprocessing import Preprocessing
 from retrieval.indexing.build import build_index
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.serve.rig import load_live_rig
-from retrieval.training.train import train
+from retrieval.training.trainer import train_matcher
 from robot.sim.rig import SimRig
 from tests.browser import address, page
 from tests.conftest import TINY
@@ -32,7 +32,7 @@ def index(recording, tmp_path_factory):
         pixels = np.ascontiguousarray(rig.sim_state.current_scene().image("photo")[..., ::-1])
         assert cv2.imwrite(str(folder / "catalog" / name / "1.jpg"), pixels)
     config = dataclasses.replace(TINY, preprocessing=Preprocessing(touch_px=32, photo_px=48, background="difference"))
-    train(recording, folder / "tiny.safetensors", config, quiet=True)
+    train_matcher(recording, folder / "tiny.safetensors", config, quiet=True)
     build_index(folder / "catalog", load_checkpoint(folder / "tiny.safetensors"), folder / "index", quiet=True)
     return folder / "index"
 

@@ -12,7 +12,7 @@ from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.export import touch_encoder_to_onnx
 from retrieval.model.shipped import shipped_model
 from retrieval.training.initial_weights import checkpoint_licences, training_licences
-from retrieval.training.train import train
+from retrieval.training.trainer import train_matcher
 from tests.conftest import TINY
 
 TERMS = "name the authors"
@@ -28,7 +28,7 @@ def licensed(recording, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def trained(licensed, tmp_path_factory):
-    return train(licensed, tmp_path_factory.mktemp("trained") / "m.safetensors", TINY, quiet=True)
+    return train_matcher(licensed, tmp_path_factory.mktemp("trained") / "m.safetensors", TINY, quiet=True)
 
 
 def test_the_licences_of_a_training_are_those_of_all_its_data(recording, licensed, trained):

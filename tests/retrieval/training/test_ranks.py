@@ -103,7 +103,7 @@ from retrieval.training.features import TrainedFeatures
 from retrieval.data.dataset import load_grasps
 from retrieval.data.pairs import PairSampler
 from retrieval.training.initial_weights import build_matcher
-from retrieval.training.train import WeightedLosses, batch_loss, set_training_mode
+from retrieval.training.trainer import WeightedLosses, batch_loss, set_training_mode
 from tests.conftest import TINY
 from tests.retrieval.training.test_train import load, with_training
 

@@ -24,7 +24,14 @@ from retrieval.training.augmentation import augment_photos
 from retrieval.training.features import BatchImages, TrainedFeatures
 from retrieval.training.initial_weights import build_matcher
 from retrieval.training.loop import state_path
-from retrieval.training.train import Trainer, WeightedLosses, batch_loss, set_training_mode, shuffle_fingers, train
+from retrieval.training.trainer import (
+    Trainer,
+    WeightedLosses,
+    batch_loss,
+    set_training_mode,
+    shuffle_fingers,
+    train_matcher,
+)
 from tests.conftest import TINY
 
 CPU = torch.device("cpu")
@@ -242,7 +249,7 @@ def whole(recording, tmp_path_factory):
     ("where", "stop"),
     [
         ("retrieval.training.distil.distillation_loss", interrupt),
-        ("retrieval.training.train.calibrate_checkpoint", lambda: 1 / 0),
+        ("retrieval.training.trainer.calibrate_checkpoint", lambda: 1 / 0),
         ("pathlib.Path.unlink", interrupt),
     ],
 )
@@ -338,7 +345,7 @@ def test_the_towers_learn_at_their_own_rate(recording, tmp_path):
 
 def test_without_validation_objects_the_checkpoint_is_the_last_step_without_a_posterior(recording, tmp_path):
     config = with_training(TINY, validation_fraction=0.0, iterations=4, validate_every=3)
-    made = train(recording, tmp_path / "m.safetensors", config, quiet=True)
+    made = train_matcher(recording, tmp_path / "m.safetensors", config, quiet=True)
     assert made.split.validation == ()
     assert len(made.split.train) + len(made.split.test) == 12
     assert (made.provenance["step"], made.posterior) == (4, None)
@@ -353,20 +360,20 @@ def test_a_background_policy_needs_no_contact_frames(recording, tmp_path):
     expected = [preprocessing.load_touch(*files) for files in zip(grasp.touches, grasp.backgrounds, strict=True)]
     np.testing.assert_array_equal(images.touch(grasp), expected)
     config = with_training(dataclasses.replace(TINY, preprocessing=preprocessing), iterations=1)
-    train(recording, tmp_path / "m.safetensors", config, quiet=True)
+    train_matcher(recording, tmp_path / "m.safetensors", config, quiet=True)
 
 
 def test_bfloat16_is_refused_where_it_would_be_emulated(recording, tmp_path, monkeypatch):
     monkeypatch.setattr("retrieval.model.encode.has_fast_bfloat16", lambda device: False)
     with pytest.raises(ConfigError, match="bfloat16 needs hardware"):
-        train(recording, tmp_path / "m.safetensors", with_training(TINY, precision="bfloat16"), quiet=True)
+        train_matcher(recording, tmp_path / "m.safetensors", with_training(TINY, precision="bfloat16"), quiet=True)
 
 
 def test_a_split_that_leaks_is_refused(recording, tmp_path):
     names = sorted({grasp.object_id for grasp in load_grasps(recording)})
     leaking = Split(0, tuple(names[:6]), tuple(names[5:9]), ())
     with pytest.raises(DatasetError, match="shares 1 object"):
-        train(recording, tmp_path / "m.safetensors", TINY, split=leaking, quiet=True)
+        train_matcher(recording, tmp_path / "m.safetensors", TINY, split=leaking, quiet=True)
 
 
 def test_a_checkpoint_that_cannot_be_written_is_an_error_before_the_first_step(recording, tmp_path, monkeypatch):
@@ -374,7 +381,7 @@ def test_a_checkpoint_that_cannot_be_written_is_an_error_before_the_first_step(r
     monkeypatch.setattr(Trainer, "loss", lambda *_: pytest.fail("trained"))
     for name, message in (("", "must be a file"), ("file/model.safetensors", "cannot be written")):
         with pytest.raises(CheckpointError, match=message):
-            train(recording, tmp_path / name, TINY, quiet=True)
+            train_matcher(recording, tmp_path / name, TINY, quiet=True)
 
 
 def test_training_continues_from_the_towers_and_the_head_of_a_checkpoint(model):

@@ -1,0 +1,112 @@
+"""The linear fit: canonical correlations of published towers' features, as an ordinary matcher.
+
+Touches are encoded by the gel tower of the package (`retrieval.model.towers.weights.gel_tower`) and by a published
+tower side by side, photos by the published one, so that the fit suits other sensors and cameras than those of the
+simulated rig. The match logit is the scaled cosine of the canonical variates (`retrieval.training.cca`).
+"""
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import torch
+from torch import nn
+
+from retrieval.console.output import say
+from retrieval.errors import CheckpointError
+from retrieval.metrics.pairs import fit_calibration
+from retrieval.model.config import Config, load_config
+from retrieval.model.encode import one_thread
+from retrieval.model.fusion import Matcher
+from retrieval.model.towers.tower import build_tower
+from retrieval.model.towers.weights import GEL, SHIPPED
+from retrieval.training.calibration import ScoredTouches
+from retrieval.training.cca import CcaSelection, select_settings, tower_widths
+from retrieval.training.features import Features
+
+PRESET = "linear"
+PUBLISHED_TOWER = "mobilenet_v2"
+"""Backbone of the published tower and of the gel tower."""
+SHIPPED_PHOTO_PX = 160
+"""Size of the photos of the shipped photo tower, which replaces a published one without weights."""
+NO_WEIGHTS = "random"
+"""Value of `init` to use no published tower."""
+
+
+def linear_config(fingers: int, init: str = "imagenet") -> Config:
+    """Return the configuration of the towers of the linear fit.
+
+    Args:
+        fingers: Number of gel images of a touch.
+        init: Weights of the published MobileNetV2: "imagenet" or a file. "random": touches are encoded by the gel tower
+            alone, and photos by that of the shipped model.
+    """
+    config = load_config(PRESET)
+    matcher, training = dataclasses.replace(config.matcher, fingers=fingers), config.training
+    if init == NO_WEIGHTS:
+        matcher = dataclasses.replace(matcher, tower=PUBLISHED_TOWER)
+        training = dataclasses.replace(training, init=NO_WEIGHTS, init_touch=GEL, init_photo=SHIPPED)
+        preprocessing = dataclasses.replace(config.preprocessing, photo_px=SHIPPED_PHOTO_PX)
+        return Config(matcher, training, preprocessing)
+    return dataclasses.replace(config, matcher=matcher, training=dataclasses.replace(training, init=init))
+
+
+def available_weights(init: str) -> str:
+    """Return `init`, or "random", with a message, if it is "imagenet" and these weights cannot be downloaded.
+
+    Raises:
+        CheckpointError: `init` is a file that cannot be read, or does not fit.
+    """
+    try:
+        build_tower(PUBLISHED_TOWER, "stages").initialise(init)
+    except CheckpointError as error:
+        if init != "imagenet":
+            raise
+        say(f"{error}. Without them, the linear fit has the gel tower only, and is worse on real touches.")
+        return NO_WEIGHTS
+    return init
+
+
+@one_thread()
+def fit_linear(features: Features, config: Config, folds: Sequence[Sequence[str]]) -> tuple[Config, Matcher]:
+    """Fit the projections to features of the towers of `config`; the objects of a fold are held out together.
+
+    Returns:
+        The configuration and a matcher without the weights of its towers.
+    """
+    choice = select_settings(features, tower_widths(config, features), folds)
+    training = dataclasses.replace(config.training, init="random", init_touch="", init_photo="")
+    matcher = Matcher(config.matcher, len(config.preprocessing.views)).eval()
+    install_projections(matcher, choice)
+    return dataclasses.replace(config, training=training), matcher
+
+
+@torch.no_grad()
+def install_projections(matcher: Matcher, choice: CcaSelection) -> None:
+    """Make the match logit `scale * cosine + offset` of the projected features; the head's layers contribute 0."""
+    projections, (scale, offset) = choice.projections, _log_odds(choice.held_out_touches)
+    for layer, found in ((matcher.touch_projection, projections.touch), (matcher.photo_projection, projections.photo)):
+        assert isinstance(layer, nn.Linear)  # the preset has no hidden layer
+        used = found.weight.shape[1]  # shorter encodings leave zeros, which do not change the cosine
+        layer.weight.zero_()
+        layer.bias.zero_()
+        layer.weight[:used] = torch.from_numpy(found.weight.T.astype(np.float32))
+        layer.bias[:used] = torch.from_numpy(found.bias.astype(np.float32))
+    for parameter in matcher.head.parameters():
+        parameter.zero_()
+    assert matcher.cosine_scale is not None
+    matcher.cosine_scale.fill_(scale)
+    matcher.head.out.bias.fill_(offset)
+
+
+def _log_odds(parts: Iterable[ScoredTouches]) -> tuple[float, float]:
+    """Return scale and offset from cosine to log-odds of a match, with equally many true and false pairs."""
+    cosines, labels = [], []
+    for part in parts:
+        same = part.touch_owner[:, None] == part.photo_owner
+        rng = np.random.default_rng(0)
+        pairs = [rng.permutation(np.flatnonzero(mask.ravel())) for mask in (same & ~part.own, ~same)]
+        count = min(len(pairs[0]), len(pairs[1]), 20_000)
+        cosines += [part.logits.ravel()[drawn[:count]] for drawn in pairs]
+        labels += [np.ones(count), np.zeros(count)]
+    return fit_calibration(np.concatenate(cosines), np.concatenate(labels))

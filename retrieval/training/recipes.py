@@ -1,0 +1,166 @@
+"""Recipes: ways to fit a matcher to a recording, which `retrieval.training.choice` compares."""
+
+import dataclasses
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from retrieval.data.dataset import Grasp, Split, make_split
+from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.config import Config
+from retrieval.model.fusion import Matcher
+from retrieval.training.features import Features
+from retrieval.training.initial_weights import TOWER_WEIGHTS, build_matcher
+from retrieval.training.linear import available_weights, fit_linear, linear_config
+from retrieval.training.selection import held_out_folds
+from retrieval.training.trainer import Trainer
+
+MIN_OBJECTS_OF_NEW_HEAD = 1000
+"""Objects that late interaction needs, if it is trained from random weights."""
+VALIDATION_FRACTION = 0.15
+"""Fraction of the fitted objects that choose the step of a trained head."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What a recipe is fitted to.
+
+    Attributes:
+        grasps: The grasps of the recording.
+        fingers: Gel images of a touch.
+        start: The start model.
+        init: Weights of the published tower: "imagenet", a file, or "random" for none.
+        kind_of: Class of each object, if the recording names it.
+        linked: Groups of objects that stay together, such as those of one sequence.
+        folder: Folder of unfinished trainings, which continue there.
+        quiet: No progress on stderr.
+    """
+
+    grasps: Sequence[Grasp]
+    fingers: int
+    start: Checkpoint
+    init: str
+    kind_of: Mapping[str, str]
+    linked: Sequence[Sequence[str]]
+    folder: Path
+    quiet: bool
+
+
+class Recipe(ABC):
+    """A way to fit a matcher to features of frozen towers.
+
+    Attributes:
+        label: What the recipe does, for people.
+        config: Configuration of the towers.
+        matcher: A matcher with the towers whose features `fit` takes.
+    """
+
+    label: ClassVar[str]
+    config: Config
+    matcher: Matcher
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem, self.config, self.matcher = problem, problem.start.config, problem.start.matcher
+
+    @classmethod
+    def applies(cls, problem: Problem, objects: int) -> bool:
+        """Whether the recipe can be fitted to so many objects. By default if the start model has as many fingers."""
+        return problem.start.config.matcher.fingers == problem.fingers
+
+    @abstractmethod
+    def fit(self, features: Features, name: str, *, is_final: bool = False) -> Checkpoint:
+        """Return a model that is fitted to these features; nothing is written.
+
+        Args:
+            features: Features of some of the grasps; nothing may be taken from the other objects.
+            name: Name of the fit, for files and progress.
+            is_final: Whether the model is the result, which also needs a candidate encoder if its head has one.
+        """
+
+
+class Start(Recipe):
+    """The start model: nothing is fitted."""
+
+    label = "start model as it is"
+
+    def fit(self, features: Features, name: str, *, is_final: bool = False) -> Checkpoint:
+        """Return the start model."""
+        return self.problem.start
+
+
+class Linear(Recipe):
+    """Canonical correlations of the features of published towers."""
+
+    label = "linear fit to published towers"
+
+    def __init__(self, problem: Problem) -> None:
+        super().__init__(problem)
+        self.config = linear_config(problem.fingers, available_weights(problem.init))
+        self.matcher = build_matcher(self.config).eval()
+
+    @classmethod
+    def applies(cls, problem: Problem, objects: int) -> bool:
+        """Whether the recipe can be fitted: always."""
+        return True
+
+    def fit(self, features: Features, name: str, *, is_final: bool = False) -> Checkpoint:
+        """Return the fitted model."""
+        folds = held_out_folds(features, self.problem.kind_of, self.problem.linked)
+        config, matcher = fit_linear(features, self.config, folds)
+        matcher.touch_tower, matcher.photo_tower = self.matcher.touch_tower, self.matcher.photo_tower
+        split = Split(0, tuple(sorted(set(features.object_ids))), (), ())
+        return Checkpoint(Path(name), "", config, {"step": 0}, matcher=matcher, split=split)
+
+
+class ContinuedHead(Recipe):
+    """The head of the start model, trained further on its frozen towers with a small learning rate."""
+
+    label = "start model's head, trained further"
+    steps: ClassVar[int] = 150
+    touches_per_batch: ClassVar[int] = 64
+    learning_rate: ClassVar[float] = 1e-4
+    continues: ClassVar[bool] = True
+    """Whether the head starts from that of the start model, and not from random weights."""
+
+    def fit(self, features: Features, name: str, *, is_final: bool = False) -> Checkpoint:
+        """Return the model of the step that is best on a part of the objects."""
+        problem, start = self.problem, self.problem.start
+        training = dataclasses.replace(
+            start.config.training.with_iterations(self.steps),
+            init="random",
+            init_touch="",
+            init_photo="",
+            start="",
+            learning_rate=self.learning_rate,
+            validate_every=max(1, self.steps // 10),
+            freeze_towers=True,
+            touches_per_batch=self.touches_per_batch,
+        )
+        config = dataclasses.replace(start.config, training=training)
+        known = set(features.grasp_ids)
+        grasps = [grasp for grasp in problem.grasps if grasp.grasp_id in known]
+        split = make_split(grasps, validation=VALIDATION_FRACTION, test=0, seed=training.seed)
+        path = problem.folder / f"{name}.safetensors"
+        trainer = Trainer(config if is_final else config.without_candidate_encoder(), split, grasps, path, "", features)
+        weights = start.matcher.state_dict()
+        taken = {part: weight for part, weight in weights.items() if self.continues or part.startswith(TOWER_WEIGHTS)}
+        trainer.matcher.load_state_dict(taken, strict=False)
+        return trainer.run_or_reuse(problem.quiet)
+
+
+class NewHead(ContinuedHead):
+    """A new head with the late interaction of the start model, trained on its frozen towers."""
+
+    label = "new head with late interaction on the start model's towers"
+    steps = 1500
+    touches_per_batch = 128
+    learning_rate = 1e-3
+    continues = False
+
+    @classmethod
+    def applies(cls, problem: Problem, objects: int) -> bool:
+        """Whether there are enough objects, and the start model has late interaction."""
+        has_cells = problem.start.config.matcher.cell_dim > 0
+        return has_cells and objects >= MIN_OBJECTS_OF_NEW_HEAD and super().applies(problem, objects)
