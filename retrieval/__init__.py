@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from retrieval.search.searcher import Searcher as Searcher
     from retrieval.search.searcher import enrol as enrol
     from retrieval.serve.client import Client as Client
-    from retrieval.training.recipes import Recipe as Recipe
+    from retrieval.training.recipes.recipe import Recipe as Recipe
     from retrieval.training.train import train as train
 
     open = Searcher.open
@@ -67,7 +67,7 @@ _MODULES = {
     "Method": "methods.method:Method",
     "Protocol": "evaluation.protocol:Protocol",
     "QueryResult": "search.answer:QueryResult",
-    "Recipe": "training.recipes:Recipe",
+    "Recipe": "training.recipes.recipe:Recipe",
     "RetrievalError": "errors:RetrievalError",
     "Searcher": "search.searcher:Searcher",
     "MethodSettings": "methods.method:MethodSettings",

@@ -18,7 +18,7 @@ from retrieval.commands.options import (
 )
 from retrieval.console.output import say
 from retrieval.errors import BadInput
-from retrieval.training import RECIPES
+from retrieval.training.recipes import RECIPES
 
 if TYPE_CHECKING:
     from retrieval.model.config import Config

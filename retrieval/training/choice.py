@@ -37,11 +37,11 @@ from retrieval.metrics.measure import Measure, pooled
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable, sibling_file, store_checkpoint
 from retrieval.model.encode import one_thread
 from retrieval.model.shipped import shipped_model
-from retrieval.training import RECIPES
 from retrieval.training.calibration import ScoredTouches, score_touches, with_calibrations, with_sensor_calibrations
 from retrieval.training.features import Features, encode_recording
 from retrieval.training.initial_weights import checkpoint_licences
-from retrieval.training.recipes import Problem, Recipe
+from retrieval.training.recipes import RECIPES
+from retrieval.training.recipes.recipe import Problem, Recipe
 from retrieval.training.selection import (
     COMPARED,
     LOW_PASS,

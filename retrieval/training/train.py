@@ -7,7 +7,7 @@ from retrieval.errors import BadInput
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
 from retrieval.training.choice import train_best
-from retrieval.training.recipes import Recipe
+from retrieval.training.recipes.recipe import Recipe
 from retrieval.training.touches import train_on_touches
 from retrieval.training.trainer import train_matcher
 
@@ -25,7 +25,7 @@ def train(
 ) -> Checkpoint:
     """Train a model on a recording and write the checkpoint `out`.
 
-    Without `config` the recipes of `retrieval.training.recipes.RECIPES` are compared on objects that they were not
+    Without `config` the recipes of `RECIPES` are compared on objects that they were not
     fitted to, and the best one is taken; `provenance["compared"]` has the accuracies. A recording without photos gives
     a model that compares touches with touches. Ctrl-C ends an unfinished training, which continues if it is repeated.
 

@@ -73,4 +73,4 @@ def test_an_error_of_a_rank_is_raised_as_a_clear_error(recording, tmp_path):
 @pytest.mark.parametrize("options", [["--cluster", "--task", "grasp-success"], ["--workers", "2"]])
 def test_cluster_options_are_only_for_matchers_on_a_cluster(options, recording, tmp_path, capsys):
     assert main(["train", str(recording), "--out", str(tmp_path / "m.safetensors"), *options]) == 2
-    assert "--cluster needs --task match" in capsys.readouterr().err
+    assert "--cluster needs --config" in capsys.readouterr().err

@@ -30,7 +30,7 @@ from retrieval.training.choice import HeldOut
 from retrieval.training.features import Features
 from retrieval.training.initial_weights import build_matcher
 from retrieval.training.linear import linear_config
-from retrieval.training.recipes import Problem, Start
+from retrieval.training.recipes.recipe import Problem, Start
 from retrieval.training.selection import COMPARED, draw_folds
 from tests.verification import calibration
 

@@ -1,4 +1,4 @@
-"""Recipes: ways to fit a matcher to a recording, which `retrieval.training.choice` compares."""
+"""The base class of recipes, and the recipes of the package."""
 
 import dataclasses
 from abc import ABC, abstractmethod
@@ -55,6 +55,16 @@ class Recipe(ABC):
         label: What the recipe does, for people.
         config: Configuration of the towers.
         matcher: A matcher with the towers whose features `fit` takes.
+
+    A recipe of your own may change another one, here the training of the start model's head. `retrieval.train` takes it
+    as `recipe`:
+
+    >>> from retrieval.training.recipes.recipe import ContinuedHead
+    >>> class Brief(ContinuedHead):
+    ...     label = "start model's head, a few steps"
+    ...     steps = 2
+    >>> issubclass(Brief, retrieval.Recipe)
+    True
     """
 
     label: ClassVar[str]
