@@ -110,19 +110,6 @@ def test_an_invalid_number_of_results_raises(built, k):
         built.search(QUERIES, k)
 
 
-@pytest.mark.parametrize(
-    ("value", "words"),
-    [(np.nan, "nan"), (np.inf, "inf"), (0.0, "got 0"), (1e30, "got 4e"), (0.26, "got 1.04"), (1e-30, "got 4e-30")],
-)
-def test_a_vector_that_is_not_a_unit_vector_is_named(value, words):
-    vectors = unit(3)
-    vectors[1] = value
-    with pytest.raises(VectorError, match=f"'1'.*{words}"):
-        indexes.build(vectors)
-    with pytest.raises(VectorError, match=f"query '0'.*{words}"):
-        indexes.build(unit(3)).search(vectors[1:2], 1)
-
-
 @pytest.mark.parametrize("vectors", [unit(3).astype(float), unit(3)[0], unit(3)[:, :0], unit(3).tolist(), None])
 def test_only_float32_tables_are_accepted(vectors):
     with pytest.raises(VectorError, match="float32 of shape"):

@@ -10,7 +10,7 @@ from retrieval.data import preprocessing
 from retrieval.data import resize as resizing
 from retrieval.data.preprocessing import BACKGROUNDS, Preprocessing
 from retrieval.data.resize import resize, to_float
-from retrieval.errors import BadInput, ConfigError, NumericalError
+from retrieval.errors import BadInput, ConfigError
 from tests.retrieval.data.test_images import saved
 
 ATOL = 2e-6  # float32 sums over at most a few dozen samples of 0..1
@@ -140,11 +140,6 @@ def test_noise_averages_out_before_its_sign_is_dropped():
     np.testing.assert_allclose(Preprocessing(touch_px=2, background="abs").touch(noisy, flat), 0, atol=1e-6)
     naive = resize(np.abs(noisy - flat), (2, 2))
     np.testing.assert_allclose(naive, 0.1, atol=1e-6)
-
-
-def test_a_nan_in_a_photo_is_refused():
-    with pytest.raises(NumericalError, match="photo contains a NaN"):
-        Preprocessing(photo_px=2).photo(np.full((4, 4, 3), np.nan, np.float32))
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """Score tables, measures, and the photos that represent an object."""
 
-import math
 from itertools import product
 
 import numpy as np
@@ -12,14 +11,6 @@ from retrieval.metrics.table import object_scores
 from tests.retrieval.metrics.test_registry import table_of
 
 # The table -------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_a_score_that_is_not_finite_is_refused(bad):
-    scores = np.zeros((3, 3))
-    scores[1, 2] = bad
-    with pytest.raises(NumericalError, match="row 1, column 2"):
-        table_of(scores, [0, 0, 1])
 
 
 def test_a_measure_needs_a_finite_value_for_each_query():

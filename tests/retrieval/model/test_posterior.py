@@ -49,16 +49,6 @@ def test_probabilities_add_up_to_one_and_have_the_order_of_the_logits(logits, pr
     assert (np.diff(found.objects[order]) >= 0).all()
 
 
-def test_large_logits_give_probabilities_where_the_naive_formula_gives_nan():
-    logits = np.array([1000.0, 999.0])
-    with np.errstate(over="ignore", invalid="ignore"):
-        naive = np.exp(logits) / (np.exp(logits).sum() + 1)
-    assert np.isnan(naive).all()
-    found = probabilities(ADDING, logits, none_prior=0.5)
-    assert found.objects == pytest.approx([1 / (1 + math.exp(-1)), math.exp(-1) / (1 + math.exp(-1))])
-    assert probabilities(ADDING, -logits, none_prior=0.5).none == 1.0
-
-
 def test_the_probability_if_present_equals_that_by_hand_for_any_prior_and_offset():
     # Weights 3 and 1, together 4.
     for offset, prior in ((0.0, 0.5), (-3.0, 0.9), (2.0, 0.0)):

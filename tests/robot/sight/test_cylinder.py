@@ -100,17 +100,6 @@ def test_glass_an_empty_table_and_unknown_depth_are_clear_errors():
             fit_cylinder(picture, views.camera_pose())
 
 
-def test_invalid_depths_are_unknown():
-    """The authors' Kinect returns 0 for unknown depth."""
-    image = view(UprightCylinder(33, 120, X, Y))
-    holes, drawn = image.depth_m.copy(), np.random.default_rng(0).uniform(size=image.depth_m.shape)
-    for part, value in enumerate([0.0, -1.0, np.inf, -np.inf]):
-        holes[(drawn > 0.0125 * part) & (drawn < 0.0125 * (part + 1))] = value
-    with np.errstate(all="raise"):
-        fit = fit_cylinder(RGBD(image.colour, holes, image.intrinsics, 0.0), views.camera_pose())
-    assert off_centre(fit) < 1.0
-
-
 def test_an_object_at_the_border_is_located_or_refused():
     pose = views.camera_pose()
     assert fit_cylinder(view(UprightCylinder(33, 120, 600, 0)), pose).x_mm == pytest.approx(600, abs=5)
