@@ -1,19 +1,14 @@
 """The hard inputs of every numerical kernel: ours holds, and the naive formula fails on the same input."""
 
 import json
-import math
 from functools import cache
 
-import numpy as np
 import pytest
 
 from benchmarks import hard_cases as command
 from benchmarks.hard_cases import KERNELS, hard_cases
-from benchmarks.optics.least_squares import solve
 from tests.documents import ROOT
 from tests.hard_case import HardCase
-from tests.robot.sight.hard_sight import naive_circle
-from tests.robot.sim.hard_gel_pictures import _columns, _grams, naive_ridge
 
 
 @pytest.fixture(scope="module")
@@ -32,17 +27,6 @@ def test_our_results_hold_and_the_naive_formulae_fail_on_the_same_inputs(rows, p
 
 
 # The naive formulae are right on easy inputs: they fail by their arithmetic, not by a mistake -----------------
-
-
-def test_the_naive_circle_is_right_on_a_whole_circle_without_noise():
-    angle = np.linspace(0, 2 * math.pi, 50)
-    plan = np.stack([3 + 7 * np.cos(angle), -2 + 7 * np.sin(angle)], axis=1)
-    assert naive_circle(plan) == pytest.approx((3, -2, 7))
-
-
-def test_the_naive_ridge_equals_ours_on_features_of_one_scale():
-    columns, target = _columns()
-    assert naive_ridge(columns, target) == pytest.approx(solve(_grams(columns, target), 1e-4), abs=1e-2)
 
 
 # The command ---------------------------------------------------------------------------------------------------

@@ -24,22 +24,6 @@ def filled(path):
     return path
 
 
-def test_a_key_depends_on_all_inputs_and_not_on_the_order_of_names():
-    assert cache_key("a", {"x": 1, "y": [2.5, None]}) == cache_key("a", {"y": [2.5, None], "x": 1})
-    keys = [cache_key(*inputs) for inputs in (("a",), ("a", 1), ("a", "1"), ("a", [1]), ("b", 1))]
-    assert len(set(keys)) == len(keys)
-
-
-def test_entries_are_found_by_key_and_listed_by_group(filled):
-    other = cache_key("b", 1)
-    with Cache(filled) as cache:
-        cache.add({other: b"other", KEYS[3]: b"new"})
-    with Cache(filled) as cache:
-        assert cache.get(KEYS[1]) == ENTRIES[KEYS[1]]
-        assert (cache.get(KEYS[3]), cache.get(other), cache.get("b/none")) == (b"new", b"other", None)
-        assert (cache.keys("a"), cache.keys("b"), cache.keys("c")) == (set(KEYS), {other}, set())
-
-
 def test_what_is_not_kept_is_deleted_and_gives_its_room_back(filled):
     before = filled.stat().st_size
     with Cache(filled) as cache:

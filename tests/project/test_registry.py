@@ -32,12 +32,6 @@ def make(table=None, **options):
     return Registry("shape", "shapes", known, error=LookupError, **{"base": f"{HERE}:Shape"} | options)
 
 
-def test_a_built_in_name_is_imported_when_it_is_loaded():
-    registry = make({"decoder": "json.decoder:JSONDecoder", "absent": "no.such.module:Thing"}, base=None)
-    assert list(registry) == ["decoder", "absent"]
-    assert registry.load("decoder") is json.decoder.JSONDecoder
-
-
 def test_an_installed_package_adds_a_name_and_cannot_replace_ours(tmp_path, monkeypatch):
     added = {"square": f"{HERE}:Square", "shape": f"{HERE}:Stone", "broken": "no_such_package:Thing"}
     plugins.install(tmp_path, monkeypatch, shapes=added)
@@ -71,9 +65,3 @@ def test_an_object_has_a_name_that_resolves_to_it():
     functions = make({}, base=None)
     assert functions.resolve("json:dumps") is json.dumps
     assert functions.name_of(json.dumps) == "json:dumps"
-
-
-@pytest.mark.parametrize("place", [f"{HERE}:Stone", "json:dumps", "no_such_package:Thing", f"{HERE}:Thing", f"{HERE}:"])
-def test_an_object_of_another_type_and_a_failed_import_are_refused(place):
-    with pytest.raises(LookupError, match=r"must be a Shape|cannot be imported|must be one of shape"):
-        make().name_of(place)

@@ -431,15 +431,6 @@ def test_any_gate_decides_which_grasps_are_accepted(tmp_path):
     assert [attempt.score for attempt in logged_attempts(tmp_path / "r")] == [0.25, 0.25, 0.75] * 2
 
 
-def test_an_attempt_is_a_function_of_seed_object_and_number_alone():
-    with FakeRig(3) as one, FakeRig(3) as two:
-        first, second = (AttemptRunner(rig, 3, AttemptSettings()) for rig in (one, two))
-        for number in (0, 1, 2):
-            first.run("round-0", number)
-        second.run("thin-1", 5)
-        assert first.run("round-2", 4) == second.run("round-2", 4)
-
-
 @pytest.mark.parametrize("device", ["arm", "depth", "gel a", "gel b", "grasp", "open"])
 def test_an_attempt_is_repeated_after_a_device_failure_and_the_recording_is_the_same(tmp_path, whole, device):
     run(tmp_path / "s", faults={device: {2, 5}})

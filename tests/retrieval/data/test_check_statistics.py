@@ -92,8 +92,3 @@ def test_equal_values_have_exactly_the_accuracy_of_chance():
     result = nearest_grasp_accuracy(np.ones((6, 4)), objects)
     assert result.value == result.chance == [pytest.approx((2 / 5 + 1 / 5) / 2)]
     assert (result.queries, result.objects) == (5, 2)
-
-
-def test_one_object_or_single_grasps_have_no_accuracy():
-    assert nearest_grasp_accuracy(np.arange(5)[:, None], np.arange(5)) is None
-    assert nearest_grasp_accuracy(np.arange(5)[:, None], np.zeros(5, int)) is None

@@ -9,7 +9,6 @@ from hypothesis.extra.numpy import arrays
 from PIL import Image
 
 from retrieval.commands.main import main
-from retrieval.data import views
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import resize
 from retrieval.data.views import VIEWS, PixelBox, crop_square, find_object, tile_views
@@ -78,34 +77,6 @@ def test_any_photo_has_a_box_inside_it(image):
     assert 0 <= box.left < box.right <= image.shape[1]
     assert 0 <= box.top < box.bottom <= image.shape[0]
     assert np.isfinite(tile_views(image, list(VIEWS), 8)).all()
-
-
-def fitted(values, ring=6):
-    """Return residuals and scatter of one map, computed as the docstring of `_ground_residuals` describes."""
-    side = len(values)
-    border = np.ones((side, side), bool)
-    border[ring:-ring, ring:-ring] = False
-    y, x = np.mgrid[:side, :side] / side - 0.5
-    plane, inliers = np.stack([np.ones_like(x), x, y], axis=2), border
-    for _ in range(4):
-        residuals = values - plane @ np.linalg.lstsq(plane[inliers], values[inliers], rcond=None)[0]
-        scatter = 1.4826 * np.median(np.abs(residuals[inliers])) + 1e-4
-        inliers = border & (np.abs(residuals) < 3 * scatter)
-    return residuals, scatter
-
-
-def test_the_ground_is_the_least_squares_plane_through_the_inliers_of_the_border():
-    rng = np.random.default_rng(0)
-    slope = np.linspace(0, 0.2, 128)[None, :, None] * [1, -1, 0.5, 0]
-    maps = (1 + slope + rng.normal(0, [0.01, 0.02, 0.03, 0.0], (128, 128, 4))).astype(np.float32).transpose(2, 0, 1)
-    maps[:, 100:, 40:90] += 0.7  # an object that touches the border
-    residuals, scatters = views._ground_residuals(maps)
-    for one, found, scatter in zip(maps, residuals, scatters, strict=True):
-        expected, expected_scatter = fitted(one.astype(np.float64))
-        np.testing.assert_allclose(found, expected, atol=1e-6)
-        assert scatter == pytest.approx(expected_scatter, rel=1e-4)
-    assert np.abs(residuals[0, 60:90]).max() < 0.06
-    assert np.abs(residuals[0, 110:, 50:80]).min() > 0.6
 
 
 @pytest.mark.parametrize("side", [1, 2, 7, 30])

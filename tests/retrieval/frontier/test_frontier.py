@@ -11,19 +11,17 @@ import torch
 
 import indexes
 from _touch_retrieval.registry import Registry
-from indexes.store.folder import IndexStore
 from retrieval.commands.frontier import recording_of
 from retrieval.commands.main import main
 from retrieval.errors import ConfigError, DatasetError
 from retrieval.frontier import APPROXIMATIONS
 from retrieval.frontier.candidates import default_k, ranks
 from retrieval.frontier.clock import time_points
-from retrieval.frontier.formats import STORED, encoders
+from retrieval.frontier.formats import encoders
 from retrieval.frontier.measure import measure_frontier
-from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, miss_rate_point
-from retrieval.frontier.report import figure, write_frontier
+from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff
+from retrieval.frontier.report import write_frontier
 from retrieval.frontier.sample import Sample, Scale
-from retrieval.indexing.build import build_index
 from retrieval.indexing.candidates import measure_candidates
 from retrieval.model.candidate_encoder import CandidateEncoder
 from retrieval.model.checkpoint import load_checkpoint
@@ -71,11 +69,6 @@ def test_the_fastest_within_the_tolerance_is_recommended_else_that_of_the_smalle
     made = panel(*points)
     marked = [dataclasses.replace(point, is_default=row == default) for row, point in enumerate(made.points)]
     assert dataclasses.replace(made, points=tuple(marked)).line() == f"errors (against the truth); {line}"
-
-
-def test_a_miss_rate_is_in_percent_with_its_exact_interval():
-    point = miss_rate_point("a", "b", [True, False, False, False])
-    assert (point.error, point.interval) == (25.0, pytest.approx((0.6, 80.6), abs=0.05))  # Clopper and Pearson
 
 
 def test_timed_works_take_turns():
@@ -137,12 +130,6 @@ def test_touches_are_encoded_by_the_default_of_the_towers(sample):
     default = next(encode for _, encode, is_default in encoders(sample.checkpoint) if is_default)
     assert np.array_equal(default(images), encode_touches(matcher, images).partial.numpy())
     assert not any(module.training for module in matcher.modules())
-
-
-def test_an_index_stores_partials_in_the_default_format(catalogue, model, tmp_path):
-    build_index(catalogue, load_checkpoint(model), tmp_path / "index", quiet=True)
-    stored = IndexStore(tmp_path / "index").open().arrays["partials"]
-    assert np.asarray(stored[:1]).dtype == STORED
 
 
 # Sample ----------------------------------------------------------------------------------------------------
@@ -223,12 +210,6 @@ def test_finished_rows_are_reused_until_their_inputs_change_or_the_cache_is_dama
     assert CALLS[3:] == ["one", "one"]
 
 
-def test_an_unknown_row_is_refused_before_anything_is_measured(model, tmp_path):
-    with pytest.raises(ConfigError, match=r"candidates, index_kinds, .*; got 'nothing'"):
-        measure_frontier(tmp_path, model, not_needed, only=["partials", "nothing"], quiet=True)
-    assert not list(tmp_path.iterdir())
-
-
 # Page and command ------------------------------------------------------------------------------------------
 
 
@@ -250,17 +231,6 @@ def test_a_page_has_the_plot_the_reason_of_a_skipped_row_and_every_point(errors,
     for words in ("every photo reranked", "a &lt;fast&gt; one", "A quick run", "Left out: nothing to measure."):
         assert words in text
     assert all(f"k = {k}" in text for k in range(len(errors)))
-
-
-@pytest.mark.parametrize(
-    ("tolerance", "errors", "lowest"), [(0.5, (3, 0), 0.5), (2, (3, 0), 1.5), (0, (3, 0), 1.5), (0.5, (0, 0), 0.5)]
-)
-def test_the_tolerance_is_drawn_at_its_value_and_no_point_below_the_floor(tolerance, errors, lowest):
-    made = panel(*enumerate(errors, start=1), tolerance=tolerance)
-    axes = figure([made]).axes[0]
-    (dashed,) = [line for line in axes.lines if line.get_label() == "tolerance"]
-    assert dashed.get_ydata()[0] == (tolerance or lowest)
-    assert min(line.get_ydata()[0] for line in axes.lines if line is not dashed and len(line.get_ydata())) == lowest
 
 
 def test_the_command_writes_a_page_and_prints_a_line_for_each_panel(model, recording, tmp_path, capsys):

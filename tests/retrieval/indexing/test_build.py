@@ -21,6 +21,7 @@ from retrieval.commands.main import main
 from retrieval.data import preprocessing
 from retrieval.data.catalogue import list_catalogue
 from retrieval.errors import DatasetError, NumericalError
+from retrieval.frontier.formats import STORED
 from retrieval.indexing import codes
 from retrieval.indexing.build import CACHE, build_index
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
@@ -404,6 +405,6 @@ def test_the_error_of_float16_partials_is_within_the_reported_bound(catalogue_co
     images = [checkpoint.config.preprocessing.load_photo(catalogue_copy / row.path) for row in generation.rows]
     exact = encode_photos(checkpoint.matcher, images).partial.numpy()
     stored = np.asarray(generation.arrays["partials"])
-    assert stored.dtype == np.float16
+    assert stored.dtype == STORED
     assert np.abs(stored - exact).max() <= report.partial_error + 1e-5  # in other batches of the tower
     assert report.partial_error == pytest.approx(2**-11 * np.abs(exact).max(), rel=1e-2)

@@ -4,8 +4,6 @@ import pytest
 import torch
 
 from retrieval.model.candidate_encoder import CandidateEncoder, PartialStatistics
-from retrieval.model.config import MatcherConfig
-from retrieval.model.fusion import Matcher
 
 
 @pytest.mark.parametrize("linear", [0, 3])
@@ -57,17 +55,3 @@ def test_constant_partial_activations_stay_finite_where_a_plain_division_gives_n
     partials = torch.full((3, 2), 5.0)
     assert (partials - partials.mean(0)).div(partials.std(correction=0)).isnan().all()
     assert PartialStatistics.of(partials, 0)(partials).tolist() == [[0.0, 0.0]] * 3
-
-
-def test_index_entries_have_the_candidate_encoders_embedding_and_without_one_the_contrastive_one():
-    for width in (0, 8):
-        torch.manual_seed(0)
-        matcher = Matcher(MatcherConfig(tower="small", hidden=6, embedding_dim=4, candidate_width=width)).eval()
-        features = torch.randn(2, matcher.photo_tower.feature_count)
-        encoding, entry = matcher.photo_encoding(features), matcher.photo_search_encoding(features)
-        assert torch.equal(encoding.partial, entry.partial)
-        encoder = matcher.candidate_encoder
-        expected = encoding.embedding if encoder is None else encoder.photo(encoding.partial)
-        assert (matcher.candidate_encoder is None) == (width == 0)
-        assert torch.equal(entry.embedding, expected)
-        assert torch.equal(entry.embedding, encoding.embedding) == (width == 0)

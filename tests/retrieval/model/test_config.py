@@ -113,6 +113,7 @@ REFUSED = [
     ("training", "precision", "other"),
     ("training", "validation_fraction", 1.0),
     ("training", "seed", 2**32),
+    ("training", "seed", 2**63),
     ("preprocessing", "touch_px", 4097),
 ]
 

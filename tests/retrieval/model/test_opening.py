@@ -32,11 +32,8 @@ def test_ratios_equal_two_plain_loops_and_are_0_where_nothing_was_measured():
     ("openings", "problem"),
     [
         ([0.041], "from 0.5 to 300; got 0.041; the value looks like metres"),
-        ([41, -1], "got -1"),
         ([41, 410.0], "got 410.0"),
         ([math.nan], "got nan"),
-        (["41", None], "got '41'"),
-        ([True, None], "got True"),
         ([10**400, None], "got 1000"),
         ([41], r"got 1 opening\(s\) for 2 grasp"),
     ],

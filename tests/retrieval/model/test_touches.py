@@ -63,16 +63,6 @@ def test_every_other_input_is_refused_with_one_sentence(touches, message):
 # Reading -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_file_gives_the_same_numbers_in_every_form(picture):
-    data = picture.read_bytes()
-    with Image.open(picture) as opened:
-        forms = [picture, str(picture), data, bytearray(data), memoryview(data), opened, np.asarray(opened)]
-        read = [read_image(image, "it") for image in forms]
-    assert read[0].shape == (24, 32, 3)
-    for other in read[1:]:
-        assert np.array_equal(read[0], other)
-
-
 @pytest.mark.parametrize("mode", ["P", "LA", "CMYK", "turned"])
 def test_a_pillow_image_is_read_upright_like_its_file(mode, picture):
     image, buffer = Image.open(picture), io.BytesIO()

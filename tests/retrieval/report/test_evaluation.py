@@ -121,12 +121,7 @@ def test_numbers_are_printed_without_recomputation(remake):
 
 def test_refused_rates_of_verification_name_the_objects_that_they_need(remake):
     text = remake(lambda results: None)[1]
-    assert (
-        "| impostors | grasps | EER, % | FRR at a FAR of 10 %, % | FRR at a FAR of 1 %, % | FRR at a FAR of 0.1" in text
-    )
-    assert (
-        "| random | 3 | 5.1 [2.0, 11.0] | 1.0 [0.0, 6.0] | 23.4 [10.0, 40.0] | refused: needs 1,246 objects |" in text
-    )
+    assert "| 5.1 [2.0, 11.0] | 1.0 [0.0, 6.0] | 23.4 [10.0, 40.0] | refused: needs 1,246 objects |" in text
     assert "| most similar object | 1 | refused: no errors |" in text
     assert len(re.findall(r"^\| (random|most similar object) \| [13] \|", text, re.MULTILINE)) == 4
 

@@ -163,17 +163,6 @@ def test_the_advice_for_an_object_with_reference_touches_requests_more():
     assert "More reference touches of mug would help." in dataclasses.replace(result, results=[match]).advice
 
 
-@pytest.mark.parametrize("verdict", ["no contact", "not a gel image"])
-def test_without_a_ranking_the_page_gives_the_reason_and_marks_the_grasps(verdict):
-    checks = [verdict, "contact" if verdict == "not a gel image" else verdict]
-    fields = {"verdict": verdict, "none_probability": None, "posterior": None, "grasps": checks}
-    page = page_of(touches=[["a.png", "b.png"], ["c.png", "d.png"]], **fields)
-    assert f"{verdict.capitalize()}: " in page.text
-    assert f"grasp 1: {verdict}, not scored" in page.text
-    assert ("grasp 2: " in page.text) == (verdict == "no contact")
-    assert "Photos, most likely first" not in page.text
-
-
 def test_a_model_without_calibration_shows_no_probability():
     one = ("mug", 1.5, None, "1.jpg", {})
     page = page_of(one, verdict="uncalibrated", none_probability=None, posterior=None)

@@ -187,12 +187,6 @@ def test_equal_photos_of_several_objects_are_all_found_in_the_order_of_their_ids
 # The candidate stage -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("candidates", [None, 24, 1000])
-def test_no_candidate_stage_runs_if_it_covers_all_photos(candidates, searcher, touch, searches):
-    assert searcher.query([touch], candidates=candidates).index["scored"] == 24
-    assert searches == []
-
-
 def test_no_candidate_stage_runs_without_trained_embeddings(catalogue, model, touch, tmp_path, searches):
     checkpoint = variant(model, tmp_path / "paper.safetensors", training__weights={})
     build_index(catalogue, checkpoint, tmp_path / "index", quiet=True)

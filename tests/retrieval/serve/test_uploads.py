@@ -21,18 +21,7 @@ def post(client, *images):
     return client.post("/v1/query", json={"touches": [[base64.b64encode(image).decode() for image in images]]})
 
 
-@pytest.mark.parametrize(
-    "image",
-    [
-        png_file(4473, 4473),  # more than 20 million pixels in its header
-        png_file(2**31 - 1, 2**31 - 1),
-        b"",
-        b"GIF89a" + b"\x00" * 100,
-        png_file(64, 64, samples=b"\x00" * 10),
-        png_file(64, 64)[:40],
-    ],
-    ids=["large", "huge", "empty", "gif", "too few samples", "cut off"],
-)
+@pytest.mark.parametrize("image", [png_file(2**31 - 1, 2**31 - 1), b"", png_file(64, 64)[:40]])
 def test_unusable_pictures_are_refused_with_their_place(client, image):
     good = png_file(8, 8, samples=b"\x00" * 8 * 25)
     detail = problem(post(client, good, image), 422, "bad-image")

@@ -163,12 +163,6 @@ def test_steps_of_a_long_episode_are_read_one_by_one():
     assert peak < 20 * 360_000  # a picture has 360,000 bytes, the episode 200 pictures
 
 
-def test_labelled_moments_define_the_columns():
-    images = episode_images(lambda: steps(3, 0), 1, ["before", "during", "after"])
-    assert sorted(images) == ["photo", "touch_a", "touch_a_after", "touch_a_before"]
-    assert [images[column]()[0, 0, 0] for column in ("touch_a_before", "touch_a", "touch_a_after")] == [200, 101, 102]
-
-
 @pytest.mark.parametrize(
     ("count", "moments", "message"),
     [

@@ -158,18 +158,6 @@ def test_casting_agrees_with_a_slow_march(index):
     assert agree.mean() >= 0.98
 
 
-@pytest.mark.parametrize("index", [1, 4, 6, 9, 16, 20])
-def test_the_slope_of_a_level_bounds_how_fast_its_field_changes(index):
-    body = draw_object(5, index).body
-    bound = 1 + max((level.slope for level in body.wall[:1]), default=0) if body.wall else 1
-    origins, directions = random_rays(body, 1500, seed=index)
-    t = body.cast(origins, directions)
-    p = (origins + t[:, None] * directions)[np.isfinite(t)]
-    q = p + np.random.default_rng(2).normal(0, 0.1, p.shape)
-    change = np.abs(body.field(*np.float32(p.T)) - body.field(*np.float32(q.T)))
-    assert (change <= 1.1 * bound * np.linalg.norm(p - q, axis=1) + 1e-3).mean() > 0.998
-
-
 # The contract over all objects -----------------------------------------------------------------------------
 
 

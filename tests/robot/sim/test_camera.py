@@ -21,14 +21,6 @@ def project(camera, point):
     return camera.focal_px * local[:2] / local[2] + (camera.px - 1) / 2
 
 
-def test_the_axes_are_right_down_and_forward():
-    right, down, forward = CAMERA.to_rig[:3, :3].T
-    np.testing.assert_allclose(right, [1, 0, 0], atol=1e-12)
-    assert forward[1] > 0 > forward[2]
-    assert down[2] < 0
-    np.testing.assert_allclose(np.cross(right, down), forward, atol=1e-12)
-
-
 def test_the_object_appears_at_its_projected_position():
     view = cast_camera_rays(POST, Placement(30.0, -10.0, 0.4), CAMERA)
     middle = project(CAMERA, (30.0, -10.0, HEIGHT_MM / 2)).round().astype(int)

@@ -46,14 +46,10 @@ def test_fitted_colours_are_the_documented_sum():
 def test_fitted_colours_are_clipped_to_the_limits_of_the_presses():
     steep = Surface(10 * dome(), SMALL)
     limit = fitted(reaches=(), steepest=0.3)
-    nx, ny = limit._tilts(steep.slopes)
-    assert np.hypot(nx, ny).max() == pytest.approx(0.3, rel=1e-5)
     gentle = Surface(0.1 * dome(), SMALL)
     free = fitted(reaches=())
     np.testing.assert_allclose(limit.colours(gentle, gentle.slopes), free.colours(gentle, gentle.slopes), atol=1e-3)
-    clipped = fitted(highest=(0.2, 9.0, 9.0))
-    assert clipped._neighbourhood(steep)[0].max() <= 0.3  # cubic interpolation overshoots slightly
-    assert fitted()._neighbourhood(steep)[0].max() > 1
+    assert np.abs(limit.colours(steep, steep.slopes) - free.colours(steep, steep.slopes)).max() > 10
 
 
 @pytest.mark.parametrize("name", FITTED)

@@ -18,22 +18,7 @@ def distance(shape, *points):
     return shape.distance(np.array(points, float))
 
 
-def can(radius=20.0, height=80.0, rim=0.0):
-    return Revolution((Drum(radius, 0, height, rim_mm=rim),), height)
-
-
 # Distances by hand -----------------------------------------------------------------------------------------
-
-
-def test_a_point_10_mm_outside_a_cylinder_is_10_mm_away():
-    found = distance(can(), [30, 0, 40], [0, -30, 40], [0, 0, 90], [0, 0, -10], [15, 0, 40], [0, 0, 75])
-    np.testing.assert_allclose(found, [10, 10, 10, 10, -5, -5], atol=1e-5)  # float32 of about 100 mm
-
-
-def test_distances_from_a_box_are_those_of_its_faces_and_rounded_edges():
-    shape = Extrusion(RoundedRectangle(20, 10, 4), 50, rim_mm=0)
-    found = distance(shape, [25, 0, 25], [0, 16, 25], [0, 0, 57], [16 + 6, 6 + 8, 25], [0, 0, 25])
-    np.testing.assert_allclose(found, [5, 6, 7, 10 - 4, -10], atol=1e-5)
 
 
 def test_distances_from_a_hexagon_are_those_of_its_faces_and_corners():
