@@ -11,15 +11,13 @@ import pytest
 pytest.importorskip("rosbags")
 
 import retrieval
-from retrieval.indexing.build import build_index
-from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
 from retrieval.model.touch_reader import TouchReader
 from robot.importers.rosbag import Bag
 from tests import synthetic
 from tests.integrations import fake_rclpy
 from tests.miniatures import rosbag
 from tests.miniatures.rosbag import GEL_A, GEL_B, INTERVAL_NS, START_NS
-from tests.verification import POSTERIOR, calibration
+from tests.verification import calibration, verified_index
 
 REST, FIRST, SECOND = 4, 9, 19
 """Numbers of the last images before the contact, of the first grasp, and of the second grasp."""
@@ -29,12 +27,7 @@ IDENTIFY, VERIFY, NEXT_GRASP, NO_CONTACT = "~/identify", "~/verify", "~/next_gra
 @pytest.fixture(scope="module")
 def index(model, catalogue, tmp_path_factory):
     """An index whose model has bounds for verification: always "another grasp" until the fourth."""
-    folder = tmp_path_factory.mktemp("ros2")
-    fitted = calibration(1e3, -1e3)
-    made = dataclasses.replace(load_checkpoint(model), posterior=POSTERIOR, verification=fitted, gel_check=None)
-    store_checkpoint(made, folder / "m.safetensors")
-    build_index(catalogue, load_checkpoint(folder / "m.safetensors"), folder / "index", quiet=True)
-    return folder / "index"
+    return verified_index(tmp_path_factory.mktemp("ros2"), model, catalogue, calibration(1e3, -1e3))
 
 
 @pytest.fixture(scope="module")

@@ -65,26 +65,10 @@ def test_an_invalid_rule_is_refused_with_the_valid_forms(rule, message):
 # Warnings --------------------------------------------------------------------------------------------------
 
 
-WARNED = [
-    ({"VAL": 4, "images": 3, "mug": 3}, "VAL, images are used as the name of an object, with 7 photo(s)"),
-    (
-        {"mug_0": 1, "mug_1": 1, "cup (1)": 1, "cup (2)": 1, "ball": 1},
-        "the names of 4 of 5 objects differ from another name only by a number: cup (1), cup (2), mug_0 and 1 more",
-    ),
-]
-
-
 def warnings(photos, rule="folder"):
     """Return the warnings on objects with these numbers of photos."""
     pairs = [(name, f"{name}/{number}.jpg") for name, count in photos.items() for number in range(count)]
     return naming_warnings(pairs, Naming(rule))
-
-
-@pytest.mark.parametrize(("photos", "start"), WARNED)
-def test_folders_of_many_objects_and_names_that_differ_by_a_number_give_a_warning(photos, start):
-    (warning,) = warnings(photos)
-    assert warning.startswith(start)
-    assert "--objects-from" in warning
 
 
 def test_plausible_names_give_no_warning():

@@ -7,7 +7,6 @@ import pytest
 
 from indexes.store.folder import IndexStore
 from retrieval.commands.main import main
-from retrieval.errors import BadInput
 from retrieval.indexing.build import build_index
 
 
@@ -68,14 +67,6 @@ def test_the_index_stores_the_rule_and_reports_a_change(tmp_path, photos, checkp
     assert IndexStore(index).open().manifest.about["objects_from"] == "folder"
     alike = build_index(own, checkpoint, index, objects_from="{object}.jpg", quiet=True)
     assert (alike.objects, alike.written) == (3, True)
-
-
-def test_an_invalid_rule_raises_before_anything_is_written(tmp_path, photos, checkpoint, index):
-    with pytest.raises(BadInput, match="folder, stem, or a pattern"):
-        build_index(
-            catalogue_of(tmp_path / "own", photos, "mug.jpg"), checkpoint, index, objects_from="name", quiet=True
-        )
-    assert not index.exists()
 
 
 def test_objects_without_a_readable_photo_are_listed_and_give_exit_code_1(tmp_path, photos, model, index, capsys):

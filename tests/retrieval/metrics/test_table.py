@@ -5,19 +5,11 @@ from itertools import product
 import numpy as np
 import pytest
 
-from retrieval.errors import BadInput, NumericalError
 from retrieval.metrics.measure import Measure, pooled
 from retrieval.metrics.table import object_scores
 from tests.retrieval.metrics.test_registry import table_of
 
 # The table -------------------------------------------------------------------------------------------------
-
-
-def test_a_measure_needs_a_finite_value_for_each_query():
-    with pytest.raises(BadInput, match=r"values of shape \(2, 1\)"):
-        Measure(np.zeros((3, 1)), np.array([0, 1]), np.array([0.5]), "")
-    with pytest.raises(NumericalError):
-        Measure(np.full((2, 1), np.nan), np.array([0, 1]), np.array([0.5]), "")
 
 
 # Photos that represent an object ---------------------------------------------------------------------------

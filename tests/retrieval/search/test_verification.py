@@ -1,6 +1,5 @@
 """`Searcher.verify` and `retrieve verify`: accept, reject, another grasp, and invalid requests."""
 
-import dataclasses
 import json
 
 import pytest
@@ -8,10 +7,8 @@ import pytest
 import retrieval
 from retrieval.commands.main import main
 from retrieval.errors import BadInput
-from retrieval.indexing.build import build_index
-from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
 from retrieval.model.verification import MAX_GRASPS
-from tests.verification import POSTERIOR, calibration
+from tests.verification import calibration, verified_index
 
 
 @pytest.fixture(scope="module")
@@ -19,11 +16,7 @@ def open_index(model, catalogue, tmp_path_factory):
     """Return a function that builds and opens an index of a model with a calibration."""
 
     def opened(fitted):
-        folder = tmp_path_factory.mktemp("verified")
-        made = dataclasses.replace(load_checkpoint(model), posterior=POSTERIOR, verification=fitted, gel_check=None)
-        store_checkpoint(made, folder / "m.safetensors")
-        build_index(catalogue, load_checkpoint(folder / "m.safetensors"), folder / "index", quiet=True)
-        return retrieval.open(folder / "index")
+        return retrieval.open(verified_index(tmp_path_factory.mktemp("verified"), model, catalogue, fitted))
 
     return opened
 

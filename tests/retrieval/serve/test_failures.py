@@ -1,4 +1,4 @@
-"""Failures of a service: failing writes, a full disk, a hanging rig or disk."""
+"""Failures of a service: a hanging rig, query or disk. A full disk is in test_history.py."""
 
 import signal
 import subprocess
@@ -11,43 +11,8 @@ import httpx
 import pytest
 
 from retrieval.serve.service import MAX_RIG_GRASPS, GraspResult, LiveRig
-from tests.serving import listening, problem, with_history
+from tests.serving import listening, problem
 from tests.waiting import wait_until
-
-
-@pytest.fixture
-def folder(tmp_path):
-    return tmp_path / "history"
-
-
-@pytest.fixture
-def client(index, folder):
-    with with_history(index, folder) as client:
-        yield client
-
-
-def ask(client, body):
-    response = client.post("/v1/query", json=body)
-    assert response.status_code == 200
-    return response.headers.get("x-query-id")
-
-
-# The disk ------------------------------------------------------------------------------------------------------------
-
-
-def test_a_query_is_answered_without_an_id_while_the_disk_is_full(client, body, searcher):
-    store = client.app.state.service.history_writer.store
-    first = ask(client, body)
-    (pages,) = store._database.execute("PRAGMA page_count").fetchone()
-    store._database.execute(f"PRAGMA max_page_count = {pages}")
-    assert ask(client, body) is None
-    feedback = {"query": first, "feedback": "object", "object_id": searcher.generation.rows[0].object_id}
-    response = client.post("/v1/feedback", json=feedback)
-    assert "database or disk is full" in problem(response, 500, "failed")
-    store._database.execute("PRAGMA max_page_count = 1000000")
-    second = ask(client, body)
-    assert [item["id"] for item in client.get("/v1/history").json()["items"]] == [second, first]
-
 
 # The rig -------------------------------------------------------------------------------------------------------------
 
@@ -132,8 +97,8 @@ with RecordingWriter(Path(folder) / "recording", {"source": "s", "sensor": "t"})
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("where", "path"), [("rig", "grasp"), ("query", "query"), ("write", "query")])
-def test_sigterm_ends_the_process_whatever_hangs(index, folder, body, where, path):
-    line = [sys.executable, "-c", HANGS, str(index), str(folder), where]
+def test_sigterm_ends_the_process_whatever_hangs(index, tmp_path, body, where, path):
+    line = [sys.executable, "-c", HANGS, str(index), str(tmp_path), where]
     with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as process, ThreadPoolExecutor(4) as client_threads:
         try:
             url = f"http://127.0.0.1:{int(process.stdout.readline())}/v1/{path}"

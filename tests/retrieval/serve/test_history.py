@@ -123,6 +123,20 @@ def test_unrecorded_feedback_is_recorded_at_the_next_start(index, touches, folde
     assert [grasp.object_id for grasp in load_grasps(folder / "recording")] == [name, name]
 
 
+def test_a_query_is_answered_without_an_id_while_the_disk_is_full(client, body, searcher):
+    store = client.app.state.service.history_writer.store
+    first = client.post("/v1/query", json=body).headers["x-query-id"]
+    (pages,) = store._database.execute("PRAGMA page_count").fetchone()
+    store._database.execute(f"PRAGMA max_page_count = {pages}")
+    response = client.post("/v1/query", json=body)
+    assert (response.status_code, "x-query-id" in response.headers) == (200, False)
+    response = add_feedback(client, first, "object", searcher.generation.rows[0].object_id)
+    assert "database or disk is full" in problem(response, 500, "failed")
+    store._database.execute("PRAGMA max_page_count = 1000000")
+    second = client.post("/v1/query", json=body).headers["x-query-id"]
+    assert [item["id"] for item in client.get("/v1/history").json()["items"]] == [second, first]
+
+
 def test_oldest_queries_without_feedback_are_deleted(touches, tmp_path, searcher):
     result, store = searcher.query(next(iter(touches.values()))), HistoryStore(tmp_path / "h.sqlite", max_queries=2)
     for number in range(10):

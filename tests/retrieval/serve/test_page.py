@@ -130,6 +130,10 @@ def test_metadata_of_an_object_are_searched_and_shown(browser, catalogue, model,
         facts = opened.get_by_role("dialog", name=name).locator(".facts")
         facts.get_by_text("Wedgwood").wait_for()
         assert facts.locator("dt, dd").all_inner_texts() == ["maker", "Wedgwood", "price", "3"]
+        opened.keyboard.press("Escape")
+        opened.get_by_role("searchbox", name="Search").fill("no such words")
+        opened.get_by_text("No photo of the catalogue matches all these words.").wait_for()
+        assert opened.locator(".grid li").count() == 0
 
 
 def test_the_browsers_camera_takes_pictures_finger_by_finger(opened):

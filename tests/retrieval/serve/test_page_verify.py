@@ -1,29 +1,10 @@
 """Verification on the page in a real browser: the expected object, the decision, and its error rates."""
 
-import dataclasses
-
 import pytest
 
-from retrieval.indexing.build import build_index
-from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
 from retrieval.search.searcher import Searcher
 from tests.browser import address, choose, page, serious
-from tests.verification import POSTERIOR, calibration
-
-
-@pytest.fixture(scope="module")
-def served(model, catalogue, tmp_path_factory):
-    """Function that builds an index whose model accepts and rejects at these log likelihood ratios."""
-
-    def build(accept, reject):
-        folder = tmp_path_factory.mktemp("verified")
-        verification = calibration(accept, reject)
-        made = dataclasses.replace(load_checkpoint(model), verification=verification, posterior=POSTERIOR)
-        store_checkpoint(made, folder / "m.safetensors")
-        build_index(catalogue, load_checkpoint(folder / "m.safetensors"), folder / "index", quiet=True)
-        return folder / "index"
-
-    return build
+from tests.verification import calibration, verified_index
 
 
 def verify(opened, name, files):
@@ -53,9 +34,9 @@ def names(catalogue):
     ],
 )
 def test_the_decision_on_the_expected_object_is_shown_with_its_ratio_and_error_rates(
-    served, browser, files, names, accept, reject, claim, sentence
+    tmp_path, model, catalogue, browser, files, names, accept, reject, claim, sentence
 ):
-    index, name = served(accept, reject), names[0]
+    index, name = verified_index(tmp_path, model, catalogue, calibration(accept, reject)), names[0]
     with Searcher.open(index) as searcher:
         expected = searcher.verify([files[:2]], name)
     with address(index) as url, page(browser, url) as opened:
@@ -74,8 +55,11 @@ def test_the_decision_on_the_expected_object_is_shown_with_its_ratio_and_error_r
 
 
 @pytest.mark.slow
-def test_the_expected_object_is_a_suggestion_and_the_false_accept_rate_an_option(served, browser, files, names):
-    with address(served(1e3, -1e3)) as url, page(browser, url, 390, color_scheme="dark") as opened:
+def test_the_expected_object_is_a_suggestion_and_the_false_accept_rate_an_option(
+    tmp_path, model, catalogue, browser, files, names
+):
+    index = verified_index(tmp_path, model, catalogue, calibration(1e3, -1e3))
+    with address(index) as url, page(browser, url, 390, color_scheme="dark") as opened:
         opened.get_by_label("Expected object").focus()
         options = opened.locator("#expected-object-names option")
         options.nth(len(names) - 1).wait_for(state="attached")

@@ -65,21 +65,6 @@ def test_feedback_right_and_none_take_one_click_and_appear_in_the_history(opened
     opened.locator(".query").first.wait_for()
 
 
-def test_the_catalogue_is_searched_and_its_photos_open(opened, catalogue):
-    name = sorted(path.name for path in catalogue.iterdir() if path.is_dir())[0]
-    open_view(opened, "Catalogue")
-    opened.locator(".grid li").nth(23).wait_for()
-    opened.get_by_role("searchbox", name="Search").fill(f"{name} 2.jpg")
-    opened.get_by_text("1 photo found").wait_for()
-    opened.locator(".grid button").click()
-    dialog = opened.get_by_role("dialog", name=name)
-    assert dialog.get_by_alt_text(f"Photo {name}/2.jpg").is_visible()
-    opened.keyboard.press("Escape")
-    opened.get_by_role("searchbox", name="Search").fill("no such words")
-    opened.get_by_text("No photo of the catalogue matches all these words.").wait_for()
-    assert opened.locator(".grid li").count() == 0
-
-
 def test_of_100_000_photos_only_those_on_the_screen_are_requested_and_keys_move_to_the_end(opened):
     offsets = []
 

@@ -1,16 +1,13 @@
 """Queries over HTTP: the same answers as in Python, for JSON and forms."""
 
 import base64
-import dataclasses
 import json
 
 import pytest
 
-from retrieval.indexing.build import build_index
-from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
 from retrieval.search.searcher import Searcher
 from tests.serving import problem, service
-from tests.verification import POSTERIOR, calibration
+from tests.verification import calibration, verified_index
 
 
 @pytest.fixture(scope="module")
@@ -44,10 +41,8 @@ def test_json_and_multipart_give_the_document_of_the_searcher(client, searcher, 
 
 
 def test_verification_returns_the_document_of_the_searcher(grasps, model, catalogue, tmp_path):
-    made = dataclasses.replace(load_checkpoint(model), verification=calibration(-1e3, -2e3), posterior=POSTERIOR)
-    store_checkpoint(made, tmp_path / "m.safetensors")
-    build_index(catalogue, load_checkpoint(tmp_path / "m.safetensors"), tmp_path / "index", quiet=True)
-    with Searcher.open(tmp_path / "index") as searcher, service(tmp_path / "index") as client:
+    index = verified_index(tmp_path, model, catalogue, calibration(-1e3, -2e3))
+    with Searcher.open(index) as searcher, service(index) as client:
         name = searcher.generation.rows[0].object_id
         found = client.post("/v1/verify", json={"expect": name, "touches": encoded(grasps), "far": 0.1}).json()
         assert found["decision"] == "accept"

@@ -16,7 +16,7 @@ from retrieval.data.check.split import check_split
 from retrieval.data.dataset import Split, load_grasps
 from robot.errors import ImporterError, RecordingError, RobotError, UnknownName
 from robot.importers import IMPORTERS, data_set_of, load_importer, options_of, read_options, title_of
-from robot.importers.importing import SOURCES_FILE, SPLITS_FOLDER, DataSet, Item, Skip, import_items, numbered_files
+from robot.importers.importing import SOURCES_FILE, SPLITS_FOLDER, DataSet, Item, Skip, import_items
 from robot.recording.folder import RecordingWriter, SharedImage, read_recording, safe_name
 from robot.storage import parse_object
 from tests.data import touch_data
@@ -294,11 +294,3 @@ def test_any_parts_become_a_valid_grasp_id():
     strange = [safe_name(*each) for each in parts]
     assert len(set(strange)) == len(strange)
     assert all(name[0].isalnum() and len(name) <= 128 for name in strange)
-
-
-def test_files_are_in_the_order_of_their_numbers(tmp_path):
-    for each in ("img_10.png", "img_9.png", "img_2_b.png", "img_2_a.png", "Thumbs.db"):
-        (tmp_path / each).touch()
-    found = [path.name for _, path in numbered_files(tmp_path, re.compile(r"img_(\d+).*\.png"))]
-    assert found == ["img_2_a.png", "img_2_b.png", "img_9.png", "img_10.png"]
-    assert not list(numbered_files(tmp_path / "gone", re.compile(".*")))

@@ -160,6 +160,7 @@ BAD_LINES = {
     json.dumps({**ROW, "grasp_id": "0"}): "grasp_id must be unique, got '0' twice",
     json.dumps({**ROW, "object_id": None}): "object_id is missing",
     json.dumps({key: ROW[key] for key in ROW if key != "touch_a_file_name"}): "at least one touch",
+    json.dumps({**ROW, "object_id": "mug\ud83d"}): "it must be",
     json.dumps({**ROW, "grasp_id": 5}): "grasp_id must be a text in quotes, got 5",
     json.dumps({**ROW, "force_n": "5"}): "force_n must be a number or nothing, got '5'",
     json.dumps({**ROW, "force_n": float("nan")}): "without NaN",
