@@ -75,7 +75,7 @@ HELD_OUT = {"gelsight": (36.0, 0.974), "gelsight_mini": (33.0, 0.968)}
 
 
 @real
-@pytest.mark.parametrize("name", HELD_OUT)
+@pytest.mark.parametrize("name", [pytest.param("gelsight", marks=pytest.mark.slow), "gelsight_mini"])
 def test_held_out_presses_are_predicted_better_than_before(name, packs):
     pack = packs[name]
     chosen, held_out = next(photometric.splits(len(pack), photometric.FIT_COUNT[name]))

@@ -13,7 +13,7 @@ from tests import plugins
 from tests.oracle import disagreements
 
 N, D = 1000, 16
-APPROXIMATE = ["IVF16,Flat;nprobe=4", "IVF16,SQ8;nprobe=4", "HNSW16;efSearch=32", "PQ8x4", "IVF8,PQ4x4,RFlat"]
+APPROXIMATE = ["IVF16,Flat;nprobe=4", "IVF16,SQ8;nprobe=4", "HNSW16;efSearch=32", "IVF8,PQ4x4,RFlat"]
 KINDS = ["flat", *APPROXIMATE]
 TOLERANCE = score_tolerance(D)
 

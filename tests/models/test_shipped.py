@@ -90,10 +90,10 @@ def test_the_shipped_checkpoints_calibrate_references_and_take_no_photo_for_a_ge
     same, other = made.opening.log_ratios([30.0], [30.2, 60.0], np.array([0, 1]))[0]
     assert other < -1 < 2 < same
     with load_rig("sim", seed=990) as rig:
-        for name in rig.object_ids(10):
+        for name in rig.object_ids(5):
             rig.prepare(name, 0)
             photos.append(made.config.preprocessing.touch(to_float(rig.camera.read(depth=False).colour)))
     features = touch_features(made.matcher, [[photo] * fingers for photo in photos])
     with torch.inference_mode():
         verdicts = made.gel_check.classify(made.matcher.gel_readings(features).numpy())
-    assert verdicts.count(NOT_A_GEL) >= 8
+    assert verdicts.count(NOT_A_GEL) >= 4

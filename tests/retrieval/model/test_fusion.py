@@ -1,8 +1,7 @@
-"""The fusion head and its partial activations on every backbone, and scoring many photos at once."""
+"""The fusion head and its partial activations, and scoring many photos at once."""
 
 import math
 
-import pytest
 import torch
 from torch.nn import functional
 
@@ -22,10 +21,9 @@ def concatenated_forward(matcher, touches, photos):
     return head.out(hidden)[:, 0]
 
 
-@pytest.mark.parametrize(("name", "output"), [("small", "classes"), ("resnet18", "pooled"), ("mobilenet_v2", "pooled")])
-def test_the_logit_from_partial_activations_equals_the_concatenated_forward(name, output):
+def test_the_logit_from_partial_activations_equals_the_concatenated_forward():
     torch.manual_seed(0)
-    matcher = Matcher(MatcherConfig(tower=name, tower_output=output, hidden=64)).eval()
+    matcher = Matcher(MatcherConfig(tower="small", tower_output="classes", hidden=64)).eval()
     touches, photos = torch.rand(3, 2, 3, 32, 32), torch.rand(3, 3, 32, 32)
     with torch.inference_mode():
         touch = matcher.touch_encoding(matcher.touch_features(touches))
