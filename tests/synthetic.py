@@ -88,9 +88,6 @@ def _colour(rng: np.random.Generator) -> tuple[float, float, float]:
 _STOCK = np.array([60, 62, 64, 80, 78, 75, 72, 62, 46, 70, 42, 33, 40, 48, 60, 52, 56, 40]).reshape(6, 3) / 100
 
 
-# Relief: one field for photo and touch -----------------------------------------------------------------------
-
-
 @lru_cache(maxsize=128)
 def relief(obj: DrawnObject) -> FloatImage:
     """Return the height in mm, 0..depth_mm: (FIELD_PX, FIELD_PX)."""
@@ -218,9 +215,6 @@ def _grain_tile() -> FloatImage:
     return np.random.default_rng(0).standard_normal((512, 512, 3), np.float32)
 
 
-# Photo ------------------------------------------------------------------------------------------------------
-
-
 def draw_photo(obj: DrawnObject, seed: int, px: int = 256) -> Picture:
     """Return a photo of the object on a table, with random rotation and light: (px, px, 3)."""
     rng = np.random.default_rng([_PHOTO, obj.seed, seed])
@@ -270,9 +264,6 @@ def _outline(
     shift = np.array([[1, 0, rng.uniform(-6, 6)], [0, 1, rng.uniform(-6, 6)]], np.float32)
     shadow = cv2.GaussianBlur(cv2.warpAffine(mask, shift, size), (0, 0), 5)
     return mask, 1 - 0.55 * shadow
-
-
-# Touch ------------------------------------------------------------------------------------------------------
 
 
 def draw_touch(
@@ -337,9 +328,6 @@ def _tint(finger: str) -> FloatImage:
     lean = [1 - rng.uniform(0.1, 0.22) * (x * c + y * s) for c, s in _LAMPS]
     tint: FloatImage = base * np.stack(lean, -1) * (1 - rng.uniform(0.1, 0.2) * (x * x + y * y))[..., None]
     return tint
-
-
-# Folders ----------------------------------------------------------------------------------------------------
 
 
 def write_recording(

@@ -29,8 +29,6 @@ def test_our_results_hold_and_the_naive_formulae_fail_on_the_same_inputs(rows, p
 # The naive formulae are right on easy inputs: they fail by their arithmetic, not by a mistake -----------------
 
 
-# The command ---------------------------------------------------------------------------------------------------
-
 GOOD = HardCase("top k", "a <NaN>", "is refused", "ranked first", "refused", True, False)
 BAD = HardCase("losses", "a logit of 1000", "1000", "inf", "inf", False, False)
 

@@ -45,9 +45,6 @@ def test_a_fit_predicts_held_out_presses_to_their_noise(monkeypatch):
         assert picture_error(drawn, index, 0.0).mse > 20
 
 
-# Real presses ----------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def packs():
     return {name: read_presses(find_presses(), name) for name in FITTED}

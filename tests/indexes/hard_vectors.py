@@ -45,9 +45,6 @@ def _text(values: object) -> str:
     return np.array2string(np.asarray(values), precision=3, separator=", ")
 
 
-# Vectors ---------------------------------------------------------------------------------------------------
-
-
 def _nan_vector() -> HardCase:
     vectors = _axes()
     vectors[1, 0] = np.nan
@@ -106,9 +103,6 @@ def _tiny_vector() -> HardCase:
     return HardCase(_UNIT, "components of 1e-30", must_hold, f"a norm of {norm}", ours, holds, norm > 0)
 
 
-# Top k -----------------------------------------------------------------------------------------------------
-
-
 def _ties_at_the_last_rank() -> HardCase:
     """Forty of 41 photos have the same score; a search returns the first six in the order (-score, row)."""
     vectors = np.repeat(_axes(8)[:1], 41, axis=0)
@@ -138,9 +132,6 @@ def _more_than_there_are() -> HardCase:
         ours == [0, 1, 2],
         -1 not in naive,
     )
-
-
-# Inner products --------------------------------------------------------------------------------------------
 
 
 def _float16_scores() -> HardCase:

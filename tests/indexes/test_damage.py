@@ -61,9 +61,6 @@ def flip(path, position: int, bit: int = 0) -> None:
     path.write_bytes(bytes(damaged))
 
 
-# Folders without an index -------------------------------------------------------------------------------------------
-
-
 def test_a_missing_index_error_names_the_command(tmp_path):
     (tmp_path / "file").write_text("hello")
     for path in (tmp_path / "absent", tmp_path):
@@ -111,9 +108,6 @@ def test_a_damaged_index_does_not_block_a_new_one(folder):
     (folder.parent / "CURRENT").write_text("garbage")
     (folder / "manifest.json").unlink()
     assert make(folder.parent).name == opened(folder).folder.name == "gen-000002"
-
-
-# Damage, by the kind of file ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -164,9 +158,6 @@ def test_an_oversized_file_raises_without_reading(folder, name):
     with pytest.raises(CorruptIndex, match=r"has 300000000 bytes; at most \d+ are allowed"):
         opened(folder, verify=False)  # verifying would compute the digest of 300 MB first
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # kB
-
-
-# Other software and forged files --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

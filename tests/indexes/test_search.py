@@ -101,9 +101,6 @@ def test_a_saved_index_loads_and_gives_the_same_results(built, tmp_path):
             indexes.load_kind(built.kind).load(tmp_path / "x", built.vectors, built.kind)
 
 
-# Input -------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("k", [0, -1, True, 2.0, "3"])
 def test_an_invalid_number_of_results_raises(built, k):
     with pytest.raises(ParameterError, match="number of results"):
@@ -121,9 +118,6 @@ def test_an_index_needs_a_vector_and_queries_of_its_size():
         indexes.build(unit(0))
     with pytest.raises(VectorError, match=r"must have 16 components.*another model"):
         indexes.build(unit(3)).search(unit(1, dim=8), 1)
-
-
-# Kinds -------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

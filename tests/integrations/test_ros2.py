@@ -112,9 +112,6 @@ def assert_answers(message, result):
         assert row.photo == match.photo
 
 
-# Identify ------------------------------------------------------------------------------------------------------
-
-
 def test_feedback_requests_the_next_grasp_and_the_result_uses_the_images_of_all(start, bag, grasps):
     made = start(top=3)
     player, feedback = Player(bag, made), []
@@ -200,9 +197,6 @@ def test_a_model_without_calibration_has_nan_in_place_of_probabilities(start, ba
     assert all(math.isnan(row.score) and math.isnan(row.probability_if_present) for row in answer.results)
 
 
-# Images --------------------------------------------------------------------------------------------------------
-
-
 def image(pixels, encoding, time_ns, **changes):
     fields = rosbag.image_fields(pixels, encoding)
     fields["data"] = fake_rclpy.array("B", fields["data"].tobytes())
@@ -244,9 +238,6 @@ def test_a_time_stamp_in_the_future_does_not_make_an_image_new(start):
     assert "the newest image is 1.0 s old" in made.node.send_goal(IDENTIFY)[1].error
 
 
-# Verify --------------------------------------------------------------------------------------------------------
-
-
 def test_verify_adds_a_grasp_to_the_previous_ones_only_on_request(start, bag, touches, grasps):
     made, name = start(), min(touches)
     player = Player(bag, made)
@@ -276,9 +267,6 @@ def test_an_invalid_verification_is_one_error_and_the_node_goes_on(start, bag, t
         assert message in response.error
         assert (response.decision, response.accepted) == ("", False)
     assert made.node.call(VERIFY, expected_object=known).error == ""
-
-
-# No-contact frames, diagnostics, start -------------------------------------------------------------------------
 
 
 def test_a_model_that_subtracts_no_contact_frames_needs_them_once(start, bag, grasps):

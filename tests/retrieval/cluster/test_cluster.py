@@ -64,9 +64,6 @@ def served(ray, cluster):
         yield searcher
 
 
-# Results --------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("count", [1, 3])
 def test_results_equal_those_of_the_folder(count, served, searcher, grasps):
     for own in grasps:
@@ -101,9 +98,6 @@ def test_shards_of_a_killed_process_are_deleted_by_the_next(ray, cluster, served
     assert not orphans & set(ray.serve.status().applications)
     assert before <= set(ray.serve.status().applications)
     assert served.query(grasps[0]).results
-
-
-# Faults ---------------------------------------------------------------------------------------------------------------
 
 
 def test_a_killed_shard_is_restarted_and_every_result_is_complete(served, grasps):
@@ -157,9 +151,6 @@ def test_a_new_generation_is_used_during_running_queries(ray, catalogue, cluster
         thread.join(300)
     assert set(reports) == {("sharded-000001", 24), ("sharded-000002", 25)}
     assert reports == sorted(reports)
-
-
-# Building -------------------------------------------------------------------------------------------------------------
 
 
 def partials_of(cluster):

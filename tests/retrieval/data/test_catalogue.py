@@ -38,9 +38,6 @@ def found(folder):
     return {item.path: item.object_id for item in list_catalogue(folder).photos}
 
 
-# Listing ---------------------------------------------------------------------------------------------------
-
-
 def test_the_first_folder_or_the_file_name_names_the_object(tmp_path):
     fill(tmp_path, "mug/2.jpg", "mug/1.png", "cup.webp", "red ball/side/deep/x.PNG", "v1.2.tif", "a.JpEg", "b.HEIC")
     assert found(tmp_path) == {
@@ -130,9 +127,6 @@ def test_a_name_that_is_not_utf8_is_skipped_and_reported(tmp_path):
     json.dumps([item.path for item in catalogue.skipped], ensure_ascii=False).encode()
 
 
-# Metadata --------------------------------------------------------------------------------------------------
-
-
 def test_a_photos_own_metadata_takes_precedence_over_its_objects(tmp_path):
     fill(tmp_path, "mug/1.png", "mug/2.png", "cup.png")
     write_metadata(
@@ -196,9 +190,6 @@ def test_metadata_that_is_not_utf8_is_an_error(tmp_path):
     (fill(tmp_path, "mug/1.png") / "metadata.jsonl").write_bytes(b'{"object_id": "\xff"}\n')
     with pytest.raises(DatasetError, match="line 1: "):
         list_catalogue(tmp_path)
-
-
-# Touches ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -85,15 +85,9 @@ def broken(clean, tmp_path):
     return Broken(clean, tmp_path / "r")
 
 
-# Clean -----------------------------------------------------------------------------------------------------
-
-
 def test_a_clean_recording_and_a_drawn_split_have_no_finding(clean):
     assert remarks(clean, good_split(clean)) == []
     assert check_gel_layout(clean) == []
-
-
-# Files and single grasps -----------------------------------------------------------------------------------
 
 
 def test_missing_and_truncated_pictures_are_named_and_others_are_still_checked(broken):
@@ -248,8 +242,6 @@ def test_an_import_prints_the_warning_about_exchanged_channels_and_succeeds(tmp_
     assert "in 1 of 8 grasps" in line
 
 
-# Near copies -----------------------------------------------------------------------------------------------
-
 COPIES = {  # source, target, whether the fine relief of drawn touches is kept
     "JPEG 20": (0, 6, False, lambda image: cv2.imdecode(cv2.imencode(".jpg", image, [1, 20])[1], 1)),
     "gain 1.1": (5, 11, True, lambda image: np.clip(np.rint(1.1 * image), 0, 255).astype(np.uint8)),
@@ -280,9 +272,6 @@ def test_near_copies_of_another_object_are_named(broken):
             is_named = f"{one} and {other}" in finding.message or f"{other} and {one}" in finding.message
             assert is_named or (kind != "photo" and not is_gentle)
     assert found["photo"].message.startswith("5 pair(s)")
-
-
-# Drift -----------------------------------------------------------------------------------------------------
 
 
 def let_drift(broken, order=range(30), columns=GELS):
@@ -338,9 +327,6 @@ def test_a_no_contact_frame_that_all_grasps_of_an_object_share_does_not_count(br
     (message,) = [finding.message for finding in found if finding.kind == "unchecked-light"]
     assert message.startswith("the order of capture alone identifies the object in 7")
     assert "touch the objects in rounds" in message
-
-
-# Splits ----------------------------------------------------------------------------------------------------
 
 
 def good_split(folder):

@@ -32,9 +32,6 @@ def test_the_nearest_picture_of_another_object_equals_that_of_plain_loops():
         assert rows[query] == min(distances, key=distances.get)
 
 
-# Fingers and layouts ---------------------------------------------------------------------------------------
-
-
 def test_similar_fingers_cannot_be_checked_and_are_not_reported_as_swapped():
     frames = np.random.default_rng(0).normal(0.5, 0.02, (2, 40, 6, 8, 3)).astype(np.float32)
     assert swapped_fingers(*frames) is None
@@ -82,9 +79,6 @@ def test_real_touches_with_exchanged_channels_are_found_and_unchanged_ones_are_n
     assert changed_layout(images) is None
     images[40:50] = images[40:50, ..., ::-1]
     assert changed_layout(images)[1].tolist() == list(range(40, 50))
-
-
-# Drift -----------------------------------------------------------------------------------------------------
 
 
 def test_equal_values_have_exactly_the_accuracy_of_chance():

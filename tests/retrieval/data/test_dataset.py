@@ -58,9 +58,6 @@ counts = st.lists(st.integers(1, 7), min_size=2, max_size=9)
 seeds = st.integers(0, 2**32 - 1)
 
 
-# Reading a recording ---------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def small_recording(tmp_path_factory):
     """Two objects with two grasps and a miss each."""
@@ -116,9 +113,6 @@ def test_the_data_digest_depends_on_bytes_and_ids_and_not_on_the_folder(small_re
     grasps[1].touches[0].unlink()
     with pytest.raises(DatasetError, match=rf"{grasps[1].touches[0].name} cannot be read .*`retrieve check`"):
         data_digest(grasps)
-
-
-# Splits ----------------------------------------------------------------------------------------------------
 
 
 def parts_of(split):
@@ -217,9 +211,6 @@ def test_a_split_can_be_stored_as_json_and_selects_its_grasps():
 def test_data_that_is_not_a_split_is_refused_with_the_required_keys(data):
     with pytest.raises(DatasetError, match=r"split(\.\S+)? must (be a|have seed, train, validation, test;)"):
         Split.from_dict(data)
-
-
-# Pairs -----------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=20)
@@ -356,9 +347,6 @@ def test_fewer_than_two_objects_and_a_photo_of_two_objects_are_refused(grasps, m
     """A shared photo would be its own negative."""
     with pytest.raises(DatasetError, match=message):
         PairSampler(grasps, seed=0)
-
-
-# Cache -----------------------------------------------------------------------------------------------------
 
 
 def test_an_image_is_loaded_once_while_it_fits_in_the_cache_and_otherwise_each_time():

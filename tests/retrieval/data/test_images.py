@@ -19,8 +19,6 @@ from retrieval.data.images import decode_rgb, read_rgb
 from retrieval.errors import ImageError
 from tests.hostile_pictures import png_chunk as chunk
 
-# Files made by hand ----------------------------------------------------------------------------------------
-
 
 def png(colour_type, depth, samples, *extra, size=None):
     """A PNG file of `samples` (H, W) or (H, W, channels), with extra chunks before the pixels."""
@@ -103,9 +101,6 @@ def sample_files():
         "webp lossless": saved(colour, "WEBP", lossless=True),
         "avif": saved(smooth, "AVIF"),
     }
-
-
-# Reading ---------------------------------------------------------------------------------------------------
 
 
 def test_a_lossless_file_returns_its_pixels(tmp_path):
@@ -193,9 +188,6 @@ def test_invalid_and_damaged_exif_is_ignored():
         assert decode_rgb(saved(Image.fromarray(noise(2, 3)), "PNG", exif=exif(orientation)), "x").shape == (2, 3, 3)
     data = png(0, 8, [[255]], chunk(b"eXIf", b"II*\0\xff\xff\xff\xff broken"))
     np.testing.assert_array_equal(decode_rgb(data, "x"), np.ones((1, 1, 3)))
-
-
-# Refusing --------------------------------------------------------------------------------------------------
 
 
 def test_files_that_cannot_be_read_give_errors_with_the_reason(tmp_path, monkeypatch):

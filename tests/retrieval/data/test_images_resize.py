@@ -16,9 +16,6 @@ from tests.retrieval.data.test_images import saved
 ATOL = 2e-6  # float32 sums over at most a few dozen samples of 0..1
 
 
-# Resizing --------------------------------------------------------------------------------------------------
-
-
 def area_by_loops(line, new):
     """Return the mean of `line` over each of `new` equal parts, by two plain loops over fractions of samples."""
     scale = len(line) / new
@@ -78,9 +75,6 @@ def test_a_picture_resized_in_bands_is_the_same_to_the_bit(shape, monkeypatch):
     np.testing.assert_array_equal(resize(samples, (90, 70)), at_once)
 
 
-# Background ------------------------------------------------------------------------------------------------
-
-
 def grey(level, size=(4, 4)):
     return to_float(np.full((*size, 3), level, np.uint8))
 
@@ -117,9 +111,6 @@ def test_arrays_that_are_no_picture_in_float32_are_refused(image):
             prepare(image)
     with pytest.raises(BadInput, match="H x W x 3 float32"):
         Preprocessing(background="abs").touch(grey(1), image)
-
-
-# Preprocessing ---------------------------------------------------------------------------------------------
 
 
 def test_photo_and_touch_have_the_papers_sizes_and_are_not_cropped(tmp_path):

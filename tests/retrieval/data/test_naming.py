@@ -62,9 +62,6 @@ def test_an_invalid_rule_is_refused_with_the_valid_forms(rule, message):
     assert "{split}/{object}/{photo}" in str(raised.value)
 
 
-# Warnings --------------------------------------------------------------------------------------------------
-
-
 def warnings(photos, rule="folder"):
     """Return the warnings on objects with these numbers of photos."""
     pairs = [(name, f"{name}/{number}.jpg") for name, count in photos.items() for number in range(count)]

@@ -49,9 +49,6 @@ def sample(unseen, model, tmp_path_factory):
     return Sample(model, lambda: unseen, tmp_path_factory.mktemp("features"), TINY, quiet=True)
 
 
-# Points ----------------------------------------------------------------------------------------------------
-
-
 def test_the_front_has_the_points_that_no_other_beats_in_both():
     made = panel((1, 5), (2, 6), (2, 3), (3, 3), (4, 1))
     assert [point.setting for point in made.pareto()] == ["s0", "s2", "s4"]
@@ -80,9 +77,6 @@ def test_timed_works_take_turns():
     assert all(point.seconds >= 0.005 for point in made)
 
 
-# Rows ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", sorted(APPROXIMATIONS))
 def test_every_row_has_points_a_reference_and_one_default(name, sample):
     row = APPROXIMATIONS.load(name)(sample)
@@ -96,9 +90,6 @@ def test_every_row_has_points_a_reference_and_one_default(name, sample):
         assert all(point.seconds > 0 and np.isfinite(point.error) and point.error >= 0 for point in each.points)
         assert len({(point.series, point.setting) for point in each.points}) == len(each.points)
         assert sum(point.is_default for point in each.points) == 1
-
-
-# Defaults are what the code uses ---------------------------------------------------------------------------
 
 
 def test_the_default_kind_and_number_of_candidates_are_those_of_build_index(candidate_sample):
@@ -132,9 +123,6 @@ def test_touches_are_encoded_by_the_default_of_the_towers(sample):
     assert not any(module.training for module in matcher.modules())
 
 
-# Sample ----------------------------------------------------------------------------------------------------
-
-
 def test_grasps_provide_a_photo_or_a_touch_and_every_object_both(sample):
     photos, touches = set(sample.photo_rows.tolist()), set(sample.touch_rows.tolist())
     assert not photos & touches
@@ -165,9 +153,6 @@ def test_exhaustive_top1_is_the_highest_logit_and_is_cached(sample, monkeypatch)
     again = dataclasses.replace(sample)
     monkeypatch.setattr(Sample, "_find_exhaustive_top1", not_needed)
     assert again.exhaustive_top1.tolist() == sample.exhaustive_top1.tolist()
-
-
-# Run -------------------------------------------------------------------------------------------------------
 
 
 def not_needed():
@@ -208,9 +193,6 @@ def test_finished_rows_are_reused_until_their_inputs_change_or_the_cache_is_dama
     (tmp_path / "cache.sqlite").write_bytes(b"damaged")
     measure("one")
     assert CALLS[3:] == ["one", "one"]
-
-
-# Page and command ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("errors", [(3.0, 1.0, 0.0), (0.0, 0.0), (5.0,)], ids=["falling", "no errors", "one point"])

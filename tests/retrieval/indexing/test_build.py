@@ -91,9 +91,6 @@ def check_same(one, other):
     np.testing.assert_allclose(one.embeddings, other.embeddings, atol=1e-5)
 
 
-# Embedding and reuse -------------------------------------------------------------------------------------------------
-
-
 def test_a_first_build_embeds_every_photo_once_in_batches(catalogue_copy, checkpoint, index, embedded):
     report = build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert sorted(embedded) == [8, 16]
@@ -221,9 +218,6 @@ def test_a_damaged_index_is_written_anew_from_the_codes(catalogue_copy, checkpoi
     assert Searcher.open(index).generation.count == 24
 
 
-# Files that are not read again ---------------------------------------------------------------------------------------
-
-
 def test_only_files_with_another_size_or_time_are_read(catalogue_copy, checkpoint, index, read, old_files):
     first = build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert (len(read), first.written) == (24, True)
@@ -271,8 +265,6 @@ def test_a_damaged_code_fails_the_build_and_the_next_one_makes_it_again(catalogu
     assert IndexStore(index).current() == "gen-000001"
     assert build_index(catalogue_copy, checkpoint, index, kind="HNSW8", quiet=True).embedded == 24
 
-
-# Interrupted builds --------------------------------------------------------------------------------------------------
 
 KILLED = """
 import os, signal, sys, torch
@@ -346,9 +338,6 @@ def test_ctrl_c_keeps_the_finished_embeddings_and_reports_it(
     assert json.loads(capsys.readouterr().out)["embedded"] <= 24 - 16
 
 
-# Unusable input ------------------------------------------------------------------------------------------------------
-
-
 def test_a_catalogue_of_only_broken_photos_raises_and_the_old_index_stays(catalogue_copy, checkpoint, index):
     build_index(catalogue_copy, checkpoint, index, quiet=True)
     for path in catalogue_copy.rglob("*.jpg"):
@@ -394,9 +383,6 @@ def test_a_second_writer_raises(catalogue_copy, checkpoint, index, embedded):
     with IndexStore(index).lock(), pytest.raises(LockedIndex):
         build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert embedded == []
-
-
-# The report ------------------------------------------------------------------------------------------------------
 
 
 def test_the_error_of_float16_partials_is_within_the_reported_bound(catalogue_copy, checkpoint, index):

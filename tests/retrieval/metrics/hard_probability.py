@@ -33,9 +33,6 @@ def hard_cases() -> Iterator[HardCase]:
     yield _last_bin()
 
 
-# Logits ----------------------------------------------------------------------------------------------------
-
-
 def _probabilities_tie() -> HardCase:
     """The best of four photos, by logits 20 to 50."""
     logits = np.array([20.0, 50.0, 30.0, 40.0], np.float32)
@@ -70,9 +67,6 @@ def _many_grasps() -> HardCase:
     must = float(expit(0.8))
     holds = [abs(float(pair[1] / pair.sum()) - must) < 1e-9 for pair in (ours, naive)]
     return HardCase(_LOGITS, "8 grasps at logit -100", f"the second object with {must:.3f}", products, text, *holds)
-
-
-# Calibration -----------------------------------------------------------------------------------------------
 
 
 def naive_fit(logits: Matrix, labels: NDArray[np.int64]) -> tuple[float, float]:
@@ -127,9 +121,6 @@ def _nan_logit() -> HardCase:
     ours, holds = error_of(lambda: fit_calibration(logits, labels), "pair 1")
     expected = "refused, the pair named"
     return HardCase(_CALIBRATION, "one logit is NaN", expected, f"slope {naive}", ours, holds, False)
-
-
-# Choices ---------------------------------------------------------------------------------------------------
 
 
 def naive_slope(scores: Matrix) -> float:

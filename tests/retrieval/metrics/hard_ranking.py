@@ -38,9 +38,6 @@ def hard_cases() -> Iterator[HardCase]:
     yield _equal_differences()
 
 
-# Partial activations -----------------------------------------------------------------------------------------
-
-
 def _adding_head(hidden: int) -> FusionHead:
     """Return a head whose logit is the sum over units of relu(touch partial + photo partial)."""
     head = FusionHead(1, 1, MatcherConfig(hidden=hidden))
@@ -91,9 +88,6 @@ def _subnormal_partials() -> HardCase:
     return HardCase(_PARTIALS, "8 photos 1e-6 apart", expected, naive_text, text, holds, not tied)
 
 
-# Measures --------------------------------------------------------------------------------------------------
-
-
 def _constant_scorer() -> HardCase:
     """A scorer that gives all of a hundred photos the same score; after sorting, the true photo may come first."""
     scores, relevant = np.zeros((1, 100)), np.arange(100)[None] == 0
@@ -133,9 +127,6 @@ def _many_rivals() -> HardCase:
     correct = [abs(value - must) < 1e-12 for value in (naive, ours)]
     text, expected = f"{ours:.6g}", f"{must:.6g}"
     return HardCase(_MEASURES, "top-1 among 1000 of 5000", expected, f"{naive}", text, correct[1], correct[0])
-
-
-# Intervals -------------------------------------------------------------------------------------------------
 
 
 def naive_interval(values: NDArray[np.float64]) -> tuple[float, float]:

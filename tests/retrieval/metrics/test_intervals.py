@@ -30,9 +30,6 @@ def some_objects(count=12, queries=7, seed=0):
     return [list(rng.random() + 0.1 * rng.normal(size=queries)) for _ in range(count)]
 
 
-# Summaries -------------------------------------------------------------------------------------------------
-
-
 def test_a_value_is_the_mean_of_the_objects_means_so_an_object_with_many_queries_counts_no_more():
     found = summarise([measure_of([[1, 1, 1, 1, 1, 1, 1, 1], [0, 0], [0]])])
     assert found.value == [pytest.approx(1 / 3)]  # naively, over queries, 8 / 11
@@ -56,9 +53,6 @@ def test_measures_of_different_queries_are_not_combined():
     for combine in (lambda: summarise([one, other]), lambda: compare([one], [other])):
         with pytest.raises(BadInput, match="the same queries"):
             combine()
-
-
-# The interval ----------------------------------------------------------------------------------------------
 
 
 def test_the_interval_equals_that_of_a_loop_over_resamples():
@@ -98,9 +92,6 @@ def test_the_interval_by_object_has_its_nominal_coverage_and_a_naive_one_does_no
     assert coverage(lambda hits: bootstrap_interval(hits.reshape(-1, 1), draws=400), trials=40) < 0.75
 
 
-# Comparisons -----------------------------------------------------------------------------------------------
-
-
 def test_the_permutation_test_equals_that_of_scipy():
     differences = np.random.default_rng(2).normal(0.4, 1, 9)
     theirs = permutation_test(
@@ -130,9 +121,6 @@ def test_a_small_difference_on_every_object_is_significant_although_the_interval
     assert summarise([a]).low[0] < summarise([b]).high[0] - 0.1
 
 
-# Choices of test objects -----------------------------------------------------------------------------------
-
-
 def of_choices(*values):
     """Return a measure of each choice: its objects differ from the value by 0.1 in either direction."""
     numbers = ((0, 1), (1, 2), (0, 2))
@@ -158,9 +146,6 @@ def test_an_interval_over_choices_is_the_corrected_resampled_t_interval():
     assert difference.p == pytest.approx(1 - 1.7320508 / np.sqrt(5))
     with pytest.raises(BadInput, match="needs at least two splits; got 1"):
         summarise_splits(of_choices(0.5, 0.6, 0.7)[:1], ratio=1.0)
-
-
-# Proportions -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -24,9 +24,6 @@ def overlapping(count=200, offset=0.0, scale=1.0):
     return scale * (np.random.default_rng(0).normal(size=count) + labels) + offset, labels
 
 
-# The fit ---------------------------------------------------------------------------------------------------
-
-
 def smoothed_loss(logits, labels, slope, intercept):
     """Return the objective of the fit, pair by pair: classes of equal weight, Platt's targets."""
     total, positives, negatives = 0.0, sum(labels), len(labels) - sum(labels)
@@ -70,9 +67,6 @@ def test_any_finite_logits_of_both_classes_can_be_calibrated(pairs, one, two):
     slope, intercept = fit_calibration(*zip(*pairs, (one, 0), (two, 1), strict=True))
     assert math.isfinite(intercept)
     assert SLOPE_BOUNDS[0] <= slope <= SLOPE_BOUNDS[1]
-
-
-# Metrics ---------------------------------------------------------------------------------------------------
 
 
 def test_pair_accuracy_and_auc_equal_those_by_hand_and_count_zero_and_a_tie_as_one_half():

@@ -61,9 +61,6 @@ def test_many_ties_neither_overflow_nor_lose_precision():
     assert recall_at(10, scores, relevant, np.ones_like(relevant))[0] == pytest.approx(expected, rel=1e-12)
 
 
-# K-way tests -----------------------------------------------------------------------------------------------
-
-
 def curve(true_score, others, k):
     others = np.array(others)
     counts = [np.array([np.sum(other)]) for other in (others > true_score, others == true_score)]

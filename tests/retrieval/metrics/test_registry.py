@@ -56,9 +56,6 @@ def mine_of(table, row):
     return np.flatnonzero((table.photo_owner == table.touch_owner[row]) & ~table.own[row])
 
 
-# Pairs -----------------------------------------------------------------------------------------------------
-
-
 def test_pair_accuracy_and_auc_equal_those_of_two_loops():
     table = uneven()
     accuracy, area = pair_accuracy(table, 1.0).values[:, 0], pair_auc(table).values[:, 0]
@@ -72,9 +69,6 @@ def test_pair_accuracy_and_auc_equal_those_of_two_loops():
             pairs = [(table.scores[row, a], table.scores[row, b]) for a in mine for b in columns]
             wins.append(np.mean([1.0 if a > b else 0.5 if a == b else 0.0 for a, b in pairs]))
         assert area[row] == pytest.approx(np.mean(wins), abs=1e-12)
-
-
-# K-way -----------------------------------------------------------------------------------------------------
 
 
 def k_way_by_enumeration(table, row, k, photos):
@@ -102,9 +96,6 @@ def test_k_way_curves_converge_to_those_over_every_draw(k, photos):
     assert k_way(table, 5) is None  # there are four objects
 
 
-# The table of metrics --------------------------------------------------------------------------------------
-
-
 def test_every_metric_is_computed_if_the_scores_allow_it_and_is_none_otherwise():
     """Four objects do not suffice for 5-way tests, no sets were drawn, and two grasps have the same photo."""
     table = perfect(objects=100, grasps=2)
@@ -117,9 +108,6 @@ def test_every_metric_is_computed_if_the_scores_allow_it_and_is_none_otherwise()
     assert {name for name, metric in METRICS.items() if metric.compute(few)} == {
         "pair_auc", "recall_1", "recall_5", "recall_10", "map",
     }  # fmt: skip
-
-
-# Chance and certainty --------------------------------------------------------------------------------------
 
 
 def every_measure(table):
@@ -148,9 +136,6 @@ def test_a_perfect_scorer_is_right_in_every_measure():
         np.testing.assert_allclose(measure.values, 1, atol=1e-12, err_msg=name)
 
 
-# Queries and galleries -------------------------------------------------------------------------------------
-
-
 def test_rows_without_another_photo_of_their_object_are_counted_and_neither_hidden_nor_scored_0():
     table = table_of(np.arange(16).reshape(4, 4), [0, 0, 1, 2])
     for measure in (pair_accuracy(table, 0.0), pair_auc(table), k_way(table, 2), *full_gallery(table).values()):
@@ -158,9 +143,6 @@ def test_rows_without_another_photo_of_their_object_are_counted_and_neither_hidd
         assert measure.gallery.endswith("; 2 queries left out, which have no other")
     with pytest.raises(BadInput, match="from another grasp; none has"):
         pair_auc(table_of(np.zeros((2, 2)), [0, 1]))
-
-
-# By object -------------------------------------------------------------------------------------------------
 
 
 def test_the_largest_confusion_comes_first_and_correct_results_are_not_listed():

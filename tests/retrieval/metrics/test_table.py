@@ -9,11 +9,6 @@ from retrieval.metrics.measure import Measure, pooled
 from retrieval.metrics.table import object_scores
 from tests.retrieval.metrics.test_registry import table_of
 
-# The table -------------------------------------------------------------------------------------------------
-
-
-# Photos that represent an object ---------------------------------------------------------------------------
-
 
 def test_an_object_is_represented_by_its_own_photos_equally_often_and_never_by_the_row_s_own():
     """Scores are powers of two, so the mean of three photos, drawn without replacement, identifies them."""

@@ -62,9 +62,6 @@ def _near(value: float, must: float) -> bool:
     return abs(value - must) <= 1e-4 * max(abs(must), 1e-2)
 
 
-# Pairs -----------------------------------------------------------------------------------------------------
-
-
 def _sure_and_wrong() -> HardCase:
     """-log(sigmoid(z)) is -z here, with slope -1."""
     return _case(
@@ -86,9 +83,6 @@ def _half_precision_logit() -> HardCase:
         lambda z: match_loss(z, torch.zeros(1)),
         (20.0, [1.0]),
     )
-
-
-# Contrast --------------------------------------------------------------------------------------------------
 
 
 def _hard_negatives() -> HardCase:
@@ -183,9 +177,6 @@ def _runaway_scale() -> HardCase:
     return HardCase(
         "InfoNCE", "log of the scale at 90", "scale 100", f"infinite: 0 x scale is {naive}", text, holds, naive == 0
     )
-
-
-# Gradients before the loss -----------------------------------------------------------------------------------
 
 
 def _constant_map() -> HardCase:

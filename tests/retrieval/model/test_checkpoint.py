@@ -64,9 +64,6 @@ def saved(tmp_path):
     return tmp_path / "m.safetensors"
 
 
-# Round trip ------------------------------------------------------------------------------------------------
-
-
 def test_every_tensor_and_every_header_entry_comes_back_and_makes_an_equal_file(tmp_path):
     first, second = tmp_path / "deep" / "er" / "m.safetensors", tmp_path / "again.safetensors"
     queries = np.ones((2, TINY.matcher.partial_width), np.float16)
@@ -93,9 +90,6 @@ def test_a_path_in_a_header_need_not_be_utf8(saved, tmp_path):
     assert load_checkpoint(tmp_path / "named.safetensors").provenance == named.provenance
 
 
-# Model card ------------------------------------------------------------------------------------------------
-
-
 def test_the_model_card_describes_the_model(saved):
     card = saved.with_suffix(".md").read_text()
     for line in (
@@ -107,9 +101,6 @@ def test_the_model_card_describes_the_model(saved):
         "* Probabilities: fitted on 40 sets of validation touches; slope 1.250, offset -0.500",
     ):
         assert f"\n{line}" in card
-
-
-# Damage ----------------------------------------------------------------------------------------------------
 
 
 def test_what_is_not_a_regular_file_is_refused_without_being_read(tmp_path):
@@ -222,9 +213,6 @@ def test_a_header_of_another_version_or_model_is_refused_with_the_wrong_entry(sa
         CheckpointError, match=rf"m\.safetensors is not a checkpoint that this version can use: .*{message}"
     ):
         load_checkpoint(saved)
-
-
-# Writing ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

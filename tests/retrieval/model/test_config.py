@@ -18,9 +18,6 @@ TABLES = Config().to_dict()
 """Tables of a configuration: settings and their defaults."""
 
 
-# Presets ---------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", preset_names())
 def test_every_preset_loads_and_names_a_tower_that_exists(name):
     config = load_config(name)
@@ -69,9 +66,6 @@ def test_photos_may_have_another_tower_and_another_tower_for_both_replaces_it():
     assert config.using(tower="small").matcher.photo_tower == ""
 
 
-# Files -----------------------------------------------------------------------------------------------------
-
-
 def test_a_file_changes_its_settings_and_leaves_the_rest(tmp_path):
     (tmp_path / "mine.toml").write_text("[training]\nlearning_rate = 1\nseed = 3\n")
     config = load_config(str(tmp_path / "mine.toml"))
@@ -91,9 +85,6 @@ def test_a_file_that_is_not_toml_is_named(tmp_path, content):
     (tmp_path / "bad.toml").write_bytes(content)
     with pytest.raises(ConfigError, match=r"bad\.toml is not valid TOML: "):
         load_config(str(tmp_path / "bad.toml"))
-
-
-# Refused values --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("table", TABLES)

@@ -94,9 +94,6 @@ def test_the_exported_encoder_gives_pytorchs_numbers_for_any_number_of_touches(m
                 np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
-# In a query ------------------------------------------------------------------------------------------------------
-
-
 def test_a_query_uses_the_export_next_to_the_model_and_ranks_the_same(model_copy, index, touch):
     by_torch = Searcher.open(index).query([touch])
     export(load_checkpoint(model_copy))
@@ -134,9 +131,6 @@ def test_an_encoder_that_gives_a_nan_is_refused_with_the_touch_named(part, model
     monkeypatch.setattr(searcher.encoder, "encode", lambda touches: encodings)
     with pytest.raises(NumericalError, match=f"the {part} of touch 2 contains a NaN"):
         searcher.query(two_grasps)
-
-
-# Photos of a long build -----------------------------------------------------------------------------------------
 
 
 def pictures(checkpoint, count=3):
@@ -183,9 +177,6 @@ def test_a_long_build_gives_the_same_index_with_either_encoder(catalogue, model,
     assert np.allclose(*partials, atol=2e-3 * np.abs(partials[0]).max())
 
 
-# The user's cache ------------------------------------------------------------------------------------------------
-
-
 def test_a_checkpoint_gets_an_export_in_the_cache_once_unless_one_is_next_to_it(model_copy, index, touch):
     checkpoint = load_checkpoint(model_copy)
     cached = onnx_encoder.cached_export_path(checkpoint.digest)
@@ -205,9 +196,6 @@ def test_without_a_cache_a_build_continues(model_copy, monkeypatch, tmp_path):
     checkpoint = load_checkpoint(model_copy)
     assert exporting.export_to_cache(checkpoint) is None
     assert onnx_encoder.find_export(checkpoint) is None
-
-
-# The command -----------------------------------------------------------------------------------------------------
 
 
 def test_the_command_writes_the_export_next_to_the_checkpoint_or_to_the_requested_file(model_copy, tmp_path, capsys):

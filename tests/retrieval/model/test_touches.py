@@ -60,9 +60,6 @@ def test_every_other_input_is_refused_with_one_sentence(touches, message):
         parse_grasps(touches, 2)
 
 
-# Reading -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("mode", ["P", "LA", "CMYK", "turned"])
 def test_a_pillow_image_is_read_upright_like_its_file(mode, picture):
     image, buffer = Image.open(picture), io.BytesIO()

@@ -191,9 +191,6 @@ def test_protocols_of_real_data_have_low_pass_controls_verdicts_and_a_section_ea
     assert {"first-overview.png", "second-overview.png"} <= set(figures)
 
 
-# Numbers and documents -------------------------------------------------------------------------------
-
-
 def test_markdown_and_html_have_the_same_content(tmp_path):
     (tmp_path / "figures").mkdir()
     Image.new("RGB", (144, 10)).save(tmp_path / "figures" / "p.png")

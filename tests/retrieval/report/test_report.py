@@ -171,9 +171,6 @@ def test_a_model_without_calibration_shows_no_probability():
     assert "%" not in page.text
 
 
-# The table on a terminal ---------------------------------------------------------------------------------------
-
-
 def test_a_piped_table_is_plain_escaped_and_uncut(capsys):
     """In a pipe, rich would fold names at 80 columns and draw frames."""
     long = "slab-knurl-with-a-long-name-20000-0001\x1b"

@@ -39,9 +39,6 @@ def index(catalogue, checkpoint, tmp_path):
     return tmp_path / "index"
 
 
-# Cells left out -------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def pooled_index(catalogue, checkpoint, tmp_path):
     build_index(catalogue, checkpoint, tmp_path / "pooled", cells=False, quiet=True)

@@ -136,9 +136,6 @@ def test_the_documented_keys_of_references_are_those_written_and_the_result_read
     assert {"references.json", "touches.npy"} <= {path.name for path in generation.folder.iterdir()}
 
 
-# Openings of the jaws ------------------------------------------------------------------------------------------------
-
-
 OPENING = OpeningCalibration(mean=3.4, spread=0.7, width=0.001, floor=0.001, objects=9, touches=9)
 
 
@@ -167,9 +164,6 @@ def test_the_opening_of_a_reference_adds_its_log_ratio_and_brings_its_object_amo
     (catalogue_with_touches / "metadata.jsonl").write_text(json.dumps({"file_name": last, "opening_mm": 0.03}))
     with pytest.raises(BadInput, match=rf"opening_mm of {NAMES[3]}/touch_1_a.png must be .*metres"):
         build_index(catalogue_with_touches, model, tmp_path / "index", quiet=True)
-
-
-# Building again -----------------------------------------------------------------------------------------------------
 
 
 def test_only_new_touches_are_encoded_again(catalogue_with_touches, calibrated_model, tmp_path, touches):
@@ -230,9 +224,6 @@ def test_a_model_without_reference_calibration_builds_nothing(catalogue_with_tou
     with pytest.raises(BadInput, match="no calibration of reference touches"):
         build_sharded(catalogue_with_touches, model, tmp_path / "sharded", 2, quiet=True)
     assert not (tmp_path / "index" / "CURRENT").exists()
-
-
-# Several shards, and forged documents -------------------------------------------------------------------------------
 
 
 def test_a_sharded_index_gives_the_results_of_one_folder(catalogue_with_touches, calibrated_model, tmp_path, touches):

@@ -130,9 +130,6 @@ def logit_tolerance(searcher, grasps):
     return grasps * float(np.abs(searcher.scorer.out) @ (np.abs(searcher.scorer.second) @ moved)) + 1e-5
 
 
-# The ranking ---------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("count", [1, 3])
 def test_the_ranking_equals_the_full_network_on_every_pair(count, posterior, searcher, grasps, oracle):
     touches = grasps[:count]
@@ -182,9 +179,6 @@ def test_equal_photos_of_several_objects_are_all_found_in_the_order_of_their_ids
         assert [match.object_id for match in results] == ["ant", "mule", "zebra"]
         assert len({match.logit for match in results}) == 1
         assert [match.rank for match in results] == [1, 2, 3]
-
-
-# The candidate stage -------------------------------------------------------------------------------------------
 
 
 def test_no_candidate_stage_runs_without_trained_embeddings(catalogue, model, touch, tmp_path, searches):
@@ -243,9 +237,6 @@ def test_the_combined_embedding_is_that_of_the_first_grasp_if_they_cancel():
     grasp = np.array([[0.6, 0.8]], dtype=np.float32)
     for off in (0, 1e-6):
         np.testing.assert_array_equal(combined_embedding(np.concatenate([grasp, off - grasp])), grasp)
-
-
-# Probability and verdict -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("none_prior", [0.5, 0.2, 0.0])
@@ -323,9 +314,6 @@ def test_an_uncalibrated_model_gives_no_probability(searcher, touch, monkeypatch
     assert (result.none_probability, result.posterior) == (None, None)
 
 
-# Wrong use -------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("count", [1, 3])
 def test_the_number_of_gel_images_must_match_the_model(count, searcher, touch):
     files = (*touch, *touch)[:count]
@@ -376,9 +364,6 @@ def test_a_model_that_uses_a_background_needs_one_for_each_finger(subtracting, s
         searcher.query([touch], background=touch)
 
 
-# Index and model -------------------------------------------------------------------------------------------------
-
-
 def test_another_model_than_the_indexs_raises(index, model, tmp_path):
     other = variant(model, tmp_path / "other.safetensors", training__seed=5)
     must = f"made with checkpoint '{load_checkpoint(model).digest[:12]}', but '{other.digest[:12]}' is required"
@@ -401,9 +386,6 @@ def test_a_moved_model_must_be_given(moved, touch):
     with pytest.raises(CheckpointError, match=r"no longer at .*here\.safetensors; name it with --model"):
         Searcher.open(index)
     assert len(Searcher.open(index, model=there).query([touch]).results) == 8
-
-
-# The best of each object -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("photos", [1, 2, 3, 7, 24, 29])

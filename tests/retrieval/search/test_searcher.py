@@ -39,9 +39,6 @@ def test_arrays_give_bitwise_the_results_of_their_files_and_one_grasp_needs_no_l
     assert ranking(searcher.query(files[0])) == ranking(searcher.query(files[:1]))
 
 
-# Several objects -----------------------------------------------------------------------------------------------------
-
-
 def test_several_objects_give_the_results_of_single_queries(searcher, grasps):
     objects = [grasps[0], grasps[1][0], grasps[1][:2]]
     batch = searcher.query_many(objects, top=3)
@@ -62,9 +59,6 @@ def test_the_bad_one_of_several_objects_is_reported_before_reading(searcher, gra
     broken = [array(path) for path in grasps[0][0]]
     with pytest.raises(ImageError, match=r"object 2, grasp 1, finger b: "):
         searcher.query_many([grasps[0], [broken[0], broken[1][..., 0]]])
-
-
-# Closing -------------------------------------------------------------------------------------------------------------
 
 
 def test_a_closed_searcher_raises_and_can_be_closed_twice(index, touch):
@@ -88,9 +82,6 @@ def test_a_running_query_finishes_when_the_searcher_is_closed(index, touch, monk
 
     monkeypatch.setattr(searcher.encoder, "encode", closed_meanwhile)
     assert ranking(searcher.query(touch)) == expected
-
-
-# For a user's own vector index ---------------------------------------------------------------------------------------
 
 
 def test_the_inner_product_of_embeddings_is_the_score_of_candidate_search(searcher, grasps, catalogue, model):
@@ -132,9 +123,6 @@ def test_no_photo_or_a_bad_one_raises(catalogue, model):
         retrieval.embed_photos([sorted(catalogue.rglob("*.jpg"))[0], np.zeros((4, 4, 3))], model=model)
 
 
-# Long runs -----------------------------------------------------------------------------------------------------------
-
-
 def resident_mb():
     """Resident memory of this process in MiB."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
@@ -151,9 +139,6 @@ def test_a_long_running_process_gives_equal_results_and_does_not_grow(searcher, 
             before = resident_mb()
     one_query = sum(image.nbytes for grasp in arrays[0] for image in grasp) / 2**20
     assert resident_mb() - before < max(8, 0.1 * 60 * one_query)  # almost no input stays in memory
-
-
-# Threads and forks ---------------------------------------------------------------------------------------------------
 
 
 def test_eight_threads_get_the_results_of_one(searcher, grasps):

@@ -47,9 +47,6 @@ def same_answers(ours, theirs):
     assert numbers(ours) == pytest.approx(numbers(theirs), abs=1e-5, nan_ok=True)
 
 
-# Tests of every implementation of `Shard` -----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("posterior", ["the model's own", STEEP, None], ids=["own", "steep", "none"])
 @pytest.mark.parametrize("count", [1, 3])
 def test_with_all_photos_scored_answers_equal_those_of_one_folder(
@@ -71,9 +68,6 @@ def test_rows_are_found_in_every_shard(divided, searcher):
     requested = [*ids[::5], "absent/1.jpg"]
     assert divided.shard.photos(requested) == searcher.shard.photos(requested)
     assert divided.shard.photos(requested)[-1] is None
-
-
-# Building -------------------------------------------------------------------------------------------------------------
 
 
 def rows_of(cluster):
@@ -213,9 +207,6 @@ def test_an_invalid_number_of_shards_or_an_index_folder_raises(catalogue, model,
         build_sharded(catalogue, load_checkpoint(model), index, 2, quiet=True)
 
 
-# Building with Ray ----------------------------------------------------------------------------------------------------
-
-
 def test_a_failure_of_ray_ends_the_build_with_a_clear_error(catalogue, model, tmp_path, monkeypatch):
     building = pytest.importorskip("retrieval.cluster.building")
 
@@ -228,9 +219,6 @@ def test_a_failure_of_ray_ends_the_build_with_a_clear_error(catalogue, model, tm
     monkeypatch.setattr(building, "ray_worker_pool", lambda ray: (1, {"num_gpus": 0}))
     with pytest.raises(RetrievalError, match=r"KeyError: .*same command again to continue"):
         build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=building.build_on_ray)
-
-
-# Damage ---------------------------------------------------------------------------------------------------------------
 
 
 def test_a_missing_shard_or_the_generation_of_another_one_is_corrupt(catalogue_copy):

@@ -104,9 +104,6 @@ def test_a_process_ends_beyond_its_limits_of_cpu_time_and_memory(limit, monkeypa
         read(("a", LARGE))
 
 
-# The service ----------------------------------------------------------------------------------------------------------
-
-
 def body_of(*images):
     return {"touches": [[base64.b64encode(image).decode() for image in images]]}
 

@@ -14,8 +14,6 @@ from retrieval.serve.service import MAX_RIG_GRASPS, GraspResult, LiveRig
 from tests.serving import listening, problem
 from tests.waiting import wait_until
 
-# The rig -------------------------------------------------------------------------------------------------------------
-
 
 @pytest.fixture
 def hanging():
@@ -67,8 +65,6 @@ def test_the_next_grasp_succeeds_after_any_exception_of_the_rig(index, error):
         assert "The rig could not grasp" in problem(httpx.post(f"{url}/v1/grasp"), 500, "failed")
         assert httpx.post(f"{url}/v1/grasp").status_code == 200
 
-
-# The end -------------------------------------------------------------------------------------------------------------
 
 HANGS = """
 import sys, time

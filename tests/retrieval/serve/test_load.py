@@ -99,9 +99,6 @@ def test_late_requests_are_dropped(index, body):
         assert len(encoder.calls) <= 1 + len(later)
 
 
-# Generations ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def grown(catalogue, index, tmp_path, model):
     """A copy of the index, and a function that builds its next generation with one object more or less, in turn."""
@@ -158,9 +155,6 @@ def test_a_broken_generation_leaves_the_previous_one_served(grown, body, caplog)
         time.sleep(0.5)  # ten polls
         assert caplog.text.count("cannot be opened") == 1  # one line in the log, not one per poll
         assert post_query(url, body).json()["index"]["generation"] == "gen-000002"
-
-
-# The end -------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("sign", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])

@@ -40,8 +40,6 @@ def test_the_pictures_of_one_request_have_a_common_limit(client):
     assert detail == "background of finger b: the file is empty"
 
 
-# Bodies of many values ------------------------------------------------------------------------------------------------
-
 JSON = {"content-type": "application/json"}
 MANY = {
     "lists": b'{"touches":[' + b"[]," * 6_000_000 + b"[]]}",
@@ -77,8 +75,6 @@ def test_only_bodies_with_pictures_may_be_large(client, path):
     assert client.post(path, content=b"[" * 16_384, headers=JSON).status_code in (400, 422)
 
 
-# Forms ----------------------------------------------------------------------------------------------------------------
-
 FORM = {"content-type": "multipart/form-data; boundary=x"}
 OPTION = b'\r\n--x\r\ncontent-disposition: form-data; name="top"\r\n\r\n3'
 FILE = b'\r\n--x\r\ncontent-disposition: form-data; name="gelsight"; filename="a"\r\n\r\n3'
@@ -101,9 +97,6 @@ def test_a_hostile_form_is_refused(client, name):
     body, status, message = FORMS[name]
     response = client.post("/v1/query", content=body, headers=FORM)
     assert message in problem(response, status, "malformed" if status == 400 else "bad-input")
-
-
-# Bodies on the line ---------------------------------------------------------------------------------------------------
 
 
 HEAD = "POST /v1/query HTTP/1.1\r\nhost: 127.0.0.1\r\ncontent-type: {kind}\r\n"

@@ -29,9 +29,6 @@ def realsense(**more):
     return RealSense(extrinsics=views.camera_pose(), **{"warmup_frames": 3, **more})
 
 
-# RealSense --------------------------------------------------------------------------------------------------
-
-
 def test_a_realsense_returns_colour_and_depth_in_metres_with_its_intrinsics(install):
     rs = install(FakeRealSense())
     with realsense() as eye:
@@ -95,18 +92,12 @@ def test_a_silent_realsense_is_an_error_and_can_be_started_again(install):
     assert rs.stopped == 2
 
 
-# Missing packages -------------------------------------------------------------------------------------------
-
-
 def test_a_missing_system_library_is_named(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "pyrealsense2", raising=False)
     (tmp_path / "pyrealsense2.py").write_text("raise ImportError('libusb-1.0.so.0: cannot open shared object file')")
     with pytest.raises(DeviceError, match=r"pyrealsense2, which is missing or incomplete \(libusb-1\.0\.so\.0"):
         realsense().connect()
-
-
-# Plain USB camera -------------------------------------------------------------------------------------------
 
 
 def test_a_plain_camera_returns_colour_has_no_depth_and_may_hang_upside_down(tmp_path, monkeypatch):

@@ -48,9 +48,6 @@ def plug(dev, monkeypatch):
     return plugged
 
 
-# Names of cameras--------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("device", ["0", "/dev/video2", "/dev//video2", "/dev/v4l/by-id/../../video2"])
 def test_a_camera_named_by_a_number_is_refused_with_the_names_of_those_connected(plug, device):
     name = plug(FakeVideoDevice())
@@ -81,9 +78,6 @@ def test_a_camera_in_use_cannot_be_connected_and_can_be_later(plug, dev):
         assert camera.captures[-1].path == str(dev / "video4")
         assert camera.captures[-1].backend == cv2.CAP_V4L2
     assert not camera.open_captures
-
-
-# Settings ---------------------------------------------------------------------------------------------------
 
 
 def test_settings_are_written_with_the_format_first_and_read_back(plug):
@@ -141,9 +135,6 @@ def test_the_zoom_control_of_a_digit_sets_its_brightness(plug):
 def test_settings_out_of_range_are_refused_before_connecting(setting, message):
     with pytest.raises(RobotConfigError, match=message):
         OpencvTactile(finger="a", device="/dev/v4l/by-id/usb-Gel", **setting)
-
-
-# Pictures ---------------------------------------------------------------------------------------------------
 
 
 def test_pictures_are_rgb_with_row_0_on_top_and_that_of_a_digit_is_rotated_to_the_left(plug):
@@ -216,9 +207,6 @@ def test_an_exception_of_opencv_is_a_device_error(plug, method, monkeypatch):
         CaptureStream(name, UsbCameraSettings(device="gel"), lambda: 0.0).next()
     if method == "set":
         assert not camera.open_captures
-
-
-# Recovery ---------------------------------------------------------------------------------------------------
 
 
 def test_a_camera_reconnected_under_another_number_gets_its_settings_again(plug):

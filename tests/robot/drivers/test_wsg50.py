@@ -54,9 +54,6 @@ def slow(**settings):
     return EmulatedWSG50(**{"referenced": True, "opening_mm": 100.0} | settings)
 
 
-# Motions -----------------------------------------------------------------------------------------------------
-
-
 @PORTS
 def test_it_grasps_holds_and_releases(port):
     with gripper_with_emulator(port) as (gripper, emulator):
@@ -163,9 +160,6 @@ def test_it_homes_on_connecting_if_the_reference_is_lost_and_motion_is_allowed(p
     assert HOME not in emulator.received
 
 
-# Faults of the gripper ---------------------------------------------------------------------------------------
-
-
 @PORTS
 def test_a_fast_stop_is_named_and_never_acknowledged_silently(port, caplog):
     with gripper_with_emulator(port, connect=False) as (gripper, emulator):
@@ -246,9 +240,6 @@ def test_a_motion_that_never_ends_is_stopped(monkeypatch):
         assert emulator.received.count(GRASP) == 1
         emulator.jammed = False
         assert gripper.grasp(10.0).status == "no_part"
-
-
-# Stopping and closing ----------------------------------------------------------------------------------------
 
 
 @PORTS
@@ -341,9 +332,6 @@ def test_recovery_raises_after_its_last_try_and_waits_seconds_at_most(monkeypatc
     assert (len(waits), waits[0], max(waits)) == (19, 0.2, 5.0)
 
 
-# Lost, doubled and damaged packets ---------------------------------------------------------------------------
-
-
 @PORTS
 def test_a_disconnect_during_a_motion_ends_with_still_jaws(port):
     emulator, script = slow(), LineFaults()
@@ -421,8 +409,6 @@ def test_a_grasp_that_was_refused_is_not_repeated():
                 gripper.grasp(10.0, 400.0)
         assert emulator.received.count(GRASP) == 3
 
-
-# The link with scripted answers -------------------------------------------------------------------------------
 
 FORCE = codec.query(CommandId.GET_FORCE_LIMIT)
 ONE, TWO = struct.pack("<f", 1), struct.pack("<f", 2)

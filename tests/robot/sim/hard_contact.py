@@ -32,9 +32,6 @@ def hard_cases() -> Iterator[HardCase]:
     yield _stiff_closing()
 
 
-# Formulae --------------------------------------------------------------------------------------------------
-
-
 def naive_symbol(x: Floats, poisson: float) -> Floats:
     """S as printed: overflows for a thick layer, cancels for a thin incompressible one."""
     k = 3.0 - 4.0 * poisson
@@ -106,8 +103,6 @@ def _far_patch() -> HardCase:
     case, expected = "Love's patch, 10,000 pixels away", "1/(pi r) to 1e-8"
     return HardCase(_KERNEL, case, expected, f"off by {naive:.1e}", f"{ours:.1e}", near[1], near[0])
 
-
-# Contact ---------------------------------------------------------------------------------------------------
 
 _SIDE = 32
 
@@ -286,9 +281,6 @@ def _every_shape() -> HardCase:
     solved = [_naive(gap, hard_layers()[0], 1.0)[1] for gap in hard_gaps().values()]
     naive, ours = f"{sum(solved)} of {len(solved)} on the half-space, 1 N", f"{count - wrong} of {count}"
     return HardCase(_CONTACT, "hard shapes on hard layers", expected, naive, ours, wrong == 0, all(solved))
-
-
-# Closing ---------------------------------------------------------------------------------------------------
 
 
 def naive_close(motion: Motion, duration_s: float, step_s: float) -> Floats:

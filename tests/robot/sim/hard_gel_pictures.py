@@ -113,9 +113,6 @@ def _press_without_information() -> HardCase:
     return HardCase(_FIT, case, expected, words, f"moved by {moved:g}", moved == 0, naive_holds)
 
 
-# Pictures --------------------------------------------------------------------------------------------------
-
-
 def _prediction_above_white() -> HardCase:
     """A prediction of 300 on a pixel of 250 appears as 255: 5 grey levels off."""
     truth, predicted = np.full((11, 11, 3), 250, np.uint8), np.full((11, 11, 3), 300.0)

@@ -45,9 +45,6 @@ def wall_rays(body, rows=24, columns=32, z=40.0, pitch=0.5):
     return origins, np.broadcast_to([0.0, 1.0, 0.0], origins.shape)
 
 
-# Closed forms ----------------------------------------------------------------------------------------------
-
-
 def test_rays_meet_a_sphere_at_the_root_of_the_quadratic():
     body = ball()
     origins, directions = random_rays(body, 3000)
@@ -113,9 +110,6 @@ def test_ribs_on_a_flat_wall_have_the_height_and_slope_of_a_cosine():
     np.testing.assert_allclose(normals[:, 2] / -normals[:, 1], -slope, atol=0.03)
 
 
-# No step passes through a surface --------------------------------------------------------------------------
-
-
 def slow_first_hits(body, origins, directions, step=0.02):
     """March every ray in small equal steps through the whole bounding box."""
     found = np.full(len(origins), np.inf)
@@ -156,9 +150,6 @@ def test_casting_agrees_with_a_slow_march(index):
     agree[hit] = np.abs(exact[hit] - found[hit]) < 0.05
     # A ray that grazes a crest by less than the stride of 0.05 mm may miss it.
     assert agree.mean() >= 0.98
-
-
-# The contract over all objects -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("family", SHAPES)

@@ -28,14 +28,8 @@ def matrix(layer, shape, pixel):
     return np.array([[table[abs(i - k), abs(j - m)] for i, j in cells] for k, m in cells])
 
 
-# Closed forms ----------------------------------------------------------------------------------------------
-
-
 def test_the_solver_is_within_the_tolerance_of_every_closed_form():
     assert [f"{c.case}, {c.quantity}, {c.grid}: {c.error}" for c in closed_form_table() if not c.holds] == []
-
-
-# Another solver --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("layer", [HALF_SPACE, GEL, Layer(0.2, 0.5, 0.3), Layer(0.2, 0.0, 0.05), Layer(5.0, 0.3, 1.0)])
@@ -74,9 +68,6 @@ def test_a_needle_missed_by_the_coarse_grid_is_found():
     assert distance.min() > -1e-6 * contact.displacement_mm.max()
 
 
-# Units and soft objects ------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("layer", [HALF_SPACE, GEL])
 def test_metres_newtons_and_pascals_give_the_same_contact(layer):
     in_mm = press(bowl(), PIXEL, layer, force_n=0.3)
@@ -105,9 +96,6 @@ def test_a_softer_object_touches_more_and_indents_less():
     assert [c.area_mm2 for c in presses] == sorted((c.area_mm2 for c in presses), reverse=True)
     assert [c.displacement_mm.max() for c in presses] == sorted(c.displacement_mm.max() for c in presses)
     assert presses[2].displacement_mm == pytest.approx(presses[3].displacement_mm, rel=1e-4)
-
-
-# Flags -----------------------------------------------------------------------------------------------------
 
 
 def test_a_resolved_light_press_has_no_flags():
@@ -143,9 +131,6 @@ def test_early_stop_is_flagged_and_carries_the_force():
     assert contact.iterations == 3
     assert contact.residual > 1e-8
     assert contact.force_n == pytest.approx(0.3, rel=1e-12)
-
-
-# Wrong input -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("gap", "force_n", "message"), [(np.nan, 1.0, "got NaN"), (0.0, 1e-300, "consistent units")])

@@ -52,9 +52,6 @@ def test_exactly_rounded_operations_are_bitwise_equal_for_any_number():
     np.testing.assert_array_equal(evaluate_formula(trace_formula(compared, 2), *pairs)[0], compared(*pairs))
 
 
-# Against plain numpy -----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("family", SHAPES)
 def test_every_family_is_the_same_in_packets_and_in_numpy(family):
     body = draw_object(3, 5, family=family, relief="knurl").body

@@ -30,9 +30,6 @@ def dome(field=SMALL, radius_mm=6.0, depth_mm=1.0):
     return np.maximum(0, depth_mm - (x * x + y * y) / (2 * radius_mm))
 
 
-# Surfaces --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("grid", [(24, 32), (12, 16), (30, 40)])
 def test_the_slopes_of_a_plane_are_right_on_every_grid(grid):
     field = Field(grid[0], grid[1], 1.0)
@@ -77,9 +74,6 @@ def test_hard_surfaces_give_pictures(name, kind):
     picture = sensor.render(HARD[name], 0)
     assert picture.shape == (24, 32, 3)
     assert picture.dtype == np.uint8
-
-
-# LEDs ------------------------------------------------------------------------------------------------------
 
 
 def by_two_loops(bar, field, slope_x, slope_y):
@@ -136,9 +130,6 @@ def test_a_bump_casts_a_shadow_away_from_the_bar_and_a_flat_gel_none():
     assert shade[40, 60] < 0.01
     assert 0 <= shade.min() <= shade.max() <= 1
     assert not cast_shadows(Surface(np.zeros((4, 4)), field), (LedBar(0.0),))[0].any()
-
-
-# Sensors ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", OPTICS)
@@ -215,9 +206,6 @@ def test_varied_sensors_have_any_number_of_lamps_colours_markers_and_cameras():
     for sensor in sensors[:20]:
         small = replace(sensor, field=Field(48, 64, 5 * sensor.field.pixel_mm))
         assert 10 < small.background(0).mean() < 245
-
-
-# Flaws and markers -----------------------------------------------------------------------------------------
 
 
 def test_flaws_stay_in_place_and_do_not_move_with_the_size_of_the_picture():

@@ -30,9 +30,6 @@ def by_loops(table, pressure):
     return total
 
 
-# Closed form of the layer ----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("poisson", POISSON)
 def test_far_thinner_than_the_wave_a_layer_is_springs_of_its_confined_modulus(poisson):
     # u = p h / M with M = E (1-v) / ((1+v)(1-2v)); in units of E* = E / (1-v^2) that is h (1-2v) / (1-v)^2.
@@ -54,9 +51,6 @@ def test_the_correction_is_the_documented_transform(poisson, rho):
     assert float(layer_correction(poisson)(rho)) == pytest.approx(exact, abs=1e-8)  # quad has an error of 1.5e-8
 
 
-# Half-space ------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("row", "col"), [(0, 2), (1, 1), (3, 5)])
 def test_love_s_patch_is_the_sum_of_point_forces_over_the_pixel(row, col):
     nodes, weights = np.polynomial.legendre.leggauss(20)
@@ -65,9 +59,6 @@ def test_love_s_patch_is_the_sum_of_point_forces_over_the_pixel(row, col):
         for x, wx in zip(nodes / 2.0, weights / 2.0, strict=True):
             total += wy * wx / (math.pi * math.hypot(row + y, col + x))
     assert love_patch((4, 6))[row, col] == pytest.approx(total, rel=1e-12)
-
-
-# Influence tables ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("poisson", POISSON)
@@ -79,9 +70,6 @@ def test_pixels_and_waves_agree_at_the_switch_between_them(poisson):
     )
     # A pixel's uniform pressure differs from a smooth one by (pixel / scale)^2 / 24, .2 %.
     assert just_thin == pytest.approx(just_thick, abs=3e-3 * just_thick.max())
-
-
-# Operator --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("thickness", [math.inf, 4.0, 0.5])

@@ -20,9 +20,6 @@ def globe(tmp_path):
     return load_mesh_object(saved(tmp_path / "ball.stl", ball(30)), 0, relief="smooth")
 
 
-# Reading ---------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", ["cube.stl", "cube.obj", "cube.PLY"])
 def test_a_cube_stands_on_the_table_in_every_format(tmp_path, name):
     moved = solid(CUBE.vertices + np.array([100, 5, -3]), CUBE.faces)
@@ -47,9 +44,6 @@ def test_only_geometry_is_read(tmp_path, monkeypatch):
     monkeypatch.setattr(builtins, "open", lambda *a, **k: opened.append(str(a[0])) or real(*a, **k))
     load_mesh_object(path, 0, relief="smooth")
     assert not [name for name in opened if name.endswith((".mtl", ".png"))]
-
-
-# Refusals --------------------------------------------------------------------------------------------------
 
 
 FIRST = np.arange(12)[:, None] == 0
@@ -87,9 +81,6 @@ def test_the_message_for_a_missing_package_names_the_extra(tmp_path, monkeypatch
     monkeypatch.delitem(sys.modules, "trimesh.ray.ray_pyembree", raising=False)
     with pytest.raises(SceneError, match=rf"{package}.*pip install 'touch-retrieval\[mesh\]'"):
         load_mesh_object(path, 0)
-
-
-# Casting ---------------------------------------------------------------------------------------------------
 
 
 def test_rays_meet_a_ball_at_the_root_of_the_quadratic(globe):

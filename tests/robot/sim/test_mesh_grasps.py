@@ -34,18 +34,12 @@ def mesh_rig(folder, seed=0, **settings):
     return load_rig("sim", seed=seed, meshes=str(folder), contact_grid=[30, 40], **settings)
 
 
-# Resting poses ----------------------------------------------------------------------------------------------
-
-
 def test_a_box_rests_on_its_six_sides_upright_first_then_the_most_stable():
     ups = stable_up_directions(box(60, 90, 180).vertices, np.zeros(3))
     assert ups[0] is UP
     np.testing.assert_allclose(np.sort(np.abs(ups[1:5]), axis=1), np.tile([0, 0, 1], (4, 1)), atol=1e-9)
     np.testing.assert_allclose([abs(up[0]) for up in ups[1:5]], [1, 1, 0, 0], atol=1e-9)  # the largest sides
     np.testing.assert_allclose(ups[5], [0, 0, -1], atol=1e-9)
-
-
-# Grasps -----------------------------------------------------------------------------------------------------
 
 
 def test_a_box_is_grasped_across_its_flat_sides_from_above_and_from_the_sides(tmp_path):
@@ -126,9 +120,6 @@ def test_an_object_that_no_allowed_force_lifts_is_reported_as_too_heavy(tmp_path
         message = rf"too heavy to lift: {mass:.2f} kg of lead need {1.5 * mass * 9.81 / 0.6:.0f} N .* ends at 25 N"
         with pytest.raises(UngraspableError, match=message):
             rig.planner.plan(rig, None, SETTINGS, np.random.default_rng(0))
-
-
-# Attempts ---------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -133,9 +133,6 @@ def test_an_object_grasped_far_from_its_middle_turns_about_the_grip():
     assert moved[False][0] == pytest.approx(30 * math.sin(angle), abs=0.4)
 
 
-# A tilted hand ---------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("tilt", [math.pi / 2, -math.pi / 2])
 def test_from_the_side_the_gap_of_an_upright_cylinder_is_turned_by_a_quarter(tilt):
     """From above the wall is parallel to the columns, so every row is the same; from a side every column."""

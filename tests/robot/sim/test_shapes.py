@@ -18,9 +18,6 @@ def distance(shape, *points):
     return shape.distance(np.array(points, float))
 
 
-# Distances by hand -----------------------------------------------------------------------------------------
-
-
 def test_distances_from_a_hexagon_are_those_of_its_faces_and_corners():
     shape = Extrusion(Polygon(6, 20, 3), 50, rim_mm=0)
     corner = 17 / np.cos(np.pi / 6) + 3
@@ -53,9 +50,6 @@ def test_slots_and_bristles_follow_their_pitch():
     np.testing.assert_allclose(inside, [2, -3, 2, -5, -1], atol=1e-5)
     brush = Brush(Brick((0, 0), (21, 11), 0, 20, 1), bristle_mm=2, pitch_mm=8, top_mm=60)
     np.testing.assert_allclose(distance(brush, [0, 0, 50], [8, 8, 50], [4, 0, 50]), [-2, -2, 2], atol=1e-5)
-
-
-# Condition for sphere tracing ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("family", SHAPES)
@@ -95,9 +89,6 @@ def test_sizes_fit_the_gripper_and_the_table(family):
         assert min(width, depth) + relief <= 95 + 1e-9
         assert max(width, depth) <= 112
         assert 25 <= height <= 200
-
-
-# Walls -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("outline", [RoundedRectangle(20, 12, 5), RoundedRectangle(20, 12, 12), Polygon(5, 18, 4)])
