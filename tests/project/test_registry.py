@@ -12,8 +12,7 @@ HERE = "tests.project.test_registry"
 
 
 class Shape:
-    class Inner:
-        pass
+    pass
 
 
 class Square(Shape):

@@ -23,11 +23,8 @@ print(before, faults())
 """
 
 
-def output_of(program):
-    return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="only the GNU C library returns freed memory like this")
 def test_kept_memory_serves_the_next_large_array_without_page_faults():
-    before, after = map(int, output_of(FAULTS).split())
+    done = subprocess.run([sys.executable, "-c", FAULTS], capture_output=True, text=True, check=True)
+    before, after = map(int, done.stdout.split())
     assert after < before / 10

@@ -200,19 +200,6 @@ def test_a_split_can_be_stored_as_json_and_selects_its_grasps():
         assert split.select(grasps, part) == [item for item in grasps if item.object_id in names]
 
 
-@pytest.mark.parametrize(
-    "data",
-    [
-        {"train": ["a"], "test": ["b"]},
-        {"train": ["mug", 3], "validation": [], "test": []},
-    ],
-    ids=repr,
-)
-def test_data_that_is_not_a_split_is_refused_with_the_required_keys(data):
-    with pytest.raises(DatasetError, match=r"split(\.\S+)? must (be a|have seed, train, validation, test;)"):
-        Split.from_dict(data)
-
-
 @settings(max_examples=20)
 @given(
     counts=counts,

@@ -136,9 +136,6 @@ def test_noise_averages_out_before_its_sign_is_dropped():
 @pytest.mark.parametrize(
     "change",
     [
-        {"touch_px": 0},
-        {"photo_px": 5000},
-        {"background": "x"},
         {"views": ("whole", "whole")},
         {"views": ("macro",)},
     ],

@@ -106,6 +106,7 @@ REFUSED = [
     ("training", "seed", 2**32),
     ("training", "seed", 2**63),
     ("preprocessing", "touch_px", 4097),
+    ("preprocessing", "background", "x"),
 ]
 
 

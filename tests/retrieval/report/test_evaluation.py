@@ -11,6 +11,7 @@ from retrieval.errors import BadInput
 from retrieval.model.posterior import FORMULA
 from retrieval.report.document import Card, Cards, Document, Picture, Section, Table, Text, to_html, to_markdown
 from retrieval.report.evaluation import write_report
+from tests.browser import chromium, page, serious
 from tests.pages import HtmlPage
 from tests.synthetic_evaluation import OBJECTS, PROTOCOL, write_synthetic_results
 
@@ -206,3 +207,9 @@ def test_markdown_and_html_have_the_same_content(tmp_path):
     page = to_html(document, tmp_path)
     for part in ('<p class="warn">one *two*</p>', "&lt;4&gt;", "<summary>folded</summary>", 'width="96"', "no picture"):
         assert part in page
+
+
+@pytest.mark.slow
+def test_axe_finds_nothing_serious(report):
+    with chromium() as browser, page(browser, (report[1] / "report.html").as_uri(), offline=True) as opened:
+        assert serious(opened) == []

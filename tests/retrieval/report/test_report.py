@@ -16,7 +16,7 @@ from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.posterior import Posterior
 from retrieval.report.query import query_page
 from retrieval.report.terminal import print_table
-from retrieval.search.answer import Match, NearestReference, QueryResult, verdict_sentence
+from retrieval.search.answer import Match, QueryResult, verdict_sentence
 from retrieval.search.searcher import Searcher
 from tests.pages import HtmlPage
 
@@ -155,12 +155,6 @@ def test_the_verdict_match_marks_the_first_card_and_gives_no_advice():
     assert "Match: mug, probability 0.80; none of these: 0.20." in page.text
     assert len(marked(page)) == 1
     assert result_of(ONE).advice is None
-
-
-def test_the_advice_for_an_object_with_reference_touches_requests_more():
-    result = result_of(CLEAR, verdict="none of these", none_probability=0.9)
-    match = dataclasses.replace(result.top, reference=NearestReference(("mug/touch_0_a.png",), ("",), 0.9, 0.1))
-    assert "More reference touches of mug would help." in dataclasses.replace(result, results=[match]).advice
 
 
 def test_a_model_without_calibration_shows_no_probability():

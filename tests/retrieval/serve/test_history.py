@@ -1,16 +1,20 @@
 """The history: stored queries and feedback as a recording for training."""
 
 import base64
+import random
 import sqlite3
+import threading
+from contextlib import suppress
 
+import httpx
 import pytest
 
 from retrieval.data.check.recording import check_recording
 from retrieval.data.dataset import load_grasps
 from retrieval.errors import BadInput
 from retrieval.serve.store import HistoryStore
-from robot.recording.folder import RecordingWriter
-from tests.serving import INFO, problem, service, with_history
+from robot.recording.folder import RecordingWriter, read_info
+from tests.serving import INFO, command, problem, service, with_history
 
 
 @pytest.fixture(scope="module")
@@ -164,3 +168,36 @@ def test_service_without_history_reports_it(index, touches):
         assert "x-query-id" not in client.post("/v1/query", json={"touches": encoded}).headers
         for path in ("/v1/history", "/v1/history/x"):
             problem(client.get(path), 404, "unknown")
+
+
+def kill_during_feedback(index, folder, body, name, after_s):
+    """Run the command, send feedback on one query after the other, kill it, and return the acknowledged queries."""
+    acknowledged = []
+    with (
+        command("--index", index, "--port", "0", "--history", folder) as (process, url, _),
+        httpx.Client(base_url=url, timeout=30) as client,
+        suppress(httpx.HTTPError),  # the process is killed
+    ):
+        while True:
+            query = client.post("/v1/query", json=body).headers["x-query-id"]
+            feedback = {"query": query, "feedback": "object", "object_id": name}
+            assert client.post("/v1/feedback", json=feedback).status_code == 201
+            if not acknowledged:
+                threading.Timer(after_s, process.kill).start()
+            acknowledged.append(query)
+    return acknowledged
+
+
+@pytest.mark.slow
+def test_all_acknowledged_feedback_survives_a_kill_once(index, body, tmp_path, searcher):
+    name, rng, every = searcher.generation.rows[0].object_id, random.Random(0), []
+    for _ in range(2):
+        every += kill_during_feedback(index, tmp_path, body, name, rng.random())
+    info = {name: value for name, value in read_info(tmp_path / "recording").items() if name in INFO}
+    with with_history(index, tmp_path, info=info) as client:
+        client.get("/v1/history")
+        stored = [client.get(f"/v1/history/{query}").json() for query in every]
+    assert [(one["feedback"], one["object_id"]) for one in stored] == [("object", name)] * len(every)
+    recorded = [grasp.grasp_id for grasp in load_grasps(tmp_path / "recording")]
+    assert len(set(recorded)) == len(recorded)
+    assert {f"{query}-00" for query in every} <= set(recorded)

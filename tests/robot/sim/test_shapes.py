@@ -91,17 +91,6 @@ def test_sizes_fit_the_gripper_and_the_table(family):
         assert 25 <= height <= 200
 
 
-@pytest.mark.parametrize("outline", [RoundedRectangle(20, 12, 5), RoundedRectangle(20, 12, 12), Polygon(5, 18, 4)])
-def test_arc_length_comes_back_from_its_point(outline):
-    s = np.linspace(0, outline.length_mm, 400, endpoint=False) + 0.03
-    points, normals = outline.points_at(s)
-    x, y = (points + 0.5 * normals).astype(np.float32).T
-    np.testing.assert_allclose(outline.locate(x, y), s, atol=2e-4)
-    np.testing.assert_allclose(outline.distance(x, y), 0.5, atol=1e-4)
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    np.testing.assert_allclose(steps, outline.length_mm / 400, rtol=0.01)
-
-
 def test_chart_rays_meet_their_coordinates():
     s, t = np.meshgrid(np.linspace(1, 100, 30), np.linspace(5, 45, 9))
     twisted = Extrusion(Polygon(4, 18, 4), 50, twist_rad=1.0, taper=0.3)
