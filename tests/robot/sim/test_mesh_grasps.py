@@ -130,7 +130,7 @@ def attempts(tmp_path_factory):
         move = rig.arm._move_to
         rig.arm._move_to = lambda pose, speed: moves.append(pose) or move(pose, speed)
         results = []
-        for number in range(12):
+        for number in range(8):
             moves.clear()
             results.append((runner.run(name, number), list(moves)))
         return results
@@ -138,8 +138,8 @@ def attempts(tmp_path_factory):
 
 def test_attempts_come_from_above_and_from_the_sides_and_most_hold(attempts):
     tilts = [len(attempt.fields["pose"]) == 5 for attempt, _ in attempts]
-    assert 2 <= sum(tilts) <= 10
-    assert sum(attempt.outcome == "held" for attempt, _ in attempts) >= 8
+    assert 2 <= sum(tilts) <= 6
+    assert sum(attempt.outcome == "held" for attempt, _ in attempts) >= 5
 
 
 def test_a_tilted_hand_descends_next_to_the_object_moves_level_and_lifts_straight_up(attempts):
