@@ -3,7 +3,6 @@ page and the command."""
 
 import dataclasses
 import json
-import time
 
 import numpy as np
 import pytest
@@ -15,8 +14,7 @@ from retrieval.commands.frontier import recording_of
 from retrieval.commands.main import main
 from retrieval.errors import ConfigError, DatasetError
 from retrieval.frontier import APPROXIMATIONS
-from retrieval.frontier.candidates import default_k, ranks
-from retrieval.frontier.clock import time_points
+from retrieval.frontier.candidates import default_k
 from retrieval.frontier.formats import encoders
 from retrieval.frontier.measure import measure_frontier
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff
@@ -66,15 +64,6 @@ def test_the_fastest_within_the_tolerance_is_recommended_else_that_of_the_smalle
     made = panel(*points)
     marked = [dataclasses.replace(point, is_default=row == default) for row, point in enumerate(made.points)]
     assert dataclasses.replace(made, points=tuple(marked)).line() == f"errors (against the truth); {line}"
-
-
-def test_timed_works_take_turns():
-    calls = []
-    works = [lambda name=name: (calls.append(name), time.sleep(0.006)) for name in "ab"]
-    made = time_points(panel((0, 1), (0, 2)).points, works, 3)
-    assert calls == ["a", "b"] * 4
-    assert [point.setting for point in made] == ["s0", "s1"]
-    assert all(point.seconds >= 0.005 for point in made)
 
 
 @pytest.mark.parametrize("name", sorted(APPROXIMATIONS))
@@ -137,13 +126,6 @@ def test_trained_objects_are_left_out_and_too_few_others_refused(model, recordin
     few = synthetic.write_recording(tmp_path / "few", synthetic.make_objects(12)[:1], 3)
     with pytest.raises(DatasetError, match="at least 2 objects that the model was not trained on"):
         _ = Sample(model, lambda: few, tmp_path, TINY, quiet=True).grasps
-
-
-def test_ranks_count_the_photos_nearer_than_the_exhaustive_top1():
-    embeddings = np.array([[1, 0], [0, 1], [0.6, 0.8]], np.float32)
-    queries = np.array([[1, 0], [0, 1]], np.float32)
-    assert ranks(queries, embeddings, np.array([0, 0])).tolist() == [0, 2]
-    assert ranks(queries, embeddings, np.array([2, 2])).tolist() == [1, 1]
 
 
 def test_exhaustive_top1_is_the_highest_logit_and_is_cached(sample, monkeypatch):

@@ -151,3 +151,24 @@ def test_the_largest_confusion_comes_first_and_correct_results_are_not_listed():
     # Object 0: means 2.5, 4.5, 0 twice. Object 1: one correct, then 0, 5, 5, a tie. Object 2: 9, 9, 0, a tie.
     assert found == [(0, 1, 1.0), (2, 0, 0.5), (2, 1, 0.5), (1, 2, 0.25)]
     assert confusions(perfect()) == []
+
+
+def test_without_ties_and_own_photos_the_metrics_equal_those_of_trec_eval():
+    """trec_eval gets the gallery of each query, which excludes photos of its own grasp, in the run and in the qrels.
+
+    R@k is "any relevant item among the first k", which trec_eval calls success.
+    """
+    trec_eval, ks = pytest.importorskip("pytrec_eval"), (1, 2, 3, 5)
+    rng = np.random.default_rng(1)
+    owner = np.repeat(np.arange(6), 4)
+    scores = rng.permuted(np.tile(np.arange(24, dtype=np.float32), (24, 1)), axis=1)
+    table = table_of(scores, owner)
+    qrels, run = (
+        {str(q): {str(i): kind(values[q, i]) for i in np.flatnonzero(~table.own[q])} for q in range(24)}
+        for values, kind in ((table.relevant, int), (scores, float))
+    )
+    theirs = trec_eval.RelevanceEvaluator(qrels, {"map", "success." + ",".join(map(str, ks))}).evaluate(run)
+    ours = {"map": average_precision(table)} | {f"success_{k}": recall(table, k) for k in ks}
+    for name, measure in ours.items():
+        expected = [theirs[str(q)][name] for q in range(24)]
+        np.testing.assert_allclose(measure.values[:, 0], expected, rtol=1e-12, atol=1e-14, err_msg=name)

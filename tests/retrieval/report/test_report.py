@@ -30,10 +30,6 @@ POSTERIOR = dataclasses.asdict(Posterior(slope=0.75, offset=-1.25, dependence=0.
 }
 
 
-def digest_of(path):
-    return file_digest(path) if path.is_file() else ""
-
-
 def result_of(*matches, catalogue=Path("catalog"), touches=(("a.png", "b.png"),), **fields):
     """Return a result with these (object, logit, probability, photo, metadata)."""
     index = {"path": "index", "generation": "gen-000001", "kind": "flat", "photos": 1, "objects": 1, "scored": 1}
@@ -47,7 +43,7 @@ def result_of(*matches, catalogue=Path("catalog"), touches=(("a.png", "b.png"),)
             rank,
             *scores,
             photo,
-            digest_of(catalogue / photo),
+            file_digest(catalogue / photo) if (catalogue / photo).is_file() else "",
             metadata,
             catalogue / photo,
             None,

@@ -177,22 +177,6 @@ def test_only_new_touches_are_encoded_again(catalogue_with_touches, calibrated_m
     assert (more.written, more.embedded, more.references["touches"], more.references["encoded"]) == (True, 0, 9, 1)
 
 
-def test_touches_change_only_the_logits_of_their_object_until_they_are_removed(
-    catalogue_copy, calibrated_model, tmp_path, touches
-):
-    def query():
-        return query_new_index(catalogue_copy, calibrated_model, tmp_path / "index", touches[NAMES[0]][2]).results
-
-    before = query()
-    synthetic.put_touch(catalogue_copy, NAMES[0], 0, touches[NAMES[0]][0])
-    bare, touched = ({match.object_id: match.logit for match in results} for results in (before, query()))
-    assert touched.pop(NAMES[0]) != pytest.approx(bare.pop(NAMES[0]), abs=1e-3)
-    assert touched == pytest.approx(bare, abs=1e-5)
-    for path in (catalogue_copy / NAMES[0]).glob("touch_*"):
-        path.unlink()
-    assert query() == before
-
-
 def test_a_recording_is_a_catalogue_of_the_photos_and_touches_of_its_grasps(recording, calibrated_model, tmp_path):
     report = build_index(recording, calibrated_model, tmp_path / "index", quiet=True)
     assert (report.objects, report.photos) == (12, 36)

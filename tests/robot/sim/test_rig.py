@@ -172,6 +172,7 @@ def test_an_empty_table_and_an_object_of_another_seed_raise(rig):
     [
         ({"fingers": ["a", "c"]}, RobotConfigError),
         ({"optics": "neon"}, UnknownName),
+        ({"families": ["teapot"]}, RobotConfigError),
         ({"gels": 0}, RobotConfigError),
         ({"grasp": {"force_n": [1.0, 10.0]}}, RobotConfigError),
         ({"gel": {"a": {"modulus_mpa": math.nan}}}, RobotConfigError),
