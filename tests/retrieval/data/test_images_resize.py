@@ -39,11 +39,6 @@ def linear_by_loops(line, new):
     return out
 
 
-def line_image(line, axis):
-    pixels = np.asarray(line, np.float32)
-    return np.repeat(pixels[:, None, None] if axis == 0 else pixels[None, :, None], 3, axis=2)
-
-
 SIZES = [(7, 3), (7, 6), (128, 127), (320, 128), (10, 1), (2, 1), (9, 3), (1, 4), (2, 3), (3, 7), (127, 128), (5, 128)]
 
 
@@ -51,7 +46,8 @@ SIZES = [(7, 3), (7, 6), (128, 127), (320, 128), (10, 1), (2, 1), (9, 3), (1, 4)
 @pytest.mark.parametrize(("old", "new"), SIZES)
 def test_an_axis_that_shrinks_is_averaged_over_areas_and_one_that_grows_is_interpolated(old, new, axis):
     line = np.random.default_rng(old).random(old).astype(np.float32)
-    out = resize(line_image(line, axis), (new, 1) if axis == 0 else (1, new))
+    image = np.repeat(line[:, None, None] if axis == 0 else line[None, :, None], 3, axis=2)
+    out = resize(image, (new, 1) if axis == 0 else (1, new))
     expected = (area_by_loops if new < old else linear_by_loops)(line, new)
     np.testing.assert_allclose(out[..., 1].ravel(), expected, atol=ATOL)
 

@@ -66,13 +66,6 @@ def test_photos_may_have_another_tower_and_another_tower_for_both_replaces_it():
     assert config.using(tower="small").matcher.photo_tower == ""
 
 
-def test_a_file_changes_its_settings_and_leaves_the_rest(tmp_path):
-    (tmp_path / "mine.toml").write_text("[training]\nlearning_rate = 1\nseed = 3\n")
-    config = load_config(str(tmp_path / "mine.toml"))
-    assert config == Config(training=TrainingConfig(learning_rate=1.0, seed=3))
-    assert type(config.training.learning_rate) is float
-
-
 @pytest.mark.parametrize("name", ["huge", ".", "../paper"])
 def test_an_unknown_name_lists_the_presets(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from retrieval.errors import BadInput, NumericalError
-from retrieval.model.posterior import EvidenceMass, Posterior, require_prior
+from retrieval.model.posterior import Posterior, require_prior
 
 ADDING = Posterior(slope=1.0, offset=0.0, dependence=0.0)
 
@@ -60,13 +60,6 @@ def test_the_probability_if_present_equals_that_by_hand_for_any_prior_and_offset
     # Two grasps: w = 1 / 1.5, so logits of 1.5 log 3 and 0 weigh 3 and 1.
     found = probabilities(Posterior(1.0, 0.0, 0.5), [1.5 * math.log(3), 0.0], 2)
     assert found.objects_if_present == pytest.approx([3 / 4, 1 / 4])
-
-
-def test_merged_parts_of_a_catalogue_give_the_probability_if_present_of_the_whole():
-    # Weights 4, 1 | 3, 8: 16 together. The parts' largest logits differ.
-    parts = [ADDING.mass([math.log(4), 0.0]), ADDING.mass([math.log(3), math.log(8)])]
-    found = ADDING.probabilities_given([math.log(8), math.log(4)], EvidenceMass.merged(parts))
-    assert found.objects_if_present == pytest.approx([1 / 2, 1 / 4])
 
 
 def test_where_none_rounds_to_one_the_probability_if_present_is_exact_and_the_quotient_is_nan():

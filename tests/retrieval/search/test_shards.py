@@ -59,10 +59,6 @@ def test_with_all_photos_scored_answers_equal_those_of_one_folder(
         same_answers(divided.query(own[:count], none_prior=0.3), searcher.query(own[:count], none_prior=0.3))
 
 
-def test_the_best_of_all_shards_are_the_best_of_the_catalogue(divided, searcher, grasps):
-    same_answers(divided.query(grasps[0], top=2), searcher.query(grasps[0], top=2))
-
-
 def rows_of(cluster):
     """{shard: its rows} of the shards in the manifest."""
     return {
