@@ -8,7 +8,7 @@ The accuracy of the choice is nested: for the touches of an object, the recipe i
 
 import dataclasses
 import shutil
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -74,13 +74,10 @@ def train_best(
 ) -> Checkpoint:
     """Fit a matcher by the best recipe, and write the checkpoint `out`; arguments as for `retrieval.train`."""
     require_writable(out)
-    recording = folder_of(recording)
-    grasps = [grasp for grasp in load_grasps(recording) if split is None or grasp.object_id not in split.test]
-    fingers, linked = finger_count(grasps), linked_objects(grasps)
-    folds = draw_folds(linked)
-    start = model if isinstance(model, Checkpoint) else load_checkpoint(model or shipped_model(min(fingers, 2)))
-    folder = sibling_file(out, ".parts")
-    problem = Problem(grasps, fingers, start, init, object_kinds(recording), linked, folder, quiet)
+    recording, folder = folder_of(recording), sibling_file(out, ".parts")
+    problem = pose(recording, folder, model=model, init=init, unused=split.test if split else (), quiet=quiet)
+    grasps, start, fingers = problem.grasps, problem.start, problem.fingers
+    folds = draw_folds(problem.linked)
     objects = sum(map(len, folds))
     if recipe is not None:
         names = [RECIPES.name_of(recipe)]
@@ -92,19 +89,18 @@ def train_best(
     else:
         names = [name for name in RECIPES.names() if RECIPES.load(name).applies(problem, objects)]
     recipes = {name: RECIPES.load(name)(problem) for name in dict.fromkeys([*names, CONTROL])}
-    folder.mkdir(exist_ok=True)
     with resumable(folder):
         comparison = Comparison(problem, folds[: -(-ENOUGH_OBJECTS // len(folds[0]))])
         held_out = {name: comparison.held_out(name, recipes[name]) for name in names}
         low_pass = comparison.held_out(CONTROL, recipes[CONTROL], "low_pass")
-        accuracies = {name: _identification(parts) for name, parts in held_out.items()}
+        accuracies = {name: identification(parts) for name, parts in held_out.items()}
         best = max(names, key=lambda name: float(accuracies[name].by_object()[1].mean()))  # among equals the first
         made = recipes[best].fit(comparison.features(recipes[best]), "final", is_final=True)
         made = _calibrated(made, held_out[best])
         made = with_sensor_calibrations(made, grasps, comparison.features(recipes[best]), quiet=quiet)
     about = {"source": recording_source(recording), "data_digest": data_digest(grasps)}
     licences = dict.fromkeys([*checkpoint_licences(start), recording_licence(recording)])
-    table = _table(accuracies, _identification(low_pass))
+    table = _table(accuracies, identification(low_pass))
     provenance = {
         **({**start.provenance, "calibrated_on": about} if made.matcher is start.matcher else {"step": 0, **about}),
         LICENCES: [dataclasses.asdict(licence) for licence in licences],
@@ -115,6 +111,23 @@ def train_best(
     store_checkpoint(dataclasses.replace(made, provenance=provenance), out)
     shutil.rmtree(folder)
     return load_checkpoint(out)
+
+
+def pose(
+    recording: Path,
+    folder: Path,
+    *,
+    model: str | Path | Checkpoint | None = None,
+    init: str = "imagenet",
+    unused: Collection[str] = (),
+    quiet: bool = False,
+) -> Problem:
+    """Return the problem of a recording without the objects `unused`; `folder` is made for unfinished parts."""
+    grasps = [grasp for grasp in load_grasps(recording) if grasp.object_id not in unused]
+    fingers = finger_count(grasps)
+    start = model if isinstance(model, Checkpoint) else load_checkpoint(model or shipped_model(min(fingers, 2)))
+    folder.mkdir(parents=True, exist_ok=True)
+    return Problem(grasps, fingers, start, init, object_kinds(recording), linked_objects(grasps), folder, quiet)
 
 
 # Touches of held-out objects -------------------------------------------------------------------------------
@@ -202,7 +215,7 @@ def sessions_of(grasps: Sequence[Grasp]) -> set[str]:
     return set().union(*seen.values()) if repeated >= MIN_OBJECTS else set()
 
 
-def _identification(parts: Sequence[HeldOut]) -> Measure:
+def identification(parts: Sequence[HeldOut]) -> Measure:
     """Return how often a random photo of the touched object has the highest logit among one of each object of the fold.
 
     Photos of the touch's own grasp, or session, are not drawn; 1/m if m photos tie.

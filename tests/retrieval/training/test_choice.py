@@ -104,11 +104,11 @@ def test_accuracy_of_hand_made_scores():
     own = np.eye(4)
     # The other photo of a is photo 4 for touch 1, and photo 1 for touch 4. Touch 2 is the only grasp of b.
     logits = [[9, 2, 3, 4], [5, 5, 1, 5], [0, 1, 2, 3], [3, 2, 3, 9]]
-    found = choice._identification([held_out(logits, [0, 1, 2, 0], [0, 1, 2, 0], own, "abc")])
+    found = choice.identification([held_out(logits, [0, 1, 2, 0], [0, 1, 2, 0], own, "abc")])
     assert (found.owner.tolist(), found.values.ravel().tolist()) == ([0, 0], [1.0, 0.5])
     assert found.chance.tolist() == [pytest.approx(1 / 3)]
     with pytest.raises(BadInput, match="at least two grasps of each object"):
-        choice._identification([held_out(np.eye(2), [0, 1], [0, 1], np.eye(2), "ab")])
+        choice.identification([held_out(np.eye(2), [0, 1], [0, 1], np.eye(2), "ab")])
 
 
 def test_the_accuracy_of_the_choice_is_nested():
