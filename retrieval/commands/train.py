@@ -128,5 +128,6 @@ def _train_with_config(
             return
     finally:
         distributed.stop()
-    figures = [f"{name.replace('_', ' ')} {value:.3f}" for name, value in checkpoint.provenance["metrics"].items()]
-    say(", ".join([f"{out}: best step {checkpoint.provenance['step']}", *figures]))
+    accuracy = checkpoint.provenance["metrics"].get("validation_pair_accuracy")
+    reached = "" if accuracy is None else f", pair accuracy of validation objects {accuracy:.3f} (chance 0.5)"
+    say(f"{out}: best step {checkpoint.provenance['step']}{reached}")

@@ -62,7 +62,7 @@ def available_weights(init: str) -> str:
     except CheckpointError as error:
         if init != "imagenet":
             raise
-        say(f"{error}. Without them, the linear fit has the gel tower only, and is worse on real touches.")
+        say(f"{error}. Without them, the linear fit has the package's towers only: 9 points worse on VT60")
         return NO_WEIGHTS
     return init
 

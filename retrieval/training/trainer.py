@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from _touch_retrieval.registry import code_digest
 from retrieval.console.interruption import interruption
+from retrieval.console.progress import Bar
 from retrieval.data.check.split import require_fit
 from retrieval.data.dataset import (
     LICENCES,
@@ -212,7 +213,9 @@ class Trainer:
             try:
                 store_checkpoint(made, self.out)
                 if not interrupted:
-                    store_checkpoint(self._completed(made, quiet), self.out)
+                    with Bar("calibrating", 1, "model", quiet=quiet) as bar:
+                        store_checkpoint(self._completed(made, quiet), self.out)
+                        bar.advance()
                     state.path.unlink()
             except KeyboardInterrupt:
                 interrupted = (

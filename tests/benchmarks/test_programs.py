@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import rerank, scale
+from benchmarks import recipes, rerank, scale
 from benchmarks.frontier import APPROXIMATIONS, NEED_NO_MODEL
 from benchmarks.frontier.__main__ import main
 from retrieval import frontier
@@ -84,3 +84,10 @@ def test_time_against_the_number_of_photos(tmp_path):
 def test_reranking_with_cells_is_compared_with_reranking_without():
     text = rerank.measure(read_checkpoint_info(shipped_model()).config.matcher, candidates=3, repetitions=1)
     assert text.startswith("3 candidates with ")
+
+
+@pytest.mark.slow
+def test_recipes_are_compared_on_objects_that_were_left_out(recording):
+    found, taken, _ = recipes.measure(recording, 8, 3, 1, "random", 0)
+    assert {len(accuracy.by_object()[0]) for accuracy in found.values()} == {3}
+    assert found[recipes.TAKEN].values.tolist() == found[taken[0]].values.tolist()
