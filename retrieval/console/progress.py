@@ -32,7 +32,8 @@ class Bar:
 
     def __init__(self, title: str, total: int, unit: str, *, done: int = 0, quiet: bool = False) -> None:
         self.title, self.total, self.unit, self.done, self.note = title, total, unit, done, ""
-        self._first, self._start, self._last_line = done, time.monotonic(), time.monotonic()
+        self._first, self._start = done, time.monotonic()
+        self._last_line = self._last_advance = self._start
         self._rich: Any = None
         self._outer = Bar._running
         self._is_shown = not quiet and (self.is_verbose or not self._outer)
@@ -61,21 +62,32 @@ class Bar:
 
     def advance(self, count: int = 1, note: str = "") -> None:
         """Add `count` finished units; `note` has the latest figures."""
-        self.done, self.note, now = self.done + count, note, time.monotonic()
+        self.done, self.note = self.done + count, note
+        if count:
+            self._last_advance = time.monotonic()
         if self._outer and not self._is_shown:
-            self._outer.advance(0, self._outer.note)
+            self._outer._show_part(f"; {self.title}: {self.done} of {self.total} {self.unit}")
         elif self._rich:
             self._rich.update(self._task, advance=count)
-        elif self._is_shown and now - self._last_line > _LINE_EVERY_S and self.done < self.total:
-            self._last_line, finished = now, self.done - self._first
-            left_s = (now - self._start) * (self.total - self.done) / max(finished, 1)
-            self._say(f"{self.done} of {self.total} {self.unit}" + f", {_duration(left_s)} left" * bool(finished))
+        else:
+            self._show_part("")
+
+    def _show_part(self, inner: str) -> None:
+        """Print a line if the last one is old; `inner` is the progress of a stage within this one."""
+        now = time.monotonic()
+        if self._rich or not self._is_shown or now - self._last_line <= _LINE_EVERY_S or self.done >= self.total:
+            return
+        self._last_line, finished = now, self.done - self._first
+        left_s = (self._last_advance - self._start) * (self.total - self.done) / max(finished, 1)
+        left_s -= now - self._last_advance
+        left = f", {_duration(left_s)} left" if finished and left_s > 0 else ""
+        self._say(f"{self.done} of {self.total} {self.unit}{left}{inner}")
 
     def show(self, done: int, total: int, note: str = "") -> None:
         """Show `done` of `total` units; the bar begins at the first call."""
         if not self.total:
             self.total, self.done, self._first = total, done, done
-            self._start = self._last_line = time.monotonic()
+            self._start = self._last_line = self._last_advance = time.monotonic()
             self.__enter__()
         self.advance(done - self.done, note)
 
