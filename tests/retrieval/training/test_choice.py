@@ -181,42 +181,44 @@ def start(model, tmp_path_factory):
     return load_checkpoint(path)
 
 
-def trained(recording, start, folder, recipe):
+@pytest.fixture(scope="module")
+def made(recording, start, tmp_path_factory):
+    """A model of each recipe that left three test objects out, and the other objects."""
     names = sorted({grasp.object_id for grasp in load_grasps(recording)})
     split = Split(0, tuple(names[3:]), (), tuple(names[:3]))
-    made = retrieval.train(
-        recording, folder / "own.safetensors", model=start, recipe=recipe, init="random", split=split, quiet=True
-    )
-    return made, set(names[3:])
+    folder = tmp_path_factory.mktemp("made")
+    options = {"model": start, "init": "random", "split": split, "quiet": True}
+    models = {
+        recipe: retrieval.train(recording, folder / f"{recipe}.safetensors", recipe=recipe, **options)
+        for recipe in ("start", "linear", "head")
+    }
+    assert not list(folder.glob("*.parts"))
+    return models, set(names[3:])
 
 
-@pytest.mark.parametrize("recipe", ["start", "linear", "head"])
 def test_each_recipe_makes_an_ordinary_checkpoint_without_test_objects(
-    recipe, recording, start, catalogue, touch, tmp_path
+    made, recording, start, catalogue, touch, tmp_path
 ):
-    made, known = trained(recording, start, tmp_path, recipe)
-    assert made.provenance["recipe"] == recipe
-    assert list(made.provenance[COMPARED]["rows"]) == [recipe, "chosen recipe", "low-pass control"]
-    assert made.provenance[COMPARED]["objects"] == len(known)
-    assert (tmp_path / "own.parts").exists() is False
-    assert stored_licences(made.provenance) == [DataLicence("another"), recording_licence(recording)]
-    # Calibrations of the start model are for its posterior and its sensor; nine objects are too few for new ones.
-    assert made.posterior not in (None, start.posterior)
-    assert (made.verification, made.gel_check) == (None, None)
-    retrieval.build_index(catalogue, made, tmp_path / "index", quiet=True)
-    answer = retrieval.open(tmp_path / "index", model=made.path).query([touch])
-    assert 0 <= answer.none_probability <= 1
-    if recipe == "start":
-        assert made.config == start.config
-        assert all(
-            torch.equal(tensor, start.matcher.state_dict()[name]) for name, tensor in made.matcher.state_dict().items()
-        )
-        return
-    assert {*made.split.train, *made.split.validation} == known
+    models, known = made
+    for recipe, model in models.items():
+        assert model.provenance["recipe"] == recipe
+        assert list(model.provenance[COMPARED]["rows"]) == [recipe, "chosen recipe", "low-pass control"]
+        assert model.provenance[COMPARED]["objects"] == len(known)
+        assert stored_licences(model.provenance) == [DataLicence("another"), recording_licence(recording)]
+        # Calibrations of the start model are for its posterior and its sensor; nine objects are too few for new ones.
+        assert model.posterior not in (None, start.posterior)
+        assert (model.verification, model.gel_check) == (None, None)
+        assert recipe == "start" or {*model.split.train, *model.split.validation} == known
+        retrieval.build_index(catalogue, model, tmp_path / recipe, quiet=True)
+        answer = retrieval.open(tmp_path / recipe, model=model.path).query([touch])
+        assert 0 <= answer.none_probability <= 1
+    weights = models["start"].matcher.state_dict()
+    assert models["start"].config == start.config
+    assert all(torch.equal(tensor, start.matcher.state_dict()[name]) for name, tensor in weights.items())
 
 
-def test_the_logit_of_the_linear_fit_is_only_the_scaled_cosine_of_the_projections(recording, start, tmp_path):
-    matcher = trained(recording, start, tmp_path, "linear")[0].matcher
+def test_the_logit_of_the_linear_fit_is_only_the_scaled_cosine_of_the_projections(made):
+    matcher = made[0]["linear"].matcher
     with torch.inference_mode():
         touch = matcher.touch_encoding(torch.randn(5, matcher.config.fingers * matcher.touch_tower.output_count))
         photo = matcher.photo_encoding(torch.randn(5, matcher.photo_feature_count))
