@@ -91,10 +91,10 @@ OTHER_DATA_SETS = """
 
 **TactileMimic** ([card](https://huggingface.co/datasets/b1o1o1m/TactileMimic); it asks you to accept conditions) has
 two GelSight Minis on a parallel gripper and a camera (RealSense D405) on the wrist, like the rig of the paper: 26
-objects, 369 successful teleoperated episodes (of the bottle only 3), all images 224 x 224. Unpack the .tar file, then
-`retrieve import open-x-tactile pick_place/ --out mimic/ --option camera=right_wrist_camera_rgb`. An episode becomes one
-grasp, so **its photo has light and pose in common with its touch: the photos of a catalogue must come from other
-episodes.** `retrieve evaluate` leaves own photos out; a catalogue of yours must do so, too.
+objects, 369 successful teleoperated episodes (of the bottle only 3), all images 224 x 224. Its files are zarr stores in
+the layout of Open-X-Tactile (FTP-1): write a [plug-in](extending.md) that yields, for each episode, the images of its
+steps. Then **a photo has light and pose in common with the touch of its episode: the photos of a catalogue must come
+from other episodes.** `retrieve evaluate` leaves own photos out; a catalogue of yours must do so, too.
 
 **RCT** (arXiv 2606.31694; 9.2 GB on figshare): a robot pressed three DIGITs on 122 materials; 1,832 presses, 29,279
 frames, a photo of each material, splits by material and by sensor. On held-out materials its authors find the text of a

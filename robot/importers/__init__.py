@@ -37,7 +37,6 @@ IMPORTERS: "Registry[Importer]" = Registry(
         "folder": "robot.importers.folder:import_folder",
         "lerobot": "robot.importers.lerobot:import_lerobot",
         "objectfolder": "robot.importers.objectfolder:import_objectfolder",
-        "open-x-tactile": "robot.importers.open_x_tactile:import_open_x_tactile",
         "physiclear": "robot.importers.physiclear:import_physiclear",
         "rct": "robot.importers.rct:import_rct",
         "rosbag": "robot.importers.rosbag:import_rosbag",

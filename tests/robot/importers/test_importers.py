@@ -24,7 +24,7 @@ from tests.documents import text_of
 from tests.miniatures import encoded, picture, pixels
 
 PICTURES = {".png", ".jpg"}
-SOURCE_FACTS = ("folder", "lerobot", "open-x-tactile", "rosbag")
+SOURCE_FACTS = ("folder", "lerobot", "rosbag")
 """Importers whose facts, such as the sensor, depend on the source."""
 
 
@@ -181,7 +181,7 @@ def test_the_page_of_data_sets_is_generated_from_the_importers():
     assert text_of(DATA_SETS) == data_sets(), "run `python -m benchmarks.reference`"
 
 
-EXTRAS = {"feeling-of-success": "h5py", "lerobot": "pyarrow", "open-x-tactile": "zarr", "physiclear": "av"}
+EXTRAS = {"feeling-of-success": "h5py", "lerobot": "pyarrow", "physiclear": "av"}
 
 
 @pytest.mark.parametrize(("name", "package"), [*EXTRAS.items(), ("rosbag", "rosbags")])
