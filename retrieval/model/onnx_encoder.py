@@ -3,7 +3,6 @@
 import logging
 import os
 from collections.abc import Sequence
-from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ import numpy as np
 from retrieval.data.resize import RgbImage
 from retrieval.errors import CheckpointError
 from retrieval.model.checkpoint_info import CheckpointInfo
-from retrieval.model.fork_guard import fork_guard
 from retrieval.model.touch_reader import TouchEncodings
 
 log = logging.getLogger(__name__)
@@ -29,20 +27,13 @@ class OnnxEncoder:
 
     def __init__(self, model: Path | bytes, checkpoint: str, threads: int | None = None) -> None:
         """Open the export of the checkpoint with that digest; the arguments and errors are those of `open_session`."""
-        self._open = partial(open_session, model, checkpoint, threads)
-        self._session = self._open()
-        fork_guard.sessions.add(self)
-
-    def close(self) -> None:
-        """Close the session; the next touch opens it again."""
-        self._session = None
+        self._session = open_session(model, checkpoint, threads)
 
     def encode(self, touches: Sequence[Sequence[RgbImage]]) -> TouchEncodings:
         """Encode grasps, each a sequence of its fingers' images, float32 in 0..1."""
         images = np.stack([np.stack(fingers) for fingers in touches])
-        session = self._session = self._session or self._open()
         try:
-            partials, embedding, *more = session.run(None, {"images": images})
+            partials, embedding, *more = self._session.run(None, {"images": images})
         except Exception as error:  # the exceptions of ONNX Runtime have no common base
             raise CheckpointError(f"the export of this checkpoint cannot be run ({error}); export it again") from error
         return TouchEncodings(partials, embedding, more[0] if more else None)
@@ -59,7 +50,7 @@ def open_session(model: Path | bytes, checkpoint: str, threads: int | None = Non
     Raises:
         CheckpointError: The model cannot be opened, or is of another checkpoint.
     """
-    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # nothing is sent, and no fork waits for its thread
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # nothing is sent
     import onnxruntime
 
     name, source = ("the export", model) if isinstance(model, bytes) else (model, str(model))

@@ -15,7 +15,6 @@ from PIL import Image
 from retrieval.data.resize import RgbImage, resize
 from retrieval.errors import BadInput, IncompleteSearch, NumericalError
 from retrieval.model.config import Config
-from retrieval.model.fork_guard import fork_guard
 from retrieval.model.gel_check import contact_level
 from retrieval.model.touches import AnyImage, GelImage, InputImage, parse_grasps, read_image
 
@@ -148,7 +147,7 @@ class TouchReader:
                 views = self._preprocessed(grasps[start : start + BATCH], no_contact_frames)
                 levels += [[level for _, level, _ in grasp] for grasp in views]
                 pictures += [[picture for *_, picture in grasp] for grasp in views]
-            with clock("encode"), fork_guard.computing():
+            with clock("encode"):
                 parts.append(self.encoder.encode([[view for view, *_ in grasp] for grasp in views]))
         partials, embeddings = (np.concatenate([part[place] for part in parts]) for place in (0, 1))
         readings = [part.readings for part in parts if part.readings is not None]
@@ -165,7 +164,7 @@ class TouchReader:
     ) -> list[list[tuple[RgbImage, float, bytes]]]:
         """Return the preprocessed images of grasps, their differences from the no-contact frames, and pixel digests.
 
-        Of several bad images, the first is reported. The threads end with the call: a fork would not have them.
+        Of several bad images, the first is reported.
         """
         for source in (source for grasp in grasps for source in grasp):
             # A Pillow image reads its file on the first access to its pixels, which two threads must not do at once.
@@ -174,11 +173,10 @@ class TouchReader:
                     source.image.load()
 
         def view(source: InputImage, reference: RgbImage | None) -> tuple[RgbImage, float, bytes]:
-            with fork_guard.computing():
-                image = self._resized(source)
-                level = 0.0 if reference is None else contact_level(image, reference)
-                picture = hashlib.blake2b(image.tobytes(), digest_size=16).digest()
-                return self._preprocessing.touch(image, reference), level, picture
+            image = self._resized(source)
+            level = 0.0 if reference is None else contact_level(image, reference)
+            picture = hashlib.blake2b(image.tobytes(), digest_size=16).digest()
+            return self._preprocessing.touch(image, reference), level, picture
 
         with ThreadPoolExecutor(DECODERS, "decode") as threads:
             views = [threads.map(view, grasp, no_contact_frames) for grasp in grasps]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import asdict
@@ -52,7 +53,7 @@ from retrieval.search.shard import FolderShard, ShardResult, Shards, resolve_obj
 class Searcher:
     """An opened index with its model.
 
-    Threads and forked processes may query it at the same time. Close it with `close` or a `with` block.
+    Threads may query it at the same time; open the index in each process. Close it with `close` or a `with` block.
 
     >>> searcher = retrieval.open("index")
     >>> one = searcher.query(["a.png", "b.png"], top=2)
@@ -74,6 +75,7 @@ class Searcher:
         compares_contact = check is not None and check.level_above is not None
         self.reader = TouchReader(checkpoint.config, encoder, compares_contact)
         self.catalogue = Path(self.manifest.about["catalogue"])
+        self._process = os.getpid()
 
     @classmethod
     def open(
@@ -388,6 +390,11 @@ class Searcher:
         opened = copy(self)
         if "shard" not in vars(opened):
             raise BadInput(f"this searcher of {self.index} is closed; open the index again")
+        if opened._process != os.getpid():  # its threads and their locks do not survive a fork
+            raise BadInput(
+                f"this searcher of {self.index} was opened before this process was forked; start processes with the "
+                'method "spawn" of multiprocessing, and open the index in each of them'
+            )
         return opened
 
     def _encoded(
