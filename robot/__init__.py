@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from robot.devices import Gripper as Gripper
     from robot.devices import TactileSensor as TactileSensor
     from robot.errors import RobotError as RobotError
-    from robot.grasping.planner import SpreadPlanner as SpreadPlanner
     from robot.importers import load_importer as load_importer
     from robot.readings import Frame as Frame
     from robot.readings import Pose as Pose
@@ -54,7 +53,6 @@ _MODULES = {
     "RobotError": "errors",
     "Scene": "sim.scene",
     "SharedImage": "recording.folder",
-    "SpreadPlanner": "grasping.planner",
     "TactileSensor": "devices",
     "collect": "collection",
     "draw_object": "sim.objects.draw",

@@ -73,8 +73,7 @@ def identify(
 ) -> int:
     """Grasp the object with a rig until the answer is clear; stay next to a real rig. Resumes a stopped run.
 
-    Each further grasp is planned at a height that differs much from those of the earlier grasps. Use another --out for
-    each object. With --enrol, the index remembers the grasps, and finds this object from then on.
+    Use another --out for each object. With --enrol, the index remembers the grasps, and finds this object from then on.
     """
     if enrol is not None:
         refuse_options("asks for a known object, and --enrol adds one; give one of them", expect=expect)
@@ -84,7 +83,6 @@ def identify(
     from retrieval.search.answer import EXIT_CODES, VERIFY_EXIT_CODES
     from retrieval.search.searcher import Searcher
     from robot.collection import CollectSettings, collect
-    from robot.grasping.planner import SpreadPlanner
     from robot.rig import load_rig
 
     with Searcher.open(path, model=model) as searcher:
@@ -102,7 +100,6 @@ def identify(
                 f"the model of {path} takes {searcher.reader.fingers} gel image(s) of a grasp, but the rig {rig} "
                 f"has {len(made.sensors)} sensor(s); give --model, or another rig"
             )
-        made.planner = SpreadPlanner(made.planner, run.heights_mm)
         if made.info["rig"] != "sim":  # a simulated rig has names of its own
             object_id = object_id or enrol
         attempts: set[int] = set()  # total counts of attempts: at the start, then after each new attempt
@@ -148,7 +145,6 @@ class _Run:
     far: float
     confidence: float
     grasps: int
-    heights_mm: list[float] = field(default_factory=list)
     touches: list[list[Path]] = field(default_factory=list)
     openings_mm: list[float | None] = field(default_factory=list)
     background: list[Path] | None = None
@@ -160,7 +156,6 @@ class _Run:
         from retrieval.model.gel_check import NOT_A_GEL
         from retrieval.model.verification import ACCEPT, REJECT
 
-        self.heights_mm[:] = [grasp.pose[2] for grasp in grasps if grasp.pose is not None]
         self.touches, self.openings_mm, seen = [], [], set[bytes]()
         for grasp in grasps:
             files = self._files(grasp.touches)

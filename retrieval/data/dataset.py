@@ -28,7 +28,6 @@ class Grasp:
         photo_file: The photo; None in a recording of touches only.
         touches: Gel images, one file per finger, in order a, b.
         backgrounds: No-contact frames of the same fingers, if recorded.
-        height_mm: Height of the point between the fingertips, in the rig's frame, if recorded.
         opening_mm: Distance between the fingers, if recorded.
         session: Name of the sitting in which the grasp was recorded, if stated; it does not restrict splits.
     """
@@ -39,7 +38,6 @@ class Grasp:
     photo_file: Path | None
     touches: tuple[Path, ...]
     backgrounds: tuple[Path, ...]
-    height_mm: float | None = None
     opening_mm: float | None = None
     session: str | None = None
 
@@ -134,7 +132,6 @@ def load_all_attempts(folder: Path) -> list[Attempt]:
                 photo_file=None if line.photo is None else folder / line.photo,
                 touches=in_finger_order(line.touches),
                 backgrounds=in_finger_order(line.touches_before),
-                height_mm=None if line.pose is None else line.pose[2],
                 opening_mm=line.opening_mm,
                 session=line.session,
             ),

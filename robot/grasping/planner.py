@@ -1,13 +1,12 @@
-"""Grasp planners: a cylinder pinched from above, and one that spreads the grasps of an object over its height."""
+"""The grasp planner of the paper: a cylinder pinched from above."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from _touch_retrieval.documents import Count, NonNegative, typed
-from robot.errors import PlanError, RobotConfigError, UngraspableError
+from _touch_retrieval.documents import NonNegative
+from robot.errors import PlanError
 from robot.grasping.settings import GraspSettings
 from robot.readings import RGBD, Pose, Region
 from robot.rig import GraspPlan, GraspPlanner, Rig
@@ -73,43 +72,3 @@ def plan_grasp(
             f"{above.z_mm:.0f} mm, but they must rise to {settings.floor_mm:g} mm above it"
         )
     return GraspPlan(pose, above, stroke_mm, force)
-
-
-class SpreadPlanner(GraspPlanner):
-    """Draws several grasps from another planner; plans the one whose height differs most from those of earlier grasps.
-
-    No gain over random grasps was shown for recognition (docs/answers.md).
-
-    Args:
-        planner: Draws the grasps.
-        heights_mm: Heights of the earlier grasps of the object. The caller adds each new one.
-        draws: Grasps to choose from.
-
-    >>> heights_mm = []
-    >>> with robot.load_rig("sim", seed=0) as rig:
-    ...     rig.planner = robot.SpreadPlanner(rig.planner, heights_mm)
-    """
-
-    def __init__(self, planner: GraspPlanner, heights_mm: Sequence[float], *, draws: int = 8) -> None:
-        typed(draws, Count, "draws", error=RobotConfigError)
-        self.planner, self.heights_mm, self.draws = planner, heights_mm, draws
-        self.needs_depth = planner.needs_depth
-
-    def check(self, rig: Rig) -> None:
-        """Raise RobotConfigError if the other planner cannot plan for `rig`."""
-        self.planner.check(rig)
-
-    def plan(self, rig: Rig, image: RGBD, settings: GraspSettings, rng: np.random.Generator) -> GraspPlan:
-        """Plan the grasp that is farthest from the earlier ones; raise the last error if all draws are impossible."""
-        plans: list[GraspPlan] = []
-        for _ in range(self.draws if self.heights_mm else 1):
-            try:
-                plans.append(self.planner.plan(rig, image, settings, rng))
-            except UngraspableError:
-                raise
-            except PlanError as error:
-                failed = error
-        if not plans:
-            raise failed
-        earlier = self.heights_mm
-        return max(plans, key=lambda plan: min((abs(plan.pose.z_mm - height) for height in earlier), default=0.0))

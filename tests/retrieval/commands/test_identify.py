@@ -1,6 +1,5 @@
 """`retrieve identify` on the simulated rig: when it stops, what it refuses before a motion, and how it continues."""
 
-import itertools
 import json
 
 import pytest
@@ -52,15 +51,11 @@ def test_it_stops_at_the_first_grasp_whose_answer_is_clear(identify, tmp_path, c
     assert len(json.loads(capsys.readouterr().out)["query"]["touches"]) == 1
 
 
-def test_an_unclear_answer_takes_all_grasps_at_different_heights_and_continues_where_it_was_stopped(
-    identify, tmp_path, capsys
-):
+def test_an_unclear_answer_takes_all_grasps_and_continues_where_it_was_stopped(identify, tmp_path, capsys):
     identify("--confidence", "1", "--grasps", "2")
     whole = capsys.readouterr().err
     lines = (tmp_path / "run" / "metadata.jsonl").read_text().splitlines()
     assert "grasp 2 of at most 2" in whole
-    heights_mm = sorted(grasp.pose[2] for grasp in read_recording(tmp_path / "run").grasps if grasp.grasped)
-    assert min(later - earlier for earlier, later in itertools.pairwise(heights_mm)) > 4
     # A killed run: the second grasp and all later ones are missing.
     attempts = tmp_path / "run" / "attempts.jsonl"
     last = next(row for row, line in enumerate(map(json.loads, attempts.read_text().splitlines())) if line["accepted"])
