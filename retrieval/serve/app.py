@@ -65,7 +65,6 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     """Start the parts; close them after the requests in flight are done."""
     parts: Service = app.state.service
     anyio.to_thread.current_default_thread_limiter().total_tokens = THREADS
-    await parts.decoders.start()
     if parts.history_writer:
         await asyncio.to_thread(parts.history_writer.record_pending)
     watching = asyncio.ensure_future(parts.generations.watch())
@@ -75,7 +74,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     finally:
         parts.stopping.set()
         watching.cancel()
-        await parts.decoders.close()
+        parts.decoders.close()
         for queue in (parts.queue, parts.grasps, *parts.frames.values()):
             queue.close()
         if parts.history_writer:

@@ -1,10 +1,10 @@
-"""Image decoding in separate processes: expensive pictures end with their process, and others are served meanwhile."""
+"""Image decoding in threads: others are served while expensive pictures are decoded."""
 
 import asyncio
 import base64
 import io
-import os
 import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import httpx
@@ -15,10 +15,9 @@ from PIL import Image
 from benchmarks import attacks
 from retrieval.data.images import decode
 from retrieval.data.resize import resize
-from retrieval.errors import ImageError, RetrievalError
+from retrieval.errors import ImageError
 from retrieval.serve import decoders
 from retrieval.serve.decoders import SMALL_PIXELS, Decoders
-from tests import decoding
 from tests.hostile_pictures import png_of_zeros
 from tests.serving import listening, problem
 from tests.waiting import wait_until
@@ -45,7 +44,7 @@ def with_decoders(work):
             async with asyncio.timeout(120):
                 return await work(pool)
         finally:
-            await pool.close()
+            pool.close()
 
     return asyncio.run(run())
 
@@ -67,69 +66,34 @@ def test_the_first_bad_picture_is_reported():
     assert (error.value.path, error.value.reason[:9]) == ("b", "not a PNG")
 
 
-def test_a_crashed_process_is_reported_for_its_picture_and_replaced(monkeypatch):
-    monkeypatch.setattr(decoders, "PROGRAM", decoding.DIE)
-
-    async def work(pool):
-        for _ in range(2):
-            with pytest.raises(ImageError, match="b: decoding needs more than 5 s of CPU time or 200 MB"):
-                await pool.read([("a", SMALL), ("b", LARGE)], 32)
-        return await pool.read([("a", SMALL)], 32)
-
-    assert with_decoders(work)[0].touch.shape == (32, 32, 3)
-
-
-def test_a_process_that_cannot_start_is_not_reported_as_a_bad_picture(monkeypatch):
-    monkeypatch.setattr(decoders, "PROGRAM", decoding.FAIL)
-    with pytest.raises(RetrievalError, match="ended during its start") as error:
-        read(("a", SMALL))
-    assert not isinstance(error.value, ImageError)
-
-
-LIMITED = "from retrieval.serve import decoders as d; {}; d.serve_pictures()"
-LINUX = pytest.mark.skipif(sys.platform != "linux", reason="only Linux enforces the memory limit")
-
-
-@pytest.mark.parametrize(
-    "limit",
-    [
-        "d.DECODE_CPU_S = 0; d.decode = lambda *_: any(iter(int, 1))",  # computes for ever
-        pytest.param("d.DECODE_BYTES = 5_000_000", marks=LINUX),
-    ],
-    ids=["time", "memory"],
-)
-def test_a_process_ends_beyond_its_limits_of_cpu_time_and_memory(limit, monkeypatch):
-    monkeypatch.setattr(decoders, "PROGRAM", LIMITED.format(limit))
-    with pytest.raises(ImageError, match="a: decoding needs more than 5 s of CPU time or 200 MB"):
-        read(("a", LARGE))
-
-
 def body_of(*images):
     return {"touches": [[base64.b64encode(image).decode() for image in images]]}
 
 
-def test_a_query_with_a_hanging_picture_ends_at_its_deadline_and_blocks_no_other(index, touch, monkeypatch, tmp_path):
-    monkeypatch.setattr(decoders, "PROGRAM", decoding.HANG)
-    monkeypatch.setattr("retrieval.serve.uploads.RequestPictures.named_files", _named_in(tmp_path))
+def test_a_query_with_a_slow_picture_ends_at_its_deadline_and_blocks_no_other(index, touch, monkeypatch):
+    begun, ended = threading.Event(), threading.Event()
+    read = decoders.read_gel_image
+
+    def slow_if_large(data, name, px):
+        if data == LARGE:
+            begun.set()
+            ended.wait(60)
+        return read(data, name, px)
+
+    monkeypatch.setattr(decoders, "read_gel_image", slow_if_large)
     with listening(index, deadline_s=3) as (url, parts), ThreadPoolExecutor(1) as attacker:
 
         def post(*images):
             return httpx.post(f"{url}/v1/query", json=body_of(*images), timeout=60)
 
         attack = attacker.submit(post, LARGE, LARGE)
-        wait_until(lambda: [file for file in tmp_path.iterdir() if file.read_text()])
-        (file,) = tmp_path.iterdir()  # large pictures are decoded one at a time
-        process = int(file.read_text())
-        assert is_running(process)
-        wait_until(lambda: post(*(path.read_bytes() for path in touch)).status_code == 200)  # a busy machine is late
-        problem(attack.result(), 504, "late")
-        wait_until(lambda: parts.queue.in_flight == 0)
-        wait_until(lambda: not is_running(process))
-
-
-def _named_in(folder):
-    """Name the pictures after files of a folder."""
-    return lambda pictures: [(str(folder / str(number)), data) for number, data in enumerate(pictures.files[0])]
+        try:
+            assert begun.wait(60)
+            wait_until(lambda: post(*(path.read_bytes() for path in touch)).status_code == 200)
+            problem(attack.result(), 504, "late")
+            wait_until(lambda: parts.queue.in_flight == 0)
+        finally:
+            ended.set()
 
 
 @pytest.mark.slow
@@ -142,11 +106,3 @@ def test_the_service_answers_others_during_an_attack_with_bounded_memory_and_end
     assert max(measured.health_s) < 2  # on a busy machine
     assert measured.memory_mb < attacks.MAX_MEMORY_MB
     assert measured.exit_s < attacks.MAX_EXIT_S
-
-
-def is_running(process):
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    return True
