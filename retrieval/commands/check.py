@@ -9,7 +9,7 @@ from retrieval.errors import RetrievalError
 
 def check(recording: Recording, *, split: SplitFile = None, json: Json = False) -> None:
     """Check a recording for broken files, duplicates, leakage and swapped folders."""
-    from retrieval.data.check.recording import COMPARED_COPIES, check_recording
+    from retrieval.data.check.recording import check_recording
     from retrieval.data.dataset import recording_licence
 
     findings, licence = check_recording(recording, read_split(split)), recording_licence(recording)
@@ -17,11 +17,9 @@ def check(recording: Recording, *, split: SplitFile = None, json: Json = False) 
         found = [dataclasses.asdict(finding) for finding in findings]
         print_json({"findings": found, "licence": dataclasses.asdict(licence)})
     for finding in findings:
-        if finding.kind != COMPARED_COPIES:
-            say(f"{finding.severity}: {finding.message}")
+        say(f"{finding.severity}: {finding.message}")
     say(f"licence of the data: {licence}")
     errors, warnings = (sum(finding.severity == severity for finding in findings) for severity in ("error", "warning"))
-    compared = [finding.message for finding in findings if finding.kind == COMPARED_COPIES]
-    say("; ".join([f"{recording}: {errors} error(s), {warnings} warning(s)", *compared]))
+    say(f"{recording}: {errors} error(s), {warnings} warning(s)")
     if errors:
         raise RetrievalError(f"{recording} is not suitable for training; see the errors above")

@@ -1,1 +1,1 @@
-"""Checks of a recording: broken files, near copies, swapped folders, leakage."""
+"""Checks of a recording: broken files, copies, swapped folders, leakage."""

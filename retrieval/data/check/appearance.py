@@ -17,8 +17,6 @@ from retrieval.data.dataset import Grasp
 
 Rows = NDArray[np.int64]
 
-COLOUR_LAYOUT = "colour-layout"
-"""Kind of the findings of `check_colour_layout`."""
 CHANGES = {
     "red and blue exchanged": (slice(None), slice(None), slice(None), slice(None, None, -1)),
     "left and right mirrored": (slice(None), slice(None), slice(None, None, -1)),
@@ -177,4 +175,4 @@ def check_colour_layout(grasps: Sequence[Grasp], records: ImageRecords) -> Itera
         for moment in ("touch", "no-contact frame"):
             names = [frames[row][0].grasp_id for row in rows if frames[row][1] == moment]
             text = f"{moment} of finger {ascii_lowercase[finger]} looks as if it had {change}, unlike the others,"
-            yield from findings_for("warning", COLOUR_LAYOUT, text, names, grasps)
+            yield from findings_for("warning", "colour-layout", text, names, grasps)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from retrieval.console.output import abbreviate_list
 from retrieval.console.progress import Bar
-from retrieval.data.check.near_copies import Greys, thumbnail
 from retrieval.data.dataset import Grasp
 from retrieval.data.images import decode_rgb, read_bytes
 from retrieval.data.resize import resize
@@ -59,13 +58,11 @@ class ImageRecord:
         digest: SHA-256 (hex) of the file's bytes.
         is_flat: Whether the picture has one colour only.
         small: The picture at (6, 8, 3).
-        thumbnail: Data for finding near copies, for accepted photos and touches only.
     """
 
     digest: str
     is_flat: bool
     small: NDArray[np.float32]
-    thumbnail: Greys | None
 
 
 ImageRecords = dict[Path, ImageRecord]
@@ -81,14 +78,8 @@ def fingers_of(grasps: Sequence[Grasp]) -> range:
     return range(min((len(grasp.touches) for grasp in grasps), default=0))
 
 
-def read_pictures(
-    files: Collection[Path], copied: Collection[Path] = frozenset()
-) -> tuple[ImageRecords, dict[Path, str]]:
+def read_pictures(files: Collection[Path]) -> tuple[ImageRecords, dict[Path, str]]:
     """Read each file once, with a progress bar on stderr.
-
-    Args:
-        files: The pictures.
-        copied: Those that are also reduced to thumbnails.
 
     Returns:
         The data of each readable file, and the reason for each other file.
@@ -100,9 +91,8 @@ def read_pictures(
             image = decode_rgb(data, path)
         except ImageError as error:
             return error.reason
-        reduced = thumbnail(image) if path in copied else None
         is_flat = bool(np.ptp(image, axis=(0, 1)).max() <= _FLAT)
-        return ImageRecord(sha256(data).hexdigest(), is_flat, resize(image, _SMALL), reduced)
+        return ImageRecord(sha256(data).hexdigest(), is_flat, resize(image, _SMALL))
 
     found: dict[Path, ImageRecord | str] = {}
     paths = sorted(files)

@@ -7,21 +7,14 @@ concerns appearance, or something missing: inspect the recording. A NOTE reports
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from string import ascii_lowercase
-
-import numpy as np
 
 from retrieval.console.output import abbreviate_list
 from retrieval.data.check import appearance
 from retrieval.data.check.drift import check_drift, check_sessions
-from retrieval.data.check.near_copies import nearest_pictures
 from retrieval.data.check.opening import check_openings
-from retrieval.data.check.pictures import Finding, ImageRecords, findings_for, fingers_of, read_pictures
+from retrieval.data.check.pictures import Finding, ImageRecords, findings_for, read_pictures
 from retrieval.data.check.split import check_split
 from retrieval.data.dataset import Attempt, Grasp, Split, load_all_attempts, require_accepted
-
-COMPARED_COPIES = "compared-copies"
-"""Kind of the finding that reports how many pictures were compared for near copies."""
 
 
 def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
@@ -45,10 +38,7 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
     """
     attempts = load_all_attempts(folder)
     accepted = require_accepted(folder, attempts)
-    records, broken = read_pictures(
-        {path for attempt in attempts for path in _pictures(attempt)},
-        copied={path for grasp in accepted for path in (*grasp.photos, *grasp.touches)},
-    )
+    records, broken = read_pictures({path for attempt in attempts for path in _pictures(attempt)})
     findings = [Finding("error", "broken", f"{path.relative_to(folder)}: {reason}") for path, reason in broken.items()]
     findings += _single_grasps(accepted)
     if any(grasp.photos for grasp in accepted):
@@ -57,8 +47,8 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
     findings += _duplicates(folder, [attempt.grasp for attempt in attempts], records)
     readable = [attempt for attempt in attempts if not broken.keys() & set(_pictures(attempt))]
 
-    def unnamed(attempts: Sequence[Attempt], besides: str = "") -> list[Grasp]:  # by findings of other kinds
-        named = {name for finding in findings if finding.kind != besides for name in finding.grasps}
+    def unnamed(attempts: Sequence[Attempt]) -> list[Grasp]:
+        named = {name for finding in findings for name in finding.grasps}
         return [attempt.grasp for attempt in attempts if attempt.grasp.grasp_id not in named]
 
     findings += _same_or_flat_images(readable, records)
@@ -77,8 +67,6 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
         used.sort(key=lambda attempt: attempt.time_s or 0.0)
     findings += check_drift(unnamed(used), records)
     findings += check_sessions(accepted)
-    # A mirrored image may be a near copy, too.
-    findings += _near_copies(unnamed(used, besides=appearance.COLOUR_LAYOUT), records, accepted)
     findings += check_openings(accepted)
     if split:
         findings += check_split(accepted, split)
@@ -172,45 +160,3 @@ def _shared_backgrounds(grasps: Sequence[Grasp], records: ImageRecords) -> Itera
             f"{len(set(served.values()))} objects: drift since such a frame was taken stays in its difference "
             "from the touch and may identify the object; compare with the controls of `retrieve evaluate`",
         )
-
-
-def _near_copies(grasps: Sequence[Grasp], records: ImageRecords, accepted: Sequence[Grasp]) -> Iterator[Finding]:
-    """Find near copies of pictures of another object, and count the pictures that were compared.
-
-    A near copy of a touch is only a warning: smooth objects that are pressed in the same way look alike. (68 pairs
-    among 4,991 touches of boxes, mugs and bowls in VT60; no inspected pair was a copy.)
-    """
-    counts, low_contact, left_out = [], 0, 0
-    for kind, every in _by_kind(accepted).items():
-        items = list(_by_kind(grasps).get(kind, {}).items())
-        thumbnails = [one for path, _ in items if (one := records[path].thumbnail) is not None]
-        nearest, is_checked, is_copy = nearest_pictures(thumbnails, [grasp.object_id for _, grasp in items])
-        pairs: dict[tuple[int, ...], str] = {}
-        for row in np.flatnonzero(is_copy).tolist():
-            (path, grasp), (near, other) = items[row], items[nearest[row]]
-            if records[path].digest != records[near].digest:
-                pairs[tuple(sorted((row, int(nearest[row]))))] = f"{grasp.grasp_id} and {other.grasp_id}"
-        if pairs:
-            text = f"{len(pairs)} pair(s) of images ({kind}) of two objects are near copies of each other"
-            severity, or_else = (
-                ("error", "") if kind == "photo" else ("warning", ", or the touches of these objects are similar")
-            )
-            yield Finding(severity, "near-copy", f"{text}{or_else}: {abbreviate_list(list(pairs.values()))}")
-        counts.append(f"{is_checked.sum()} of {len(every)} images ({kind})")
-        low_contact += int((~is_checked).sum())
-        left_out += len(every) - len(items)
-    text = f"near copies were searched for in {', '.join(counts)}"
-    if low_contact:
-        text += f"; {low_contact} show too little to recognise a copy (little contact, or too many similar pictures)"
-    if left_out:
-        text += f"; {left_out} belong to grasps that are named above"
-    yield Finding("note", COMPARED_COPIES, text)
-
-
-def _by_kind(grasps: Sequence[Grasp]) -> dict[str, dict[Path, Grasp]]:
-    """Return, for photos and for the touches of each finger, one grasp for each picture file."""
-    photos = {path: grasp for grasp in grasps for path in grasp.photos}
-    kinds = {"photo": photos} if photos else {}
-    for finger in fingers_of(grasps):
-        kinds[f"touch {ascii_lowercase[finger]}"] = {grasp.touches[finger]: grasp for grasp in grasps}
-    return kinds

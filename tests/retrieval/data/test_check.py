@@ -243,38 +243,6 @@ def test_an_import_prints_the_warning_about_exchanged_channels_and_succeeds(tmp_
     assert "in 1 of 8 grasps" in line
 
 
-COPIES = {  # source, target, whether the fine relief of drawn touches is kept
-    "JPEG 20": (0, 6, False, lambda image: cv2.imdecode(cv2.imencode(".jpg", image, [1, 20])[1], 1)),
-    "gain 1.1": (5, 11, True, lambda image: np.clip(np.rint(1.1 * image), 0, 255).astype(np.uint8)),
-    "2 px": (10, 16, False, lambda image: np.pad(image, ((2, 0), (0, 2), (0, 0)), "reflect")[:-2, 2:]),
-    "mirrored": (15, 21, True, lambda image: image[:, ::-1]),
-    "upside down": (20, 26, True, lambda image: image[::-1]),
-}
-
-
-def test_near_copies_of_another_object_are_named(broken):
-    for source, target, _, change in COPIES.values():
-        for column in ("photo", "touch_a", "touch_b"):
-            image = change(cv2.imread(str(broken.file(source, column))))
-            broken.edit(target, column, lambda _, image=image: image)
-    found = {
-        re.search(r"images \((.*?)\) of two objects", finding.message)[1]: finding
-        for finding in remarks(broken.folder)
-        if finding.kind == "near-copy"
-    }
-    assert {kind: finding.severity for kind, finding in found.items()} == {
-        "photo": "error",
-        "touch a": "warning",
-        "touch b": "warning",
-    }
-    for kind, finding in found.items():
-        for source, target, is_gentle, _ in COPIES.values():
-            one, other = broken.names((source, target))
-            is_named = f"{one} and {other}" in finding.message or f"{other} and {one}" in finding.message
-            assert is_named or (kind != "photo" and not is_gentle)
-    assert found["photo"].message.startswith("5 pair(s)")
-
-
 def let_drift(broken, order=range(30), columns=GELS):
     """Raise the brightness of the gel images by 20 % in this order of the lines."""
     for place, number in enumerate(order):

@@ -1,35 +1,12 @@
 """Statistics of the checks of a recording, compared with plain loops and with hand-made images."""
 
-from itertools import product
-
 import cv2
 import numpy as np
 import pytest
 
 from retrieval.data.check.appearance import CHANGES, changed_layout, swapped_fingers
 from retrieval.data.check.drift import nearest_grasp_accuracy
-from retrieval.data.check.near_copies import flip_greys, nearest_pictures, shapes, thumbnail
 from tests.data import touch_data
-
-
-def scene(seed, size=(120, 160)):
-    """Return a gel of one tint, dark at its edges, with a soft random dent."""
-    y, x = np.mgrid[-1 : 1 : size[0] * 1j, -1 : 1 : size[1] * 1j]
-    dent = cv2.resize(np.random.default_rng(seed).normal(size=(5, 6)), size[::-1], interpolation=cv2.INTER_CUBIC)
-    gel = 140 - 30 * (x * x + y * y) + 12 * dent
-    return np.clip(gel, 0, 255)[..., None].repeat(3, axis=2).astype(np.float32) / 255
-
-
-def test_the_nearest_picture_of_another_object_equals_that_of_plain_loops():
-    thumbnails = [thumbnail(scene(seed)) for seed in range(7)]
-    greys = np.stack([one[0] for one in thumbnails])
-    common = np.median(greys, axis=0)
-    unit = [shapes(one[None], common)[0] for one in greys]
-    rows, _, _ = nearest_pictures(thumbnails, [f"object {row}" for row in range(7)])
-    for query in range(7):
-        turned = [shapes(flip_greys(greys[[query]], flip), common)[0] for flip in product((1, -1), repeat=2)]
-        distances = {row: min(1 - float(turn @ unit[row]) for turn in turned) for row in range(7) if row != query}
-        assert rows[query] == min(distances, key=distances.get)
 
 
 def test_similar_fingers_cannot_be_checked_and_are_not_reported_as_swapped():
