@@ -45,7 +45,6 @@ if TYPE_CHECKING:
     from retrieval.search.answer import Match as Match
     from retrieval.search.answer import QueryResult as QueryResult
     from retrieval.search.answer import Verification as Verification
-    from retrieval.search.embeddings import embed_photos as embed_photos
     from retrieval.search.searcher import Searcher as Searcher
     from retrieval.search.searcher import enrol as enrol
     from retrieval.serve.client import Client as Client
@@ -75,7 +74,6 @@ _MODULES = {
     "Verification": "search.answer:Verification",
     "build_index": "indexing.build:build_index",
     "check_recording": "data.check.recording:check_recording",
-    "embed_photos": "search.embeddings:embed_photos",
     "encode_photos": "model.encode:encode_photos",
     "encode_touches": "model.encode:encode_touches",
     "enrol": "search.searcher:enrol",

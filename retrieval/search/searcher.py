@@ -237,12 +237,22 @@ class Searcher:
     def encode(self, touches: AnyTouches, *, background: Sequence[AnyImage] | None = None) -> EncodedTouches:
         """Return the unit embeddings (G, embedding_dim) and partial activations (G, touch_partial_width) of G grasps.
 
-        The inner product of a grasp's embedding with a photo's (`retrieval.embed_photos`) orders candidates; it is not
+        The inner product of a grasp's embedding with a photo's (`retrieval.encode_photos`) orders candidates; it is not
         a probability. `searcher.scorer.logits(partials, photo_partials)` gives match logits, summed over the grasps.
 
         Args:
             touches: As for `query`.
             background: As for `query`.
+
+        >>> checkpoint = retrieval.load_checkpoint("model.safetensors")
+        >>> files = ["catalog/mug/1.jpg", "catalog/tin/1.jpg"]
+        >>> photos = retrieval.encode_photos(checkpoint.matcher, map(checkpoint.config.preprocessing.load_photo, files))
+        >>> with retrieval.open("index") as searcher:
+        ...     embeddings, partials = searcher.encode(["a.png", "b.png"])
+        ...     logits = searcher.scorer.logits(partials, photos.partial.numpy())
+        >>> scores = embeddings @ photos.embedding.numpy().T  # a row for each grasp
+        >>> scores.shape, logits.shape
+        ((1, 2), (2,))
         """
         opened = self._snapshot()
         grasps = parse_grasps(touches, opened.reader.fingers)

@@ -67,7 +67,7 @@ def test_importing_the_packages_and_listing_their_names_imports_no_large_package
     code = "import retrieval, robot, indexes\nprint(dir(retrieval), dir(robot), dir(indexes), indexes.load_kind)"
     done = run_blocked(code, HEAVY)
     assert done.returncode == 0, done.stderr
-    for name in ("open", "embed_photos", "read_recording", "IndexStore", "__getattr__"):
+    for name in ("open", "encode_photos", "read_recording", "IndexStore", "__getattr__"):
         assert f"'{name}'" in done.stdout
 
 

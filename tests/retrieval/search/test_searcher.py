@@ -14,6 +14,7 @@ from PIL import Image
 import retrieval
 from retrieval.errors import BadInput, ImageError
 from retrieval.model.checkpoint import load_checkpoint
+from retrieval.model.touch_reader import EncodedTouches
 from retrieval.search.searcher import Searcher
 
 
@@ -79,9 +80,15 @@ def test_a_running_query_finishes_when_the_searcher_is_closed(index, touch, monk
     assert ranking(searcher.query(touch)) == expected
 
 
+def encoded_photos(paths, model):
+    checkpoint = load_checkpoint(model)
+    code = retrieval.encode_photos(checkpoint.matcher, map(checkpoint.config.preprocessing.load_photo, paths))
+    return EncodedTouches(code.embedding.numpy(), code.partial.numpy())
+
+
 def test_the_inner_product_of_embeddings_is_the_score_of_candidate_search(searcher, grasps, catalogue, model):
     rows = list(searcher.generation.rows)
-    photos = retrieval.embed_photos([catalogue / row.path for row in rows], model=model)
+    photos = encoded_photos([catalogue / row.path for row in rows], model)
     touches = searcher.encode(grasps[0])
     np.testing.assert_allclose(np.linalg.norm(touches.embeddings, axis=1), 1, atol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(photos.embeddings, axis=1), 1, atol=1e-6)
@@ -93,29 +100,10 @@ def test_the_inner_product_of_embeddings_is_the_score_of_candidate_search(search
 
 def test_the_scorer_gives_the_logits_of_two_partials(searcher, grasps, catalogue, model):
     paths = [row.path for row in searcher.generation.rows][::5]
-    photos = retrieval.embed_photos([catalogue / path for path in paths], model=load_checkpoint(model))
+    photos = encoded_photos([catalogue / path for path in paths], model)
     partials, stored = searcher.encode(grasps[0]).partials, searcher.generation.arrays["partials"]
     expected = searcher.scorer.logits(partials, stored, np.arange(0, len(stored), 5))
     np.testing.assert_allclose(searcher.scorer.logits(partials, photos.partials), expected, atol=0.01)  # float16
-
-
-def test_photos_are_embedded_from_paths_bytes_images_and_arrays(catalogue, model):
-    path = sorted(catalogue.rglob("*.jpg"))[0]
-    photos = [path, path.read_bytes(), Image.open(path), array(path)]
-    code = retrieval.embed_photos(photos, model=model)
-    for embedding in code.embeddings[1:]:
-        np.testing.assert_allclose(embedding, code.embeddings[0], atol=1e-6)
-
-
-def test_no_photo_or_a_bad_one_raises(catalogue, model):
-    with pytest.raises(BadInput, match="photos must contain at least one photo"):
-        retrieval.embed_photos([], model=model)
-    with pytest.raises(BadInput, match="photos must be a list; put a single photo into"):
-        retrieval.embed_photos("catalog/mug/1.jpg", model=model)
-    with pytest.raises(ImageError, match=r"photo 1: an image must be a path, .*, got int"):
-        retrieval.embed_photos([5], model=model)
-    with pytest.raises(ImageError, match=r"photo 2: an array must contain uint8"):
-        retrieval.embed_photos([sorted(catalogue.rglob("*.jpg"))[0], np.zeros((4, 4, 3))], model=model)
 
 
 def resident_mb():
