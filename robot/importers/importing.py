@@ -46,8 +46,6 @@ NOT_STATED = "not stated"
 
 SPLITS_FOLDER = "splits"
 SOURCES_FILE = "sources.json"
-_MAX_OPENING_MM = 200.0
-"""Largest opening that is believed: more may be the angle of a joint, or another unit."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +150,6 @@ def import_items(
     with RecordingWriter(out, data_set.info()) as writer:
         _check_same_import(writer, data_set, source, options)
         names: set[str] = set()
-        openings: list[str] = []
         infinite: list[str] = []
         for done, item in enumerate(_readable(items), start=1):
             if isinstance(item, Skip):
@@ -160,9 +157,6 @@ def import_items(
             else:
                 finite = {key: value for key, value in item.fields.items() if not _is_infinite(value)}
                 infinite += [key for key in item.fields if key not in finite]
-                opening = finite.get("opening_mm")
-                if isinstance(opening, float) and not 0 <= opening <= _MAX_OPENING_MM:
-                    openings.append(f"{opening:.0f} mm")
                 skip = _append(writer, replace(item, fields=finite), names)
                 stored = writer.info.get("left_out", {})
                 if item.left_out.items() - stored.items():
@@ -176,12 +170,6 @@ def import_items(
             raise ImporterError(f"no grasp could be imported: {'; '.join(skips) or 'the source contains none'}")
         if split is not None:
             notes = [*_write_split(out, split), *notes]
-        if openings:
-            notes.insert(
-                0,
-                f"the opening of {len(openings)} grasp(s), such as {openings[0]}, is doubtful: grippers open 0 to "
-                f"{_MAX_OPENING_MM:.0f} mm; the source may state an angle, or another unit",
-            )
         if infinite:
             notes.insert(0, f"left out {len(infinite)} number(s) that are not finite, such as {infinite[0]}")
         if left_out := writer.info.get("left_out", {}):
