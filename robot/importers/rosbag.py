@@ -3,12 +3,11 @@
     <name>.bag                                        ROS 1
     <name>/metadata.yaml    <name>/<name>_0.mcap      ROS 2, or .db3 (SQLite)
     <name>.mcap             <name>.db3                ROS 2, a file without its folder
-    <name>.db3.zstd         <name>.bag.active         compressed by rosbag2, or left by a crash
 
-The package rosbags (extra `importers`) reads them without ROS. The content decides what is a bag. The source is a bag
-or a folder of bags. A bag is a sequence; with a topic of names (`object`) the grasps of one object in a bag are. The
-options name its topics; `touch_b` is empty for a sensor with one finger. Images are sensor_msgs/Image (rgb8, bgr8,
-mono8, rgba8, bgra8) or CompressedImage, whose files are stored unchanged.
+The package rosbags (extra `importers`) reads them without ROS. The source is a bag or a folder of bags. Decompress a
+file that was compressed without its folder first (`zstd -d`). A bag is a sequence; with a topic of names (`object`) the
+grasps of one object in a bag are. The options name its topics; `touch_b` is empty for a sensor with one finger. Images
+are sensor_msgs/Image (rgb8, bgr8, mono8, rgba8, bgra8) or CompressedImage, whose files are stored unchanged.
 
 A grasp lasts while the gel of any finger differs from the first usable image of its bag (black, dim or blue first
 images of a camera are left out and counted) over the fraction `contact` of its area, by the rule of the contact-area
@@ -27,8 +26,6 @@ Repair a bag whose recording was cut off before you import it: `rosbag reindex` 
 
 import contextlib
 import re
-import shutil
-import tempfile
 from array import array
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -44,7 +41,6 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from _touch_retrieval.documents import NonNegative, typed
-from _touch_retrieval.files import open_regular
 from _touch_retrieval.names import is_system_name
 from robot.errors import ImporterError
 from robot.grasping.gates import ContactAreaGate, GraspFrames
@@ -80,14 +76,12 @@ DATA_SET = DataSet(
 )
 _Contact = Annotated[float, Meta(gt=0, le=1)]
 _SUFFIXES = (".bag", ".mcap", ".db3")
-_MAGIC = {b"#ROSBAG V2": ".bag", b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3\0": ".db3"}
-"""First bytes of each kind of bag -> suffix by which rosbags knows it."""
-_ZSTD = b"\x28\xb5\x2f\xfd"
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _RGB_OF = {"rgb8": [0, 1, 2], "bgr8": [2, 1, 0], "mono8": [0, 0, 0], "rgba8": [0, 1, 2], "bgra8": [2, 1, 0]}
 """Channels of red, green and blue in each encoding."""
 _REPAIR = (
-    "if its recording was cut off, repair it: rosbag reindex (ROS 1), mcap recover (MCAP), ros2 bag reindex (folder)"
+    "if its recording was cut off, repair it: rosbag reindex (ROS 1), mcap recover (MCAP), ros2 bag reindex (folder); "
+    "if the file is compressed, decompress it: zstd -d"
 )
 
 
@@ -185,49 +179,12 @@ def _storage_files(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
     inside = (file for _, file in numbered_files(path, re.compile(".*", re.DOTALL)) if file.is_file())
-    return [file for file in inside if _is_bag(file) and _kind(file) != ".bag"]
+    return [file for file in inside if _is_bag(file) and ".bag" not in file.suffixes]
 
 
 def _is_bag(path: Path) -> bool:
-    """Whether a file is a bag by its content, or at least by its name."""
-    return bool(_kind(path)) or not set(_SUFFIXES).isdisjoint(path.suffixes)
-
-
-def _kind(path: Path) -> str:
-    """Return the suffix of the kind of bag that the content of a file is; empty for other files."""
-    start = b""
-    with contextlib.suppress(OSError, EOFError), open_regular(path) as file:
-        start = file.read(16)
-        if start.startswith(_ZSTD):
-            file.seek(0)
-            start = _zstd().open(file).read(16)
-    return next((suffix for magic, suffix in _MAGIC.items() if start.startswith(magic)), "")
-
-
-def _zstd() -> Any:
-    """Return the module for zstd that rosbags uses."""
-    return import_extra("rosbags.rosbag2.reader", "a ROS bag").zstd
-
-
-def _with_suffix(path: Path, folder: Path) -> Path:
-    """Return a bag under a name by which rosbags knows its kind: itself, or a link or decompressed copy in `folder`."""
-    log = path.with_name(f"{path.name}-wal")
-    if log.is_file() and log.stat().st_size:
-        raise ImporterError(
-            f"a crash left messages in {log.name}; add them: sqlite3 {path.name} 'PRAGMA wal_checkpoint(TRUNCATE)'"
-        )
-    kind = _kind(path)
-    if kind in ("", path.suffix):
-        return path
-    named = folder / f"{path.name}{kind}"
-    with open_regular(path) as file:
-        if file.read(4) != _ZSTD:
-            named.symlink_to(path.resolve())
-            return named
-        file.seek(0)
-        with open(named, "wb") as out:
-            shutil.copyfileobj(_zstd().open(file), out)
-    return named
+    """Whether a file is named like a bag; one that rosbags cannot read, such as a compressed one, is reported."""
+    return not set(_SUFFIXES).isdisjoint(path.suffixes)
 
 
 class Bag(contextlib.AbstractContextManager["Bag"]):
@@ -242,20 +199,22 @@ class Bag(contextlib.AbstractContextManager["Bag"]):
     """
 
     def __init__(self, path: Path) -> None:
-        plain = Path(path.stem) if path.suffix in (".zstd", ".zst", ".active") else path
-        self.name = plain.stem if path.is_file() else path.name
+        self.name = path.stem if path.is_file() else path.name
         reader = import_extra("rosbags.highlevel", "a ROS bag").AnyReader
         types = import_extra("rosbags.typesys", "a ROS bag")
-        self._folder = tempfile.TemporaryDirectory()
+        files = [path] if path.is_dir() and _has_metadata(path) else _storage_files(path)
+        for file in _storage_files(path):
+            log = file.with_name(f"{file.name}-wal")
+            if log.is_file() and log.stat().st_size:
+                raise ImporterError(
+                    f"its bag is incomplete: a crash left messages in {log.name}; add them: sqlite3 {file.name} "
+                    "'PRAGMA wal_checkpoint(TRUNCATE)'"
+                )
         try:
-            files = [_with_suffix(file, Path(self._folder.name)) for file in _storage_files(path)]
-            if path.is_dir() and _has_metadata(path):
-                files = [path]
             # The types are for older bags, which do not contain their definitions.
             self._reader = reader(files, default_typestore=types.get_typestore(types.Stores.LATEST))
             self._reader.open()
         except Exception as error:  # rosbags raises many types for damaged files
-            self._folder.cleanup()
             raise ImporterError(f"its bag cannot be read: {error}; {_REPAIR}") from error
         self.topics = {connection.topic: connection.msgtype for connection in self._reader.connections}
 
@@ -276,7 +235,6 @@ class Bag(contextlib.AbstractContextManager["Bag"]):
 
     def __exit__(self, *_: object) -> None:
         self._reader.close()
-        self._folder.cleanup()
 
 
 def picture_of(message: Any) -> NDArray[np.uint8] | bytes:

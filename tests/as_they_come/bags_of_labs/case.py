@@ -1,4 +1,4 @@
-"""The content decides what is a bag; pictures with alpha are read; a number that cannot be costs no grasp."""
+"""Bags with and without their folder, pictures with alpha, and a number that cannot be, which costs no grasp."""
 
 import shutil
 
@@ -32,21 +32,18 @@ def check(folder, get):
         for name, encoding in (("a.bag", "rgba8"), ("sqlite", "bgra8"), ("mcap", "rgba8"))
     )
     (database,), (log,) = sqlite.glob("*.db3"), mcap.glob("*.mcap")
-    (source / "zipped.db3.zstd").write_bytes(zstd.compress(database.read_bytes()))
-    shutil.copy(ros1, source / "crashed.bag.active")
-    shutil.copy(log, source / "no-suffix")
-    shutil.copy(ros1, source / "wrong.db3")
-    for name in ("zipped folder", "empty metadata"):
-        (source / name).mkdir()
-    (source / "zipped folder/0.mcap.zstd").write_bytes(zstd.compress(log.read_bytes()))
-    shutil.copy(database, source / "empty metadata/0.sqlite")
+    shutil.copy(ros1, source / "one.bag")
+    shutil.copy(log, source / "two.mcap")
+    (source / "empty metadata").mkdir()
+    shutil.copy(database, source / "empty metadata/0.db3")
     (source / "empty metadata/metadata.yaml").write_text('rosbag2_bagfile_information:\n  storage_identifier: ""')
     (source / "notes.txt").write_text("no bag")
-    (source / "other.zst").write_bytes(zstd.compress(b"no bag either"))
+    (source / "zipped.db3.zstd").write_bytes(zstd.compress(database.read_bytes()))
     recording = import_rosbag(source, folder / "out")
-    names = {"crashed", "empty metadata", "no-suffix", "wrong", "zipped", "zipped folder"}
+    names = {"empty metadata", "one", "two"}
     assert {grasp.object_id for grasp in recording.grasps} == names
-    assert recording.info["skipped"] == {}
+    (reason,) = recording.info["skipped"]
+    assert "decompress it: zstd -d" in reason
     before = import_rosbag(rosbag.write_bag(folder / "plain.bag", rosbag.messages()), expected).grasps
     pictures = [(expected / grasp.touches["a"]).read_bytes() for grasp in before]
     assert [(folder / "out" / grasp.touches["a"]).read_bytes() for grasp in recording.grasps] == pictures * len(names)
