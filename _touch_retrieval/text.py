@@ -9,7 +9,6 @@ import csv
 import io
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import zip_longest
 
 _MARKS = {  # that of UTF-32 begins like that of UTF-16
@@ -37,63 +36,49 @@ def decode_text(data: bytes) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-@dataclass(frozen=True)
-class Table:
-    """A table of text.
+def read_numbers(data: bytes, columns: Sequence[str]) -> list[list[float]]:
+    r"""Return the numbers in some columns of a CSV file, row by row.
 
-    Attributes:
-        rows: (number of the line, column -> text) for each row that is not empty.
-        delimiter: What separates the cells.
-    """
-
-    rows: list[tuple[int, dict[str, str]]]
-    delimiter: str
-
-    def number(self, text: str) -> float:
-        """Return the number in a cell; a comma is its decimal mark unless commas separate the cells.
-
-        Raises:
-            ValueError: It is no number, or it may have a separator of thousands.
-        """
-        if "," in text and (self.delimiter == "," or "." in text):
-            raise ValueError(f"must be a number without separators of thousands, got {text!r}")
-        number = float(text.replace(",", ".").replace("\N{MINUS SIGN}", "-"))
-        if not math.isfinite(number):
-            raise ValueError(f"must be a finite number, got {text!r}")
-        return number
-
-    def numbers(self, columns: Sequence[str]) -> list[list[float]]:
-        """Return the numbers of some columns, row by row. Raises ValueError, which names the line and the column."""
-        found = []
-        marks = {mark for _, row in self.rows for column in columns for mark in ",." if mark in row[column]}
-        for line, row in self.rows:
-            for column in columns:
-                try:
-                    if len(marks) > 1:
-                        raise ValueError("some numbers have a comma and some a point; remove separators of thousands")
-                    found.append(self.number(row[column]))
-                except ValueError as error:
-                    raise ValueError(f"line {line}: {column}: {error}") from error
-        return [found[at : at + len(columns)] for at in range(0, len(found), len(columns))]
-
-
-def read_table(data: bytes, columns: Sequence[str]) -> Table:
-    r"""Read a CSV file whose first line names its columns, in any order and among others.
-
-    Cells are separated by commas, semicolons, tabs, bars or spaces, as the first line shows. Spaces around a cell,
-    the case of column names and empty rows do not matter.
+    The first line of the file names its columns, in any order and among others. Cells are separated by commas,
+    semicolons, tabs, bars or spaces, as this line shows. Spaces around a cell, the case of column names and empty rows
+    do not matter. A comma is the decimal mark unless commas separate the cells.
 
     Args:
         data: Content of the file.
         columns: Names of the required columns, in lower case.
 
     Raises:
-        ValueError: It is no such table. The message names the missing columns and those that were found, or the line.
+        ValueError: It is no such table, a cell is no finite number, or numbers may have separators of thousands. The
+            message names the missing columns and those that were found, or the line and the column.
 
-    >>> read_table(b"Shelf;Width\n B 4;1,5\n", ["width"]).numbers(["width"])
+    >>> read_numbers(b"Shelf;Width\n B 4;1,5\n", ["width"])
     [[1.5]]
     """
-    text = decode_text(data)
+    rows, delimiter = _read_rows(decode_text(data), columns)
+    marks = {mark for _, row in rows for column in columns for mark in ",." if mark in row[column]}
+    found = []
+    for line, row in rows:
+        for column in columns:
+            try:
+                if len(marks) > 1:
+                    raise ValueError("some numbers have a comma and some a point; remove separators of thousands")
+                found.append(_number(row[column], delimiter))
+            except ValueError as error:
+                raise ValueError(f"line {line}: {column}: {error}") from error
+    return [found[at : at + len(columns)] for at in range(0, len(found), len(columns))]
+
+
+def _number(text: str, delimiter: str) -> float:
+    if "," in text and (delimiter == "," or "." in text):
+        raise ValueError(f"must be a number without separators of thousands, got {text!r}")
+    number = float(text.replace(",", ".").replace("\N{MINUS SIGN}", "-"))
+    if not math.isfinite(number):
+        raise ValueError(f"must be a finite number, got {text!r}")
+    return number
+
+
+def _read_rows(text: str, columns: Sequence[str]) -> tuple[list[tuple[int, dict[str, str]]], str]:
+    """Return (number of the line, column -> text) of each row that is not empty, and what separates the cells."""
     head, _, rest = text.partition("\n")
     if skipped := head.lower().startswith("sep="):  # a hint for Excel
         text, head = rest, rest.partition("\n")[0]
@@ -113,4 +98,4 @@ def read_table(data: bytes, columns: Sequence[str]) -> Table:
     for line, row in rows:
         if any(row[len(names) :]):
             raise ValueError(f"line {line}: it has {len(row)} cells for {len(names)} columns")
-    return Table([(line, dict(zip_longest(names, row[: len(names)], fillvalue=""))) for line, row in rows], delimiter)
+    return [(line, dict(zip_longest(names, row[: len(names)], fillvalue=""))) for line, row in rows], delimiter

@@ -98,8 +98,8 @@ from other episodes.** `retrieve evaluate` leaves own photos out; a catalogue of
 
 **RCT** (arXiv 2606.31694; 9.2 GB on figshare): a robot pressed three DIGITs on 122 materials; 1,832 presses, 29,279
 frames, a photo of each material, splits by material and by sensor. On held-out materials its authors find the text of a
-touch first in 25.1 % (± 6.1). The options of [`rct`](#rct) name its folders. These are flat materials and one finger,
-not objects in a hand.
+touch first in 25.1 % (± 6.1). [`folder`](#other-data-sets) reads it. These are flat materials and one finger, not
+objects in a hand.
 
 **The Feeling of Success**
 ([files](https://opara.zih.tu-dresden.de/items/d5c56810-fc26-4b53-8201-acb75ff055ac); older links are dead): 9,269
@@ -117,6 +117,7 @@ plug-in](extending.md).
 | --- | --- |
 | SSVTP | `touch=images_tac/image_{object}_tac photo=images_rgb/image_{object}_rgb`; each pair is an object |
 | TVL, part HCT | `touch={data}/{object}/tactile/{frame} photo={data}/{object}/vision/{frame}` |
+| RCT | `touch=tactile/{object}/{position}/{sensor}/{frame} photo=rgb/{object}`, with the names of its folders |
 | X-Capture | `touch={object}/{point}/*_tactile photo={object}/{point}/*_rgb` |
 | YCB-Slide | `touch=real/{object}/{log}/frames/{n}00 photo=real/{object}/{log}/webcam_frames/{n}00` |
 | HapticMatch | none, write a [plug-in](extending.md): the height maps are pickled |

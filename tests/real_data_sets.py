@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from tests.miniatures import billets, estimate_modulus, feeling_of_success, objectfolder, physiclear, rct, vt60
+from tests.miniatures import billets, estimate_modulus, feeling_of_success, objectfolder, physiclear, vt60
 
 CLASSES = ("01_stapler", "02_bottleempty", "03_ball", "04_box", "05_bear", "06_shoe", "07_mug", "09_bowl", "10_can")
 
@@ -21,7 +21,6 @@ def write_billets(folder: Path) -> None:
 def write(folder: Path) -> None:
     write_vt60(folder / "vt60", instances=3)
     write_billets(folder / "billets")
-    rct.write(folder / "rct", [f"material-{number}" for number in range(50)])
     names = [str(number) for number in range(1, 25)]
     split = {"train": names[:12], "val": names[12:14], "test": names[14:]}
     objectfolder.write(folder / "objectfolder", objects=names, split=split)

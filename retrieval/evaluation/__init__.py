@@ -22,7 +22,6 @@ PROTOCOLS: "Registry[Protocol]" = Registry(
         "billets-unseen": "retrieval.evaluation.protocols.billets:UNSEEN",
         "billets-places": "retrieval.evaluation.protocols.billets:PLACES",
         "objectfolder": "retrieval.evaluation.protocols.published:OBJECTFOLDER",
-        "rct": "retrieval.evaluation.protocols.published:RCT",
         "touch-to-touch": "retrieval.evaluation.touch_to_touch:ACROSS",
         "touch-to-touch-within": "retrieval.evaluation.touch_to_touch:WITHIN",
         "physiclear": "retrieval.evaluation.touch_to_touch:PHYSICLEAR",

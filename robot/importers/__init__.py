@@ -38,7 +38,6 @@ IMPORTERS: "Registry[Importer]" = Registry(
         "lerobot": "robot.importers.lerobot:import_lerobot",
         "objectfolder": "robot.importers.objectfolder:import_objectfolder",
         "physiclear": "robot.importers.physiclear:import_physiclear",
-        "rct": "robot.importers.rct:import_rct",
         "rosbag": "robot.importers.rosbag:import_rosbag",
         "vt60": "robot.importers.vt60:import_vt60",
     },

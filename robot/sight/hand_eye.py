@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from _touch_retrieval.documents import typed
 from _touch_retrieval.files import write_atomically
-from _touch_retrieval.text import read_table
+from _touch_retrieval.text import read_numbers
 from robot.errors import RobotConfigError
 from robot.storage import read_content, read_json_object, storage_errors
 
@@ -108,9 +108,9 @@ def _distinct(points: Points) -> int:
 
 
 def read_pairs(path: Path) -> tuple[Points, Points]:
-    """Read camera and rig points from a CSV file with COLUMNS, as `read_table` does; raise RobotConfigError."""
+    """Read camera and rig points from a CSV file with COLUMNS, as `read_numbers` does; raise RobotConfigError."""
     try:
-        numbers = read_table(read_content(path, RobotConfigError), COLUMNS).numbers(COLUMNS)
+        numbers = read_numbers(read_content(path, RobotConfigError), COLUMNS)
     except ValueError as error:
         raise RobotConfigError(f"{path}: {error}") from error
     pairs = np.array(numbers, dtype=np.float64).reshape(-1, 6)

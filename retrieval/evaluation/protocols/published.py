@@ -1,31 +1,14 @@
-"""Protocols of RCT, ObjectFolder's cross-sensory retrieval, and The Feeling of Success: unseen objects."""
+"""Protocols of ObjectFolder's cross-sensory retrieval, and The Feeling of Success: unseen objects."""
 
 import numpy as np
 
 from retrieval.data.dataset import Split
 from retrieval.errors import DatasetError
-from retrieval.evaluation.protocol import Protocol, RecordingFacts, fold, folds, topn_accuracy
+from retrieval.evaluation.protocol import Protocol, RecordingFacts, fold
 from retrieval.evaluation.queries import MIN_THRESHOLD_OBJECTS
 from retrieval.metrics.registry import METRICS, Metric, average_precision
 
-_RCT_FOLDS = 5
 _OBJECTS, _TEST = 98, 18  # of Lin, Calandra and Levine
-
-
-def _five_folds(facts: RecordingFacts, seed: int) -> list[Split]:
-    order = np.random.default_rng([seed, 31]).permutation(facts.names).tolist()
-    return folds(facts.names, [order[turn::_RCT_FOLDS] for turn in range(_RCT_FOLDS)], seed)
-
-
-RCT = Protocol(
-    "rct",
-    "RCT: unseen materials",
-    "Materials are randomly assigned to five folds, again for each seed; all presses of a material stay together. "
-    "Each material has one photo, and every press is compared with it.",
-    _five_folds,
-    {**topn_accuracy(10), **topn_accuracy(5), "pair_auc": METRICS["pair_auc"]},
-    allows_own_photos=True,
-)
 
 
 def _published(facts: RecordingFacts, seed: int) -> list[Split]:

@@ -10,11 +10,9 @@ from _touch_retrieval.files import read_json
 from retrieval.data.catalogue import list_catalogue
 from retrieval.errors import DatasetError
 from retrieval.model.config import load_config
-from robot.errors import ImporterError, RobotConfigError
-from robot.importers.rct import import_rct
+from robot.errors import RobotConfigError
 from robot.sight.hand_eye import COLUMNS, read_pairs
 from tests.as_they_come import write_pictures
-from tests.miniatures import rct
 
 ENCODINGS = ("utf-8", "utf-8-sig", "utf-16")  # a script; Windows; PowerShell and "Unicode text" of Excel
 POINTS = np.arange(12).reshape(2, 6) - 0.5
@@ -74,12 +72,3 @@ def check(folder, get):
         metadata.write_text(text, "utf-8")
         with pytest.raises(DatasetError, match="one JSON object a line"):
             list_catalogue(catalogue)
-
-    rct.write(folder / "rct")
-    table = folder / "rct" / "metadata" / "force_metadata.csv"
-    text = table.read_text()
-    table.write_bytes(text.replace(",", ";").replace(".", ",").encode("utf-16"))
-    assert import_rct(folder / "rct", folder / "out").grasps[0].force_n is not None
-    table.write_text(text.replace("z_frame", "frame"))
-    with pytest.raises(ImporterError, match=r"z_frame.*it has .*frame"):
-        import_rct(folder / "rct", folder / "out2")

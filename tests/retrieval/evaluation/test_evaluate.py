@@ -318,8 +318,8 @@ def test_wrong_arguments_are_refused_before_anything_is_read(run, tmp_path):
         run(tmp_path / "out", methods=("cca", "oracle"))
     with pytest.raises(BadInput, match="at least 1 seed, got 0"):
         run(tmp_path / "out", seeds=0)
-    with pytest.raises(BadInput, match="takes a split, got rct"):
-        run(tmp_path / "out", protocols=["rct"], split=Split(0, (), (), ()))
+    with pytest.raises(BadInput, match="takes a split, got objectfolder"):
+        run(tmp_path / "out", protocols=["objectfolder"], split=Split(0, (), (), ()))
     assert not (tmp_path / "out").exists()
 
 

@@ -43,7 +43,6 @@ RECORDINGS = {
     "objectfolder": facts(
         dict.fromkeys("abcdefgh"), splits={"published": Split(0, tuple("abcd"), tuple("ef"), tuple("gh"))}
     ),
-    "rct": facts(dict.fromkeys(f"m{n}" for n in range(60))),
     "feeling-of-success": facts(dict.fromkeys(f"o{n}" for n in range(105))),
 }
 WITHOUT_SPLIT = {name for name in PROTOCOLS if isinstance(PROTOCOLS.load(name), TouchToTouch)}
@@ -133,7 +132,7 @@ def test_the_published_splits_of_the_paper_and_of_objectfolder():
 
 
 def test_no_contact_control_needs_one_frame_per_grasp():
-    grasps = RECORDINGS["rct"].grasps[:4]
+    grasps = RECORDINGS["feeling-of-success"].grasps[:4]
     assert "lacks" in missing_no_contact_reason(grasps)
     for names, reason in (("xxxx", "all touches share one no-contact frame"), ("xxxy", "None")):
         framed = [replace(one, backgrounds=(Path(name),)) for one, name in zip(grasps, names, strict=True)]
