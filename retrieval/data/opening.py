@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from retrieval.errors import BadInput
 
@@ -14,8 +13,8 @@ RANGE_MM = (0.5, 300.0)
 """Openings that are believed: what grippers hold. Less is metres in most cases, more another unit or an angle."""
 
 
-def parse_openings(openings: Openings, grasps: int, of: str = "") -> NDArray[np.float64]:
-    """Return the openings (grasps,) in millimetres, NaN where none was measured.
+def parse_openings(openings: Openings, grasps: int, of: str = "") -> list[float | None]:
+    """Return the opening of each grasp in millimetres, None where none was measured.
 
     Args:
         openings: As `Openings`.
@@ -26,7 +25,7 @@ def parse_openings(openings: Openings, grasps: int, of: str = "") -> NDArray[np.
         BadInput: The number of openings is not that of grasps, or an opening is outside `RANGE_MM`.
     """
     if openings is None:
-        return np.full(grasps, np.nan)
+        return [None] * grasps
     given: Sequence[object] = (
         openings
         if isinstance(openings, Sequence | np.ndarray) and not isinstance(openings, str | bytes)
@@ -37,7 +36,7 @@ def parse_openings(openings: Openings, grasps: int, of: str = "") -> NDArray[np.
             f"{of}give one opening for each grasp, or none: got {len(given)} opening(s) for {grasps} grasp(s); None "
             "stands for a grasp without one"
         )
-    return np.array([np.nan if one is None else require_opening(one, f"{of}opening_mm") for one in given])
+    return [None if one is None else require_opening(one, f"{of}opening_mm") for one in given]
 
 
 def require_opening(value: object, name: str) -> float:

@@ -224,7 +224,8 @@ class Searcher:
             if _fault(classes) is None:
                 used = classes == CONTACT
                 require_distinct(compress(grasps, used), compress(codes.pictures[span], used))
-                query = EncodedQuery(codes.embeddings[span][used], codes.partials[span][used], openings_mm[used])
+                measured_mm = np.array(openings_mm, np.float64)[used]  # None becomes NaN
+                query = EncodedQuery(codes.embeddings[span][used], codes.partials[span][used], measured_mm)
                 result = opened.shard.search(query, top, candidates)
             clock.add({stage: result.timing_ms[stage] if result else 0.0 for stage in ("candidates", "rerank")})
             found.append((classes.tolist(), result))
@@ -340,7 +341,7 @@ class Searcher:
         opened, stored = self._snapshot(), self.checkpoint
         name, fingers = opened.enrolled_name(object_id), opened.reader.fingers
         grasps = [list(map(with_file, grasp)) for grasp in parse_grasps(touches, fingers)]
-        openings = parse_openings(opening_mm, len(grasps)).tolist()
+        openings = parse_openings(opening_mm, len(grasps))
         frames = [] if background is None else parse_grasps(background, fingers, noun="background")[0]
         frames = list(map(with_file, frames))
         codes, classes = opened._encoded(grasps, [frame.image for frame in frames] or None, Stopwatch())
@@ -357,7 +358,7 @@ class Searcher:
                 name,
                 {path: content_digest(file) for path, file in files(grasp).items()},
                 {model_key(fingerprint(stored)): to_code(partial, stored)},
-                None if np.isnan(opening) else opening,
+                opening,
                 tuple(files(frames)),
             )
             for grasp, partial, opening in zip(grasps, codes.partials, openings, strict=True)
@@ -420,7 +421,7 @@ class Searcher:
     def _result(
         self,
         grasps: Sequence[Sequence[InputImage]],
-        openings_mm: NDArray[np.float64],
+        openings_mm: list[float | None],
         classes: list[str],
         timing_ms: dict[str, float],
         found: ShardResult | None,
@@ -428,6 +429,7 @@ class Searcher:
     ) -> QueryResult:
         """Return the answer; `found` is None without a grasp with contact."""
         manifest, posterior, count = self.manifest, self.posterior, classes.count(CONTACT)
+        has_openings = any(opening is not None for opening in openings_mm)
         probabilities, formula, more_grasps = None, None, None
         verdict = _fault(classes) or UNCALIBRATED
         if found is not None and posterior is not None:
@@ -448,7 +450,7 @@ class Searcher:
                 counts = dict(zip(("touches", "objects"), found.references, strict=True))
                 built = manifest.about.get(REFERENCE_ROWS, {})
                 formula[REFERENCE_ROWS] = {**built, **counts, "calibration": asdict(self.checkpoint.references)}
-            if np.isfinite(openings_mm).any():
+            if has_openings:
                 opening = self.checkpoint.opening
                 formula["opening"] = {
                     "compared_objects": found.compared_openings,
@@ -491,9 +493,7 @@ class Searcher:
                 for place, one in enumerate(found.best if found else ())
             ],
             more_grasps=more_grasps,
-            opening_mm=[None if np.isnan(one) else one for one in openings_mm.tolist()]
-            if np.isfinite(openings_mm).any()
-            else None,
+            opening_mm=openings_mm if has_openings else None,
         )
 
 

@@ -1,7 +1,6 @@
 """Client of the service: `Searcher.query` for an index on another machine."""
 
 import base64
-import math
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -171,11 +170,10 @@ def _pictures(
 ) -> dict[str, Any]:
     """Return the part of a body that describes the grasps."""
     frames = [InputImage(image, f"background {number}") for number, image in enumerate(background or (), start=1)]
-    openings = parse_openings(opening_mm, len(grasps)).tolist()
     return {
         "touches": [_encoded(grasp) for grasp in grasps],
         "background": None if background is None else _encoded(frames),
-        "opening_mm": [None if math.isnan(opening) else opening for opening in openings],
+        "opening_mm": parse_openings(opening_mm, len(grasps)),
     }
 
 

@@ -43,5 +43,5 @@ def test_an_opening_that_is_no_distance_in_millimetres_is_refused(openings, prob
         parse_openings(openings, 2 if "grasp" in problem else len(openings))
     with pytest.raises(BadInput, match="got '41'"):
         parse_openings("41", 1)  # type: ignore[arg-type]
-    np.testing.assert_array_equal(parse_openings(None, 2), [np.nan, np.nan])
-    np.testing.assert_array_equal(parse_openings([41, None], 2), [41.0, np.nan])
+    assert parse_openings(None, 2) == [None, None]
+    assert parse_openings([41, None], 2) == [41.0, None]
