@@ -101,8 +101,10 @@ def train_best(
     about = {"source": recording_source(recording), "data_digest": data_digest(grasps)}
     licences = dict.fromkeys([*checkpoint_licences(start), recording_licence(recording)])
     table = _table(accuracies, identification(low_pass))
+    origin = {"calibrated_on": about} if made.matcher is start.matcher else about
     provenance = {
-        **({**start.provenance, "calibrated_on": about} if made.matcher is start.matcher else {"step": 0, **about}),
+        **made.provenance,
+        **origin,
         LICENCES: [dataclasses.asdict(licence) for licence in licences],
         "recipe": best,
         COMPARED: table,
