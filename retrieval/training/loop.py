@@ -130,8 +130,8 @@ def train_loop(
         interruption() if state else nullcontext(threading.Event()) as stop,
         Bar(title, plan.steps, "steps", done=done, quiet=quiet) as bar,
     ):
-        if validate and not done:
-            best, best_weights = BestStep(0, validate()), _copied(module)
+        if validate and not done and (metrics := validate()):
+            best, best_weights = BestStep(0, metrics), _copied(module)
         for batch in batches(range(done, plan.steps)):
             for group in optimizer.param_groups:
                 group["lr"] = plan.learning_rate * group.get(RATE, 1.0) * SCHEDULES[plan.schedule](done, plan.steps)

@@ -74,6 +74,13 @@ def test_a_run_keeps_the_weights_that_it_starts_from_if_no_step_is_better():
     assert (best.step, best.metrics, module[0].item()) == (0, {"score": 0.9}, 0)
 
 
+def test_without_validation_objects_the_last_step_is_the_model():
+    module = one_weight()
+    weights, best = descend(Plan(2, 0.1), module=module, validate=dict)
+    assert (best.step, module[0].item()) == (2, weights[-1])
+    assert weights[-1] != 0
+
+
 def run(path, at=None, validations=4, **identity):
     """Train, with a power cut in step `at`; the last `validations` of four validations are left."""
     module = one_weight()
