@@ -1,10 +1,12 @@
 """Initial weights of a matcher (random, published, from a file, or of a checkpoint), and the licences of their data."""
 
+import dataclasses
 from functools import partial
 from pathlib import Path
 
 from torch import Tensor
 
+from retrieval.console.output import say
 from retrieval.data.dataset import DataLicence, recording_licence, stored_licences
 from retrieval.errors import CheckpointError
 from retrieval.model.checkpoint import load_checkpoint
@@ -18,6 +20,25 @@ from retrieval.model.towers.weights import GEL, SHIPPED
 TOWER_WEIGHTS = ("touch_tower.", "photo_tower.")
 """Prefixes of the names of the towers' weights in a matcher."""
 _SHIPPED = DataLicence("simulated objects of the shipped models", "MIT", "as touch-retrieval")
+
+
+def with_available_weights(config: Config) -> Config:
+    """Return the configuration, or one with random initial weights if those of ImageNet cannot be downloaded.
+
+    A line on stderr states it. Frozen towers are never random: they would learn nothing.
+    """
+    settings = config.training
+    inits = {settings.tower_init(init) for init in (settings.init_touch, settings.init_photo)}
+    if inits != {"imagenet"} or settings.start or settings.freeze_towers:
+        return config
+    try:
+        build_matcher(config)
+    except CheckpointError as error:
+        say(f"{error}. The training starts from random weights, as with --init random")
+        return dataclasses.replace(
+            config, training=dataclasses.replace(settings, init="random", init_touch="", init_photo="")
+        )
+    return config
 
 
 def build_matcher(config: Config) -> Matcher:

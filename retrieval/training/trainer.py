@@ -49,7 +49,12 @@ from retrieval.training.features import (
     TrainedFeatures,
     features_by_image,
 )
-from retrieval.training.initial_weights import TOWER_WEIGHTS, build_matcher, training_licences
+from retrieval.training.initial_weights import (
+    TOWER_WEIGHTS,
+    build_matcher,
+    training_licences,
+    with_available_weights,
+)
 from retrieval.training.loop import (
     RATE,
     Plan,
@@ -80,6 +85,7 @@ def train_matcher(
     distributed.start()
     grasps = load_grasps(recording)
     config = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, fingers=finger_count(grasps)))
+    config = with_available_weights(config)
     settings = config.training
     if split is None:
         split = make_split(

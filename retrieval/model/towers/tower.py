@@ -153,7 +153,7 @@ class Tower(nn.Module):
             self.load(read_state(Path(init)), init)
 
     def load(self, state: State, source: str) -> None:
-        """Load a state dict. Every layer must fit; either side may lack an optional one.
+        """Load a state dict. Every layer must fit; either side may lack an optional one, and a count of batches.
 
         Args:
             state: The weights by name, perhaps in an older layout (`rename_state`).
@@ -165,7 +165,9 @@ class Tower(nn.Module):
         state, own, kind = self.rename_state(state), self.state_dict(), type(self).__name__
         optional, classes = self.optional_prefixes, self.optional_prefixes[:1]
         unknown = [key for key in state if key not in own and not key.startswith(optional)]
-        missing = [key for key in own if key not in state and not key.startswith(classes)]
+        # PyTorch before 0.4.1 stored no count of the batches of a normalisation.
+        required = (key for key in own if not key.startswith(classes) and not key.endswith(".num_batches_tracked"))
+        missing = [key for key in required if key not in state]
         if unknown or missing:
             problem = f"lacks {missing[0]}" if missing else f"has an unknown {unknown[0]}"
             raise CheckpointError(f"{source} does not fit {kind}: it {problem}; name the tower it is for")

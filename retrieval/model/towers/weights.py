@@ -1,5 +1,6 @@
 """State dicts of towers, from files or published ones."""
 
+import socket
 from importlib import resources
 from pathlib import Path
 
@@ -13,6 +14,8 @@ SHIPPED = "shipped"
 """Value of init for the weights of the checkpoint in the package."""
 GEL = "gel"
 """Value of init for the touch tower of the package that was trained for real gels (`gel_tower`)."""
+_TIMEOUT_S = 10.0
+"""Longest wait for each address of the server, and for its next bytes; without it a blocked network takes minutes."""
 
 
 def gel_tower() -> Path:
@@ -52,10 +55,14 @@ def download(url: str) -> State:
     Raises:
         CheckpointError: The download fails or is damaged.
     """
-    path = Path(torch.hub.get_dir(), "checkpoints", url.rsplit("/", 1)[1])
+    path, timeout = Path(torch.hub.get_dir(), "checkpoints", url.rsplit("/", 1)[1]), socket.getdefaulttimeout()
+    socket.setdefaulttimeout(_TIMEOUT_S)  # torch.hub sets none
     try:
         return dict(torch.hub.load_state_dict_from_url(url, map_location="cpu", check_hash=True, weights_only=True))
     except Exception as error:  # of the network, of the file or of its digest
         raise CheckpointError(
-            f"ImageNet weights could not be downloaded ({error}); fetch {url} elsewhere and put it at {path}"
+            f"ImageNet weights could not be downloaded ({error}); fetch {url} elsewhere, and name the file with "
+            f"--init, or put it at {path}"
         ) from error
+    finally:
+        socket.setdefaulttimeout(timeout)

@@ -2,6 +2,7 @@
 
 import math
 import re
+import socket
 from unittest.mock import Mock
 from urllib.error import URLError
 
@@ -13,7 +14,7 @@ from torch.nn import functional
 from retrieval.errors import BadInput, CheckpointError, NumericalError
 from retrieval.model.towers.mobilenet import InvertedResidual
 from retrieval.model.towers.tower import Tower, build_tower, stage_statistics
-from retrieval.model.towers.weights import read_state
+from retrieval.model.towers.weights import download, read_state
 from tests.data import touch_data
 
 RESNETS = {
@@ -157,6 +158,28 @@ def test_without_network_the_error_names_the_file_to_fetch_and_its_place(tmp_pat
     monkeypatch.setattr(torch.hub, "download_url_to_file", Mock(side_effect=URLError("no route to host")))
     with pytest.raises(CheckpointError, match=re.escape(str(tmp_path / "checkpoints" / "resnet18-f37072fd.pth"))):
         build_tower("resnet18").initialise("imagenet")
+
+
+def test_a_download_from_a_server_that_does_not_answer_ends(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    monkeypatch.setattr("retrieval.model.towers.weights._TIMEOUT_S", 0.1)
+    with socket.create_server(("127.0.0.1", 0)) as silent, pytest.raises(CheckpointError, match="timed out"):
+        download(f"http://127.0.0.1:{silent.getsockname()[1]}/resnet50-0676ba61.pth")
+    assert socket.getdefaulttimeout() is None
+
+
+def test_a_published_file_may_lack_the_counts_of_batches_and_contain_parameters(tmp_path):
+    tower, path = build_tower("resnet50", "classes"), tmp_path / "resnet50-0676ba61.pth"
+    published = {
+        name: nn.Parameter(torch.rand_like(value)) if name in dict(tower.named_parameters()) else torch.rand_like(value)
+        for name, value in tower.state_dict().items()
+        if not name.endswith("num_batches_tracked")
+    }
+    torch.save(published, path)
+    tower.initialise(str(path))
+    loaded = tower.state_dict()
+    assert all(torch.equal(loaded[name], value) for name, value in published.items())
+    assert loaded["bn1.num_batches_tracked"] == 0
 
 
 def test_real_imagenet_weights_load_in_their_older_key_layout():

@@ -6,6 +6,8 @@ import signal
 from copy import deepcopy
 from pathlib import Path
 from pkgutil import resolve_name
+from unittest.mock import Mock
+from urllib.error import URLError
 
 import numpy as np
 import pytest
@@ -382,6 +384,21 @@ def test_a_checkpoint_that_cannot_be_written_is_an_error_before_the_first_step(r
     for name, message in (("", "must be a file"), ("file/model.safetensors", "cannot be written")):
         with pytest.raises(CheckpointError, match=message):
             train_matcher(recording, tmp_path / name, TINY, quiet=True)
+
+
+def test_trained_towers_start_from_random_weights_without_a_download_and_the_checkpoint_says_so(
+    recording, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    monkeypatch.setattr(torch.hub, "download_url_to_file", Mock(side_effect=URLError("no route to host")))
+    config = with_training(TINY.using(tower="resnet18"), init="imagenet", iterations=1)
+    made = train_matcher(recording, tmp_path / "m.safetensors", config, quiet=True)
+    assert made.config.training.init == "random"
+    *_, line = capsys.readouterr().err.splitlines()
+    assert "name the file with --init" in line
+    assert "The training starts from random weights" in line
+    with pytest.raises(CheckpointError, match=r"resnet18-f37072fd\.pth"):  # random ones would stay so
+        train_matcher(recording, tmp_path / "m.safetensors", with_training(config, freeze_towers=True), quiet=True)
 
 
 def test_training_continues_from_the_towers_and_the_head_of_a_checkpoint(model):
