@@ -50,7 +50,7 @@ def measure(
             recipes = {
                 name: recipe
                 for name in RECIPES
-                if (recipe := RECIPES.load(name)).applies(comparison.problem, len(fitted))
+                if not (recipe := RECIPES.load(name)).obstacle(comparison.problem, len(fitted))
             }
             for name, recipe in recipes.items():
                 fit = recipe(comparison.problem)

@@ -8,7 +8,6 @@ import typer
 from retrieval.commands.options import (
     WORKERS,
     CheckpointOut,
-    Init,
     Iterations,
     Recording,
     SplitFile,
@@ -45,7 +44,13 @@ def train(
     config: Annotated[
         str | None, typer.Option(help="train with these settings instead: a preset, such as paper, or a TOML file")
     ] = None,
-    init: Init = None,
+    init: Annotated[
+        str | None,
+        typer.Option(
+            help="weights of the published towers: imagenet (a download), random, or a state dict file; with --config "
+            "also shipped or gel (default: imagenet, or that of --config)"
+        ),
+    ] = None,
     iterations: Iterations = None,
     split: SplitFile = None,
     cluster: Annotated[

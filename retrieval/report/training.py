@@ -6,6 +6,9 @@ from retrieval.report.numbers import interval, percent
 from retrieval.report.terminal import print_columns
 from retrieval.training.selection import COMPARED
 
+FORCED_ROWS = 3
+"""Rows of a table with one recipe: the recipe, the choice and the control."""
+
 
 def print_comparison(checkpoint: Checkpoint) -> None:
     """Print the accuracies that a checkpoint of `retrieval.train` stores, and sentences on them."""
@@ -15,10 +18,13 @@ def print_comparison(checkpoint: Checkpoint) -> None:
     print_columns(table["gallery"], ("one touch", "top-1 accuracy, %", "chance, %"), rows, words=(0,))
     show(f"Measured with {table['touches']} touches of {table['objects']} objects; {table['gallery']}.")
     if recipe := provenance.get("recipe"):
-        show(f"{checkpoint.path} is made by the recipe {recipe}: of those compared, it identifies the most touches.")
+        reason = ": of those compared, it identifies the most touches" * (len(table["rows"]) > FORCED_ROWS)
+        show(f"{checkpoint.path} is made by the recipe {recipe}{reason}.")
+    else:
+        show(f"{checkpoint.path} compares touches with touches.")
     gain, low, high = table["gain"]
     difference = f"{100 * gain:+.1f} points [{100 * low:+.1f}, {100 * high:+.1f}] against touches of 8 x 6 pixels"
     if low > 0:
-        show(f"{difference}: the model uses more than light and coarse shape.")
+        show(f"{difference}: more than a linear fit makes of light and coarse shape.")
     else:
         show(f"{difference}: no evidence that the model uses touch. Record more objects.")

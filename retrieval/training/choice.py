@@ -3,7 +3,7 @@
 recording -> folds of objects -> features of each recipe's towers -> fits without a fold, scores of its touches
 -> the best recipe -> its fit to all objects, calibrated on those scores -> checkpoint
 
-The accuracy of the choice is nested: for the touches of an object, the recipe is chosen by the other objects.
+The accuracy of the choice is nested: for the objects of a fold, the recipe is chosen by the other folds.
 """
 
 import dataclasses
@@ -17,7 +17,9 @@ import torch
 from numpy.typing import NDArray
 
 from retrieval.console.interruption import resumable
+from retrieval.console.output import say
 from retrieval.console.progress import Bar
+from retrieval.data.check.split import require_fit
 from retrieval.data.dataset import (
     LICENCES,
     AnyRecording,
@@ -29,7 +31,6 @@ from retrieval.data.dataset import (
     linked_objects,
     load_grasps,
     object_kinds,
-    recording_licence,
     recording_source,
 )
 from retrieval.errors import BadInput
@@ -39,13 +40,12 @@ from retrieval.model.encode import one_thread
 from retrieval.model.shipped import shipped_model
 from retrieval.training.calibration import ScoredTouches, score_touches, with_calibrations, with_sensor_calibrations
 from retrieval.training.features import Features, encode_recording
-from retrieval.training.initial_weights import checkpoint_licences
 from retrieval.training.recipes import RECIPES
 from retrieval.training.recipes.recipe import Problem, Recipe
 from retrieval.training.selection import (
     COMPARED,
     LOW_PASS,
-    MIN_OBJECTS,
+    MIN_OBJECTS_FOR_FOUR_FOLDS,
     accuracy_row,
     comparison_table,
     draw_folds,
@@ -59,6 +59,8 @@ MAX_TOUCHES, MAX_TOUCHES_OF_OBJECT = 2_000, 60
 """Touches that are held out and scored."""
 DRAWS = 4
 """Random photos of each object with which a touch is compared."""
+MIN_OBJECTS = 8
+"""Minimum number of objects: two folds of four, which trained heads divide again."""
 CHOSEN = "chosen recipe"
 
 
@@ -75,19 +77,27 @@ def train_best(
     """Fit a matcher by the best recipe, and write the checkpoint `out`; arguments as for `retrieval.train`."""
     require_writable(out)
     recording, folder = folder_of(recording), sibling_file(out, ".parts")
+    if split is not None:
+        require_fit(split, load_grasps(recording))
     problem = pose(recording, folder, model=model, init=init, unused=split.test if split else (), quiet=quiet)
-    grasps, start, fingers = problem.grasps, problem.start, problem.fingers
-    folds = draw_folds(problem.linked)
-    objects = sum(map(len, folds))
-    if recipe is not None:
-        names = [RECIPES.name_of(recipe)]
-        if not RECIPES.load(names[0]).applies(problem, objects):
-            raise BadInput(
-                f"recipe {names[0]} does not apply: the recording has {objects} objects and {fingers} gel image(s) for "
-                f"each touch, the start model takes {start.config.matcher.fingers}. Leave the recipe out"
-            )
-    else:
-        names = [name for name in RECIPES.names() if RECIPES.load(name).applies(problem, objects)]
+    objects = {grasp.object_id for grasp in problem.grasps}
+    if len(objects) < MIN_OBJECTS or len(objects) == len(problem.grasps):
+        raise BadInput(
+            f"A fit needs at least {MIN_OBJECTS} objects with two grasps each, got {len(objects)} objects with "
+            f"{len(problem.grasps)} grasps. Record more."
+        )
+    testable = testable_objects(problem)
+    kinds = {name: RECIPES.load(name) for name in (RECIPES.names() if recipe is None else [RECIPES.name_of(recipe)])}
+    if len(testable) < MIN_OBJECTS:
+        kinds = {name: kind for name, kind in kinds.items() if not kind.uses_start}
+        say("The start model was trained on these objects, so recipes that use it cannot be tested and are left out")
+        testable = objects
+    obstacles = {name: kind.obstacle(problem, len(objects)) for name, kind in kinds.items()}
+    names = [name for name, obstacle in obstacles.items() if not obstacle]
+    if not names:
+        reasons = next(iter(obstacles.values()), "the start model was trained on these objects")
+        raise BadInput(f"Recipe {recipe} does not apply: {reasons}. Leave the recipe out.")
+    folds = draw_folds([group for group in problem.linked if testable.issuperset(group)])
     recipes = {name: RECIPES.load(name)(problem) for name in dict.fromkeys([*names, CONTROL])}
     with resumable(folder):
         comparison = Comparison(problem, folds[: -(-ENOUGH_OBJECTS // len(folds[0]))])
@@ -95,22 +105,25 @@ def train_best(
         low_pass = comparison.held_out(CONTROL, recipes[CONTROL], "low_pass")
         accuracies = {name: identification(parts) for name, parts in held_out.items()}
         best = max(names, key=lambda name: float(accuracies[name].by_object()[1].mean()))  # among equals the first
-        made = recipes[best].fit(comparison.features(recipes[best]), "final", is_final=True)
-        made = _calibrated(made, held_out[best])
-        made = with_sensor_calibrations(made, grasps, comparison.features(recipes[best]), quiet=quiet)
-    about = {"source": recording_source(recording), "data_digest": data_digest(grasps)}
-    licences = dict.fromkeys([*checkpoint_licences(start), recording_licence(recording)])
-    table = _table(accuracies, identification(low_pass))
-    origin = {"calibrated_on": about} if made.matcher is start.matcher else about
+        features = comparison.features(recipes[best])
+        fitted = recipes[best].fit(features, "final", is_final=True)
+        parts = [part for part in held_out[best] if part.touches.has_trials]
+        pooled_parts = [part.pooled for part in parts if part.pooled is not None]
+        fitted = with_calibrations(fitted, [part.touches for part in parts], pooled_parts)
+        fitted = with_sensor_calibrations(fitted, problem.grasps, features, quiet=quiet)
+    licences = dict.fromkeys(recipes[best].licences(recording))
+    table = _table(accuracies, identification(low_pass), _groups(comparison.folds))
     provenance = {
-        **made.provenance,
-        **origin,
+        "source": recording_source(recording),
+        "data_digest": data_digest(problem.grasps),
+        **fitted.provenance,
         LICENCES: [dataclasses.asdict(licence) for licence in licences],
         "recipe": best,
         COMPARED: table,
-        "metrics": {"held_out_top1": table["rows"][CHOSEN][0], "held_out_top1_chance": table["rows"][CHOSEN][3]},
+        "metrics": fitted.provenance.get("metrics", {})
+        | {"held_out_top1": table["rows"][CHOSEN][0], "held_out_top1_chance": table["rows"][CHOSEN][3]},
     }
-    store_checkpoint(dataclasses.replace(made, provenance=provenance), out)
+    store_checkpoint(dataclasses.replace(fitted, provenance=provenance), out)
     shutil.rmtree(folder)
     return load_checkpoint(out)
 
@@ -124,11 +137,10 @@ def pose(
     unused: Collection[str] = (),
     quiet: bool = False,
 ) -> Problem:
-    """Return the problem of a recording without the objects `unused`; `folder` is made for unfinished parts."""
+    """Return the problem of a recording without the objects `unused`; unfinished parts are stored in `folder`."""
     grasps = [grasp for grasp in load_grasps(recording) if grasp.object_id not in unused]
     fingers = finger_count(grasps)
     start = model if isinstance(model, Checkpoint) else load_checkpoint(model or shipped_model(min(fingers, 2)))
-    folder.mkdir(parents=True, exist_ok=True)
     return Problem(grasps, fingers, start, init, object_kinds(recording), linked_objects(grasps), folder, quiet)
 
 
@@ -154,16 +166,18 @@ class Comparison:
     """Fits of recipes without the objects of each fold, scored on these objects."""
 
     def __init__(self, problem: Problem, folds: Sequence[Sequence[str]]) -> None:
+        problem.folder.mkdir(parents=True, exist_ok=True)
         self.problem, self.folds = problem, folds
-        self._encoded: dict[tuple[int, str], Features] = {}
-        sessions = sessions_of(problem.grasps)
-        self._session_of = {grasp.grasp_id: grasp.session for grasp in problem.grasps} if sessions else {}
+        self._encoded: dict[tuple[int, str, str], Features] = {}
+        sessions = list(dict.fromkeys(grasp.session for grasp in problem.grasps))
+        self._session_of = {grasp.grasp_id: sessions.index(grasp.session) for grasp in problem.grasps}
+        self._across_sessions = bool(objects_of_two_sessions(problem.grasps))
         objects = sum(map(len, folds))
         self._max_touches = min(max(MAX_TOUCHES // objects, 2), MAX_TOUCHES_OF_OBJECT)
 
     def features(self, recipe: Recipe, variant: str = "touch") -> Features:
         """Return the features of all grasps by the towers of a recipe; each tower encodes once."""
-        key = id(recipe.matcher), variant
+        key = id(recipe.matcher), recipe.config.preprocessing.digest(), variant
         if key not in self._encoded:
             photos = None if variant == "touch" else self.features(recipe)
             self._encoded[key] = encode_recording(
@@ -194,27 +208,38 @@ class Comparison:
         rows = [np.flatnonzero(features.owner == owner) for owner in np.unique(features.owner)]
         places = [np.linspace(0, len(part) - 1, min(len(part), self._max_touches)).astype(int) for part in rows]
         features = features.select(np.concatenate([part[some] for part, some in zip(rows, places, strict=True)]))
+        sessions = np.array([self._session_of[name] for name in features.grasp_ids])
         own = np.eye(len(features), dtype=np.bool_)
-        if self._session_of:
-            sessions = np.array([self._session_of[name] or "" for name in features.grasp_ids])
+        if self._across_sessions:
             own = sessions[:, None] == sessions
         tensors = torch.from_numpy(features.touch_rows), torch.from_numpy(features.photo)
         owners = features.owner, features.owner
         has_cells = bool(fitted.config.matcher.cell_dim)
-        return HeldOut(
-            score_touches(fitted.matcher, tensors, owners, own),
-            score_touches(fitted.matcher, tensors, owners, own, pooled=True) if has_cells else None,
-            tuple(sorted(set(features.object_ids))),
-        )
+        scored = [
+            score_touches(fitted.matcher, tensors, owners, own, pooled=pooled)
+            for pooled in ((False, True) if has_cells else (False,))
+        ]
+        if self._across_sessions:
+            scored = [dataclasses.replace(touches, touch_group=sessions) for touches in scored]
+        return HeldOut(scored[0], scored[1] if has_cells else None, tuple(sorted(set(features.object_ids))))
 
 
-def sessions_of(grasps: Sequence[Grasp]) -> set[str]:
-    """Return the sessions of grasps if at least `MIN_OBJECTS` objects were touched in two, else nothing."""
-    seen: dict[str, set[str]] = {}
+def objects_of_two_sessions(grasps: Sequence[Grasp]) -> set[str]:
+    """Return the objects that were touched in two sessions, if they are half of all, or 12; else nothing."""
+    sessions: dict[str, set[str]] = {}
     for grasp in grasps:
-        seen.setdefault(grasp.object_id, set()).add(grasp.session or "")
-    repeated = sum(len(sessions) > 1 for sessions in seen.values())
-    return set().union(*seen.values()) if repeated >= MIN_OBJECTS else set()
+        sessions.setdefault(grasp.object_id, set()).add(grasp.session or "")
+    repeated = {name for name, of_object in sessions.items() if len(of_object) > 1}
+    needed = max(MIN_OBJECTS, min(MIN_OBJECTS_FOR_FOUR_FOLDS, len(sessions) / 2))
+    return repeated if len(repeated) >= needed else set()
+
+
+def testable_objects(problem: Problem) -> set[str]:
+    """Return the objects that the start model was not trained on; with sessions, those that were touched in two."""
+    objects = {grasp.object_id for grasp in problem.grasps}
+    if split := problem.start.split:
+        objects -= {*split.train, *split.validation}
+    return objects & (objects_of_two_sessions(problem.grasps) or objects)
 
 
 def identification(parts: Sequence[HeldOut]) -> Measure:
@@ -255,20 +280,23 @@ def _drawn(keys: NDArray[np.float64], is_photo: NDArray[np.bool_]) -> NDArray[np
 # The result ------------------------------------------------------------------------------------------------
 
 
-def _table(accuracies: dict[str, Measure], low_pass: Measure) -> dict[str, Any]:
-    """Return the accuracy of each recipe, of the choice and of the control."""
+def _groups(folds: Sequence[Sequence[str]]) -> NDArray[np.int64]:
+    """Return the group (O,) of each object, in order of names: its fold, or one of two halves of a single fold."""
+    if len(folds) == 1:
+        return np.arange(len(folds[0])) % 2
+    fold_of = {name: number for number, fold in enumerate(folds) for name in fold}
+    return np.array([fold_of[name] for name in sorted(fold_of)])
+
+
+def _table(accuracies: dict[str, Measure], low_pass: Measure, groups: NDArray[np.int64]) -> dict[str, Any]:
+    """Return the accuracy of each recipe, of the choice by the objects of other `groups` (O,), and of the control."""
     first = next(iter(accuracies.values()))
-    means = np.stack([measure.by_object()[1][:, 0] for measure in accuracies.values()])
-    of_others = means.sum(1, keepdims=True) - means
-    chosen = np.take_along_axis(means, of_others.argmax(0)[None], 0).T
+    objects, means = first.by_object()[0], np.stack([each.by_object()[1][:, 0] for each in accuracies.values()])
+    chosen, groups = np.empty((len(objects), 1)), groups[objects]
+    for group in np.unique(groups):
+        best = means[:, groups != group].mean(1).argmax()
+        chosen[groups == group, 0] = means[best, groups == group]
     choice = Measure(chosen, np.arange(len(chosen)), first.chance, "")
     rows = {**accuracies, CHOSEN: choice, LOW_PASS: low_pass}
     gallery = f"about {round(1 / first.chance[0])} objects that no fit has seen, one photo of each"
     return comparison_table(gallery, {name: accuracy_row(row) for name, row in rows.items()}, choice, low_pass)
-
-
-def _calibrated(made: Checkpoint, parts: Sequence[HeldOut]) -> Checkpoint:
-    """Return the model with calibrations on touches of objects that a fit of the same recipe has not seen."""
-    return with_calibrations(
-        made, [part.touches for part in parts], [part.pooled for part in parts if part.pooled is not None]
-    )

@@ -13,7 +13,7 @@ import torch
 from torch import nn
 
 from retrieval.console.output import say
-from retrieval.errors import CheckpointError
+from retrieval.errors import BadInput, CheckpointError
 from retrieval.metrics.pairs import fit_calibration
 from retrieval.model.config import Config, load_config
 from retrieval.model.encode import one_thread
@@ -55,8 +55,11 @@ def available_weights(init: str) -> str:
     """Return `init`, or "random", with a message, if it is "imagenet" and these weights cannot be downloaded.
 
     Raises:
+        BadInput: `init` names a tower of the package.
         CheckpointError: `init` is a file that cannot be read, or does not fit.
     """
+    if init in (GEL, SHIPPED):
+        raise BadInput(f'The initial weights must be "imagenet", "random" or a file of MobileNetV2, got {init!r}.')
     try:
         build_tower(PUBLISHED_TOWER, "stages").initialise(init)
     except CheckpointError as error:

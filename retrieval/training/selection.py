@@ -57,7 +57,7 @@ def draw_folds(linked: Sequence[Sequence[str]], seed: int = 0) -> list[tuple[str
     """Draw folds of objects, each left out once; the objects of a group stay together.
 
     Raises:
-        BadInput: There are fewer than `MIN_OBJECTS` objects.
+        BadInput: There are fewer than `MIN_OBJECTS` objects, or too many share a sequence.
     """
     total = sum(map(len, linked))
     if total < MIN_OBJECTS:
@@ -65,6 +65,11 @@ def draw_folds(linked: Sequence[Sequence[str]], seed: int = 0) -> list[tuple[str
     folds: list[list[str]] = [[] for _ in range(min(max(round(total / GALLERY), 2), total // 3, MAX_FOLDS))]
     for place in np.random.default_rng([seed, 7]).permutation(len(linked)):
         min(folds, key=len).extend(linked[place])
+    if min(map(len, folds)) < MIN_OBJECTS / 2:
+        raise BadInput(
+            f"A fit needs objects that do not share a sequence; {max(map(len, linked))} of {total} share one. Give "
+            "each object a sequence_id of its own."
+        )
     return [tuple(sorted(fold)) for fold in folds]
 
 

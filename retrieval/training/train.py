@@ -43,7 +43,7 @@ def train(
 
     Raises:
         DatasetError: The recording cannot be read.
-        BadInput: The recording has fewer than six objects, or too few touches of them.
+        BadInput: The recording has fewer than eight objects, or too few touches of them.
         ConfigError: The configuration or the recipe is unknown, or does not fit.
         CheckpointError: The start model or the weights cannot be read, or `out` cannot be written.
         JobInterrupted: After Ctrl-C.
@@ -67,5 +67,7 @@ def train(
             raise BadInput("A configuration trains without recipe and start model; leave out either.")
         return train_matcher(recording, out, config, split=split, quiet=quiet)
     if not any(grasp.photos for grasp in load_grasps(folder_of(recording))):
+        if recipe is not None or model is not None:
+            raise BadInput("A recording without photos has one way to be trained. Leave recipe and start model out.")
         return train_on_touches(recording, out, init=init, split=split, quiet=quiet)
     return train_best(recording, out, recipe=recipe, model=model, init=init, split=split, quiet=quiet)

@@ -3,22 +3,25 @@
 import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from retrieval.data.dataset import Grasp, Split, make_split
-from retrieval.model.checkpoint import Checkpoint
+from retrieval.data.dataset import DataLicence, Grasp, Split, make_split, recording_licence
+from retrieval.model.checkpoint import Checkpoint, tensors_digest
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
 from retrieval.training.features import Features
-from retrieval.training.initial_weights import TOWER_WEIGHTS, build_matcher
+from retrieval.training.initial_weights import TOWER_WEIGHTS, build_matcher, checkpoint_licences, training_licences
 from retrieval.training.linear import available_weights, fit_linear, linear_config
 from retrieval.training.selection import held_out_folds
 from retrieval.training.trainer import Trainer
 
 MIN_OBJECTS_OF_NEW_HEAD = 1000
 """Objects that late interaction needs, if it is trained from random weights."""
+DISTIL_STEPS = 600
+"""Steps of the candidate encoder of a trained head."""
 VALIDATION_FRACTION = 0.15
 """Fraction of the fitted objects that choose the step of a trained head."""
 
@@ -53,6 +56,7 @@ class Recipe(ABC):
 
     Attributes:
         label: What the recipe does, for people.
+        uses_start: Whether it uses the start model, which must then not know the objects that it is tested with.
         config: Configuration of the towers.
         matcher: A matcher with the towers whose features `fit` takes.
 
@@ -68,6 +72,7 @@ class Recipe(ABC):
     """
 
     label: ClassVar[str]
+    uses_start: ClassVar[bool] = True
     config: Config
     matcher: Matcher
 
@@ -75,9 +80,16 @@ class Recipe(ABC):
         self.problem, self.config, self.matcher = problem, problem.start.config, problem.start.matcher
 
     @classmethod
-    def applies(cls, problem: Problem, objects: int) -> bool:
-        """Whether the recipe can be fitted to so many objects. By default if the start model has as many fingers."""
-        return problem.start.config.matcher.fingers == problem.fingers
+    def obstacle(cls, problem: Problem, objects: int) -> str:
+        """Return why the recipe cannot be fitted to so many objects; empty if it can."""
+        fingers = problem.start.config.matcher.fingers
+        if cls.uses_start and fingers != problem.fingers:
+            return f"the start model takes {fingers} gel image(s) of a touch, and the recording has {problem.fingers}"
+        return ""
+
+    def licences(self, recording: Path) -> list[DataLicence]:
+        """Return the licences of all data that a model of this recipe is made from."""
+        return [*checkpoint_licences(self.problem.start), recording_licence(recording)]
 
     @abstractmethod
     def fit(self, features: Features, name: str, *, is_final: bool = False) -> Checkpoint:
@@ -96,24 +108,24 @@ class Start(Recipe):
     label = "start model as it is"
 
     def fit(self, features: Features, name: str, *, is_final: bool = False) -> Checkpoint:
-        """Return the start model."""
-        return self.problem.start
+        """Return the start model, with a matcher of its own, since a new gel check changes it."""
+        return dataclasses.replace(self.problem.start, matcher=deepcopy(self.problem.start.matcher))
 
 
 class Linear(Recipe):
     """Canonical correlations of the features of published towers."""
 
     label = "linear fit to published towers"
+    uses_start = False
 
     def __init__(self, problem: Problem) -> None:
         super().__init__(problem)
         self.config = linear_config(problem.fingers, available_weights(problem.init))
         self.matcher = build_matcher(self.config).eval()
 
-    @classmethod
-    def applies(cls, problem: Problem, objects: int) -> bool:
-        """Whether the recipe can be fitted: always."""
-        return True
+    def licences(self, recording: Path) -> list[DataLicence]:
+        """Return the licences of the towers' data and of the recording."""
+        return training_licences(recording, self.config.training)
 
     def fit(self, features: Features, name: str, *, is_final: bool = False) -> Checkpoint:
         """Return the fitted model."""
@@ -138,7 +150,9 @@ class ContinuedHead(Recipe):
         """Return the model of the step that is best on a part of the objects."""
         problem, start = self.problem, self.problem.start
         training = dataclasses.replace(
-            start.config.training.with_iterations(self.steps),
+            start.config.training,
+            iterations=self.steps,
+            distil_steps=DISTIL_STEPS,
             init="random",
             init_touch="",
             init_photo="",
@@ -152,12 +166,14 @@ class ContinuedHead(Recipe):
         known = set(features.grasp_ids)
         grasps = [grasp for grasp in problem.grasps if grasp.grasp_id in known]
         split = make_split(grasps, validation=VALIDATION_FRACTION, test=0, seed=training.seed)
-        path = problem.folder / f"{name}.safetensors"
-        trainer = Trainer(config if is_final else config.without_candidate_encoder(), split, grasps, path, "", features)
         weights = start.matcher.state_dict()
         taken = {part: weight for part, weight in weights.items() if self.continues or part.startswith(TOWER_WEIGHTS)}
+        path = problem.folder / f"{name}-{tensors_digest(taken, '')[:12]}.safetensors"  # of equal initial weights
+        config = config if is_final else config.without_candidate_encoder()
+        trainer = Trainer(config, split, grasps, path, "", features)
         trainer.matcher.load_state_dict(taken, strict=False)
-        return trainer.run_or_reuse(problem.quiet)
+        fitted = trainer.run_or_reuse(problem.quiet)
+        return dataclasses.replace(fitted, provenance={key: fitted.provenance[key] for key in ("step", "metrics")})
 
 
 class NewHead(ContinuedHead):
@@ -170,7 +186,10 @@ class NewHead(ContinuedHead):
     continues = False
 
     @classmethod
-    def applies(cls, problem: Problem, objects: int) -> bool:
-        """Whether there are enough objects, and the start model has late interaction."""
-        has_cells = problem.start.config.matcher.cell_dim > 0
-        return has_cells and objects >= MIN_OBJECTS_OF_NEW_HEAD and super().applies(problem, objects)
+    def obstacle(cls, problem: Problem, objects: int) -> str:
+        """Return why the recipe cannot be fitted, such as too few objects; empty if it can."""
+        if objects < MIN_OBJECTS_OF_NEW_HEAD:
+            return f"it needs {MIN_OBJECTS_OF_NEW_HEAD} objects, and the recording has {objects}"
+        if not problem.start.config.matcher.cell_dim:
+            return "the start model has no late interaction"
+        return super().obstacle(problem, objects)
