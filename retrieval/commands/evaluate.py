@@ -8,15 +8,14 @@ import typer
 from retrieval.commands.import_ import run_importer
 from retrieval.commands.options import (
     COUNT,
-    DEFAULT_PRESET,
     SEED,
     Init,
-    Iterations,
     Json,
     OptionValues,
     ReportOut,
     SplitFile,
     read_split,
+    resolve_model,
     training_config,
 )
 from retrieval.console.output import print_json, say
@@ -29,8 +28,6 @@ if TYPE_CHECKING:
     from retrieval.model.config import Config
 
 ALL = "all"
-METHODS_OF_PRESETS = {"linear": ("cca_towers", "chance")}
-"""Default methods of presets that fit only some of the methods."""
 
 
 def evaluate(
@@ -53,16 +50,26 @@ def evaluate(
         ),
     ] = None,
     methods: Annotated[
-        str | None, typer.Option(help=f"methods to compare, separated by commas: {', '.join(METHODS)} (default: all)")
+        str | None,
+        typer.Option(
+            help=f"methods to compare, separated by commas: {', '.join(METHODS)} (default: all but cca_towers; with "
+            "--protocol cca_towers, cca, late_fusion, chance)"
+        ),
     ] = None,
     config: Annotated[
         str | None,
         typer.Option(
-            help=f"a preset, such as tiny, small, mobilenet or relief, or a TOML file (default: {DEFAULT_PRESET}; with "
-            "--protocol real, or linear if only touches are compared)"
+            help="fit on the towers of a preset or TOML file, not a model's (default with --protocol: mobilenet, or "
+            "linear if only touches are compared)"
         ),
     ] = None,
-    model: Annotated[Path | None, typer.Option(help="checkpoint to evaluate, instead of fitting one")] = None,
+    model: Annotated[
+        str | None,
+        typer.Option(
+            help=f"checkpoint to evaluate, a file or {' or '.join(SHIPPED_NAMES)}; methods are fitted on its features "
+            "(default: the shipped one for the recording's fingers)"
+        ),
+    ] = None,
     compare: Annotated[
         OptionValues | None,
         typer.Option(
@@ -73,13 +80,12 @@ def evaluate(
         ),
     ] = None,
     init: Init = None,
-    iterations: Iterations = None,
     seeds: Annotated[
         int | None, typer.Option(parser=COUNT, help="training runs per method (default: 1; with --protocol 3)")
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option(parser=SEED, help="seed of split, queries and first training (default: that of the preset)"),
+        typer.Option(parser=SEED, help="seed of split, queries and first training (default: 0, or that of --config)"),
     ] = None,
     split: SplitFile = None,
     json: Json = False,
@@ -93,19 +99,22 @@ def evaluate(
 
     if model and (config or init):
         raise BadInput("--model already defines towers and settings; give either --model or --config and --init")
+    if init and not (config or protocol):
+        raise BadInput("--init needs --config, which has the towers that it initialises, such as --config mobilenet")
     protocols, recordings, skipped = (
         _data_sets(protocol, data, out / "recordings") if protocol else ([], {None: data}, {})
     )
-    preset = config or (data_set_preset(protocols) if protocol else DEFAULT_PRESET)
+    preset = config or (data_set_preset(protocols) if protocol and not model else None)
     results = run(
         recordings,
         out,
         protocols=protocols,
-        config=training_config(preset, iterations, init=init, seed=seed),
-        preset=Path(preset).stem,
-        methods=methods.split(",") if methods else METHODS_OF_PRESETS.get(preset, ()),
-        model=model,
+        config=training_config(preset, None, init=init) if preset else None,
+        preset=Path(preset).stem if preset else None,
+        methods=methods.split(",") if methods else (),
+        model=resolve_model(model) if model else None,
         compared=dict(_compared(word, init) for word in compare or ()),
+        seed=seed,
         seeds=seeds,
         split=read_split(split),
         skipped=skipped,

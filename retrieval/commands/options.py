@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from retrieval.data.dataset import Split
     from retrieval.model.config import Config
 
-DEFAULT_PRESET = "small"
 DEFAULT_MODEL = "that of the index, else the shipped one"
 SPLIT = "JSON file with train, validation and test objects"
 
@@ -198,11 +197,11 @@ def read_split(path: Path | None) -> "Split | None":
         raise BadInput(f"{path} is not a JSON file: {error}") from error
 
 
-def training_config(preset: str | None, iterations: int | None, **overrides: str | int | None) -> "Config":
+def training_config(preset: str, iterations: int | None, **overrides: str | int | None) -> "Config":
     """Return the configuration of a preset or TOML file; options that are not None override settings of training."""
     from retrieval.model.config import load_config
 
-    config = load_config(preset or DEFAULT_PRESET)
+    config = load_config(preset)
     changed: dict[str, Any] = {name: value for name, value in overrides.items() if value is not None}
     training = config.training if iterations is None else config.training.with_iterations(iterations)
     return dataclasses.replace(config, training=dataclasses.replace(training, **changed))

@@ -3,12 +3,13 @@
 import os
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
 from _touch_retrieval.cache import Cache
 from retrieval.console.interruption import resumable
-from retrieval.data.dataset import AnyRecording, Split, folder_of
+from retrieval.data.dataset import AnyRecording, Split, finger_count, folder_of
 from retrieval.errors import BadInput
 from retrieval.evaluation import PROTOCOLS, UNSEEN_OBJECTS
 from retrieval.evaluation.experiment import ProtocolRun
@@ -18,9 +19,11 @@ from retrieval.evaluation.protocols.recording import with_split
 from retrieval.evaluation.results import ProtocolResult, ProtocolTimes, Results, Setting, Timings, write_results
 from retrieval.evaluation.touch_to_touch import FROZEN, TouchToTouch, run_touch_to_touch
 from retrieval.methods import METHODS
+from retrieval.methods.late_fusion import LateFusion
 from retrieval.methods.method import Method
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.config import Config, named_config
+from retrieval.model.shipped import is_shipped, shipped_model
 from retrieval.training.initial_weights import training_licences
 from retrieval.training.trainer import Trainer
 from retrieval.version import __version__
@@ -39,6 +42,7 @@ def evaluate(
     methods: Sequence[str | type[Method]] = (),
     model: Path | None = None,
     compared: Mapping[str, Path | Config] = MappingProxyType({}),
+    seed: int | None = None,
     seeds: int | None = None,
     split: Split | None = None,
     skipped: Mapping[str, str] = MappingProxyType({}),
@@ -54,17 +58,18 @@ def evaluate(
         out: Folder of the results.
         protocols: Names, or your own protocols, which are named by their titles. Default: "unseen-objects", one split
             of the recording, with which each method is described in depth.
-        config: Towers, heads and split, if `model` does not give them: a `Config` (`Config.using` accepts your own
-            towers and losses), or an argument of `load_config`. Its seed is the seed of every random draw. Default:
-            "small", with `protocols` "real", or "linear" if all compare touches with touches. Only "unseen-objects"
-            trains towers; other protocols use frozen ones.
+        config: Towers, heads and split in place of those of a model: a `Config` (`Config.using` accepts your own towers
+            and losses), or an argument of `load_config`. Only "unseen-objects" trains towers; other protocols use
+            frozen ones. Default: none, with `protocols` "mobilenet", or "linear" if all compare touches with touches.
         preset: Name of the configuration in the report. Default: the configuration's name.
-        methods: Names, or your own classes, which the report lists by class name. Default: all, with `protocols` those
-            of `DATA_SET_METHODS`.
-        model: A checkpoint: late fusion scores with it as it is, and other methods are fitted on its towers.
-        compared: More rows by name: a checkpoint, with which late fusion scores as it is; or a configuration whose
-            frozen touch tower is compared by touch-to-touch protocols.
-        seeds: Number of seeds, from that of `config` on. Each repeats the training of each method; with `protocols`,
+        methods: Names, or your own classes, which the report lists by class name. Default: all but "cca_towers", with
+            `protocols` those of `DATA_SET_METHODS`.
+        model: A checkpoint. The first row scores with it as it is; methods are fitted on its features, and late fusion
+            starts from its head. Default: without `config` the shipped model for the number of fingers.
+        compared: More rows by name: a checkpoint that scores as it is; or a configuration whose frozen touch tower is
+            compared by touch-to-touch protocols.
+        seed: Seed of every random draw. Default: that of `config`, else 0.
+        seeds: Number of seeds, from `seed` on. Each repeats the training of each method; with `protocols`,
             each also draws the folds and queries again. Default: 1, with `protocols` 3.
         split: Objects of each part of "unseen-objects". Default: the split of `model`; without a model, a random one.
         skipped: Why a protocol is left out, by its name. The report states these reasons.
@@ -74,7 +79,7 @@ def evaluate(
         The content of results.json.
 
     Raises:
-        BadInput: There is neither method nor model, or a model was trained on test objects.
+        BadInput: There are both a configuration and a model, or a model was trained on test objects.
         ConfigError: A protocol or method is unknown.
         DatasetError: A recording does not fit a protocol.
         CheckpointError: A model cannot be read.
@@ -101,24 +106,37 @@ def evaluate(
     ['cca', 'chance']
     """
     selected = dict(map(_named, protocols or [UNSEEN_OBJECTS]))
-    config, config_name = named_config(config or (data_set_preset(protocols) if protocols else "small"), preset)
-    names = [METHODS.name_of(method) for method in methods or (DATA_SET_METHODS if protocols else METHODS)]
+    if model and config:
+        raise BadInput("A model already defines towers and settings. Give either a model or a configuration.")
+    if protocols and not model:
+        config = config or data_set_preset(protocols)
+    default_methods = DATA_SET_METHODS if protocols else [name for name in METHODS if name != "cca_towers"]
+    names = [METHODS.name_of(method) for method in methods or default_methods]
     count = seeds if seeds is not None else DATA_SET_SEEDS if protocols else 1
     if count < 1:
         raise BadInput(f"An evaluation needs at least 1 seed, got {count}.")
     _require_use(selected, names, compared, split)
     if not isinstance(recordings, Mapping):
         recordings = dict.fromkeys((protocol.data_set for protocol in selected.values()), recordings)
-    training_seeds = list(range(config.training.seed, config.training.seed + count))
-    checkpoint = load_checkpoint(model) if model else None
+    facts_of = {name: read_recording_facts(folder_of(recording)) for name, recording in recordings.items()}
+    own: Config | Checkpoint
+    if config:
+        own, config_name = named_config(config, preset)
+        seed = own.training.seed if seed is None else seed
+        own = replace(own, training=replace(own.training, seed=seed))
+    else:
+        if model is None:
+            (facts,) = facts_of.values()
+            model = shipped_model(finger_count(facts.grasps))
+        own, config_name, seed = load_checkpoint(model), "of the model", seed or 0
+    training_seeds = list(range(seed, seed + count))
     others = {name: one if isinstance(one, Config) else load_checkpoint(one) for name, one in compared.items()}
 
     def encoder(facts: RecordingFacts, source: Config | Checkpoint) -> TowerEncoder:
-        return TowerEncoder.of(facts.grasps, source, config.training.iterations, out, quiet)
+        return TowerEncoder.of(facts.grasps, source, seed, out, quiet)
 
-    facts_of = {name: read_recording_facts(folder_of(recording)) for name, recording in recordings.items()}
     towers_of = {
-        name: {row: encoder(facts, source) for row, source in {FROZEN: checkpoint or config, **others}.items()}
+        name: {row: encoder(facts, source) for row, source in {FROZEN: own, **others}.items()}
         for name, facts in facts_of.items()
     }
     found: dict[str, ProtocolResult] = {}
@@ -127,21 +145,28 @@ def evaluate(
     with resumable(out), Cache(out / "cache.sqlite") as cache:
         for name, protocol in selected.items():
             facts, towers = facts_of[protocol.data_set], towers_of[protocol.data_set]
+            first, are_trained = towers[FROZEN], False
             if name == UNSEEN_OBJECTS:
-                protocol = with_split(facts, config.training, checkpoint, split)
-                if not towers[FROZEN].config.training.freeze_towers:
-                    towers = {**towers, FROZEN: encoder(facts, _trained(facts, protocol, towers[FROZEN], out, quiet))}
+                protocol = with_split(facts, first.config.training, first.checkpoint, split)
+                if are_trained := not first.config.training.freeze_towers:
+                    first = encoder(facts, _trained(facts, protocol, first, out, quiet))
             if isinstance(protocol, TouchToTouch):
                 found[name] = run_touch_to_touch(protocol, facts, towers, training_seeds, out / "common-frame", quiet)
                 continue
-            rows = [Row(method, method, towers[FROZEN]) for method in dict.fromkeys(names)]
-            rows += [Row(row, "late_fusion", towers[row]) for row in others if towers[row].checkpoint]
+            rows = []
+            if model:
+                rows = [Row("shipped model" if is_shipped(model) else model.name, "late_fusion", first, True)]
+            rows += [
+                Row(method, method, first, are_trained and issubclass(METHODS.load(method), LateFusion))
+                for method in dict.fromkeys(names)
+            ]
+            rows += [Row(row, "late_fusion", towers[row], True) for row in others if towers[row].checkpoint]
             run = ProtocolRun(name, protocol, facts, rows, training_seeds, out, quiet)
             found[name], times[name] = run.measure(cache)
     setting = Setting(
-        preset="of the model" if model else config_name,
-        config=config.without_paths(),
-        model=checkpoint.digest if checkpoint else None,
+        preset=config_name,
+        config=(own if isinstance(own, Config) else own.config).without_paths(),
+        model=own.digest if isinstance(own, Checkpoint) else None,
         compared={name: one.without_paths() if isinstance(one, Config) else one.digest for name, one in others.items()},
         seeds=training_seeds,
     )
@@ -153,7 +178,7 @@ def evaluate(
 
 def data_set_preset(protocols: Sequence[str | Protocol]) -> str:
     """Return the default preset of an evaluation by these protocols."""
-    return "linear" if all(isinstance(_named(choice)[1], TouchToTouch) for choice in protocols) else "real"
+    return "linear" if all(isinstance(_named(choice)[1], TouchToTouch) for choice in protocols) else "mobilenet"
 
 
 def _named(choice: str | Protocol) -> tuple[str, Protocol]:

@@ -25,7 +25,6 @@ from retrieval.evaluation.protocol import Protocol, RecordingFacts
 from retrieval.evaluation.queries import MethodScores, draw_queries, score_queries, timed
 from retrieval.evaluation.results import MethodTimes, ProtocolResult, ProtocolTimes, RowResult
 from retrieval.methods import CHANCE, METHODS
-from retrieval.methods.late_fusion import LateFusion
 from retrieval.methods.method import Method, MethodSettings
 from retrieval.metrics.measure import Measure, pooled
 from retrieval.metrics.registry import MethodScoreTables
@@ -69,7 +68,7 @@ class Experiment:
         split: Split of the fold.
         seed: Seed of the fit.
         draw_seed: Seed of folds, queries, pairs and tests.
-        is_control: Whether the method is fitted in any case, also if the row's towers are those of a whole model.
+        is_control: Whether only the measures of controls are computed, without details.
     """
 
     of: "ProtocolRun"
@@ -128,6 +127,7 @@ class Experiment:
                 "method": self.row.method,
                 "kind": self.kind,
                 "is_control": self.is_control,
+                "is_unfitted": self.row.is_unfitted,
                 "seeds": [self.seed, self.draw_seed],
                 "features": self.features.digest,
                 "recording": self.of.facts.digest,
@@ -167,27 +167,26 @@ class Experiment:
     def _fit(self) -> tuple[Method, float]:
         is_quiet = self.of.quiet or not self.of.protocol.in_depth  # a bar shows the progress
         if not is_quiet:
-            say(f"evaluate: {self.row.method}, seed {self.seed}" + (f" ({self.kind})" if self.is_control else ""))
-        is_permuted, method = self.kind == "permuted", METHODS.load(self.row.method)
-        config, checkpoint = self.row.towers.config, None if self.is_control else self.row.towers.checkpoint
+            name = f"{self.row.method} ({self.kind})" if self.is_control else self.row.name
+            say(f"evaluate: {name}, seed {self.seed}")
         settings = MethodSettings(
-            config.without_candidate_encoder() if is_permuted else config,  # there is no ranking to learn
+            self.row.towers.config,
             self.seed,
             self._folder,
             is_quiet,
             fit_on_validation=not self.of.protocol.in_depth,
             kind_of=self.of.facts.kind_of,
+            model=self.row.towers.checkpoint if self.row.is_unfitted else None,
         )
-        if checkpoint and issubclass(method, LateFusion):
-            return method.of_checkpoint(checkpoint, settings), 0.0
         rows = self.of.protocol.rows_to_fit(thin_grasps(self.of.facts.grasps, self._max_grasps))
         features = self.features.select(rows)
         parts = [features.of_objects(part) for part in (self.split.train, self.split.validation)]
-        if is_permuted:
+        if self.kind == "permuted":
             parts = [permute_touches(part, self.seed) for part in parts]
-        fitted = method(settings)
+        fitted = METHODS.load(self.row.method)(settings)
         with one_thread():  # heads are small; times refer to one core
-            return fitted, timed(lambda: fitted.fit(*parts))[1]
+            seconds = timed(lambda: fitted.fit(*parts))[1]
+        return fitted, 0.0 if self.row.is_unfitted else seconds
 
     def _measures(self, scores: MethodScores) -> dict[str, Measure]:
         """Return the measures of each gallery, pooled."""
@@ -323,9 +322,7 @@ class ProtocolRun:
         """Return the experiments of a row with one kind of inputs, by seed and fold."""
         seeds = {seed: seed for seed in self.folds}  # of the fit, and of the draws
         if self.protocol.in_depth:
-            method = METHODS.load(row.method)
-            is_whole_model = row.towers.checkpoint is not None and issubclass(method, LateFusion)
-            is_one_fit = is_control or is_whole_model or not method.is_seeded
+            is_one_fit = is_control or row.is_unfitted or not METHODS.load(row.method).is_seeded
             seeds = dict.fromkeys(self.seeds[:1] if is_one_fit else self.seeds, self.seeds[0])
         return [
             [

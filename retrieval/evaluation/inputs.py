@@ -8,7 +8,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,17 @@ INPUTS = {
 }
 """Kind of inputs -> description. "touch" is the result, the last two are ceilings, the others are controls."""
 _BUMPS = (4, 16, 64)
+FURTHER: dict[str, Any] = {
+    "freeze_towers": True,
+    "iterations": 40,
+    "touches_per_batch": 32,
+    "learning_rate": 1e-4,
+    "schedule": "cosine",
+    "validate_every": 10,
+    "validation_fraction": 0.2,
+    "test_fraction": 0.3,
+}
+"""Settings with which the head of a checkpoint is trained further, and fractions of the objects for its evaluation."""
 
 
 class ControlCca(Cca):
@@ -51,8 +62,8 @@ CONTROL_CCA = METHODS.name_of(ControlCca)
 class TowerEncoder:
     """Towers that encode the grasps of a recording; each kind of inputs is encoded once.
 
-    Late fusion scores with `checkpoint` as it is; without one, heads are fitted with `config`. `cache` is the folder of
-    the cache of features.
+    Heads are fitted with `config`, from the head of `checkpoint` if there is one. `cache` is the folder of the cache of
+    features.
     """
 
     grasps: list[Grasp]
@@ -64,11 +75,10 @@ class TowerEncoder:
     _encoded: dict[tuple[str, bool, int | None], Features] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, grasps: list[Grasp], source: Config | Checkpoint, iterations: int, cache: Path, quiet: bool) -> Self:
-        """Return the frozen towers of a configuration, or the towers of a checkpoint.
+    def of(cls, grasps: list[Grasp], source: Config | Checkpoint, seed: int, cache: Path, quiet: bool) -> Self:
+        """Return the frozen towers of a configuration, or the towers of a checkpoint, whose seed is replaced.
 
-        If a checkpoint has two fingers and the recording one, both fingers get the same touch. Heads on the towers of a
-        checkpoint are fitted with `iterations` steps.
+        If a checkpoint has two fingers and the recording one, both fingers get the same touch.
 
         Raises:
             DatasetError: The recording has more fingers than the checkpoint.
@@ -82,15 +92,7 @@ class TowerEncoder:
                 f"{source.path} needs {fingers} finger(s), but the recording has {recorded}. Evaluate a model for "
                 f"{recorded} finger(s)."
             )
-        training = replace(
-            source.config.training,
-            init="random",
-            init_photo="",
-            start="",
-            init_touch="",
-            iterations=iterations,
-            freeze_towers=True,
-        )
+        training = replace(source.config.training, **FURTHER, seed=seed, start=str(source.path))
         config = replace(source.config, training=training)
         return cls(with_fingers(grasps, fingers), config, source.matcher, source, cache, quiet)
 
@@ -152,11 +154,12 @@ class TowerEncoder:
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """A row of the result table: its name, a method, and the towers under it."""
+    """A row of the result table: its name, a method, the towers under it, and whether their checkpoint scores as is."""
 
     name: str
     method: str
     towers: TowerEncoder
+    is_unfitted: bool = False
 
 
 def with_fingers(grasps: Sequence[Grasp], fingers: int) -> list[Grasp]:

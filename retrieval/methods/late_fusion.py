@@ -4,7 +4,6 @@ import dataclasses
 import tempfile
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 import torch
@@ -23,27 +22,22 @@ SOURCE = "features of a recording"
 
 
 class LateFusion(Method):
-    """Match logits of a fusion head over frozen towers. The encodings are partial activations of its first layer."""
+    """Match logits of a fusion head over frozen towers. The encodings are partial activations of its first layer.
+
+    If the configuration names a checkpoint to start from, its head is trained further, and kept if no step is better
+    on validation objects.
+    """
 
     uses_cells = True
 
-    @classmethod
-    def of_checkpoint(cls, checkpoint: Checkpoint, settings: MethodSettings) -> Self:
-        """Return the method with the model of a checkpoint, already fitted."""
-        method = cls(settings)
-        method._use_checkpoint(checkpoint)
-        if checkpoint.posterior is not None:  # the logit at which the likelihood ratio is 1
-            method.best_params["pair_threshold"] = checkpoint.posterior.threshold
-        matcher = checkpoint.matcher
-        method._shapes = (matcher.config.fingers, matcher.touch_tower.output_count), (matcher.photo_feature_count,)
-        return method
-
     def _fit(self, train: Features, validation: Features) -> None:
-        self._use_checkpoint(trained_checkpoint(self.settings, train, validation))
+        self._use_checkpoint(self.settings.model or trained_checkpoint(self.settings, train, validation))
 
     def _use_checkpoint(self, checkpoint: Checkpoint) -> None:
         self.checkpoint, self._matcher = checkpoint, checkpoint.matcher
         self.best_params = {"step": checkpoint.provenance["step"], **checkpoint.provenance["metrics"]}
+        if checkpoint.posterior is not None:  # the logit at which the likelihood ratio is 1
+            self.best_params["pair_threshold"] = checkpoint.posterior.threshold
 
     @torch.inference_mode()
     def _encode_touch(self, touch: Array) -> Array:

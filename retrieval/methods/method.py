@@ -13,6 +13,7 @@ from retrieval.errors import BadInput, NumericalError
 from retrieval.model.config import Config
 
 if TYPE_CHECKING:
+    from retrieval.model.checkpoint import Checkpoint
     from retrieval.training.features import Features
 
 Array = NDArray[np.float32]
@@ -31,6 +32,7 @@ class MethodSettings:
             settings are chosen. A calibration on their scores is then overconfident.
         kind_of: The kind of each object, if the recording names it. Half of each kind is then held out together to
             choose settings.
+        model: A trained model, with which late fusion and retrieve and rerank score as it is.
 
     >>> retrieval.MethodSettings(retrieval.load_config("tiny")).seed
     0
@@ -42,6 +44,7 @@ class MethodSettings:
     quiet: bool = True
     fit_on_validation: bool = False
     kind_of: Mapping[str, str] | None = None
+    model: "Checkpoint | None" = None
 
 
 class Method(ABC):

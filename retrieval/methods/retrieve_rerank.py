@@ -1,12 +1,15 @@
 """Retrieve and rerank, as in a user's query: candidates by embedding, scored by match logit; trained as late fusion."""
 
+import dataclasses
+from pathlib import Path
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from retrieval.methods.late_fusion import LateFusion, trained_checkpoint
 from retrieval.methods.method import Array
-from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.training.distil import feature_partials, with_candidate_encoder
 from retrieval.training.features import Features
 
@@ -23,11 +26,18 @@ class RetrieveRerank(LateFusion):
     """Fraction of the gallery that is reranked."""
 
     def _fit(self, train: Features, validation: Features) -> None:
-        checkpoint = trained_checkpoint(self.settings, train, validation)
-        if self.settings.config.matcher.candidate_width:
-            config = checkpoint.config.with_candidate_encoder_of(self.settings.config)
-            partials = (feature_partials(checkpoint.matcher, part) for part in (train, validation))
-            checkpoint = with_candidate_encoder(checkpoint, config, *partials, quiet=self.settings.quiet)
+        checkpoint, settings = self.settings.model, self.settings.config
+        if checkpoint is None:
+            checkpoint = trained_checkpoint(self.settings, train, validation)
+            config = checkpoint.config.with_candidate_encoder_of(settings)
+            if settings.training.start and config.matcher.candidate_width:  # that of the start still fits
+                start = load_checkpoint(Path(settings.training.start)).matcher
+                checkpoint.matcher.candidate_encoder = start.candidate_encoder
+                checkpoint.matcher.config = config.matcher
+                checkpoint = dataclasses.replace(checkpoint, config=config)
+            elif config.matcher.candidate_width:
+                partials = (feature_partials(checkpoint.matcher, part) for part in (train, validation))
+                checkpoint = with_candidate_encoder(checkpoint, config, *partials, quiet=self.settings.quiet)
         self._use_checkpoint(checkpoint)
 
     def _use_checkpoint(self, checkpoint: Checkpoint) -> None:

@@ -262,7 +262,7 @@ class Config:
         Raises:
             ConfigError: A name is unknown.
 
-        >>> config = retrieval.load_config("small").using(tower="resnet18", losses={"listwise": 0.5})
+        >>> config = retrieval.load_config("mobilenet").using(tower="resnet18", losses={"listwise": 0.5})
         >>> config.matcher.tower, config.training.weights["listwise"]
         ('resnet18', 0.5)
         """
@@ -303,9 +303,9 @@ class Config:
 
 
 def load_config(name_or_path: str) -> Config:
-    """Read a named preset (`paper`, `small`, ...) or a TOML file, and import its modules. Raises ConfigError.
+    """Read a named preset (`paper`, `mobilenet`, ...) or a TOML file, and import its modules. Raises ConfigError.
 
-    >>> retrieval.load_config("small").training.weights["contrastive"] > 0
+    >>> retrieval.load_config("mobilenet").training.weights["contrastive"] > 0
     True
     >>> retrieval.load_config("huge")
     Traceback (most recent call last):

@@ -104,7 +104,7 @@ def print_results(results: Results) -> None:
     for view in views(results, None):
         if table := tables.measures(view, {key: view.measure_label(key) for key in view.headlines}):
             print_columns(view.result.title, table.header, table.rows, words=(0,))
-            for note in table.notes:
+            for note in filter(None, (view.note, *table.notes)):
                 show(note)
         for line in tables.verdicts(view):
             show(line)
@@ -125,6 +125,8 @@ def _lead(view: ProtocolView) -> Iterator[Text]:
         f"{view.result.rule} {recording.objects} objects, {recording.grasps:,} grasps, source: {recording.source}; "
         f"{counts}."
     )
+    if view.note:
+        yield Text(capitalized(view.note))
     if verdicts := tables.verdicts(view):
         yield from (Text(line, warn="does not count" in line) for line in verdicts)
     else:
@@ -250,10 +252,10 @@ def _reject(view: ProtocolView) -> Blocks:
         yield Text(TOO_FEW)
 
 
-def _verification(view: ProtocolView) -> Blocks:
-    for found in (details.verification for details in view.details.values() if details.verification):
-        one = next(iter(found["random"].values()))
-        yield tables.verification(found)
+def _verification(view: ProtocolView, _: str, details: Details) -> Iterator[Block]:
+    if details.verification:
+        one = next(iter(details.verification["random"].values()))
+        yield tables.verification(details.verification)
         yield Text(
             f"{one.sequences:,} sequences of grasps of {one.objects} unseen objects. A sequence is accepted if "
             "its largest log likelihood ratio so far reaches the threshold. Impostors: every other unseen object, or "
@@ -299,6 +301,6 @@ PARTS: dict[str, Callable[[ProtocolView], Blocks]] = {
     "Confusions": lambda view: _each(view, tables.confusions),
     "Calibration": lambda view: _each(view, _reliability),
     "Is the object in the catalogue?": _reject,
-    "Is it the expected object?": _verification,
+    "Is it the expected object?": lambda view: _each(view, _verification),
     "Recording": _recording,
 }

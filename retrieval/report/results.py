@@ -16,6 +16,8 @@ METHOD_LABELS = {
     "cca": "CCA",
     "chance": "random scores",
 }
+NOT_FITTED = ", not fitted"
+"""End of the label of a checkpoint that scores as it is."""
 HEADLINES = ("pair_accuracy", "topn_k5", "topn_k10", grasps_metric_name(5), "map")
 """Measures of the overview of a protocol with many measures."""
 
@@ -61,8 +63,19 @@ class ProtocolView:
         """Return the label of a row: that of its method, or the name of a checkpoint that scores as it is."""
         found = self.result.rows.get(row)
         if found and found.method != row and found.model is not None:
-            return f"{row} (unadapted)"
+            return f"{row}{NOT_FITTED}"
         return METHOD_LABELS.get(row, row.rpartition(":")[2].replace("_", " "))
+
+    @property
+    def note(self) -> str | None:
+        """A sentence on the rows of checkpoints that score as they are; None without such a row."""
+        labels = [label for row in self.result.rows if (label := self.label(row)).endswith(NOT_FITTED)]
+        if not labels:
+            return None
+        return (
+            f"{' and '.join(labels)}: the checkpoint as it is, trained on none of the test objects. The other "
+            "methods are fitted on the training objects of the recording."
+        )
 
     def measure_label(self, key: str) -> str:
         """Return the label of a measure."""

@@ -43,7 +43,7 @@ SHORTER = {
     "identify": ["--grasps", "2"],
     "export": [],
     "export-recording": [],
-    "evaluate": ["--config", "tiny", "--iterations", "2", "--seeds", "1", "--methods", "late_fusion,chance"],
+    "evaluate": ["--config", "tiny", "--seeds", "1", "--methods", "late_fusion,chance"],
     "frontier": ["--only", "partials", "--recording", "recording"],
     "serve": ["--port", "0"],
 }

@@ -76,7 +76,7 @@ def test_the_exit_codes_of_a_query():
 def test_the_results_of_an_evaluation(tmp_path, recording):
     split = make_split(load_grasps(recording), validation=0.3, test=0.3, seed=0)
     (tmp_path / "split.json").write_text(json.dumps(split.to_dict()))
-    quick = ["--config", "tiny", "--iterations", "2", "--methods", "late_fusion,chance"]
+    quick = ["--config", "tiny", "--methods", "late_fusion,chance"]
     quick += ["--split", str(tmp_path / "split.json")]
     assert main(["evaluate", str(recording), "--out", str(tmp_path / "out"), *quick]) == 0
     results = json.loads((tmp_path / "out" / "results.json").read_text())

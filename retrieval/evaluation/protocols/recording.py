@@ -24,10 +24,10 @@ UNSEEN_OBJECTS = Protocol(
     f"{_RULE}The split is drawn.",
     lambda facts, seed: [make_split(facts.grasps, validation=0.15, test=0.15, seed=seed)],
     METRICS,
-    controls=dict.fromkeys(("permuted", "no_contact", "low_pass"), "late_fusion"),
+    controls={"permuted": "cca", "no_contact": "cca", "low_pass": "late_fusion"},
     ceilings=dict.fromkeys(("touch_to_touch", "photo_to_photo"), "cca"),
     control_measures=("pair_accuracy", "topn_k5", "topn_k10"),
-    max_grasps={"train": 8, "validation": 12},
+    max_grasps={"train": 2, "validation": 12},
     in_depth=True,
 )
 
@@ -85,7 +85,7 @@ def _split(
     if shared := trained & recorded:
         raise DatasetError(
             f"The recording must contain all training objects of the model or none of them, but contains {len(shared)} "
-            f"of {len(trained)}, such as {min(shared)}. Give a split with --split."
+            f"of {len(trained)}, such as {min(shared)}. Give a split with --split, or other towers with --config."
         )
     drawn = make_split(grasps, validation=settings.validation_fraction, test=settings.test_fraction, seed=settings.seed)
     return drawn, "drawn; the model was trained on none of its objects" if model else "drawn"

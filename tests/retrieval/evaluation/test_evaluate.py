@@ -4,6 +4,7 @@ import dataclasses
 import json
 import shutil
 from collections import defaultdict
+from importlib import resources
 
 import numpy as np
 import pytest
@@ -68,7 +69,8 @@ def run(grasped):
     """Function that evaluates the recording into a folder."""
 
     def run(out, **changes):
-        options = {"config": CONFIG, "preset": "test", "methods": FEW, "quiet": True} | changes
+        towers = {} if "model" in changes else {"config": CONFIG, "preset": "test"}
+        options = towers | {"methods": FEW, "quiet": True} | changes
         return evaluate(options.pop("recording", grasped), out, **options)
 
     return run
@@ -189,7 +191,8 @@ def test_a_stopped_run_resumes_and_ends_byte_identical_without_paths_and_times(m
     assert fitted == ["LateFusion", "LateFusion", "RetrieveRerank", "RetrieveRerank", "Cca"]
     fitted.clear()
     run(out, seeds=2)
-    assert fitted == ["Cca", "Constant", *["LateFusion"] * 3, "Cca", "Cca"]  # last: the controls and the ceilings
+    # last: the controls and the ceilings
+    assert fitted == ["Cca", "Constant", "Cca", "Cca", "LateFusion", "Cca", "Cca"]
     text = (out / "results.json").read_text()
     assert text == (made[1] / "results.json").read_text()
     assert not [part for part in (str(tmp_path), '_s"', '_ms"') if part in text]
@@ -268,12 +271,14 @@ def model(grasped, tmp_path_factory):
 def test_a_checkpoint_is_evaluated_on_its_unseen_objects(model, run, tmp_path, monkeypatch):
     fitted = count_fits(monkeypatch)
     results = run(tmp_path / "out", model=model.path, methods=("late_fusion", "cca"), seeds=2)
-    assert fitted == ["Cca", *["LateFusion"] * 3, "Cca", "Cca"]  # the controls and the ceilings
+    # The model as it is, late fusion from its head for each seed, then the controls and the ceilings
+    assert fitted == [*["LateFusion"] * 3, "Cca", "Cca", "Cca", "LateFusion", "Cca", "Cca"]
     assert set(of(results).folds[0][0]["test"]) == set(model.split.test)
     assert "the model's own" in of(results).rule
     assert results.setting.model == model.digest
     own = -model.posterior.offset / model.posterior.slope  # where slope * logit + offset is 0
-    fusion, cca = of(results).rows["late_fusion"], of(results).rows["cca"]
+    fusion, cca = of(results).rows["m.safetensors"], of(results).rows["cca"]
+    assert list(of(results).rows) == ["m.safetensors", "late_fusion", "cca"]
     assert fusion.best_params == [
         [{"step": model.provenance["step"], **model.provenance["metrics"], "pair_threshold": pytest.approx(own)}]
     ]
@@ -284,7 +289,7 @@ def test_a_checkpoint_is_evaluated_on_its_unseen_objects(model, run, tmp_path, m
     assert "pair_accuracy" not in cca.measures
     assert all(one.measure != "pair_accuracy" for one in of(results).comparisons)
     times = read_results(tmp_path / "out" / "timings.json", Timings).protocols[UNSEEN_OBJECTS].rows
-    assert times["late_fusion"].fit_s is None  # a checkpoint is not fitted
+    assert times["m.safetensors"].fit_s is None  # a checkpoint is not fitted
     assert times["cca"].fit_s > 0
 
 
@@ -309,6 +314,7 @@ def test_a_preset_with_trained_towers_uses_them_for_late_fusion(run, model, tmp_
     results = run(tmp_path / "out", config=TRAINED_TOWERS, methods=("late_fusion", "retrieve_rerank"))
     made = load_checkpoint(tmp_path / "out" / "model.safetensors")
     assert of(results).rows["late_fusion"].model == made.digest == model.digest  # the checkpoint of `retrieve train`
+    assert of(results).rows["late_fusion"].best_params[0][0]["step"] == made.provenance["step"]  # not trained further
     no_fits(monkeypatch)
     assert run(tmp_path / "out", config=TRAINED_TOWERS, methods=("late_fusion", "retrieve_rerank")) == results
 
@@ -316,6 +322,8 @@ def test_a_preset_with_trained_towers_uses_them_for_late_fusion(run, model, tmp_
 def test_wrong_arguments_are_refused_before_anything_is_read(run, tmp_path):
     with pytest.raises(ConfigError, match=r"late_fusion, .*; got 'oracle'"):
         run(tmp_path / "out", methods=("cca", "oracle"))
+    with pytest.raises(BadInput, match="either a model or a configuration"):
+        run(tmp_path / "out", config=CONFIG, model=tmp_path / "m.safetensors")
     with pytest.raises(BadInput, match="at least 1 seed, got 0"):
         run(tmp_path / "out", seeds=0)
     with pytest.raises(BadInput, match="takes a split, got objectfolder"):
@@ -325,11 +333,13 @@ def test_wrong_arguments_are_refused_before_anything_is_read(run, tmp_path):
 
 def test_the_command_writes_a_report_and_one_json_document(grasped, tmp_path, capsys):
     out = tmp_path / "report"
-    command = ["evaluate", str(grasped), "--out", str(out), "--config", "tiny", "--iterations", "6"]
+    tiny = (resources.files("retrieval") / "configs" / "tiny.toml").read_text()
+    (tmp_path / "tiny.toml").write_text(tiny.replace("iterations = 120", "iterations = 6"))
+    command = ["evaluate", str(grasped), "--out", str(out), "--config", str(tmp_path / "tiny.toml")]
     assert main([*command, "--methods", "late_fusion,cca,chance", "--json"]) == 0
     output = capsys.readouterr()
-    for role in ("", " (permuted)", " (low_pass)"):
-        assert f"evaluate: late_fusion, seed 0{role}\n" in output.err
+    for role in ("late_fusion", "cca (permuted)", "late_fusion (low_pass)"):
+        assert f"evaluate: {role}, seed 0\n" in output.err
     assert json.loads(output.out) == json.loads((out / "results.json").read_text())
     assert (out / "report.html").is_file()
     assert json.loads(output.out)["setting"]["preset"] == "tiny"
@@ -345,3 +355,28 @@ def test_the_command_refuses_conflicting_options(grasped, tmp_path, capsys):
     assert main([*command, "--config", "paper"]) == 2
     assert "give either --model or --config and --init" in capsys.readouterr().err
     assert main(command) == 2
+    assert main([*command[:-2], "--init", "random"]) == 2
+    assert "--init needs --config" in capsys.readouterr().err
+
+
+def test_without_a_configuration_the_first_row_is_the_shipped_model(grasped, tmp_path):
+    results = evaluate(grasped, tmp_path, methods=("late_fusion", "retrieve_rerank", "chance"), quiet=True)
+    write_report(tmp_path)
+    found, text = of(results), (tmp_path / "report.md").read_text()
+    assert list(found.rows) == ["shipped model", "late_fusion", "retrieve_rerank", "chance"]
+    assert "Shipped model, not fitted: the checkpoint as it is, trained on none of the test objects." in text
+    assert [len(found.folds[0][0][part]) for part in ("train", "validation", "test")] == [9, 4, 5]
+
+
+@pytest.mark.parametrize("objects", [1, 3])
+def test_too_few_objects_are_one_line(objects, tmp_path, capsys):
+    few = synthetic.write_recording(tmp_path / "few", synthetic.make_objects(objects), 3)
+    assert main(["evaluate", str(few), "--out", str(tmp_path / "out")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "two objects in each" in line
+
+
+def test_eight_objects_give_a_result_that_says_how_little_it_is_worth(tmp_path, capsys):
+    few = synthetic.write_recording(tmp_path / "few", synthetic.make_objects(8), 3)
+    assert main(["evaluate", str(few), "--out", str(tmp_path / "out"), "--methods", "cca,chance"]) == 0
+    assert "Fewer than 5 objects" in capsys.readouterr().out

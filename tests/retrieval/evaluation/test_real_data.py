@@ -10,7 +10,7 @@ from retrieval.evaluation.results import Results, read_results
 from tests import real_data_sets
 from tests.data import touch_data
 
-TINY = ["--config", "tiny", "--iterations", "2", "--seeds", "2", "--methods", "cca,chance"]
+TINY = ["--config", "tiny", "--seeds", "2", "--methods", "cca,chance"]
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,7 @@ def test_a_checkpoint_is_a_row_and_one_finger_is_used_for_both_of_its_fingers(da
     row = read(tmp_path)["billets-places"].rows["mine"]
     assert row.model
     assert row.verdict
-    assert "mine (unadapted)" in (tmp_path / "report.md").read_text()
+    assert "mine, not fitted" in (tmp_path / "report.md").read_text()
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from retrieval.errors import BadInput
 from retrieval.methods.late_fusion import LateFusion
 from retrieval.methods.method import MethodSettings
 from retrieval.methods.retrieve_rerank import RetrieveRerank, merge_scores
-from retrieval.model.checkpoint import load_checkpoint
+from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
 from retrieval.training.features import encode_recording
 from retrieval.training.initial_weights import build_matcher
 from retrieval.training.trainer import Trainer, train_matcher
@@ -87,7 +87,8 @@ def test_another_setting_or_other_features_are_trained_again(parts, tmp_path, mo
 def test_a_finished_fit_or_a_checkpoint_is_not_trained_again_and_scores_the_same(method, fitted, parts, monkeypatch):
     monkeypatch.setattr(Trainer, "run", lambda *_, **__: pytest.fail("trained"))
     checkpoint = load_checkpoint(fitted.settings.folder / "late_fusion-0.safetensors")
-    loaded = method.of_checkpoint(checkpoint, MethodSettings(FROZEN))
+    loaded = method(MethodSettings(FROZEN, model=checkpoint))
+    loaded.fit(*parts[:2])
     again = fit(method, parts, fitted.settings.folder)
     assert again.best_params["step"] == fitted.best_params["step"]
     scores = [each.score(*encodings(each, parts[2])) for each in (loaded, again)]
@@ -134,6 +135,18 @@ def test_a_model_without_trained_embeddings_scores_every_photo(parts, tmp_path):
     assert method.best_params["reranked_fraction"] == 1.0
     late = fit(LateFusion, parts, tmp_path, with_training(FROZEN, weights={}))
     np.testing.assert_array_equal(method.score(*encodings(method, parts[2])), late.score(*encodings(late, parts[2])))
+
+
+def test_a_fit_from_a_checkpoint_is_not_worse_on_validation_objects_and_takes_its_candidate_encoder(parts, tmp_path):
+    config = dataclasses.replace(FROZEN, matcher=dataclasses.replace(FROZEN.matcher, candidate_width=8))
+    first = fit(RetrieveRerank, parts, tmp_path / "a", config)
+    store_checkpoint(first.checkpoint, tmp_path / "start.safetensors")
+    further = with_training(config, start=str(tmp_path / "start.safetensors"), learning_rate=1e-5, iterations=2)
+    second = fit(RetrieveRerank, parts, tmp_path / "b", further)
+    assert second.best_params["validation_auc"] >= first.best_params["validation_auc"]
+    encoders = (each.checkpoint.matcher.candidate_encoder.state_dict() for each in (first, second))
+    for ours, theirs in zip(*(encoder.values() for encoder in encoders), strict=True):
+        torch.testing.assert_close(ours, theirs)
 
 
 def test_candidates_come_from_the_candidate_encoder_of_the_configuration(parts, tmp_path):
