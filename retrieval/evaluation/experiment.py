@@ -357,7 +357,7 @@ def _method_times(outcomes: Sequence[Sequence[Outcome]]) -> MethodTimes:
 
 
 @one_thread()
-def _tower_times(towers: TowerEncoder, count: int = 4, repeats: int = 3) -> tuple[float, float]:
+def _tower_times(towers: TowerEncoder, count: int = 3, repeats: int = 1) -> tuple[float, float]:
     """Return the median times (ms) of the towers for a touch and a photo, on one thread, without reading files."""
     images, grasps = BatchImages(towers.config.preprocessing), towers.grasps[:count] * repeats
     touches = [timed(partial(touch_features, towers.matcher, [images.touch(grasp)]))[1] for grasp in grasps]

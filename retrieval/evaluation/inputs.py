@@ -38,7 +38,7 @@ INPUTS = {
 _BUMPS = (4, 16, 64)
 FURTHER: dict[str, Any] = {
     "freeze_towers": True,
-    "iterations": 40,
+    "iterations": 20,
     "touches_per_batch": 32,
     "learning_rate": 1e-4,
     "schedule": "cosine",

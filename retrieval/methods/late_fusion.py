@@ -78,9 +78,10 @@ def trained_checkpoint(settings: MethodSettings, train: Features, validation: Fe
     with nullcontext(settings.folder) if settings.folder else tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"late_fusion-{settings.seed}.safetensors"
         trainer = Trainer(config, split, grasps, path, SOURCE, known)
-        towers = frozen_matcher(settings.config)
-        trainer.matcher.touch_tower.load_state_dict(towers.touch_tower.state_dict())
-        trainer.matcher.photo_tower.load_state_dict(towers.photo_tower.state_dict())
+        if not config.training.start:  # which has the towers
+            towers = frozen_matcher(settings.config)
+            trainer.matcher.touch_tower.load_state_dict(towers.touch_tower.state_dict())
+            trainer.matcher.photo_tower.load_state_dict(towers.photo_tower.state_dict())
         return trainer.run_or_reuse(settings.quiet)
 
 
