@@ -165,15 +165,14 @@ class Experiment:
         return dict(self.of.protocol.gallery_of(self.of.facts, self.split))
 
     def _fit(self) -> tuple[Method, float]:
-        is_quiet = self.of.quiet or not self.of.protocol.in_depth  # a bar shows the progress
-        if not is_quiet:
+        if Bar.is_verbose and not self.of.quiet:
             name = f"{self.row.method} ({self.kind})" if self.is_control else self.row.name
             say(f"evaluate: {name}, seed {self.seed}")
         settings = MethodSettings(
             self.row.towers.config,
             self.seed,
             self._folder,
-            is_quiet,
+            self.of.quiet,
             fit_on_validation=not self.of.protocol.in_depth,
             kind_of=self.of.facts.kind_of,
             model=self.row.towers.checkpoint if self.row.is_unfitted else None,
@@ -277,7 +276,7 @@ class ProtocolRun:
                 jobs["", kind] = self._experiments(Row(kind, method, towers), kind, is_control=True)
         outcomes: dict[Job, list[list[Outcome]]] = {}
         count = sum(len(by_fold) for by_seed in jobs.values() for by_fold in by_seed)
-        with Bar(f"evaluating {self.name}", count, "fits", quiet=self.quiet or protocol.in_depth) as bar:
+        with Bar(f"evaluating {self.name}", count, "fits", quiet=self.quiet) as bar:
             for job, by_seed in jobs.items():
                 outcomes[job] = [[] for _ in by_seed]
                 for found, experiments in zip(outcomes[job], by_seed, strict=True):

@@ -338,8 +338,6 @@ def test_the_command_writes_a_report_and_one_json_document(grasped, tmp_path, ca
     command = ["evaluate", str(grasped), "--out", str(out), "--config", str(tmp_path / "tiny.toml")]
     assert main([*command, "--methods", "late_fusion,cca,chance", "--json"]) == 0
     output = capsys.readouterr()
-    for role in ("late_fusion", "cca (permuted)", "late_fusion (low_pass)"):
-        assert f"evaluate: {role}, seed 0\n" in output.err
     assert json.loads(output.out) == json.loads((out / "results.json").read_text())
     assert (out / "report.html").is_file()
     assert json.loads(output.out)["setting"]["preset"] == "tiny"
