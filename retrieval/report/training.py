@@ -28,3 +28,5 @@ def print_comparison(checkpoint: Checkpoint) -> None:
         show(f"{difference}: more than a linear fit makes of light and coarse shape.")
     else:
         show(f"{difference}: no evidence that the model uses touch. Record more objects.")
+    if not table["across_sessions"]:
+        show("Within one session drift of light and gel can help: record the objects in another session to exclude it.")

@@ -112,7 +112,9 @@ def train_best(
         fitted = with_calibrations(fitted, [part.touches for part in parts], pooled_parts)
         fitted = with_sensor_calibrations(fitted, problem.grasps, features, quiet=quiet)
     licences = dict.fromkeys(recipes[best].licences(recording))
-    table = _table(accuracies, identification(low_pass), _groups(comparison.folds))
+    table = _table(
+        accuracies, identification(low_pass), _groups(comparison.folds), across_sessions=comparison.across_sessions
+    )
     provenance = {
         "source": recording_source(recording),
         "data_digest": data_digest(problem.grasps),
@@ -171,7 +173,7 @@ class Comparison:
         self._encoded: dict[tuple[int, str, str], Features] = {}
         sessions = list(dict.fromkeys(grasp.session for grasp in problem.grasps))
         self._session_of = {grasp.grasp_id: sessions.index(grasp.session) for grasp in problem.grasps}
-        self._across_sessions = bool(objects_of_two_sessions(problem.grasps))
+        self.across_sessions = bool(objects_of_two_sessions(problem.grasps))
         objects = sum(map(len, folds))
         self._max_touches = min(max(MAX_TOUCHES // objects, 2), MAX_TOUCHES_OF_OBJECT)
 
@@ -210,7 +212,7 @@ class Comparison:
         features = features.select(np.concatenate([part[some] for part, some in zip(rows, places, strict=True)]))
         sessions = np.array([self._session_of[name] for name in features.grasp_ids])
         own = np.eye(len(features), dtype=np.bool_)
-        if self._across_sessions:
+        if self.across_sessions:
             own = sessions[:, None] == sessions
         tensors = torch.from_numpy(features.touch_rows), torch.from_numpy(features.photo)
         owners = features.owner, features.owner
@@ -219,7 +221,7 @@ class Comparison:
             score_touches(fitted.matcher, tensors, owners, own, pooled=pooled)
             for pooled in ((False, True) if has_cells else (False,))
         ]
-        if self._across_sessions:
+        if self.across_sessions:
             scored = [dataclasses.replace(touches, touch_group=sessions) for touches in scored]
         return HeldOut(scored[0], scored[1] if has_cells else None, tuple(sorted(set(features.object_ids))))
 
@@ -288,7 +290,9 @@ def _groups(folds: Sequence[Sequence[str]]) -> NDArray[np.int64]:
     return np.array([fold_of[name] for name in sorted(fold_of)])
 
 
-def _table(accuracies: dict[str, Measure], low_pass: Measure, groups: NDArray[np.int64]) -> dict[str, Any]:
+def _table(
+    accuracies: dict[str, Measure], low_pass: Measure, groups: NDArray[np.int64], *, across_sessions: bool
+) -> dict[str, Any]:
     """Return the accuracy of each recipe, of the choice by the objects of other `groups` (O,), and of the control."""
     first = next(iter(accuracies.values()))
     objects, means = first.by_object()[0], np.stack([each.by_object()[1][:, 0] for each in accuracies.values()])
@@ -299,4 +303,5 @@ def _table(accuracies: dict[str, Measure], low_pass: Measure, groups: NDArray[np
     choice = Measure(chosen, np.arange(len(chosen)), first.chance, "")
     rows = {**accuracies, CHOSEN: choice, LOW_PASS: low_pass}
     gallery = f"about {round(1 / first.chance[0])} objects that no fit has seen, one photo of each"
-    return comparison_table(gallery, {name: accuracy_row(row) for name, row in rows.items()}, choice, low_pass)
+    accuracies_by_name = {name: accuracy_row(row) for name, row in rows.items()}
+    return comparison_table(gallery, accuracies_by_name, choice, low_pass, across_sessions=across_sessions)

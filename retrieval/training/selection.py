@@ -133,7 +133,7 @@ def accuracy_row(measure: Measure) -> list[float]:
 
 
 def comparison_table(
-    gallery: str, rows: Mapping[str, Sequence[float]], result: Measure, low_pass: Measure
+    gallery: str, rows: Mapping[str, Sequence[float]], result: Measure, low_pass: Measure, *, across_sessions: bool
 ) -> dict[str, Any]:
     """Return accuracies on held-out objects in JSON types, as a checkpoint stores them.
 
@@ -142,6 +142,7 @@ def comparison_table(
         rows: `accuracy_row` by label.
         result: The accuracy of the model.
         low_pass: That of the control; `gain` is the difference, by object.
+        across_sessions: Whether a touch is compared only with pictures of another session.
     """
     gain = result.by_object()[1] - low_pass.by_object()[1]
     ends = (float(end[0]) for end in bootstrap_interval(gain))
@@ -151,4 +152,5 @@ def comparison_table(
         "gain": [float(gain.mean()), *ends],
         "objects": len(gain),
         "touches": len(low_pass.owner),
+        "across_sessions": across_sessions,
     }

@@ -320,7 +320,7 @@ def _table(measures: Mapping[str, Measure], has_sessions: bool) -> dict[str, Any
     }
     same, low_pass = (measures[name] for name in ("same", "same_low_pass"))
     title = f"one touch, compared with touches of another {'session' if has_sessions else 'sequence'}"
-    return comparison_table(title, rows, same, low_pass)
+    return comparison_table(title, rows, same, low_pass, across_sessions=has_sessions)
 
 
 def _configuration(fingers: int, init: str) -> Config:

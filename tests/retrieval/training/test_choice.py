@@ -119,7 +119,7 @@ def test_the_accuracy_of_the_choice_is_nested():
         Measure(np.array(values)[:, None], np.arange(4), np.array([0.5]), "") for values in ([1, 1, 0, 0], [0, 0, 1, 1])
     )
     groups = choice._groups([["a", "b"], ["c", "d"]])
-    table = choice._table({"first": first, "second": second}, first, groups)
+    table = choice._table({"first": first, "second": second}, first, groups, across_sessions=False)
     assert table["rows"][choice.CHOSEN][0] == 0
     assert table["rows"]["second"][0] == 0.5
     assert choice._groups([["a", "b", "c", "d"]]).tolist() == [0, 1, 0, 1]
