@@ -15,6 +15,7 @@ import os
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from PIL import Image
@@ -42,15 +43,22 @@ def main(names: list[str]) -> int:
 
 
 def execute(document: Mapping[str, Any], parameters: str | None = None) -> Iterator[list[Output]]:
-    """Run the code cells in order; yield the outputs of each. `parameters` replaces the source of the first one."""
-    names: dict[str, Any] = {"__name__": "__main__"}
+    """Run the code cells in order; yield the outputs of each. `parameters` replaces the source of the first one.
+
+    As in Jupyter, the cells run in the module `__main__`, so that their classes can be imported.
+    """
     cells = ["".join(cell["source"]) for cell in document["cells"] if cell["cell_type"] == "code"]
-    for number, source in enumerate(cells):
-        try:
-            yield _run(source if number or parameters is None else parameters, names)
-        except Exception as error:
-            error.add_note(f"in code cell {number + 1}:\n{source}")
-            raise
+    module, program = ModuleType("__main__"), sys.modules["__main__"]
+    sys.modules["__main__"] = module
+    try:
+        for number, source in enumerate(cells):
+            try:
+                yield _run(source if number or parameters is None else parameters, vars(module))
+            except Exception as error:
+                error.add_note(f"in code cell {number + 1}:\n{source}")
+                raise
+    finally:
+        sys.modules["__main__"] = program
 
 
 def kinds(outputs: list[Output]) -> set[str]:

@@ -92,7 +92,7 @@ def synthetic_protocol(methods):
         },
         "ceilings": {"touch_to_touch": control(rng, "two touches of one object", "cca")},
         "comparisons": [
-            {"a": methods[0], "b": other, "measure": "pair_accuracy", "difference": difference} for other in methods[1:]
+            {"a": other, "b": methods[0], "measure": "pair_accuracy", "difference": difference} for other in methods[1:]
         ],
     }
 

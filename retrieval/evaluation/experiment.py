@@ -304,7 +304,7 @@ class ProtocolRun:
             self.folds.values(),
             rows,
             {job: self._by_name(found) for job, found in outcomes.items()},
-            [(self.rows[0].name, other.name) for other in self.rows[1:]],
+            [(other.name, self.rows[0].name) for other in self.rows[1:]],
             Aggregation(self.seeds[0], ratio if protocol.choices else None),
             reasons,
         )

@@ -104,7 +104,7 @@ def test_results_describe_data_settings_and_measures_with_intervals(made):
     assert list(found.rows) == list(FEW)
     assert list(found.controls) == ["permuted", "no_contact", "low_pass"]
     assert list(found.ceilings) == ["touch_to_touch", "photo_to_photo"]
-    assert {(one.a, one.b) for one in found.comparisons} == {("late_fusion", name) for name in FEW[1:]}
+    assert {(one.a, one.b) for one in found.comparisons} == {(name, "late_fusion") for name in FEW[1:]}
     summary = found.rows["late_fusion"].measures["topn_k5"]
     assert (summary.objects, summary.queries, len(summary.value)) == (6, 24, 5)
     for row in found.rows.values():
