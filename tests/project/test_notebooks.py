@@ -13,13 +13,7 @@ from tests import synthetic
 from tests.documents import README, blocks
 
 TINY = {
-    "comparing_baselines": {
-        "recording": "../demo/recording",
-        "out": "../build/comparing-baselines",
-        "preset": "tiny",
-        "iterations": 4,
-        "methods": ("late_fusion", "cca", "chance"),
-    },
+    "comparing_baselines": {"out": "../build/comparing-baselines", "objects": 18, "grasps": 2, "seed": 0, "jobs": 1},
     "error_against_time": {
         "out": "../build/error-against-time",
         "demo": "../demo",
@@ -40,11 +34,12 @@ TINY = {
         "gallery": 2,
     },
     "your_own_data": {
-        "demo": "../demo/recording",
-        "catalogue": "../demo/catalog",
         "out": "../build/your-own-data",
-        "preset": "tiny",
-        "iterations": 2,
+        "objects": 8,
+        "grasps": 2,
+        "seed": 0,
+        "jobs": 1,
+        "init": "random",
         "top": 2,
     },
 }
