@@ -80,24 +80,7 @@ def train_best(
     if split is not None:
         require_fit(split, load_grasps(recording))
     problem = pose(recording, folder, model=model, init=init, unused=split.test if split else (), quiet=quiet)
-    objects = {grasp.object_id for grasp in problem.grasps}
-    if len(objects) < MIN_OBJECTS or len(objects) == len(problem.grasps):
-        raise BadInput(
-            f"A fit needs at least {MIN_OBJECTS} objects with two grasps each, got {len(objects)} objects with "
-            f"{len(problem.grasps)} grasps. Record more."
-        )
-    testable = testable_objects(problem)
-    kinds = {name: RECIPES.load(name) for name in (RECIPES.names() if recipe is None else [RECIPES.name_of(recipe)])}
-    if len(testable) < MIN_OBJECTS:
-        kinds = {name: kind for name, kind in kinds.items() if not kind.uses_start}
-        say("The start model was trained on these objects, so recipes that use it cannot be tested and are left out")
-        testable = objects
-    obstacles = {name: kind.obstacle(problem, len(objects)) for name, kind in kinds.items()}
-    names = [name for name, obstacle in obstacles.items() if not obstacle]
-    if not names:
-        reasons = next(iter(obstacles.values()), "the start model was trained on these objects")
-        raise BadInput(f"Recipe {recipe} does not apply: {reasons}. Leave the recipe out.")
-    folds = draw_folds([group for group in problem.linked if testable.issuperset(group)])
+    names, folds = _candidates(problem, recipe)
     recipes = {name: RECIPES.load(name)(problem) for name in dict.fromkeys([*names, CONTROL])}
     with resumable(folder):
         comparison = Comparison(problem, folds[: -(-ENOUGH_OBJECTS // len(folds[0]))])
@@ -128,6 +111,35 @@ def train_best(
     store_checkpoint(dataclasses.replace(fitted, provenance=provenance), out)
     shutil.rmtree(folder)
     return load_checkpoint(out)
+
+
+def _candidates(problem: Problem, recipe: str | type[Recipe] | None) -> tuple[list[str], list[tuple[str, ...]]]:
+    """Return the names of the recipes that can be compared, or of the only one, and the folds of objects.
+
+    Raises:
+        BadInput: There are too few objects or grasps, or the recipe cannot be fitted.
+    """
+    objects = {grasp.object_id for grasp in problem.grasps}
+    if len(objects) < MIN_OBJECTS or len(objects) == len(problem.grasps):
+        raise BadInput(
+            f"A fit needs at least {MIN_OBJECTS} objects with two grasps each, got {len(objects)} objects with "
+            f"{len(problem.grasps)} grasps. Record more."
+        )
+    testable = objects_of_two_sessions(problem.grasps) or objects
+    split = problem.start.split
+    unknown = testable.difference((*split.train, *split.validation) if split else ())
+    kinds = {name: RECIPES.load(name) for name in (RECIPES.names() if recipe is None else [RECIPES.name_of(recipe)])}
+    if len(unknown) < MIN_OBJECTS:
+        kinds = {name: kind for name, kind in kinds.items() if not kind.uses_start}
+        say("The start model was trained on these objects, so recipes that use it cannot be tested and are left out")
+    else:
+        testable = unknown
+    obstacles = {name: kind.obstacle(problem, len(objects)) for name, kind in kinds.items()}
+    names = [name for name, obstacle in obstacles.items() if not obstacle]
+    if not names:
+        reason = next(iter(obstacles.values()), "the start model was trained on these objects")
+        raise BadInput(f"Recipe {recipe} does not apply: {reason}. Leave the recipe out.")
+    return names, draw_folds([group for group in problem.linked if testable.issuperset(group)])
 
 
 def pose(
@@ -234,14 +246,6 @@ def objects_of_two_sessions(grasps: Sequence[Grasp]) -> set[str]:
     repeated = {name for name, of_object in sessions.items() if len(of_object) > 1}
     needed = max(MIN_OBJECTS, min(MIN_OBJECTS_FOR_FOUR_FOLDS, len(sessions) / 2))
     return repeated if len(repeated) >= needed else set()
-
-
-def testable_objects(problem: Problem) -> set[str]:
-    """Return the objects that the start model was not trained on; with sessions, those that were touched in two."""
-    objects = {grasp.object_id for grasp in problem.grasps}
-    if split := problem.start.split:
-        objects -= {*split.train, *split.validation}
-    return objects & (objects_of_two_sessions(problem.grasps) or objects)
 
 
 def identification(parts: Sequence[HeldOut]) -> Measure:
