@@ -74,7 +74,7 @@ def test_the_shipped_checkpoint_is_far_above_chance_on_unseen_objects(tmp_path, 
     monkeypatch.setattr(recording, "UNSEEN_OBJECTS", without_controls)
     assert shipped.main(["score", str(tmp_path), "--objects", "13", "--grasps", "2", "--jobs", "1"]) == 0
     results = json.loads((tmp_path / "report" / "results.json").read_text())
-    measures = results["protocols"]["unseen-objects"]["rows"]["late_fusion"]["measures"]
+    measures = results["protocols"]["unseen-objects"]["rows"]["shipped model"]["measures"]
     assert measures["topn_k5"]["objects"] == 7
     assert measures["topn_k5"]["value"][0] > 0.4  # chance 0.2
 
