@@ -31,13 +31,21 @@ def with_available_weights(config: Config) -> Config:
     inits = {settings.tower_init(init) for init in (settings.init_touch, settings.init_photo)}
     if inits != {"imagenet"} or settings.start or settings.freeze_towers:
         return config
+    random = dataclasses.replace(settings, init="random", init_touch="", init_photo="")
+    consequence = "The training starts from random weights, as with --init random"
+    return downloaded_or(dataclasses.replace(config, training=random), config, consequence)
+
+
+def downloaded_or(replacement: Config, config: Config, consequence: str) -> Config:
+    """Return `config`, whose initial weights are ImageNet's; if they cannot be downloaded, its replacement.
+
+    A line on stderr states the reason and the consequence.
+    """
     try:
         build_matcher(config)
     except CheckpointError as error:
-        say(f"{error}. The training starts from random weights, as with --init random")
-        return dataclasses.replace(
-            config, training=dataclasses.replace(settings, init="random", init_touch="", init_photo="")
-        )
+        say(f"{error}. {consequence}")
+        return replacement
     return config
 
 

@@ -12,17 +12,16 @@ import numpy as np
 import torch
 from torch import nn
 
-from retrieval.console.output import say
-from retrieval.errors import BadInput, CheckpointError
+from retrieval.errors import BadInput
 from retrieval.metrics.pairs import fit_calibration
 from retrieval.model.config import Config, load_config
 from retrieval.model.encode import one_thread
 from retrieval.model.fusion import Matcher
-from retrieval.model.towers.tower import build_tower
 from retrieval.model.towers.weights import GEL, SHIPPED
 from retrieval.training.calibration import ScoredTouches
 from retrieval.training.cca import CcaSelection, select_settings, tower_widths
 from retrieval.training.features import Features
+from retrieval.training.initial_weights import downloaded_or
 
 PRESET = "linear"
 PUBLISHED_TOWER = "mobilenet_v2"
@@ -51,23 +50,19 @@ def linear_config(fingers: int, init: str = "imagenet") -> Config:
     return dataclasses.replace(config, matcher=matcher, training=dataclasses.replace(training, init=init))
 
 
-def available_weights(init: str) -> str:
-    """Return `init`, or "random", with a message, if it is "imagenet" and these weights cannot be downloaded.
+def available_config(fingers: int, init: str) -> Config:
+    """Return `linear_config`, without the published tower if `init` is "imagenet" and cannot be downloaded.
 
     Raises:
         BadInput: `init` names a tower of the package.
-        CheckpointError: `init` is a file that cannot be read, or does not fit.
     """
     if init in (GEL, SHIPPED):
         raise BadInput(f'The initial weights must be "imagenet", "random" or a file of MobileNetV2, got {init!r}.')
-    try:
-        build_tower(PUBLISHED_TOWER, "stages").initialise(init)
-    except CheckpointError as error:
-        if init != "imagenet":
-            raise
-        say(f"{error}. Without them, the linear fit has the package's towers only: 9 points worse on VT60")
-        return NO_WEIGHTS
-    return init
+    config = linear_config(fingers, init)
+    if init != "imagenet":
+        return config
+    consequence = "Without them, the linear fit has the package's towers only: 9 points worse on VT60"
+    return downloaded_or(linear_config(fingers, NO_WEIGHTS), config, consequence)
 
 
 @one_thread()

@@ -59,7 +59,7 @@ from retrieval.training.cca import (
 )
 from retrieval.training.features import Features, encode_recording
 from retrieval.training.initial_weights import build_matcher, training_licences
-from retrieval.training.linear import available_weights, linear_config
+from retrieval.training.linear import available_config
 from retrieval.training.selection import (
     COMPARED,
     LOW_PASS,
@@ -325,7 +325,7 @@ def _table(measures: Mapping[str, Measure], has_sessions: bool) -> dict[str, Any
 
 def _configuration(fingers: int, init: str) -> Config:
     """Return the configuration of the touch towers of the linear fit; `init` as for `retrieval.train`."""
-    config = linear_config(fingers, available_weights(init))
+    config = available_config(fingers, init)
     return Config(
         dataclasses.replace(config.matcher, photo_tower=NO_TOWER),
         dataclasses.replace(config.training, init_photo="random"),

@@ -14,7 +14,7 @@ from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
 from retrieval.training.features import Features
 from retrieval.training.initial_weights import TOWER_WEIGHTS, build_matcher, checkpoint_licences, training_licences
-from retrieval.training.linear import available_weights, fit_linear, linear_config
+from retrieval.training.linear import available_config, fit_linear
 from retrieval.training.selection import held_out_folds
 from retrieval.training.trainer import Trainer
 
@@ -120,7 +120,7 @@ class Linear(Recipe):
 
     def __init__(self, problem: Problem) -> None:
         super().__init__(problem)
-        self.config = linear_config(problem.fingers, available_weights(problem.init))
+        self.config = available_config(problem.fingers, problem.init)
         self.matcher = build_matcher(self.config).eval()
 
     def licences(self, recording: Path) -> list[DataLicence]:
