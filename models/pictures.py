@@ -1,7 +1,8 @@
 """Labelled pictures of simulated objects, which need no grasp: photos, or presses of both fingers.
 
     metadata.jsonl    a line for each object: object_id, its labels (`robot.sim.objects.draw.SimObject.labels`), and
-                      the names of its pictures under "pictures": photo, or touch_a, touch_a_before, touch_b, ...
+                      the names of its pictures under "pictures": photo, or touch_a, touch_a_before, touch_b, ...; for
+                      several photos the names of their conditions with a number
     images/           the pictures
 
 A photographed object takes a tenth of the time of a grasp, and a press a third. An object's line is written when its
@@ -22,10 +23,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from models.photography import CONDITIONS, Photography, Shot, develop, draw, shoot
 from retrieval.console.progress import Bar
 from robot.recording.folder import read_info
 from robot.rig import load_rig
+from robot.sim.camera import PinholeCamera
 from robot.sim.rig import SimRig
+from robot.sim.scene import Scene
 from robot.storage import SYNC_THREADS, LineFile, file_content, write_files
 from robot.workers import Work, WorkerPool
 
@@ -35,6 +39,10 @@ MIN_AMPLITUDE_MM = 0.05
 """Smaller amplitudes are raised to this one."""
 MAX_PRESSES = 3
 """Maximum number of presses of one object until the jaws meet it."""
+PHOTOS = 3
+"""Photos of an object in each condition, or in varied ones."""
+FIRST_PHOTO = 1000
+"""Number of the placement in the first of several photos; smaller numbers are those of attempts."""
 IMAGES, METADATA = "images", "metadata.jsonl"
 Pictures = dict[str, NDArray[np.uint8]]
 
@@ -72,6 +80,7 @@ class ObjectLabels:
 class LabelledPicture:
     """A photo, or one finger's gel image with its no-contact frame, and the labels of its object."""
 
+    name: str
     file: Path
     before: Path | None
     object_id: str
@@ -89,7 +98,8 @@ def collect_pictures(
     """Photograph or press the first objects of a simulated rig, or continue; return all pictures.
 
     Args:
-        kind: "photo" (one picture of each object) or "touch" (one of each finger).
+        kind: "photo" (one picture of each object), "varied" (`PHOTOS` photos, taken as `photography.draw` decides),
+            "conditions" (`PHOTOS` in each of `CONDITIONS`) or "touch" (one of each finger).
         folder: The folder to write or continue. It must belong to the same kind, seed and rig.
         objects: Number of objects.
         seed: Seed of the rig.
@@ -133,7 +143,7 @@ def load_pictures(folder: Path) -> list[LabelledPicture]:
         for name, file in files.items():
             if not name.endswith("_before"):
                 before = files.get(f"{name}_before")
-                pictures.append(LabelledPicture(file, before, row["object_id"], ObjectLabels.from_dict(row)))
+                pictures.append(LabelledPicture(name, file, before, row["object_id"], ObjectLabels.from_dict(row)))
     return pictures
 
 
@@ -154,4 +164,23 @@ def _worker(kind: str, rig: str, seed: int) -> Work[tuple[Pictures, Mapping[str,
         tries = (sim_rig.press(object_id, number + each) for each in range(MAX_PRESSES))
         return next((pictures for pictures in tries if pictures), {}), sim_rig.labels(object_id)
 
-    return photograph if kind == "photo" else press
+    def several(object_id: str, number: int) -> tuple[Pictures, Mapping[str, Any]]:
+        pictures = {}
+        for number in range(PHOTOS):
+            sim_rig.prepare(object_id, FIRST_PHOTO + number)
+            pictures |= _photos(sim_rig.sim_state.current_scene(), number, None if kind == "varied" else CONDITIONS)
+        return pictures, sim_rig.labels(object_id)
+
+    return {"photo": photograph, "touch": press, "varied": several, "conditions": several}[kind]
+
+
+def _photos(scene: Scene, number: int, conditions: Mapping[str, Photography] | None) -> Pictures:
+    """Return the photo of a scene in each condition, or in a drawn one, by the name of the condition and the number."""
+    conditions = conditions or {"varied": draw(np.random.default_rng([95, scene.seed]))}
+    shots: dict[PinholeCamera, Shot] = {}
+    pictures = {}
+    for name, how in conditions.items():
+        if how.camera not in shots:
+            shots[how.camera] = shoot(scene.obj, scene.placement, how.camera, scene.seed)
+        pictures[f"{name}-{number}"] = develop(shots[how.camera], how, scene.seed)
+    return pictures

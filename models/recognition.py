@@ -93,7 +93,10 @@ def measures(
     features = encode_recording(grasps, checkpoint.matcher, checkpoint.config, cache)
     touches, photos = feature_partials(checkpoint.matcher, features)
     owner, objects = features.owner, len(set(features.object_ids))
-    others = distractor_partials(checkpoint, distractors) if distractors else photos[:0]
+    others = photos[:0]
+    if distractors:
+        pictures = collect_pictures("photo", distractors, objects=DISTRACTORS, seed=SEED, jobs=2)
+        others = photo_partials(checkpoint, [picture.file for picture in pictures])
     photo_owner = np.concatenate([owner, objects + np.arange(len(others))])
     scores = all_scores(checkpoint, touches, torch.cat([photos, others]))
     found: dict[str, Measure] = {}
@@ -152,11 +155,10 @@ def grasp_sets(owner: NDArray[np.int64], count: int, photos: int) -> NDArray[np.
 
 
 @torch.inference_mode()
-def distractor_partials(checkpoint: Checkpoint, folder: Path) -> torch.Tensor:
-    """Return partial activations (N, partial) of photo-only objects."""
-    files = [each.file for each in collect_pictures("photo", folder, objects=DISTRACTORS, seed=SEED, jobs=2)]
+def photo_partials(checkpoint: Checkpoint, files: Sequence[Path]) -> torch.Tensor:
+    """Return partial activations (N, partial) of photos."""
     encoded = []
-    with Bar("encode distractors", len(files), "photos") as bar, worker_pool() as pool:
+    with Bar("encode photos", len(files), "photos") as bar, worker_pool() as pool:
         for images in batches(map_in_order(pool, checkpoint.config.preprocessing.load_photo, files), 32):
             features = photo_features(checkpoint.matcher, images)
             encoded.append(checkpoint.matcher.photo_encoding(features).partial)

@@ -71,12 +71,14 @@ class PinholeCamera:
         focal_px: focal length in pixels.
         position_mm: centre of projection in the rig frame.
         target_mm: point in the middle of the picture, in the rig frame.
+        roll_rad: rotation of the camera about its axis; the picture turns anticlockwise.
     """
 
     px: int = 256
     focal_px: float = 860.0
     position_mm: tuple[float, float, float] = (0.0, -560.0, 390.0)
     target_mm: tuple[float, float, float] = (0.0, 0.0, 80.0)
+    roll_rad: float = 0.0
 
     @cached_property
     def to_rig(self) -> Array:
@@ -85,8 +87,10 @@ class PinholeCamera:
         forward = forward / np.linalg.norm(forward)
         right = np.cross(forward, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
+        down = np.cross(forward, right)
+        c, s = math.cos(self.roll_rad), math.sin(self.roll_rad)
         matrix = np.eye(4)
-        matrix[:3] = np.stack([right, np.cross(forward, right), forward, self.position_mm], axis=1)
+        matrix[:3] = np.stack([c * right + s * down, c * down - s * right, forward, self.position_mm], axis=1)
         return matrix
 
     @cached_property
