@@ -6,7 +6,7 @@ import tomllib
 
 import pytest
 
-from tests.documents import CONTRIBUTING, NOTEBOOKS, PAGES, README, ROOT, SITE, anchors, links, table_rows, text_of
+from tests.documents import CONTRIBUTING, NOTEBOOKS, PAGES, README, ROOT, SITE, anchors, links, text_of
 
 LINKED = (*PAGES, CONTRIBUTING, *NOTEBOOKS)
 OURS = r"(?:retrieval|robot|indexes|tests|benchmarks)"
@@ -22,14 +22,17 @@ def test_every_link_leads_to_a_file_and_to_a_heading_in_it(page):
             assert not anchor or anchor in anchors(target), link
 
 
-def test_the_tables_of_the_readme_are_parts_of_those_in_the_pages():
-    """Each row occurs in a page with the same first cell and its other cells in the same order."""
-    documented = [row for page in SITE for row in table_rows(page)]
-    shown = table_rows(README)
-    assert len(shown) > 15
-    for first, *cells in shown:
-        candidates = [iter(row[1:]) for row in documented if row[0] == first]
-        assert any(all(cell in rest for cell in cells) for rest in candidates), first
+def intervals(text):
+    """Return each value with an interval, in percent: 0.123 [0.1, 0.2] and 12.3 % [10, 20] are (12.3, 10, 20)."""
+    written = re.findall(r"(\d*\.?\d+)(?: %)? \[([\d.]+), ([\d.]+)\]", text)
+    values = [tuple(map(float, numbers)) for numbers in written]
+    return {tuple(round(number * (100 if max(value) <= 1 else 1), 1) for number in value) for value in values}
+
+
+def test_the_results_of_the_readme_are_those_of_the_pages():
+    shown = intervals(text_of(README))
+    assert len(shown) > 10
+    assert shown <= {value for page in SITE for value in intervals(text_of(page))}
 
 
 @pytest.mark.parametrize("page", [*PAGES, CONTRIBUTING], ids=lambda page: page.stem)
