@@ -180,7 +180,7 @@ class Posterior:
 
             slope * n / (1 + dependence * (n - 1)) * l / g + offset  >  log objects + log (p / (1 - p))
 
-        (trials: docs/measurements/answers.md). None if `MAX_GRASPS` in total do not suffice; the prior p is above 0.
+        None if `MAX_GRASPS` in total do not suffice; the prior p is above 0.
         """
         needed = math.log(objects) + math.log(none_prior) - math.log1p(-none_prior) - self.offset
         for total in range(grasps + 1, MAX_GRASPS + 1):

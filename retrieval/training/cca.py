@@ -5,10 +5,9 @@ The fit is in float64, from the singular value decomposition of the centred data
 squares the condition number.
 
 For few objects and concatenated towers (`retrieve train`), the features of each tower are first reduced to their widest
-directions, with equal weight for every tower. On a few dozen objects nothing with more freedom was better
-(docs/measurements/real_data.md). The maps of each modality compose to one affine map, so the result is stored as the
-projections of an ordinary matcher. Settings are chosen from `GRID` on held-out training objects (`select_settings`),
-never on test objects.
+directions, with equal weight for every tower. The maps of each modality compose to one affine map, so the result is
+stored as the projections of an ordinary matcher. Settings are chosen from `GRID` on held-out training objects
+(`select_settings`), never on test objects.
 """
 
 from collections.abc import Iterator, Sequence

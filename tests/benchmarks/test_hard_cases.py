@@ -48,8 +48,8 @@ def test_cases_are_printed_and_written_and_the_exit_code_states_whether_all_hold
     assert json.loads((tmp_path / "stability.json").read_text())["failed"] == code
 
 
-def test_the_performance_page_has_the_number_of_cases(rows):
+def test_the_page_of_results_has_the_number_of_cases(rows):
     found = [row for package in KERNELS for row in rows(package)]
-    page = " ".join((ROOT / "docs" / "performance.md").read_text("utf-8").split())
+    page = " ".join((ROOT / "docs" / "results.md").read_text("utf-8").split())
     kernels = {(package, row.kernel) for package in KERNELS for row in rows(package)}
     assert f"{len(found)} stiff, extreme or degenerate inputs of {len({name for _, name in kernels})} numerical" in page

@@ -55,8 +55,8 @@ def test_the_frontier_of_kernels_plots_a_row_without_a_recording(model, tmp_path
     assert not (tmp_path / "recording").exists()
 
 
-def test_the_performance_page_names_every_approximation_of_kernels_and_counts_those_of_a_search():
-    text = (ROOT / "docs" / "performance.md").read_text("utf-8")
+def test_the_page_of_results_names_every_approximation_of_kernels_and_counts_those_of_a_search():
+    text = (ROOT / "docs" / "results.md").read_text("utf-8")
     assert [name for name in APPROXIMATIONS if f"`{name}`" not in text] == []
     assert f" {len(frontier.APPROXIMATIONS)} approximations of a search" in text
 

@@ -105,8 +105,6 @@ def home(tmp_path, recording, catalogue, model, monkeypatch):
     "page", [page for page in RUN_TOGETHER if of_program("retrieve", page)], ids=lambda page: page.stem
 )
 def test_every_retrieve_command_of_a_page_runs_from_top_to_bottom(page, home):
-    if page.stem == "benchmark":  # another page collects it
-        shutil.copytree(home / "recording", home / "benchmark")
     for line in of_program("retrieve", page):
         if line[1] == "serve":  # runs until SIGTERM
             with serving.command(*line[2:], *SHORTER["serve"], cwd=home) as (process, _, _):
