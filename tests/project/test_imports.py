@@ -1,7 +1,6 @@
 """Import rules between packages, tested by reading the imports and by running with blocked modules."""
 
 import ast
-import itertools
 import subprocess
 import sys
 from graphlib import TopologicalSorter
@@ -16,10 +15,7 @@ PACKAGES = ("indexes", "robot", "retrieval")
 SHARED = "_touch_retrieval"
 ROWS = table_rows(CONTRIBUTING)
 _first = next(number for number, row in enumerate(ROWS) if row[0] == "layers of `retrieval/`") + 2
-DOCUMENTED = [
-    tuple(cell.strip("`") for cell in row[0].split(", "))
-    for row in itertools.takewhile(lambda row: row[0] != "part", ROWS[_first:])
-]
+DOCUMENTED = [tuple(cell.strip("`") for cell in row[0].split(", ")) for row in ROWS[_first:]]
 LAYERS = [*DOCUMENTED, ("__main__",)]
 """A module of `retrieval` may import modules of its own layer and of the layers before it."""
 MAY_IMPORT_ROBOT = ("retrieval/data/dataset.py", "retrieval/serve/rig.py", "retrieval/commands/")
