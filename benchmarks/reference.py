@@ -67,21 +67,16 @@ retrieve check recording/                                   # before training
 ```
 
 An importer reads a public data set in its published layout, or your own pictures, and writes a
-[recording](formats.md#recording) for training, evaluation and search. It processes one grasp at a time, so memory
-grows only with names and with the lines of the recording. An interrupted import continues when you run it again.
-With other options, or if a file changed or is gone (`sources.json` lists them), it is refused: give another `--out`.
-New files are added. First images of a video that are black, dim or in another colour are left out and counted.
-Unreadable items are skipped, counted by reason and reported. `recording.json` stores the counts under `skipped`, the
-licence with its terms, the citation, and under `objects` the data set's own information on them. Pictures that many
-grasps share, such as one no-contact frame, are stored once. A published split by objects is in `splits/<name>.json`,
-for `--split`. Some importers need packages of the extra: `pip install 'touch-retrieval[importers]'`.
+[recording](formats.md#recording). Some need packages: `pip install 'touch-retrieval[importers]'`. An interrupted import
+continues when you run it again, and new files are added; with other options, or if a file changed or is gone, it is
+refused: give another `--out`. Unreadable items, and first images of a video that are black, dim or in another colour,
+are left out and counted (`skipped` of `recording.json`, which also has licence, citation and the data set's own
+information on objects). A published split by objects is in `splits/<name>.json`, for `--split`.
 
 The data sets are not ours, and their licences bind you. "Not stated" means that we know of no licence: look at the
-page of the data set, ask its authors, and write the answer into `recording.json`. `retrieve check` and `retrieve train`
-print the licence, and a checkpoint [lists the licences](training.md#licences) of all data that trained it. If parts of
-a layout are not verified, the importer follows the authors' descriptions and other people's readers, and lists these
-parts when it ends.
-[Real data](real.md#what-counts-as-touch) defines the controls that the notes name.
+page of the data set, ask its authors, and write the answer into `recording.json`
+([licences](training.md#licences)). If parts of a layout are not verified, the importer follows the authors'
+descriptions and other people's readers. [Real data](real.md#what-counts-as-touch) defines the controls of the notes.
 
 """
 OTHER_DATA_SETS = """
@@ -89,24 +84,15 @@ OTHER_DATA_SETS = """
 
 **Not run**: we could not download these. The facts are from their pages, read in November 2026.
 
-**TactileMimic** ([card](https://huggingface.co/datasets/b1o1o1m/TactileMimic); it asks you to accept conditions) has
-two GelSight Minis on a parallel gripper and a camera (RealSense D405) on the wrist, like the rig of the paper: 26
-objects, 369 successful teleoperated episodes (of the bottle only 3), all images 224 x 224. Its files are zarr stores in
-the layout of Open-X-Tactile (FTP-1): write a [plug-in](extending.md) that yields, for each episode, the images of its
-steps. Then **a photo has light and pose in common with the touch of its episode: the photos of a catalogue must come
-from other episodes.** `retrieve evaluate` leaves own photos out; a catalogue of yours must do so, too.
-
-**RCT** (arXiv 2606.31694; 9.2 GB on figshare): a robot pressed three DIGITs on 122 materials; 1,832 presses, 29,279
-frames, a photo of each material, splits by material and by sensor. On held-out materials its authors find the text of a
-touch first in 25.1 % (± 6.1). [`folder`](#other-data-sets) reads it. These are flat materials and one finger, not
-objects in a hand.
-
-**The Feeling of Success**
-([files](https://opara.zih.tu-dresden.de/items/d5c56810-fc26-4b53-8201-acb75ff055ac); older links are dead): 9,269
-grasps of about a hundred objects with two GelSights and a Kinect, in 38 files; [some of
-them](#feeling-of-success) are enough. Protocol `feeling-of-success` of `retrieve evaluate` computes the paper's
-numbers (64.3 % pair accuracy on 18 unseen objects of its own). Objects were grasped one after the other, so [drift can
-identify them](real.md#what-counts-as-touch).
+* **TactileMimic** ([card](https://huggingface.co/datasets/b1o1o1m/TactileMimic); it asks you to accept conditions): two
+  GelSight Minis on a parallel gripper and a camera on the wrist, like the rig of the paper; 26 objects, 369 episodes.
+  Its files are zarr stores: write a [plug-in](extending.md) that yields the images of each episode. A photo has light and
+  pose in common with the touch of its episode, so the photos of a catalogue must come from other episodes.
+* **RCT** (arXiv 2606.31694; 9.2 GB on figshare): three DIGITs pressed on 122 flat materials, 1,832 presses, a photo of
+  each material. [`folder`](#other-data-sets) reads it.
+* **The Feeling of Success**
+  ([files](https://opara.zih.tu-dresden.de/items/d5c56810-fc26-4b53-8201-acb75ff055ac); older links are dead): the data
+  set of the paper's kind; [some of its 38 files](#feeling-of-success) are enough.
 
 ## Other data sets
 

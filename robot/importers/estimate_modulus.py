@@ -4,8 +4,7 @@
 
 The folders can also be in `example_data/`. A date is a session, a video a sequence; an object has the same name on each
 day. A video provides `frames` grasps (default 5): the frames that differ most from the first one, in order of time. The
-first frame is their no-contact frame. There are no photos, so the recording is for touch-to-touch search (`retrieve
-evaluate --protocol`).
+first frame is their no-contact frame.
 """
 
 import re

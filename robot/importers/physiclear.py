@@ -4,8 +4,7 @@
 
 The videos can also be in `dataset/`. A part is an object, a video a sequence. A video provides `frames` grasps
 (default 5): the frames that differ most from the first one, in order of time. The first frame is their no-contact
-frame. There are no photos, so the recording is for touch-to-touch search (`retrieve evaluate --protocol`). It has the
-order of the file names, part by part. The videos were made in two sessions, which differ in length: `50-frames` and
+frame. The recording has the order of the file names, part by part. The videos were made in two sessions, which differ in length: `50-frames` and
 `126-frames`; a video of another length has no session.
 """
 

@@ -5,11 +5,8 @@
     vision/<NN_class>/<II>/IMG_inst_<II>_img_<k>_validframeID_<f>.jpg                      about 40 per object
 
 An object is `<NN_class>-<II>`; recording.json lists class, instance and nickname under `objects`. There are no photos
-of the moment of a touch: touch number i of an object, in order of k, gets photo number i modulo the number of photos,
-so all photos are used equally often. Any photo of the object would be equivalent.
-
-An object was touched in one session, which is its sequence. A bottle that occurs twice, empty and full, has one
-sequence for both, so a split by sequence does not divide it.
+of the moment of a touch: touch number i of an object, in order of k, gets photo number i modulo the number of photos.
+An object was touched in one session, which is its sequence.
 """
 
 import filecmp
