@@ -86,8 +86,8 @@ OTHER_DATA_SETS = """
 
 * **TactileMimic** ([card](https://huggingface.co/datasets/b1o1o1m/TactileMimic); it asks you to accept conditions): two
   GelSight Minis on a parallel gripper and a camera on the wrist, like the rig of the paper; 26 objects, 369 episodes.
-  Its files are zarr stores: write a [plug-in](extending.md) that yields the images of each episode. A photo has light and
-  pose in common with the touch of its episode, so the photos of a catalogue must come from other episodes.
+  Its files are zarr stores: write a [plug-in](extending.md) that yields the images of each episode. A photo has light
+  and pose in common with the touch of its episode, so the photos of a catalogue must come from other episodes.
 * **RCT** (arXiv 2606.31694; 9.2 GB on figshare): three DIGITs pressed on 122 flat materials, 1,832 presses, a photo of
   each material. [`folder`](#other-data-sets) reads it.
 * **The Feeling of Success**

@@ -2,10 +2,10 @@
 
     <part>_<k>.mov    320 x 240, about 110 frames; the first one is without contact (extra `importers`)
 
-The videos can also be in `dataset/`. A part is an object, a video a sequence. A video provides `frames` grasps
-(default 5): the frames that differ most from the first one, in order of time. The first frame is their no-contact
-frame. The recording has the order of the file names, part by part. The videos were made in two sessions, which differ in length: `50-frames` and
-`126-frames`; a video of another length has no session.
+The videos can also be in `dataset/`. A part is an object, a video a sequence. A video provides `frames` grasps (default
+5): the frames that differ most from the first one, in order of time. The first frame is their no-contact frame. The
+recording has the order of the file names, part by part. The videos were made in two sessions, which differ in length:
+`50-frames` and `126-frames`; a video of another length has no session.
 """
 
 import re
