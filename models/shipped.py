@@ -1,9 +1,9 @@
 """The checkpoints of the package: their training, and their accuracy on unseen objects.
 
-    python -m models.shipped make FOLDER --init WEIGHTS
-        collect grasps on simulated rigs, photos and presses of other objects; pretrain both towers on relief, train
-        them together in three rounds, train a head for two fingers and one for one finger, calibrate both, and store
-        them in FOLDER
+    python -m models.shipped make FOLDER --meshes MESHES
+        collect grasps of procedural objects and of meshes on simulated rigs, and photos of them by other cameras, on
+        other grounds and with faults; train the shipped towers further, and a head for two fingers and one for one
+        finger; calibrate both, and store them in FOLDER
     python -m models.shipped calibrate FOLDER
         calibrate the shipped checkpoints again; keep their weights
     python -m models.shipped score FOLDER
@@ -15,20 +15,20 @@ An interrupted job continues. Accuracy on simulated touches does not predict acc
 
 import argparse
 import dataclasses
+import itertools
 import json
 import sys
-from collections.abc import Mapping, Sequence
+import zlib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from models.labels import LabelTrainer
-from models.pictures import collect_pictures, load_object_labels
-from models.relief import pretrain
+from models.pictures import collect_pictures, load_object_labels, load_pictures
 from retrieval.commands.main import main as run_command
 from retrieval.console.memory import keep_freed_memory
-from retrieval.console.output import say
 from retrieval.data.dataset import Grasp, Split, data_digest, load_grasps
 from retrieval.methods.late_fusion import frozen_matcher, trained_checkpoint
 from retrieval.methods.method import MethodSettings
@@ -41,26 +41,36 @@ from retrieval.training.calibration import calibrate_checkpoint, fit_verificatio
 from retrieval.training.features import Features, FrozenFeatures, encode_recording, features_by_image, recorded_features
 
 RIGS = Path(__file__).parent
-RIG, TOUCH_RIG, GELS_RIG = (RIGS / f"shipped_{name}.toml" for name in ("rig", "touches", "gels"))
-ROUNDS = (
-    {"shipped_training.toml": (112_000, 20, 400), "shipped_varied.toml": (122_000, 5, 120)},
-    {"shipped_training.toml": (112_020, 15, 400), "shipped_varied.toml": (122_010, 1, 150)},
-    {"shipped_training.toml": (112_035, 15, 400), "shipped_varied.toml": (122_011, 1, 150)},
+RIG, GELS_RIG = (RIGS / f"shipped_{name}.toml" for name in ("rig", "gels"))
+
+
+class Part(NamedTuple):
+    """Rigs of training grasps, one for each seed: optics of its gels, and its objects, procedural or meshes."""
+
+    optics: str
+    has_meshes: bool
+    first_seed: int
+    seeds: int
+    objects: int
+
+
+PARTS = (
+    Part("led", False, 113_000, 6, 250),
+    Part("varied", False, 123_000, 6, 200),
+    Part("gelsight", False, 124_000, 1, 250),
+    Part("gelsight_mini", False, 125_000, 1, 250),
+    Part("led", True, 126_000, 3, 260),
+    Part("varied", True, 127_000, 2, 260),
 )
-"""Rigs of the training grasps that each round adds: the first seed, the number of seeds, and the objects of each seed,
-which has its own gels."""
-TRAINED_ON = ((0,), (1,), (1, 2))
-"""Rounds whose training grasps each round uses."""
+RECORDINGS, CALIBRATION = "recordings", "calibration"
+"""Folders of the recordings."""
+GELS_OF_RIG = 4
+"""Pairs of gels of a training rig: with more, it computes the properties of a gel again for nearly every object."""
 SEED_VALIDATED, SEED_VERIFIED, SEED_GELS, SEED_SCORED = 150_000, 130_000, 140_000, 30_000
 """Seeds of other object sets. The demo has its own (retrieval.commands.demo.SEED), the benchmark has 0."""
-SEED_PHOTOS, SEED_TOUCHES = 60_000, 61_000
 TOWERS, HEADS = RIGS / "shipped_towers.toml", RIGS / "shipped_heads.toml"
-"""Configurations of the training of the towers and of the heads."""
-LATER_ROUND = {"learning_rate": 1e-3, "tower_rate": 0.5}
-LATER_STEPS = 800, 1100
-"""Settings and steps of the towers' later rounds. Each starts from the towers and the head of the round
-before. The last step is used: the head that is trained together with the towers does not tell which step has the best
-towers."""
+"""Configurations of the training of the towers and of the heads. The last step of the towers is used: the head that is
+trained together with them does not tell which step has the best towers."""
 GRASPS, VALIDATED, VERIFIED, GELS = 2, (100, 8), (150, 5), (400, 2)
 """Grasps of each training object; objects that choose the step and calibrate the model, and grasps of each; objects on
 which the bounds of verifications are fitted, and grasps of each; further objects for the check of gel images, and
@@ -79,10 +89,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     jobs = parser.add_subparsers(dest="job", required=True)
     make = jobs.add_parser("make", help="collect and train the checkpoints that come with the package")
-    make.add_argument("--init", type=Path, required=True, help="state dict of MobileNetV2, torchvision's key names")
-    make.add_argument("--photos", type=int, default=10_000, help="number of photo-only objects")
-    make.add_argument("--touches", type=int, default=9_361, help="number of touch-only objects")
-    make.add_argument("--steps", type=int, default=2500, help="steps of pretraining each tower on relief")
+    make.add_argument("--meshes", type=Path, required=True, help="folder of closed meshes (STL)")
     calibrate_job = jobs.add_parser("calibrate", help="calibrate the shipped checkpoints again; keep their weights")
     score = jobs.add_parser("score", help="evaluate a checkpoint on other objects")
     score.add_argument("--objects", type=int, default=120)
@@ -102,12 +109,7 @@ def make_shipped(arguments: argparse.Namespace) -> int:
     folder = arguments.folder
     if code := collect_training(arguments) or collect_calibration(arguments):
         return code
-    pretrain_towers(arguments)
-    files = {f"init_{side}": str(folder / f"{side}-tower.safetensors") for side in ("photo", "touch")}
-    last = train_round(folder, 0, files)
-    for number, steps in enumerate(LATER_STEPS, start=1):
-        start = {"start": str(train_head(for_fingers(last, 2)).path)}
-        last = train_round(folder, number, start | LATER_ROUND | {"iterations": steps, "validate_every": steps})
+    last = train_towers(folder)
     for fingers, name in SHIPPED.items():
         trained = for_fingers(last, fingers)
         made = distilled(train_head(trained), *trained.features)
@@ -117,7 +119,7 @@ def make_shipped(arguments: argparse.Namespace) -> int:
     return 0
 
 
-class Round(NamedTuple):
+class Trained(NamedTuple):
     """Trained towers, as a configuration of heads, and the training and validation grasps with their features."""
 
     folder: Path
@@ -126,45 +128,44 @@ class Round(NamedTuple):
     features: tuple[Features, Features]
 
 
-def train_round(folder: Path, number: int, settings: Mapping[str, Any]) -> Round:
-    """Train both towers on the recordings of one round; `settings` are its changes of TOWERS."""
-    out = folder / f"round-{number}"
-    parts = [
-        part for each in TRAINED_ON[number] for part in sorted((folder / f"round-{each}" / "recordings").iterdir())
-    ]
-    train, validation = [grasp for part in parts for grasp in load_grasps(part)], load_grasps(folder / "validation")
-    config = head_config(out, train_towers(out, settings, parts, train, validation))
-    features, validated = (
-        encode_recording(each, frozen_matcher(config), config, out / "features") for each in (train, validation)
-    )
-    return Round(out, config, (train, validation), (features, validated))
-
-
-def train_towers(
-    folder: Path, settings: Mapping[str, Any], parts: Sequence[Path], train: list[Grasp], validation: list[Grasp]
-) -> Checkpoint:
-    """Train both towers, with the head of two fingers.
-
-    Args:
-        folder: Folder of the result.
-        settings: Changes of the settings, with the initial weights.
-        parts: The recordings, which have the labels of the training objects.
-        train: Their grasps.
-        validation: Grasps that choose the step.
-    """
+def train_towers(folder: Path, **settings: Any) -> Trained:
+    """Train both towers further, with the head of two fingers; `settings` change those of TOWERS."""
+    parts = sorted((folder / RECORDINGS).iterdir())
+    train = [grasp for part in parts for grasp in grasps_with_varied_photos(part)]
+    validation = grasps_with_varied_photos(folder / CALIBRATION / "validation")
     config = load_config(TOWERS)
-    training = dataclasses.replace(config.training, **settings)
-    labels = {name: each for part in parts for name, each in load_object_labels(part).items()}
-    done = folder / "towers.safetensors"
+    training = dataclasses.replace(config.training, start=str(shipped_model(2)), **settings)
     trainer = LabelTrainer(
         dataclasses.replace(config, training=training),
-        split_of(train, validation),
-        [*train, *validation],
-        done,
+        split_of(train, []),
+        train,
+        folder / "towers.safetensors",
         source="simulated rigs",
-        labels=labels,
+        labels={name: labels for part in parts for name, labels in load_object_labels(part).items()},
     )
-    return trainer.run_or_reuse(quiet=False)
+    config = head_config(folder, trainer.run_or_reuse(quiet=False))
+    features, validated = (
+        encode_recording(grasps, frozen_matcher(config), config, folder / "features") for grasps in (train, validation)
+    )
+    return Trained(folder, config, (train, validation), (features, validated))
+
+
+def grasps_with_varied_photos(recording: Path) -> list[Grasp]:
+    """Return the grasps of a recording, each with its own photo or, as likely, with one of the object's varied ones."""
+    varied: dict[str, list[Path]] = {}
+    for picture in load_pictures(varied_photos(recording)):
+        varied.setdefault(picture.object_id, []).append(picture.file)
+    grasps = []
+    for grasp in load_grasps(recording):
+        choices = [grasp.photo, *varied[grasp.object_id]]
+        drawn = np.random.default_rng(zlib.crc32(grasp.grasp_id.encode())).integers(len(choices))
+        grasps.append(dataclasses.replace(grasp, photo_file=choices[drawn]))
+    return grasps
+
+
+def varied_photos(recording: Path) -> Path:
+    """Return the folder of the varied photos of a recording's objects, next to it."""
+    return recording.parent.parent / "photos" / recording.name
 
 
 def head_config(folder: Path, towers: Checkpoint) -> Config:
@@ -184,8 +185,8 @@ def tower_weights(folder: Path, made: Checkpoint) -> dict[str, str]:
     return files
 
 
-def train_head(trained: Round) -> Checkpoint:
-    """Train a head on the features of a round, for its number of fingers."""
+def train_head(trained: Trained) -> Checkpoint:
+    """Train a head on the features of the towers, for its number of fingers."""
     folder = trained.folder / f"{trained.config.matcher.fingers}-fingers"
     settings = MethodSettings(trained.config, folder=folder, quiet=False)
     made = trained_checkpoint(settings, *trained.features)
@@ -194,8 +195,8 @@ def train_head(trained: Round) -> Checkpoint:
     return dataclasses.replace(made, provenance=made.provenance | about, split=split_of(train, validation))
 
 
-def for_fingers(trained: Round, fingers: int) -> Round:
-    """Return the round for heads of one finger, whose grasps are the touches of each finger, or of two."""
+def for_fingers(trained: Trained, fingers: int) -> Trained:
+    """Return the trained towers for heads of one finger, whose grasps are the touches of each finger, or of two."""
     matcher = dataclasses.replace(trained.config.matcher, fingers=fingers)
     trained = trained._replace(config=dataclasses.replace(trained.config, matcher=matcher))
     if fingers == 2:
@@ -234,39 +235,49 @@ def each_finger_features(features: Features) -> Features:
 
 
 def collect_training(arguments: argparse.Namespace) -> int:
-    """Collect the training grasps, one recording for each seed."""
-    for number, rigs in enumerate(ROUNDS):
-        for rig, (first, seeds, objects) in rigs.items():
-            for seed in range(first, first + seeds):
-                out = arguments.folder / f"round-{number}" / "recordings" / str(seed)
-                if code := collect(out, RIGS / rig, objects, GRASPS, seed, arguments.jobs):
-                    return code
+    """Collect the training grasps, one recording for each seed, and varied photos of their objects."""
+    folder, jobs = arguments.folder, arguments.jobs
+    folder.mkdir(parents=True, exist_ok=True)
+    meshes = itertools.cycle(sorted(arguments.meshes.glob("*.stl")))
+    for optics, has_meshes, first_seed, seeds, objects in PARTS:
+        for seed in range(first_seed, first_seed + seeds):
+            settings: dict[str, Any] = {"rig": "sim", "gels": GELS_OF_RIG, "optics": optics}
+            if has_meshes:
+                settings["meshes"] = str(vary_meshes(itertools.islice(meshes, objects), folder / "meshes", seed))
+            rig = folder / f"{seed}.toml"
+            rig.write_text("".join(f"{key} = {json.dumps(value)}\n" for key, value in settings.items()))
+            out = folder / RECORDINGS / str(seed)
+            if code := collect(out, rig, objects, GRASPS, seed, jobs):
+                return code
+            collect_pictures("varied", varied_photos(out), objects=objects, seed=seed, rig=str(rig), jobs=jobs)
     return 0
+
+
+def vary_meshes(files: Iterable[Path], folder: Path, seed: int) -> Path:
+    """Write each mesh with a random size and other proportions into a folder of its own; return this folder."""
+    import trimesh
+
+    out, rng = folder / str(seed), np.random.default_rng(seed)
+    out.mkdir(parents=True, exist_ok=True)
+    for file in files:
+        mesh = trimesh.load_mesh(file)
+        mesh.apply_scale(np.exp(rng.uniform(np.log(0.5), np.log(1.6)) + rng.uniform(-0.35, 0.35, 3)))
+        mesh.export(out / file.name)
+    return out
 
 
 def collect_calibration(arguments: argparse.Namespace) -> int:
     """Collect the grasps of the validation objects, and those that `calibrated` needs besides."""
-    folder, jobs = arguments.folder, arguments.jobs
-    return (
-        collect(folder / "validation", RIG, *VALIDATED, SEED_VALIDATED, jobs)
-        or collect(folder / "verification", RIG, *VERIFIED, SEED_VERIFIED, jobs)
-        or collect(folder / "gels", GELS_RIG, *GELS, SEED_GELS, jobs)
-    )
-
-
-def pretrain_towers(arguments: argparse.Namespace) -> None:
-    """Photograph and press objects of two other seeds, and pretrain each tower on relief with them."""
-    heads = load_config(HEADS)
-    config = dataclasses.replace(heads, training=dataclasses.replace(heads.training, init=str(arguments.init)))
-    for kind, objects, seed, rig in (
-        ("photo", arguments.photos, SEED_PHOTOS, "sim"),
-        ("touch", arguments.touches, SEED_TOUCHES, str(TOUCH_RIG)),
+    folder, jobs = arguments.folder / CALIBRATION, arguments.jobs
+    for name, rig, (objects, grasps), seed in (
+        ("validation", RIG, VALIDATED, SEED_VALIDATED),
+        ("verification", RIG, VERIFIED, SEED_VERIFIED),
+        ("gels", GELS_RIG, GELS, SEED_GELS),
     ):
-        tower = arguments.folder / f"{kind}-tower.safetensors"
-        if not tower.exists():
-            folder = arguments.folder / f"{kind}-pictures"
-            pictures = collect_pictures(kind, folder, objects=objects, seed=seed, rig=rig, jobs=arguments.jobs)
-            say(pretrain(kind, pictures, tower, config, arguments.steps))
+        if code := collect(folder / name, rig, objects, grasps, seed, jobs):
+            return code
+        collect_pictures("varied", varied_photos(folder / name), objects=objects, seed=seed, rig=str(rig), jobs=jobs)
+    return 0
 
 
 def calibrate_shipped(arguments: argparse.Namespace) -> int:
@@ -281,7 +292,7 @@ def calibrate_shipped(arguments: argparse.Namespace) -> int:
 
 def calibrated(made: Checkpoint, folder: Path, fingers: int) -> Checkpoint:
     """Return a checkpoint with its gel check, posterior, calibration of reference touches and bounds."""
-    parts = [load_grasps(folder / name) for name in ("validation", "verification", "gels")]
+    parts = [grasps_with_varied_photos(folder / CALIBRATION / name) for name in ("validation", "verification", "gels")]
     if fingers == 1:
         parts = [[each_finger(grasp)[0] for grasp in part] for part in parts]
     validation, verification, gels = parts

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from models import shipped
 from models.labels import LabelHead
@@ -17,29 +18,32 @@ from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import touch_features
 from retrieval.model.gel_check import NOT_A_GEL
 from retrieval.model.shipped import SHIPPED, shipped_model
-from retrieval.model.towers.tower import build_tower
 from robot.rig import load_rig
 
 
 @pytest.mark.slow
-def test_towers_are_pretrained_trained_with_labels_and_get_a_head_for_each_number_of_fingers(tmp_path, monkeypatch):
-    init, rigs = tmp_path / "mobilenet.pth", {"shipped_training.toml": (1, 1, 6)}
-    torch.save(build_tower("mobilenet_v2", "stages").state_dict(), init)
-    small = {"ROUNDS": (rigs,), "VALIDATED": (4, 3), "VERIFIED": (2, 1), "GELS": (2, 1), "HEAD_STEPS": 2}
+def test_towers_learn_varied_photos_and_meshes_and_get_a_head_for_each_number_of_fingers(tmp_path, monkeypatch):
+    parts = shipped.Part("led", False, 1, 1, 6), shipped.Part("varied", True, 2, 1, 4)
+    small = {"PARTS": parts, "VALIDATED": (4, 3), "VERIFIED": (2, 1), "GELS": (2, 1), "HEAD_STEPS": 2}
     for name, value in small.items():
         monkeypatch.setattr(shipped, name, value)
-    arguments = argparse.Namespace(folder=tmp_path, init=init, photos=8, touches=8, steps=2, jobs=1)
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    for number in range(4):
+        trimesh.creation.box((30 + 5 * number, 40, 70)).export(meshes / f"{number}.stl")
+    arguments = argparse.Namespace(folder=tmp_path / "made", meshes=meshes, jobs=1)
     assert (shipped.collect_training(arguments), shipped.collect_calibration(arguments)) == (0, 0)
-    shipped.pretrain_towers(arguments)
-    files = {f"init_{side}": str(tmp_path / f"{side}-tower.safetensors") for side in ("photo", "touch")}
     steps = {"iterations": 2, "validate_every": 2, "touches_per_batch": 4}
-    trained = shipped.train_round(tmp_path, 0, files | steps)
-    pretrained = torch.load(init)["features.17.conv.0.0.weight"]
+    trained = shipped.train_towers(tmp_path / "made", **steps)
+    train = trained.grasps[0]
+    assert any(grasp.object_id.startswith("mesh") for grasp in train)
+    assert {"varied" in grasp.photo.name for grasp in train} == {True, False}
+    before = load_checkpoint(shipped_model(2)).matcher.touch_tower.state_dict()["features.17.conv.2.weight"]
     for fingers in (1, 2):
         made = shipped.train_head(shipped.for_fingers(trained, fingers))
         assert made.config.matcher.fingers == fingers
         assert made.split == shipped.split_of(*trained.grasps)
-        assert not torch.equal(made.matcher.touch_tower.state_dict()["features.17.conv.0.0.weight"], pretrained)
+        assert not torch.equal(made.matcher.touch_tower.state_dict()["features.17.conv.2.weight"], before)
 
 
 def test_a_stopped_collection_of_pictures_continues(tmp_path):
