@@ -5,15 +5,12 @@ training. `python -m benchmarks.frontier --out report/` measures and plots them 
 search.
 """
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 from _touch_retrieval.registry import Registry
 from retrieval.errors import ConfigError
 
-if TYPE_CHECKING:
-    from retrieval.frontier import Approximations
-
-APPROXIMATIONS: "Approximations" = Registry(
+APPROXIMATIONS: Registry[Any] = Registry(
     "approximation",
     "approximations",
     {

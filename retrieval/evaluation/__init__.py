@@ -1,16 +1,13 @@
 """Evaluate methods by protocols: the split of a recording or a real data set, the queries, controls and measures."""
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 from _touch_retrieval.registry import Registry
 from retrieval.errors import ConfigError
 
-if TYPE_CHECKING:
-    from retrieval.evaluation.protocol import Protocol
-
 UNSEEN_OBJECTS = "unseen-objects"
 """Name of the protocol of any recording: a split into training, validation and test objects."""
-PROTOCOLS: "Registry[Protocol]" = Registry(
+PROTOCOLS: Registry[Any] = Registry(
     "protocol",
     "protocols",
     {

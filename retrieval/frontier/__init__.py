@@ -4,20 +4,12 @@ A new approximation is one function from a `Sample` to an `ApproximationResult`,
 test parameter. Approximations of kernels, which need no recording, are in `benchmarks/frontier/` of the repository.
 """
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 from _touch_retrieval.registry import Registry
 from retrieval.errors import ConfigError
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from retrieval.frontier.points import ApproximationResult
-    from retrieval.frontier.sample import Sample
-
-    Approximations = Registry[Callable[[Sample], ApproximationResult]]
-
-APPROXIMATIONS: "Approximations" = Registry(
+APPROXIMATIONS: Registry[Any] = Registry(
     "approximation",
     "approximations",
     {

@@ -3,14 +3,16 @@
 Each finished row is stored, so a stopped run continues with the missing rows.
 """
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
 from _touch_retrieval.cache import cache_key
 from _touch_retrieval.files import file_digest, write_atomically
+from _touch_retrieval.registry import Registry
 from retrieval.console.output import say
 from retrieval.data.dataset import AnyRecording
 from retrieval.frontier import APPROXIMATIONS
@@ -21,10 +23,11 @@ from retrieval.frontier.sample import Sample, Scale
 from retrieval.model.shipped import shipped_model
 from retrieval.version import __version__
 
-if TYPE_CHECKING:
-    from retrieval.frontier import Approximations
-
 FORMAT = 5
+
+
+def _measured(work: Callable[[Sample], ApproximationResult], sample: Sample) -> Any:
+    return msgspec.to_builtins(work(sample))
 
 
 def measure_frontier(
@@ -37,7 +40,7 @@ def measure_frontier(
     queries: int = Scale.queries,
     repeats: int = Scale.repeats,
     quick: bool = False,
-    table: "Approximations" = APPROXIMATIONS,
+    table: Registry[Any] = APPROXIMATIONS,
     model_free: Collection[str] = (),
     quiet: bool = False,
 ) -> dict[str, Any]:
@@ -78,7 +81,10 @@ def measure_frontier(
     sample = Sample(Path(model or shipped_model()), grasps, out, scale, quiet)
     rows, model_digest, here = {}, file_digest(sample.model), machine()
     for name, work in works.items():
-        rows[name] = _row(sample, name, work, here, [] if name in model_free else [model_digest, sample.digest])
+        digests = [] if name in model_free else [model_digest, sample.digest]
+        key = cache_key("frontier", name, FORMAT, __version__, here, msgspec.to_builtins(scale), *digests)
+        stored = sample.stored(key, partial(_measured, work, sample))
+        rows[name] = msgspec.convert(stored, ApproximationResult)
         if not quiet:
             for line in rows[name].lines():
                 say(f"{name}: {line}")
@@ -87,21 +93,3 @@ def measure_frontier(
     write_atomically(out / "frontier.json", msgspec.json.format(document, indent=1))
     write_frontier(out, rows, here, scale.quick)
     return msgspec.json.decode(document, type=dict[str, Any])
-
-
-def _row(
-    sample: Sample,
-    name: str,
-    work: Callable[[Sample], ApproximationResult],
-    here: dict[str, Any],
-    digests: Sequence[str],
-) -> ApproximationResult:
-    """Return the stored result of an approximation, or measure and store it."""
-
-    def make() -> Any:
-        if not sample.quiet:
-            say(f"measuring {name}")
-        return msgspec.to_builtins(work(sample))
-
-    key = cache_key("frontier", name, FORMAT, __version__, here, msgspec.to_builtins(sample.scale), *digests)
-    return msgspec.convert(sample.stored(key, make), ApproximationResult)

@@ -4,15 +4,12 @@ A new method is one file and one row of `METHODS`, or a class in a user's own pa
 every row.
 """
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 from _touch_retrieval.registry import Registry
 from retrieval.errors import ConfigError
 
-if TYPE_CHECKING:
-    from retrieval.methods.method import Method
-
-METHODS: "Registry[type[Method]]" = Registry(
+METHODS: Registry[Any] = Registry(
     "method",
     "methods",
     {

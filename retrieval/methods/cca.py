@@ -3,14 +3,12 @@
 Dimensions are weighted by rho^p (Gong et al., IJCV 2014: a plain cosine would give noise dimensions full weight).
 """
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from retrieval.methods.method import Array, Method
 from retrieval.training.cca import CanonicalCorrelations, canonical_correlations, decompose, unit_rows
+from retrieval.training.features import Features
 from retrieval.training.selection import ranking_auc, validation_rows
-
-if TYPE_CHECKING:
-    from retrieval.training.features import Features
 
 RIDGES = (1e-3, 1e-2, 1e-1, 1e0, 1e1, 1e2)
 COMPONENTS = (8, 16, 32, 64, 128, 256)
@@ -28,7 +26,7 @@ class Cca(Method):
     is_seeded = False
     max_directions: ClassVar[int | None] = None
 
-    def _fit(self, train: "Features", validation: "Features") -> None:
+    def _fit(self, train: Features, validation: Features) -> None:
         touch, photo = (decompose(part, self.max_directions) for part in (train.touch, train.photo))
         self._standardise = touch.standardise, photo.standardise
         # The decompositions are made once; a ridge only damps them.
@@ -55,7 +53,7 @@ class Cca(Method):
             "rank": {"touch": len(touch.singular), "photo": len(photo.singular)},
         }
 
-    def _cells(self, found: CanonicalCorrelations, validation: "Features") -> dict[tuple[int, int], float]:
+    def _cells(self, found: CanonicalCorrelations, validation: Features) -> dict[tuple[int, int], float]:
         """Return the AUC on validation objects of each number of components and power."""
         touch = self._standardise[0](validation.touch) @ found.touch_weights
         photo = self._standardise[1](validation.photo) @ found.photo_weights

@@ -2,16 +2,13 @@
 
 from contextlib import suppress
 from dataclasses import asdict
-from typing import TYPE_CHECKING
 
 from retrieval.errors import BadInput
 from retrieval.methods.method import Array, Method
 from retrieval.training.calibration import fit_posterior
 from retrieval.training.cca import fit_projections, select_settings, tower_widths, unit_rows
+from retrieval.training.features import Features
 from retrieval.training.selection import held_out_folds
-
-if TYPE_CHECKING:
-    from retrieval.training.features import Features
 
 
 class CcaTowers(Method):
@@ -23,7 +20,7 @@ class CcaTowers(Method):
 
     is_seeded = False
 
-    def _fit(self, train: "Features", validation: "Features") -> None:
+    def _fit(self, train: Features, validation: Features) -> None:
         blocks = tower_widths(self.settings.config, train)
         known, folds = train.concatenate(validation), [tuple(sorted(set(validation.object_ids)))]
         if self.settings.fit_on_validation:

@@ -1,14 +1,11 @@
 """Random scores, which show the value of every metric by chance."""
 
 from hashlib import blake2b
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from retrieval.methods.method import Array, Method
-
-if TYPE_CHECKING:
-    from retrieval.training.features import Features
+from retrieval.training.features import Features
 
 DIM = 64
 
@@ -19,7 +16,7 @@ class Chance(Method):
     Scores are thus independent of other items, of their order and of the batch.
     """
 
-    def _fit(self, train: "Features", validation: "Features") -> None:
+    def _fit(self, train: Features, validation: Features) -> None:
         pass
 
     def _encode_touch(self, touch: Array) -> Array:

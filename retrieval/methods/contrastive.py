@@ -1,6 +1,6 @@
 """Two projections into one metric space, trained by a contrastive loss on fixed tower features."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,11 +12,9 @@ from retrieval.methods.method import Array, Method
 from retrieval.model.fusion import LOG_SCALE_INIT, LOG_SCALE_MAX
 from retrieval.model.losses.listwise import contrastive_loss
 from retrieval.training.cca import Standardiser
+from retrieval.training.features import Features
 from retrieval.training.loop import BestStep, Plan, train_loop
 from retrieval.training.selection import ranking_auc, validation_rows
-
-if TYPE_CHECKING:
-    from retrieval.training.features import Features
 
 STEPS, VALIDATE_EVERY = 200, 20
 LEARNING_RATE = 1e-3
@@ -48,7 +46,7 @@ class Projections(nn.Module):
 class ContrastiveEmbedding(Method):
     """Scaled cosine of InfoNCE embeddings; regularisation and steps are chosen by ranking on validation objects."""
 
-    def _fit(self, train: "Features", validation: "Features") -> None:
+    def _fit(self, train: Features, validation: Features) -> None:
         self._touch, self._photo = Standardiser.fit(train.touch), Standardiser.fit(train.photo)
         chosen = validation.select(validation_rows(validation))
         fits = [self._train(train, chosen, place) for place in range(len(REGULARISATIONS))]
@@ -64,7 +62,7 @@ class ContrastiveEmbedding(Method):
             "scale": self._scale,
         }
 
-    def _train(self, train: "Features", validation: "Features", place: int) -> tuple[Projections, BestStep]:
+    def _train(self, train: Features, validation: Features, place: int) -> tuple[Projections, BestStep]:
         """Return projections trained with one regularisation, at their best step."""
         (dropout, weight_decay), config = REGULARISATIONS[place], self.settings.config
         touch, photo = self._tensors(train)
@@ -106,7 +104,7 @@ class ContrastiveEmbedding(Method):
             )
         return module.eval(), best
 
-    def _tensors(self, features: "Features") -> tuple[Tensor, Tensor]:
+    def _tensors(self, features: Features) -> tuple[Tensor, Tensor]:
         return _tensor(self._touch, features.touch), _tensor(self._photo, features.photo)
 
     @torch.inference_mode()
