@@ -1,4 +1,4 @@
-"""`python -m benchmarks.scale [--sizes 1e3 1e4 1e5] [--recording R --features F] [--json]`: time against N.
+"""`python -m benchmarks.scale [--sizes 1e3 1e4 1e5] [--recording R --features F]`: time against N.
 
 Catalogues of N photos are drawn from the trained model's own distribution: partial activations of recorded photos, each
 a blend of two (w A + (1 - w) B, w uniform in 1/2..1), with their embeddings by the checkpoint's candidate encoder. The
@@ -25,7 +25,6 @@ make small products many times slower. A million photos take 1.2 GB on disk, and
 """
 
 import argparse
-import json
 import shutil
 import subprocess
 import sys
@@ -50,6 +49,7 @@ from indexes.store.rows import Row
 from retrieval.commands.main import main as retrieve
 from retrieval.data.dataset import load_grasps
 from retrieval.frontier.candidates import STRUCTURES
+from retrieval.frontier.points import format_duration
 from retrieval.metrics.intervals import binomial_interval
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.fusion_scorer import FusionScorer
@@ -144,10 +144,10 @@ def blended_photos(model: Path, recording: Path, features: Path | None) -> Blend
     return BlendedPhotos(checkpoint, scorer, np.unique(photos, axis=0), queries[:middle], held_out)
 
 
-def measure(crowd: BlendedPhotos, photos: int, kinds: Sequence[str], folder: Path, queries: int = QUERIES) -> Size:
+def measure(crowd: BlendedPhotos, photos: int, kinds: Sequence[str], folder: Path) -> Size:
     """Build, search and grow an index of this many photos of each kind in `folder`."""
     max_touches = max(60, int(RERANKED / (2 * crowd.photos.shape[1] ** 2 * photos)))
-    chosen = min(queries, len(crowd.touches), max_touches // 3)
+    chosen = min(QUERIES, len(crowd.touches), max_touches // 3)
     evaluated = min(HELD_OUT, len(crowd.held_out), max_touches - chosen)
     size, store = Size(photos, chosen, evaluated), IndexStore(folder)
     generation = _build(crowd, store, size)
@@ -313,15 +313,10 @@ def _median(work: Callable[[int], object], numbers: Sequence[int]) -> float:
     return float(np.median(seconds))
 
 
-def duration(seconds: float) -> str:
-    """Return seconds or milliseconds with three digits as text."""
-    return f"{seconds:.3g} s" if seconds >= 1 else f"{1e3 * seconds:.3g} ms"
-
-
 def lines(size: Size) -> Iterator[str]:
     """Yield the measurements at one size as text."""
     f = size.figures
-    written, scored = duration(f["build_s"]), duration(f["exhaustive_s"])
+    written, scored = format_duration(f["build_s"]), format_duration(f["exhaustive_s"])
     yield (
         f"{size.photos:,} photos: written in {written} with {f['build_mb']:.0f} MB of memory; scoring all of them "
         f"takes {scored} ({size.queries} touches choose, {size.held_out} evaluate)"
@@ -330,7 +325,7 @@ def lines(size: Size) -> Iterator[str]:
         if "refused" in p:
             yield f"  {kind}: {p['refused']}"
             continue
-        times = {name: duration(value) for name, value in p.items() if name.endswith("_s")}
+        times = {name: format_duration(value) for name, value in p.items() if name.endswith("_s")}
         yield (
             f"  {p['kind']}: {p['gain']:.3g} times faster than scoring all, exhaustive top-1 found "
             f"{p['recall']:.1%} ({p['low']:.1%} to {p['high']:.1%}) among {p['k']} ({p['needed']} for 99 % of all); "
@@ -371,19 +366,17 @@ def main() -> None:
         "--recording", type=Path, help="recording whose photos are blended (default: a small one is collected)"
     )
     parser.add_argument("--features", type=Path, help="file to store encoded features")
-    parser.add_argument("--queries", type=int, default=QUERIES)
-    parser.add_argument("--json", action="store_true", help="one JSON document per line")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
         crowd = blended_photos(arguments.model, arguments.recording or collected(folder), arguments.features)
         sizes = []
         for number in arguments.sizes:
-            sizes.append(measure(crowd, int(number), arguments.kinds, folder / "index", arguments.queries))
+            sizes.append(measure(crowd, int(number), arguments.kinds, folder / "index"))
             shutil.rmtree(folder / "index")
-            print(json.dumps(vars(sizes[-1])) if arguments.json else "\n".join(lines(sizes[-1])), flush=True)
+            print("\n".join(lines(sizes[-1])), flush=True)
         for name, slope in slopes(sizes):
-            print(json.dumps({"slope": name, "value": slope}) if arguments.json else f"N^{slope:.2f}  {name}")
+            print(f"N^{slope:.2f}  {name}")
 
 
 if __name__ == "__main__":

@@ -34,6 +34,7 @@ from retrieval.metrics.table import ScoreTable, object_scores
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import batches, photo_features
 from retrieval.model.posterior import Posterior
+from retrieval.report import numbers
 from retrieval.search.opening import find_model
 from retrieval.training.distil import feature_partials
 from retrieval.training.features import encode_recording
@@ -48,6 +49,8 @@ CATALOGUE = 100
 DRAWS = 4
 DISTRACTORS, SEED = 1000, 181_000
 """Photo-only objects, and the seed of their object set."""
+interval = partial(numbers.interval, write="{:.3f}".format)
+"""Writes a value with its interval."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -188,21 +191,11 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
             continue
         cells = [f"{summary['chance'][0]:.3f}"]
         for name, each in rows.items():
-            cells.append(summary_cell(each[key]))
+            cells.append(interval(*(each[key][part][0] for part in ("value", "low", "high"))))
             if name != first:
                 cells.append(interval(*(each[key]["against_first"][part] for part in ("value", "low", "high"))))
         lines.append(f"| {key} | {' | '.join(cells)} |")
     return "\n".join(lines)
-
-
-def summary_cell(summary: dict[str, Any]) -> str:
-    """Return the value of a summary (`summarise`) with its interval."""
-    return interval(*(summary[part][0] for part in ("value", "low", "high")))
-
-
-def interval(value: float, low: float, high: float) -> str:
-    """Return a value with its interval."""
-    return f"{value:.3f} [{low:.3f}, {high:.3f}]"
 
 
 if __name__ == "__main__":

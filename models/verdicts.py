@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.stats import rankdata
+from scipy.special import softmax
 
 from models import shipped
 from models.recognition import interval
@@ -33,6 +33,7 @@ from retrieval.data.dataset import load_grasps
 from retrieval.data.images import read_rgb
 from retrieval.data.resize import RgbImage
 from retrieval.metrics.intervals import binomial_interval
+from retrieval.metrics.measure import weight_below
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import for_inference, photo_features, touch_batch
 from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
@@ -182,9 +183,7 @@ def measured(ratios: OpenSetRatios) -> dict[str, Any]:
 
 def posterior_probabilities(ratios: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return probabilities (T, 1 + K) of "none of these" and each object, at even odds, as in `Posterior`."""
-    terms = np.column_stack([np.zeros(len(ratios)), ratios - np.log(ratios.shape[1])])
-    weights = np.exp(terms - terms.max(1, keepdims=True))
-    return np.asarray(weights / weights.sum(1, keepdims=True))
+    return np.asarray(softmax(np.column_stack([np.zeros(len(ratios)), ratios - np.log(ratios.shape[1])]), axis=1))
 
 
 def redrawn(owner: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
@@ -204,8 +203,7 @@ def resampled(
 
 def auroc(known: NDArray[np.float64], unknown: NDArray[np.float64]) -> float:
     """Return the probability that a query with the object scores higher than one without; ties count half."""
-    ranks = rankdata(np.concatenate([known, unknown]))[: len(known)]
-    return float((ranks.sum() - len(known) * (len(known) + 1) / 2) / (len(known) * len(unknown)))
+    return float(weight_below(known, unknown).mean() / len(unknown))
 
 
 def calibration_error(stated: NDArray[np.float64], true: NDArray[np.bool_]) -> float:

@@ -107,8 +107,8 @@ def _panel(
     works: Sequence[Callable[[], object]],
     repeats: int,
 ) -> Panel:
-    title, timed = f"contact grid and tolerance, {surface}", time_points(points, works, repeats)
-    return Panel(title, "one contact", unit, reference, tolerance, timed)
+    title = f"contact grid and tolerance, {surface}"
+    return Panel(title, "one contact", unit, reference, tolerance, time_points(points, works, repeats))
 
 
 def _pressed_ridges(grid: Grid, tolerance: float) -> Contact:
@@ -168,9 +168,8 @@ def products_panel(repeats: int, rows: int | None = None, tolerances: Sequence[f
             is_default = (tolerance, single_precision) == (hand.tolerance, True)
             series = "float32" if single_precision else "float64"
             points.append(Tradeoff(series, f"tolerance {tolerance:g}", error, is_default=is_default))
-    timed = time_points(points, works, repeats)
-    reference = "float64, tolerance 1e-08"
-    return Panel("precision of contact", "one contact", "um rms of surface", reference, 0.1, timed)
+    labels = "precision of contact", "one contact", "um rms of surface", "float64, tolerance 1e-08"
+    return Panel(*labels, 0.1, time_points(points, works, repeats))
 
 
 def _pressed(gap: Floats, pixel_mm: float, tolerance: float, single_precision: bool, force_n: float = 3.0) -> Floats:

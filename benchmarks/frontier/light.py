@@ -49,8 +49,8 @@ def sky_panel(repeats: int, px: int = 512, steps: Sequence[int] = (1, 2, 4, 8)) 
     for count, work in zip(steps, works, strict=True):
         error = 100.0 * _SKY_FRACTION * float(np.abs(work() - exact)[~mask].max())
         points.append(Tradeoff("", f"{count} steps", error, is_default=count == SKY_STEPS))
-    timed = time_points(points, works, repeats)
-    return Panel("sky occlusion", f"a photo of {px} px", "% of light", "the full grid", 1.0, timed)
+    labels = "sky occlusion", f"a photo of {px} px", "% of light", "the full grid"
+    return Panel(*labels, 1.0, time_points(points, works, repeats))
 
 
 # Arithmetic ------------------------------------------------------------------------------------------------
@@ -70,8 +70,8 @@ def light_panel(repeats: int, objects: int = 8, px: int = 256) -> Panel:
         Tradeoff(name, "", float(np.abs(work().astype(np.int64) - exact).max()), is_default=place == 0)
         for place, (name, work) in enumerate(zip(names, works, strict=True))
     ]
-    timed = time_points(points, works, repeats)
     time, reference = f"shading and developing {objects} photos of {px} px", "float64, array by array"
+    timed = time_points(points, works, repeats)
     return Panel("arithmetic of light", time, "grey levels at most", reference, 1.0, timed)
 
 
