@@ -15,7 +15,7 @@ from retrieval.evaluation.results import Confusion, Details, Rejection
 from retrieval.evaluation.verification import ErrorsByImpostors, verification_errors, verification_rates
 from retrieval.methods.late_fusion import LateFusion
 from retrieval.methods.method import Method
-from retrieval.metrics.intervals import Summary, summarise
+from retrieval.metrics.intervals import summarise
 from retrieval.metrics.measure import Measure
 from retrieval.metrics.pairs import reliability_bins
 from retrieval.metrics.registry import confusions, k_way
@@ -127,6 +127,8 @@ def combine(by_seed: Sequence[SeedDetails], seed: int) -> Details:
         fractions[one.object_id, one.mistaken_for] += one.share / len(by_seed)
     largest = sorted(fractions.items(), key=lambda item: (-item[1], item[0]))[:_CONFUSIONS]
     rejections = [one.reject for one in by_seed if one.reject]
+    names = ("auroc", "false_accepts_at_95", "balanced_accuracy") if rejections else ()
+    summaries = {name: summarise([getattr(one, name) for one in rejections], seed=seed) for name in names}
     verified = [one.verification for one in by_seed if one.verification]
     return replace(
         first,
@@ -135,12 +137,6 @@ def combine(by_seed: Sequence[SeedDetails], seed: int) -> Details:
             for key, accuracies in first.per_object.items()
         },
         confusions=[Confusion(*pair, fraction) for pair, fraction in largest],
-        reject=_rejection(rejections, seed) if rejections else None,
+        reject=Rejection(**summaries, roc=rejections[0].roc) if rejections else None,
         verification=verification_rates(verified) if verified else None,
     )
-
-
-def _rejection(by_seed: Sequence[Rejection[Measure]], seed: int) -> Rejection[Summary]:
-    names = "auroc", "false_accepts_at_95", "balanced_accuracy"
-    summaries = {name: summarise([getattr(one, name) for one in by_seed], seed=seed) for name in names}
-    return Rejection(**summaries, roc=by_seed[0].roc)

@@ -57,21 +57,15 @@ def reject(posterior: Posterior, table: ScoreTable, *, seed: int = 0) -> Rejecti
     def measure(values: Floats, chance: float) -> Measure:
         return Measure(values[:, None], targets.touch_owner, np.array([chance]), words)
 
+    # The object-weighted mean is the area under the curve; the object means give its variance (DeLong 1988; Obuchowski
+    # 1997 for clustered data): v = P(present > any absent) + P(any present > absent) - area.
+    hits, alarms = weight_below(present, absent, weights), 1 - weight_below(absent, present, weights)
     return Rejection(
-        auroc=measure(_areas(present, absent, weights), 0.5),
+        auroc=measure(hits + alarms - np.sum(weights * hits), 0.5),
         balanced_accuracy=measure(((present >= 0) + 1.0 - (absent >= 0)) / 2, 0.5),
         false_accepts_at_95=measure(false_accepts(present, absent, targets.touch_owner), TRUE_ACCEPTS),
         roc=_roc(present, absent, weights),
     )
-
-
-def _areas(present: Floats, absent: Floats, weights: Floats) -> Floats:
-    """Return values (T,): their object-weighted mean is the area under the curve; their object means give its variance.
-
-    DeLong 1988; Obuchowski 1997 for clustered data: v = P(present > any absent) + P(any present > absent) - area.
-    """
-    hits, alarms = weight_below(present, absent, weights), 1 - weight_below(absent, present, weights)
-    return np.asarray(hits + alarms - np.sum(weights * hits))
 
 
 def false_accepts(present: Floats, absent: Floats, owner: NDArray[np.int64]) -> Floats:

@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.errors import BadInput, NumericalError
-
 FEW_OBJECTS = 5
 """With fewer objects, the coverage of an interval is far below its level."""
 
@@ -28,15 +26,6 @@ class Measure:
     owner: NDArray[np.int64]
     chance: NDArray[np.float64]
     gallery: str
-
-    def __post_init__(self) -> None:
-        shape = (len(self.owner), len(self.chance))
-        if self.values.shape != shape or 0 in shape:
-            raise BadInput(
-                f"a measure must have values of shape {shape}, and at least one query; got {self.values.shape}"
-            )
-        if not np.isfinite(self.values).all():
-            raise NumericalError("every value of a measure must be finite; one is not")
 
     def by_object(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the objects (R,), ascending, and the mean value (R, m) of the queries of each."""

@@ -195,7 +195,7 @@ class Matcher(nn.Module):
         return features.float().reshape(-1, fingers * self.touch_tower.output_count)
 
     def photo_features(self, photos: Tensor) -> Tensor:
-        """Return features (B, photo_feature_count) of photos (B, 3, H, views * W) in 0..1."""
+        """Return features (B, F) of photos (B, 3, H, views * W) in 0..1."""
         if self.views > 1:
             # One copy with channels last: without it, convolutions in training take 1.4 times as long.
             count, _, height, _ = photos.shape
@@ -210,12 +210,6 @@ class Matcher(nn.Module):
     def pooled_counts(self) -> tuple[int, int]:
         """Lengths of the features of a finger and of a photo, without cells."""
         return self.touch_tower.feature_count, self.views * self.photo_tower.feature_count
-
-    @property
-    def photo_feature_count(self) -> int:
-        """Length of the features of a photo."""
-        tower = self.photo_tower
-        return (self.views - 1) * tower.feature_count + tower.output_count
 
     def touch_encoding(self, features: Tensor) -> ImageEncoding:
         """Return partial activations of touch features, and their embeddings by the contrastive projection."""

@@ -1,10 +1,9 @@
 """Any recording: unseen objects of one split, each method described in depth."""
 
 import dataclasses
-from collections.abc import Sequence
 
 from retrieval.data.check.split import require_fit
-from retrieval.data.dataset import Grasp, Split, make_split
+from retrieval.data.dataset import Split, make_split
 from retrieval.errors import DatasetError
 from retrieval.evaluation.inputs import CONTROL_CCA
 from retrieval.evaluation.protocol import Protocol, RecordingFacts, split_of
@@ -41,7 +40,23 @@ def with_split(
         DatasetError: The requested split does not fit the recording, or the recording has some, but not all training
             objects of the model.
     """
-    split, origin = _split(facts.grasps, settings, model, requested)
+    own = model.split if model else None
+    trained = {*own.train, *own.validation} if own else set()
+    recorded = {grasp.object_id for grasp in facts.grasps}
+    if requested is not None:
+        require_fit(requested, facts.grasps)
+        split, origin = requested, "given"
+    elif own and trained and trained <= recorded:
+        split, origin = dataclasses.replace(own, test=own.test or tuple(sorted(recorded - trained))), "the model's own"
+    elif shared := trained & recorded:
+        raise DatasetError(
+            f"The recording must contain all training objects of the model or none of them, but contains {len(shared)} "
+            f"of {len(trained)}, such as {min(shared)}. Give a split with --split, or other towers with --config."
+        )
+    else:
+        fractions = {"validation": settings.validation_fraction, "test": settings.test_fraction}
+        split = make_split(facts.grasps, seed=settings.seed, **fractions)
+        origin = "drawn; the model was trained on none of its objects" if model else "drawn"
     protocol = dataclasses.replace(UNSEEN_OBJECTS, rule=f"{_RULE}The split is {origin}.", folds=lambda *_: [split])
     return _across_sessions(protocol, facts, split) if len(facts.sessions) > 1 else protocol
 
@@ -69,23 +84,3 @@ def _across_sessions(protocol: Protocol, facts: RecordingFacts, split: Split) ->
         controls={**protocol.controls, "order": CONTROL_CCA},
         across_sessions=True,
     )
-
-
-def _split(
-    grasps: Sequence[Grasp], settings: TrainingConfig, model: Checkpoint | None, requested: Split | None
-) -> tuple[Split, str]:
-    if requested is not None:
-        require_fit(requested, grasps)
-        return requested, "given"
-    own = model.split if model else None
-    trained = {*own.train, *own.validation} if own else set()
-    recorded = {grasp.object_id for grasp in grasps}
-    if own and trained and trained <= recorded:
-        return dataclasses.replace(own, test=own.test or tuple(sorted(recorded - trained))), "the model's own"
-    if shared := trained & recorded:
-        raise DatasetError(
-            f"The recording must contain all training objects of the model or none of them, but contains {len(shared)} "
-            f"of {len(trained)}, such as {min(shared)}. Give a split with --split, or other towers with --config."
-        )
-    drawn = make_split(grasps, validation=settings.validation_fraction, test=settings.test_fraction, seed=settings.seed)
-    return drawn, "drawn; the model was trained on none of its objects" if model else "drawn"

@@ -19,24 +19,23 @@ class ContrastiveLoss(Loss):
 class ListwiseLoss(Loss):
     """`listwise_loss` of the match logits of every touch of a batch with every photo of it."""
 
+    has_cells = True
+
     def forward(self, batch: EncodedBatch) -> Tensor:
         """Return the loss (scalar) of a batch."""
-        logits = batch.matcher.head.all_logits(batch.touch.partial, batch.photo.partial)
+        width = None if self.has_cells else batch.matcher.config.pooled_width
+        logits = batch.matcher.head.all_logits(batch.touch.partial[:, :width], batch.photo.partial[:, :width])
         return listwise_loss(logits, batch.touch_objects, batch.photo_objects)
 
 
-class PooledListwiseLoss(Loss):
+class PooledListwiseLoss(ListwiseLoss):
     """`listwise_loss` of the match logits without late interaction.
 
     Candidates are found by the pooled logit, and an index without cells ranks by it. Without this loss the cells learn
     to explain everything, and the pooled logit becomes useless.
     """
 
-    def forward(self, batch: EncodedBatch) -> Tensor:
-        """Return the loss (scalar) of a batch."""
-        pooled = batch.matcher.config.pooled_width
-        logits = batch.matcher.head.all_logits(batch.touch.partial[:, :pooled], batch.photo.partial[:, :pooled])
-        return listwise_loss(logits, batch.touch_objects, batch.photo_objects)
+    has_cells = False
 
 
 def contrastive_loss(

@@ -117,12 +117,13 @@ def test_the_pooled_posterior_is_fitted_on_the_logits_of_the_matcher_without_cel
     """Twelve touches of six objects, each of two photos: without cells, photo features end before those of cells."""
     matcher, pooled = checkpoint.matcher, checkpoint.matcher.without_cells()
     rng = torch.Generator().manual_seed(0)
-    photos = {Path(f"{at}.png"): torch.rand(matcher.photo_feature_count, generator=rng) for at in range(12)}
+    width = matcher.photo_tower.output_count + (matcher.views - 1) * matcher.photo_tower.feature_count
+    photos = {Path(f"{at}.png"): torch.rand(width, generator=rng) for at in range(12)}
     touches = torch.rand(12, 2 * matcher.touch_tower.output_count, generator=rng)
     grasps = [
         SimpleNamespace(object_id=f"object {at // 2}", photo=photo, opening_mm=None) for at, photo in enumerate(photos)
     ]
-    each, count = pooled.touch_tower.feature_count, pooled.photo_feature_count
+    each, count = pooled.touch_tower.feature_count, pooled.pooled_counts[1]
     short = {photo: features[:count] for photo, features in photos.items()}
     short_touches = touches.reshape(12, 2, -1)[..., :each].reshape(12, -1)
     expected = score_grasps(pooled, grasps, short_touches, short)
