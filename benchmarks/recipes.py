@@ -46,7 +46,8 @@ def measure(
             made = train(recording, Path(folder) / "model.safetensors", init=init, split=split)
             seconds += (time.monotonic() - begin) / folds
             taken.append(made.provenance["recipe"])
-            comparison = Comparison(pose(recording, Path(folder) / "parts", init=init, unused=rest), [left_out])
+            grasps = [grasp for grasp in load_grasps(recording) if grasp.object_id not in rest]
+            comparison = Comparison(pose(recording, grasps, Path(folder) / "parts", init=init), [left_out])
             recipes = {
                 name: recipe
                 for name in RECIPES

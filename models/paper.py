@@ -10,7 +10,6 @@ an interrupted run. At the end it evaluates the checkpoint; the report is in pap
 """
 
 import argparse
-import dataclasses
 import itertools
 import statistics
 import sys
@@ -26,16 +25,14 @@ from retrieval.commands.options import training_config
 from retrieval.console.memory import keep_freed_memory
 from retrieval.console.output import say
 from retrieval.console.progress import Bar
-from retrieval.data.dataset import Grasp, finger_count, load_grasps, make_split, recording_source
+from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.data.loading import map_in_order, worker_pool
 from retrieval.data.pairs import PairBatch
 from retrieval.errors import RetrievalError
-from retrieval.model.checkpoint import require_writable
 from retrieval.model.config import Config
 from retrieval.model.encode import autocast
 from retrieval.model.towers.tower import build_tower
-from retrieval.training.initial_weights import training_licences, with_available_weights
-from retrieval.training.trainer import Trainer
+from retrieval.training.trainer import Trainer, prepare_run
 
 TIMED_STEPS = 20
 """First steps that the second estimate is made from."""
@@ -67,17 +64,11 @@ def train(recording: Path, out: Path, config: Config) -> None:
 
     `config.training.workers` must be 0: a worker process would have a memory of its own.
     """
-    require_writable(out)
-    grasps = load_grasps(recording)
-    config = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, fingers=finger_count(grasps)))
-    config = with_available_weights(config)
-    settings = config.training
-    split = make_split(grasps, validation=settings.validation_fraction, test=settings.test_fraction, seed=settings.seed)
-    licences = training_licences(recording, settings)
-    trainer = Trainer(config, split, grasps, out, recording_source(recording), licences=licences)
-    decode(trainer, [grasp for grasp in grasps if grasp.object_id not in split.test])
+    trainer = prepare_run(recording, out, config)
+    settings = trainer.config.training
+    decode(trainer, [grasp for grasp in load_grasps(recording) if grasp.object_id not in trainer.split.test])
     rate = matrix_rate(trainer.device, settings.precision)
-    operations = tower_operations(config, trainer.sampler.batch(0, settings.touches_per_batch))
+    operations = tower_operations(trainer.config, trainer.sampler.batch(0, settings.touches_per_batch))
     say(
         f"estimate from arithmetic: the towers take {operations / 1e12:.3g} TFLOP a step; this device multiplies "
         f"matrices at {rate / 1e12:.3g} TFLOP/s: {settings.iterations:,} steps take at least "

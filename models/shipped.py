@@ -140,7 +140,7 @@ def train_towers(folder: Path, **settings: Any) -> Trained:
         split_of(train, []),
         train,
         folder / "towers.safetensors",
-        source="simulated rigs",
+        {"source": "simulated rigs", "data_digest": data_digest(train)},
         labels={name: labels for part in parts for name, labels in load_object_labels(part).items()},
     )
     config = head_config(folder, trainer.run_or_reuse(quiet=False))

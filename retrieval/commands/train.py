@@ -81,17 +81,15 @@ def train(
         refuse_options("needs --config", iterations=iterations)
         from retrieval.data.check.recording import check_gel_layout
         from retrieval.report.training import print_comparison
-        from retrieval.training.touches import train_on_touches
-        from retrieval.training.train import train as train_best
+        from retrieval.training.train import train as train_model
 
         for finding in check_gel_layout(recording):
             say(f"{finding.severity}: {finding.message}")
-        weights, objects = init or "imagenet", read_split(split)
+        options: dict[str, Any] = {"recipe": recipe, "model": model, "init": init or "imagenet"}
         if task == "touches":
             refuse_options("does not apply to --task touches", recipe=recipe, model=model)
-            print_comparison(train_on_touches(recording, out, init=weights, split=objects))
-        else:
-            print_comparison(train_best(recording, out, recipe=recipe, model=model, init=weights, split=objects))
+        made = train_model(recording, out, touches_only=task == "touches", split=read_split(split), **options)
+        print_comparison(made)
 
 
 def _train_gate(recording: Path, out: Path, iterations: int | None) -> None:

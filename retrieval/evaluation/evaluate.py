@@ -24,7 +24,7 @@ from retrieval.methods.method import Method
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.config import Config, named_config
 from retrieval.model.shipped import is_shipped, shipped_model
-from retrieval.training.initial_weights import training_licences
+from retrieval.training.initial_weights import made_from, training_licences
 from retrieval.training.trainer import Trainer
 from retrieval.version import __version__
 
@@ -211,7 +211,6 @@ def _require_use(
 def _trained(facts: RecordingFacts, protocol: Protocol, towers: TowerEncoder, out: Path, quiet: bool) -> Checkpoint:
     """Train the towers on the split of the protocol, unless `out` has this model; return the checkpoint."""
     (split,) = protocol.folds(facts, towers.config.training.seed)
-    licences = training_licences(facts.folder, towers.config.training)
-    path = out / "model.safetensors"
     grasps = [facts.grasps[row] for row in protocol.rows_to_fit(facts.grasps)]
-    return Trainer(towers.config, split, grasps, path, facts.source, licences=licences).run_or_reuse(quiet)
+    made = made_from(facts.folder, grasps, training_licences(facts.folder, towers.config.training))
+    return Trainer(towers.config, split, grasps, out / "model.safetensors", made).run_or_reuse(quiet)

@@ -168,6 +168,7 @@ class Experiment:
         if Bar.is_verbose and not self.of.quiet:
             name = f"{self.row.method} ({self.kind})" if self.is_control else self.row.name
             say(f"evaluate: {name}, seed {self.seed}")
+        model = self.row.towers.checkpoint
         settings = MethodSettings(
             self.row.towers.config,
             self.seed,
@@ -175,7 +176,7 @@ class Experiment:
             self.of.quiet,
             fit_on_validation=not self.of.protocol.in_depth,
             kind_of=self.of.facts.kind_of,
-            model=self.row.towers.checkpoint if self.row.is_unfitted else None,
+            **{"model" if self.row.is_unfitted else "start": model},
         )
         rows = self.of.protocol.rows_to_fit(thin_grasps(self.of.facts.grasps, self._max_grasps))
         features = self.features.select(rows)
@@ -356,9 +357,9 @@ def _method_times(outcomes: Sequence[Sequence[Outcome]]) -> MethodTimes:
 
 
 @one_thread()
-def _tower_times(towers: TowerEncoder, count: int = 3, repeats: int = 1) -> tuple[float, float]:
+def _tower_times(towers: TowerEncoder) -> tuple[float, float]:
     """Return the median times (ms) of the towers for a touch and a photo, on one thread, without reading files."""
-    images, grasps = BatchImages(towers.config.preprocessing), towers.grasps[:count] * repeats
+    images, grasps = BatchImages(towers.config.preprocessing), towers.grasps[:3]
     touches = [timed(partial(touch_features, towers.matcher, [images.touch(grasp)]))[1] for grasp in grasps]
     photos = [timed(partial(photo_features, towers.matcher, [images.photo(grasp.photo)]))[1] for grasp in grasps]
     return 1e3 * float(np.median(touches)), 1e3 * float(np.median(photos))

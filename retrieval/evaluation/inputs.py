@@ -92,8 +92,7 @@ class TowerEncoder:
                 f"{source.path} needs {fingers} finger(s), but the recording has {recorded}. Evaluate a model for "
                 f"{recorded} finger(s)."
             )
-        training = replace(source.config.training, **FURTHER, seed=seed, start=str(source.path))
-        config = replace(source.config, training=training)
+        config = replace(source.config, training=source.config.training.with_given_weights(**FURTHER, seed=seed))
         return cls(with_fingers(grasps, fingers), config, source.matcher, source, cache, quiet)
 
     def inputs(self, kind: str, with_cells: bool = True, max_grasps: int | None = None) -> Features:
@@ -105,10 +104,8 @@ class TowerEncoder:
 
     def touches(self, grasps: Sequence[Grasp], touch_variant: str) -> NDArray[np.float32]:
         """Return the features (G, fingers * F) of other touches, without cells; their photos are not read."""
-        ids = tuple(grasp.grasp_id for grasp in grasps)
-        no_photos = Features(ids, ids, np.zeros((len(ids), 1, 1), np.float32), np.zeros((len(ids), 1), np.float32))
-        encoded = self._encode(with_fingers(grasps, self.config.matcher.fingers), touch_variant, "photo", no_photos)
-        return encoded.pooled(self.matcher).touch.reshape(len(ids), -1)
+        encoded = self._encode(with_fingers(grasps, self.config.matcher.fingers), touch_variant, "none")
+        return encoded.pooled(self.matcher).touch_rows
 
     def missing_reason(self, kind: str) -> str | None:
         """Return why the recording cannot give this kind of inputs; None if it can."""
@@ -135,20 +132,13 @@ class TowerEncoder:
         if not with_cells:
             return self.inputs(kind, max_grasps=max_grasps).pooled(self.matcher)
         grasps = thin_grasps(self.grasps, max_grasps)
-        if kind in ("touch", "background"):
-            return self._encode(grasps, "touch", "margin" if kind == "background" else "photo", None)
-        return self._encode(grasps, kind, "photo", self.inputs("touch"))
+        if kind == "background":
+            return self._encode(grasps, "touch", "margin")
+        return self._encode(grasps, kind)
 
-    def _encode(self, grasps: Sequence[Grasp], touch: str, photo: str, photos_from: Features | None) -> Features:
+    def _encode(self, grasps: Sequence[Grasp], touch: str, photo: str = "photo") -> Features:
         return encode_recording(
-            grasps,
-            self.matcher,
-            self.config,
-            self.cache,
-            touch_variant=touch,
-            photo_variant=photo,
-            photo_features_from=photos_from,
-            quiet=self.quiet,
+            grasps, self.matcher, self.config, self.cache, touch_variant=touch, photo_variant=photo, quiet=self.quiet
         )
 
 

@@ -14,18 +14,17 @@ from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
 from retrieval.training.features import Features
-from retrieval.training.initial_weights import build_matcher
+from retrieval.training.initial_weights import build_matcher, weights_of
 from retrieval.training.trainer import Trainer
 
-SOURCE = "features of a recording"
-"""Training source in the checkpoint's provenance."""
+SOURCE = {"source": "features of a recording"}
+"""Provenance of a head that is trained on features."""
 
 
 class LateFusion(Method):
     """Match logits of a fusion head over frozen towers. The encodings are partial activations of its first layer.
 
-    If the configuration names a checkpoint to start from, its head is trained further, and kept if no step is better
-    on validation objects.
+    The head of a start model is trained further, and kept if no step is better on validation objects.
     """
 
     uses_cells = True
@@ -75,14 +74,11 @@ def trained_checkpoint(settings: MethodSettings, train: Features, validation: Fe
         matcher=dataclasses.replace(config.matcher, fingers=train.touch.shape[1]),
         training=dataclasses.replace(config.training, seed=settings.seed, freeze_towers=True),
     )
+    start = settings.start
+    weights = weights_of(start.matcher if start else frozen_matcher(settings.config), head=start is not None)
     with nullcontext(settings.folder) if settings.folder else tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"late_fusion-{settings.seed}.safetensors"
-        trainer = Trainer(config, split, grasps, path, SOURCE, known)
-        if not config.training.start:  # which has the towers
-            towers = frozen_matcher(settings.config)
-            trainer.matcher.touch_tower.load_state_dict(towers.touch_tower.state_dict())
-            trainer.matcher.photo_tower.load_state_dict(towers.photo_tower.state_dict())
-        return trainer.run_or_reuse(settings.quiet)
+        return Trainer(config, split, grasps, path, SOURCE, known, weights).run_or_reuse(settings.quiet)
 
 
 def frozen_matcher(config: Config) -> Matcher:

@@ -2,19 +2,17 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.errors import BadInput, NumericalError
+from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
-
-if TYPE_CHECKING:
-    from retrieval.model.checkpoint import Checkpoint
-    from retrieval.training.features import Features
+from retrieval.training.features import Features
 
 Array = NDArray[np.float32]
 
@@ -33,6 +31,7 @@ class MethodSettings:
         kind_of: The kind of each object, if the recording names it. Half of each kind is then held out together to
             choose settings.
         model: A trained model, with which late fusion and retrieve and rerank score as it is.
+        start: A model whose head they train further.
 
     >>> retrieval.MethodSettings(retrieval.load_config("tiny")).seed
     0
@@ -42,9 +41,11 @@ class MethodSettings:
     seed: int = 0
     folder: Path | None = None
     quiet: bool = True
+    _: KW_ONLY
     fit_on_validation: bool = False
     kind_of: Mapping[str, str] | None = None
-    model: "Checkpoint | None" = None
+    model: Checkpoint | None = None
+    start: Checkpoint | None = None
 
 
 class Method(ABC):
@@ -78,7 +79,7 @@ class Method(ABC):
         self.best_params: dict[str, Any] = {}
         self._shapes: tuple[tuple[int, ...], ...] = ()
 
-    def fit(self, train: "Features", validation: "Features") -> None:
+    def fit(self, train: Features, validation: Features) -> None:
         """Fit on the grasps of training objects; choose settings on those of validation objects.
 
         Raises:
@@ -117,7 +118,7 @@ class Method(ABC):
         return _checked("scores", scores, len(sets), len(photo_encodings))
 
     @abstractmethod
-    def _fit(self, train: "Features", validation: "Features") -> None: ...
+    def _fit(self, train: Features, validation: Features) -> None: ...
 
     @abstractmethod
     def _encode_touch(self, touch: Array) -> Array: ...

@@ -1,7 +1,6 @@
 """Retrieve and rerank, as in a user's query: candidates by embedding, scored by match logit; trained as late fusion."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -9,7 +8,7 @@ from numpy.typing import NDArray
 
 from retrieval.methods.late_fusion import LateFusion, trained_checkpoint
 from retrieval.methods.method import Array
-from retrieval.model.checkpoint import Checkpoint, load_checkpoint
+from retrieval.model.checkpoint import Checkpoint
 from retrieval.training.distil import feature_partials, with_candidate_encoder
 from retrieval.training.features import Features
 
@@ -30,9 +29,8 @@ class RetrieveRerank(LateFusion):
         if checkpoint is None:
             checkpoint = trained_checkpoint(self.settings, train, validation)
             config = checkpoint.config.with_candidate_encoder_of(settings)
-            if settings.training.start and config.matcher.candidate_width:  # that of the start still fits
-                start = load_checkpoint(Path(settings.training.start)).matcher
-                checkpoint.matcher.candidate_encoder = start.candidate_encoder
+            if self.settings.start and config.matcher.candidate_width:  # that of the start still fits
+                checkpoint.matcher.candidate_encoder = self.settings.start.matcher.candidate_encoder
                 checkpoint.matcher.config = config.matcher
                 checkpoint = dataclasses.replace(checkpoint, config=config)
             elif config.matcher.candidate_width:

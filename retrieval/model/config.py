@@ -205,6 +205,10 @@ class TrainingConfig:
         """Return a copy with `iterations` optimiser steps, and at most as many distillation steps."""
         return dataclasses.replace(self, iterations=iterations, distil_steps=min(self.distil_steps, iterations))
 
+    def with_given_weights(self, **settings: Any) -> "TrainingConfig":
+        """Return a copy that names no initial weights, because they are given, or are random; with other settings."""
+        return dataclasses.replace(self, init="random", init_touch="", init_photo="", start="", **settings)
+
 
 WEIGHT_SUFFIX = "_weight"
 """Suffix of the settings that are weights of losses."""

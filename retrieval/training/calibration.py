@@ -436,7 +436,11 @@ def verification_sequences(
     rows, true = np.arange(len(sets)), np.searchsorted(objects, owner)
     highest = ratios.max(0)
     is_impostor = np.arange(len(objects)) != true[:, None]
-    similar = _nearest_objects(objects, scored.photo_owner, scored.photo_embeddings)[true]
+    means = np.stack([scored.photo_embeddings[scored.photo_owner == name].mean(0) for name in objects])
+    means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-9)
+    cosines = means @ means.T
+    np.fill_diagonal(cosines, -np.inf)
+    similar = cosines.argmax(1)[true]
     return VerificationSequences(
         owner,
         ratios[:, rows, true].T,
@@ -470,17 +474,6 @@ def fit_verification(
 
 def _quantiles(values: Floats, at: Sequence[float] | Floats = QUANTILES) -> tuple[float, ...]:
     return tuple(np.quantile(values, at).tolist())
-
-
-def _nearest_objects(
-    objects: NDArray[np.int64], owner: NDArray[np.int64], embeddings: NDArray[np.floating[Any]]
-) -> NDArray[np.int64]:
-    """Return for each object the place (O,) of the other object with the most similar mean embedding."""
-    means = np.stack([embeddings[owner == name].mean(0) for name in objects])
-    means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-9)
-    cosines = means @ means.T
-    np.fill_diagonal(cosines, -np.inf)
-    return np.asarray(cosines.argmax(1))
 
 
 # The checkpoint ----------------------------------------------------------------------------------------------
@@ -521,22 +514,20 @@ def calibrate_checkpoint(
 def with_calibrations(
     checkpoint: Checkpoint,
     scored: Sequence[ScoredTouches],
-    pooled: Sequence[ScoredTouches] = (),
-    verified: Sequence[ScoredTouches] | None = None,
+    pooled: Sequence[ScoredTouches],
     *,
     seed: int = 0,
 ) -> Checkpoint:
     """Return the checkpoint with calibrations on touches of objects outside the fit, of one matcher or several.
 
     `pooled` are the touches without late interaction, for an index without cells; empty for a model without cells.
-    `verified` are those for verification, by default `scored`.
     """
     posterior = fit_posterior(*scored, seed=seed)
     return dataclasses.replace(
         checkpoint,
         posterior=posterior,
         references=fit_references(*scored, seed=seed),
-        verification=fit_verification(scored if verified is None else verified, posterior, seed),
+        verification=fit_verification(scored, posterior, seed),
         pooled_posterior=fit_posterior(*pooled, seed=seed) if pooled else checkpoint.pooled_posterior,
         pooled_references=fit_references(*pooled, seed=seed) if pooled else checkpoint.pooled_references,
     )

@@ -1,14 +1,13 @@
 """Choice of the recipe that identifies objects best, by touches of objects that the fits have not seen.
 
 recording -> folds of objects -> features of each recipe's towers -> fits without a fold, scores of its touches
--> the best recipe -> its fit to all objects, calibrated on those scores -> checkpoint
+-> the best recipe -> its fit to all objects, calibrated on those scores
 
 The accuracy of the choice is nested: for the objects of a fold, the recipe is chosen by the other folds.
 """
 
 import dataclasses
-import shutil
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,23 +18,10 @@ from numpy.typing import NDArray
 from retrieval.console.interruption import resumable
 from retrieval.console.output import say
 from retrieval.console.progress import Bar
-from retrieval.data.check.split import require_fit
-from retrieval.data.dataset import (
-    LICENCES,
-    AnyRecording,
-    Grasp,
-    Split,
-    data_digest,
-    finger_count,
-    folder_of,
-    linked_objects,
-    load_grasps,
-    object_kinds,
-    recording_source,
-)
+from retrieval.data.dataset import DataLicence, Grasp, finger_count, linked_objects, object_kinds
 from retrieval.errors import BadInput
 from retrieval.metrics.measure import Measure, pooled
-from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable, sibling_file, store_checkpoint
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import one_thread
 from retrieval.model.shipped import shipped_model
 from retrieval.training.calibration import ScoredTouches, score_touches, with_calibrations, with_sensor_calibrations
@@ -64,25 +50,13 @@ MIN_OBJECTS = 8
 CHOSEN = "chosen recipe"
 
 
-def train_best(
-    recording: AnyRecording,
-    out: Path,
-    *,
-    recipe: str | type[Recipe] | None = None,
-    model: str | Path | Checkpoint | None = None,
-    init: str = "imagenet",
-    split: Split | None = None,
-    quiet: bool = False,
-) -> Checkpoint:
-    """Fit a matcher by the best recipe, and write the checkpoint `out`; arguments as for `retrieval.train`."""
-    require_writable(out)
-    recording, folder = folder_of(recording), sibling_file(out, ".parts")
-    if split is not None:
-        require_fit(split, load_grasps(recording))
-    problem = pose(recording, folder, model=model, init=init, unused=split.test if split else (), quiet=quiet)
+def fit_best(
+    recording: Path, problem: Problem, recipe: str | type[Recipe] | None
+) -> tuple[Checkpoint, list[DataLicence]]:
+    """Fit a matcher by the best recipe, or by the only one; return it, and the licences of its data."""
     names, folds = _candidates(problem, recipe)
     recipes = {name: RECIPES.load(name)(problem) for name in dict.fromkeys([*names, CONTROL])}
-    with resumable(folder):
+    with resumable(problem.folder):
         comparison = Comparison(problem, folds[: -(-ENOUGH_OBJECTS // len(folds[0]))])
         held_out = {name: comparison.held_out(name, recipes[name]) for name in names}
         low_pass = comparison.held_out(CONTROL, recipes[CONTROL], "low_pass")
@@ -93,24 +67,18 @@ def train_best(
         parts = [part for part in held_out[best] if part.touches.has_trials]
         pooled_parts = [part.pooled for part in parts if part.pooled is not None]
         fitted = with_calibrations(fitted, [part.touches for part in parts], pooled_parts)
-        fitted = with_sensor_calibrations(fitted, problem.grasps, features, quiet=quiet)
-    licences = dict.fromkeys(recipes[best].licences(recording))
+        fitted = with_sensor_calibrations(fitted, problem.grasps, features, quiet=problem.quiet)
     table = _table(
         accuracies, identification(low_pass), _groups(comparison.folds), across_sessions=comparison.across_sessions
     )
     provenance = {
-        "source": recording_source(recording),
-        "data_digest": data_digest(problem.grasps),
         **fitted.provenance,
-        LICENCES: [dataclasses.asdict(licence) for licence in licences],
         "recipe": best,
         COMPARED: table,
         "metrics": fitted.provenance.get("metrics", {})
         | {"held_out_top1": table["rows"][CHOSEN][0], "held_out_top1_chance": table["rows"][CHOSEN][3]},
     }
-    store_checkpoint(dataclasses.replace(fitted, provenance=provenance), out)
-    shutil.rmtree(folder)
-    return load_checkpoint(out)
+    return dataclasses.replace(fitted, provenance=provenance), recipes[best].licences(recording)
 
 
 def _candidates(problem: Problem, recipe: str | type[Recipe] | None) -> tuple[list[str], list[tuple[str, ...]]]:
@@ -144,15 +112,14 @@ def _candidates(problem: Problem, recipe: str | type[Recipe] | None) -> tuple[li
 
 def pose(
     recording: Path,
+    grasps: list[Grasp],
     folder: Path,
     *,
     model: str | Path | Checkpoint | None = None,
     init: str = "imagenet",
-    unused: Collection[str] = (),
     quiet: bool = False,
 ) -> Problem:
-    """Return the problem of a recording without the objects `unused`; unfinished parts are stored in `folder`."""
-    grasps = [grasp for grasp in load_grasps(recording) if grasp.object_id not in unused]
+    """Return the problem of grasps of a recording; unfinished parts are stored in `folder`."""
     fingers = finger_count(grasps)
     start = model if isinstance(model, Checkpoint) else load_checkpoint(model or shipped_model(min(fingers, 2)))
     return Problem(grasps, fingers, start, init, object_kinds(recording), linked_objects(grasps), folder, quiet)
@@ -182,7 +149,6 @@ class Comparison:
     def __init__(self, problem: Problem, folds: Sequence[Sequence[str]]) -> None:
         problem.folder.mkdir(parents=True, exist_ok=True)
         self.problem, self.folds = problem, folds
-        self._encoded: dict[tuple[int, str, str], Features] = {}
         sessions = list(dict.fromkeys(grasp.session for grasp in problem.grasps))
         self._session_of = {grasp.grasp_id: sessions.index(grasp.session) for grasp in problem.grasps}
         self.across_sessions = bool(objects_of_two_sessions(problem.grasps))
@@ -190,20 +156,9 @@ class Comparison:
         self._max_touches = min(max(MAX_TOUCHES // objects, 2), MAX_TOUCHES_OF_OBJECT)
 
     def features(self, recipe: Recipe, variant: str = "touch") -> Features:
-        """Return the features of all grasps by the towers of a recipe; each tower encodes once."""
-        key = id(recipe.matcher), recipe.config.preprocessing.digest(), variant
-        if key not in self._encoded:
-            photos = None if variant == "touch" else self.features(recipe)
-            self._encoded[key] = encode_recording(
-                self.problem.grasps,
-                recipe.matcher,
-                recipe.config,
-                self.problem.folder,
-                touch_variant=variant,
-                photo_features_from=photos,
-                quiet=self.problem.quiet,
-            )
-        return self._encoded[key]
+        """Return the features of all grasps by the towers of a recipe; a tower of several recipes encodes once."""
+        grasps, folder, quiet = self.problem.grasps, self.problem.folder, self.problem.quiet
+        return encode_recording(grasps, recipe.matcher, recipe.config, folder, touch_variant=variant, quiet=quiet)
 
     def held_out(self, name: str, recipe: Recipe, variant: str = "touch") -> list[HeldOut]:
         """Return the scored touches of each fold."""

@@ -369,7 +369,6 @@ def encode_recording(
     *,
     touch_variant: str = "touch",
     photo_variant: str = "photo",
-    photo_features_from: Features | None = None,
     quiet: bool = False,
 ) -> Features:
     """Return features of grasps by the frozen towers of `matcher`; each photo file is encoded once.
@@ -383,8 +382,7 @@ def encode_recording(
         touch_variant: "touch" for gel images, "low_pass" for low-pass ones (8 x 6), "no_contact" for the no-contact
             frames, which every grasp must then have.
         photo_variant: "photo" for whole photos; "margin" for their margin, which rarely shows the object, only with
-            whole touches; "none" for a recording of touches only.
-        photo_features_from: Features of at least these grasps; their photo features are used without encoding.
+            whole touches; "none" if no photo is needed.
         quiet: No progress on stderr.
 
     Raises:
@@ -403,14 +401,11 @@ def encode_recording(
     touch = _encoded_once(cache, made_by, touched, images.touch, partial(touch_features, matcher), images.files, quiet)
     if photo_variant == "none":
         photo = np.zeros((len(grasps), 0), np.float32)
-    elif photo_features_from is None:
+    else:
         files = {path: row for row, path in enumerate(dict.fromkeys(grasp.photo for grasp in grasps))}
         made_by, encode = (photo_variant, _tower_digest(matcher.photo_tower), digest), partial(photo_features, matcher)
         photo = _encoded_once(cache, made_by, list(files), images.photo, encode, lambda file: (file,), quiet)
         photo = photo[[files[grasp.photo] for grasp in grasps]]
-    else:
-        row_of = {grasp_id: row for row, grasp_id in enumerate(photo_features_from.grasp_ids)}
-        photo = photo_features_from.photo[[row_of[grasp.grasp_id] for grasp in grasps]]
     return Features(
         tuple(grasp.grasp_id for grasp in grasps),
         tuple(grasp.object_id for grasp in grasps),

@@ -27,22 +27,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from retrieval.console.progress import Bar
-from retrieval.data.dataset import (
-    LICENCES,
-    Attempt,
-    ImageCache,
-    data_digest,
-    load_attempts,
-    make_split,
-    recording_licence,
-    recording_source,
-)
+from retrieval.data.dataset import Attempt, ImageCache, load_attempts, make_split, recording_licence
 from retrieval.errors import DatasetError
 from retrieval.metrics.intervals import grouped_interval
 from retrieval.model.checkpoint import require_writable, write_tensors
 from retrieval.model.encode import batches, one_thread, touch_batch
 from retrieval.model.gate import TASK, GateSettings, GraspNet, GraspSuccessGate
 from retrieval.model.losses.loss import match_loss
+from retrieval.training.initial_weights import made_from
 from retrieval.training.loop import Plan, train_loop
 
 BATCH = 32
@@ -131,9 +123,7 @@ def train_gate(
     provenance = {
         "iterations": iterations,
         "seed": seed,
-        "source": recording_source(recording),
-        LICENCES: [dataclasses.asdict(recording_licence(recording))],
-        "data_digest": data_digest(attempt.grasp for attempt in attempts),
+        **made_from(recording, (attempt.grasp for attempt in attempts), [recording_licence(recording)]),
         "outcomes": dict(Counter(attempt.outcome for attempt in attempts)),
         "metrics": metrics,
     }

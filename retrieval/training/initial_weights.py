@@ -1,13 +1,23 @@
 """Initial weights of a matcher (random, published, from a file, or of a checkpoint), and the licences of their data."""
 
 import dataclasses
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
 from retrieval.console.output import say
-from retrieval.data.dataset import DataLicence, recording_licence, stored_licences
+from retrieval.data.dataset import (
+    LICENCES,
+    DataLicence,
+    Grasp,
+    data_digest,
+    recording_licence,
+    recording_source,
+    stored_licences,
+)
 from retrieval.errors import CheckpointError
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.checkpoint_info import CheckpointInfo, read_checkpoint_info
@@ -31,9 +41,8 @@ def with_available_weights(config: Config) -> Config:
     inits = {settings.tower_init(init) for init in (settings.init_touch, settings.init_photo)}
     if inits != {"imagenet"} or settings.start or settings.freeze_towers:
         return config
-    random = dataclasses.replace(settings, init="random", init_touch="", init_photo="")
     consequence = "The training starts from random weights, as with --init random"
-    return downloaded_or(dataclasses.replace(config, training=random), config, consequence)
+    return downloaded_or(dataclasses.replace(config, training=settings.with_given_weights()), config, consequence)
 
 
 def downloaded_or(replacement: Config, config: Config, consequence: str) -> Config:
@@ -63,6 +72,11 @@ def build_matcher(config: Config) -> Matcher:
         if settings.freeze_stem:
             tower.stem_layers().requires_grad_(False)
     return matcher
+
+
+def weights_of(matcher: Matcher, *, head: bool) -> dict[str, Tensor]:
+    """Return the weights of a matcher, or without `head` those of its towers, by name."""
+    return {name: part for name, part in matcher.state_dict().items() if head or name.startswith(TOWER_WEIGHTS)}
 
 
 def _start_from(matcher: Matcher, path: Path) -> None:
@@ -106,6 +120,15 @@ def training_licences(recording: Path, settings: TrainingConfig) -> list[DataLic
         for name in sorted({part for init in inits for part in init.split(TOWER_SEPARATOR)} - {"random", "imagenet"}):
             found.append(_SHIPPED if name in (SHIPPED, GEL) else DataLicence(name))
     return list(dict.fromkeys(found))
+
+
+def made_from(recording: Path, grasps: Iterable[Grasp], licences: Iterable[DataLicence]) -> dict[str, Any]:
+    """Return the entries of a model's provenance that name its data."""
+    return {
+        "source": recording_source(recording),
+        LICENCES: [dataclasses.asdict(licence) for licence in dict.fromkeys(licences)],
+        "data_digest": data_digest(grasps),
+    }
 
 
 def checkpoint_licences(info: CheckpointInfo) -> list[DataLicence]:

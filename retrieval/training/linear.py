@@ -73,10 +73,9 @@ def fit_linear(features: Features, config: Config, folds: Sequence[Sequence[str]
         The configuration and a matcher without the weights of its towers.
     """
     choice = select_settings(features, tower_widths(config, features), folds)
-    training = dataclasses.replace(config.training, init="random", init_touch="", init_photo="")
     matcher = Matcher(config.matcher, len(config.preprocessing.views)).eval()
     install_projections(matcher, choice)
-    return dataclasses.replace(config, training=training), matcher
+    return dataclasses.replace(config, training=config.training.with_given_weights()), matcher
 
 
 @torch.no_grad()

@@ -25,23 +25,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from retrieval.data.dataset import (
-    LICENCES,
-    AnyRecording,
-    Grasp,
-    Split,
-    data_digest,
-    finger_count,
-    folder_of,
-    linked_objects,
-    load_grasps,
-    object_kinds,
-    recording_source,
-)
+from retrieval.data.dataset import DataLicence, Grasp, Split, finger_count, linked_objects, object_kinds
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import BadInput
 from retrieval.metrics.measure import Measure, pooled
-from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable, store_checkpoint
+from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
 from retrieval.model.encode import one_thread
 from retrieval.model.fusion import Matcher
@@ -52,7 +40,6 @@ from retrieval.training.cca import (
     MAX_CALIBRATION_TOUCHES,
     MAX_CHOICE_TOUCHES,
     AffineMap,
-    Array,
     CcaSettings,
     Modality,
     unit_rows,
@@ -175,10 +162,6 @@ class TouchFit:
     map: AffineMap
     held_out: list[ScoredTouches]
 
-    def codes(self, touches: Touches) -> Array:
-        """Return the codes (G, k) of touches."""
-        return unit_rows(self.map(touches.features.touch_rows))
-
 
 def fit_touches(
     touches: Touches, widths: Sequence[int], folds_of: Callable[[Features], Sequence[Sequence[str]]]
@@ -220,7 +203,7 @@ def recognition(touches: Touches, fit: Callable[[Numbers], TouchFit], gallery: s
         objects, starts = np.unique(touches.owner[references], return_index=True)
         queries = np.flatnonzero((touches.turn == turn) & np.isin(touches.owner, objects))
         if len(queries):
-            codes, owner = fit(references).codes(touches), touches.owner[queries]
+            codes, owner = unit_rows(fit(references).map(touches.features.touch_rows)), touches.owner[queries]
             near = reference_similarity(codes[queries] @ codes[references].T, starts)
             own = np.take_along_axis(near, np.searchsorted(objects, owner)[:, None], 1)
             values = np.where((near > own).any(1), 0.0, 1 / (near == own).sum(1))
@@ -246,27 +229,21 @@ def _accuracies(
 # The checkpoint ---------------------------------------------------------------------------------------------
 
 
-def train_on_touches(
-    recording: AnyRecording,
-    out: Path,
-    *,
-    init: str = "imagenet",
-    split: Split | None = None,
-    quiet: bool = False,
-) -> Checkpoint:
-    """Fit a model to the touches of a recording, and write the checkpoint `out`; arguments as for `retrieval.train`.
+def fit_to_touches(
+    recording: Path, grasps: Sequence[Grasp], init: str, *, quiet: bool = False
+) -> tuple[Checkpoint, list[DataLicence]]:
+    """Fit a model to the touches of grasps of a recording; return it, and the licences of its data.
 
     Raises:
-        DatasetError: The recording cannot be read.
-        BadInput: The recording has fewer than six objects, or no object was touched again.
-        CheckpointError: The weights cannot be read, or `out` cannot be written.
+        BadInput: There are fewer than six objects, or no object was touched again.
+        CheckpointError: The weights cannot be read.
     """
-    require_writable(out)
-    recording = folder_of(recording)
-    grasps = load_grasps(recording)
-    if split is not None:
-        grasps = [grasp for grasp in grasps if grasp.object_id not in split.test]
-    config, linked = _configuration(finger_count(grasps), init), linked_objects(grasps)
+    published, linked = available_config(finger_count(grasps), init), linked_objects(grasps)
+    config = Config(
+        dataclasses.replace(published.matcher, photo_tower=NO_TOWER),
+        dataclasses.replace(published.training, init_photo="random"),
+        Preprocessing(touch_px=published.preprocessing.touch_px, photo_px=32, background="none"),
+    )
     seed, folds = config.training.seed, draw_folds(linked)
     licences = training_licences(recording, config.training)
     matcher = build_matcher(config).eval()
@@ -290,14 +267,11 @@ def train_on_touches(
         raise BadInput("too few objects have touches of two sequences to calibrate the model; touch more objects again")
     config, matcher = _with_map(config, matcher, choice.map)
     made = Checkpoint(
-        path=out,
+        path=Path("touches"),
         digest="",
         config=config,
         provenance={
             "step": 0,
-            "source": recording_source(recording),
-            "data_digest": data_digest(grasps),
-            LICENCES: [dataclasses.asdict(licence) for licence in licences],
             COMPARED: _table(measures, parts.has_sessions),
             "metrics": {f"{name}_top1": float(measure.by_object()[1].mean()) for name, measure in measures.items()},
         },
@@ -306,9 +280,7 @@ def train_on_touches(
         posterior=references.touch_only,
         references=references,
     )
-    made = with_sensor_calibrations(made, grasps, encoded["touch"].features, quiet=quiet)
-    store_checkpoint(made, out)
-    return load_checkpoint(out)
+    return with_sensor_calibrations(made, grasps, encoded["touch"].features, quiet=quiet), licences
 
 
 def _table(measures: Mapping[str, Measure], has_sessions: bool) -> dict[str, Any]:
@@ -323,20 +295,9 @@ def _table(measures: Mapping[str, Measure], has_sessions: bool) -> dict[str, Any
     return comparison_table(title, rows, same, low_pass, across_sessions=has_sessions)
 
 
-def _configuration(fingers: int, init: str) -> Config:
-    """Return the configuration of the touch towers of the linear fit; `init` as for `retrieval.train`."""
-    config = available_config(fingers, init)
-    return Config(
-        dataclasses.replace(config.matcher, photo_tower=NO_TOWER),
-        dataclasses.replace(config.training, init_photo="random"),
-        Preprocessing(touch_px=config.preprocessing.touch_px, photo_px=32, background="none"),
-    )
-
-
 def _with_map(config: Config, matcher: Matcher, found: AffineMap) -> tuple[Config, Matcher]:
     """Return the matcher whose embedding of a touch is its code, with the same towers, and its configuration."""
     settings = dataclasses.replace(config.matcher, embedding_dim=found.weight.shape[1])
-    training = dataclasses.replace(config.training, init="random", init_touch="", init_photo="")
     made = Matcher(settings).eval()
     made.touch_tower = matcher.touch_tower
     unused = {name: part for name, part in made.state_dict().items() if name.startswith(("head.", "photo_projection."))}
@@ -347,4 +308,4 @@ def _with_map(config: Config, matcher: Matcher, found: AffineMap) -> tuple[Confi
         "cosine_scale": torch.tensor(1.0),
     }
     made.load_state_dict(state, strict=False)
-    return dataclasses.replace(config, matcher=settings, training=training), made
+    return dataclasses.replace(config, matcher=settings, training=config.training.with_given_weights()), made

@@ -1,14 +1,18 @@
 """Train a model from a recording: by the best recipe, by a configuration, or from touches only."""
 
+import dataclasses
+import shutil
 from pathlib import Path
 
-from retrieval.data.dataset import AnyRecording, Split, folder_of, load_grasps
+from retrieval.data.check.split import require_fit
+from retrieval.data.dataset import LICENCES, AnyRecording, Split, folder_of, load_grasps
 from retrieval.errors import BadInput
-from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable, sibling_file, store_checkpoint
 from retrieval.model.config import Config
-from retrieval.training.choice import train_best
+from retrieval.training.choice import fit_best, pose
+from retrieval.training.initial_weights import made_from
 from retrieval.training.recipes.recipe import Recipe
-from retrieval.training.touches import train_on_touches
+from retrieval.training.touches import fit_to_touches
 from retrieval.training.trainer import train_matcher
 
 
@@ -20,14 +24,15 @@ def train(
     recipe: str | type[Recipe] | None = None,
     model: str | Path | Checkpoint | None = None,
     init: str = "imagenet",
+    touches_only: bool = False,
     split: Split | None = None,
     quiet: bool = False,
 ) -> Checkpoint:
     """Train a model on a recording and write the checkpoint `out`.
 
-    Without `config` the recipes of `RECIPES` are compared on objects that they were not
-    fitted to, and the best one is taken; `provenance["compared"]` has the accuracies. A recording without photos gives
-    a model that compares touches with touches. Ctrl-C ends an unfinished training, which continues if it is repeated.
+    Without `config` the recipes of `RECIPES` are compared on objects that they were not fitted to, and the best one is
+    taken; `provenance["compared"]` has the accuracies. Ctrl-C ends an unfinished training, which continues if it is
+    repeated.
 
     Args:
         recording: A folder, or the result of `robot.read_recording`. It decides the number of fingers.
@@ -38,12 +43,13 @@ def train(
         model: The start model. Default: the shipped model for as many fingers.
         init: Weights of the published MobileNetV2 of the linear fit: "imagenet", which are downloaded once, a file, or
             "random" to do without.
+        touches_only: Whether the model compares touches with touches, as always for a recording without photos.
         split: A split whose test objects are not used at all; with `config`, also the training and validation objects.
         quiet: No progress on stderr.
 
     Raises:
         DatasetError: The recording cannot be read.
-        BadInput: The recording has fewer than eight objects, or too few touches of them.
+        BadInput: The recording has fewer than eight objects (six with `touches_only`), or too few touches of them.
         ConfigError: The configuration or the recipe is unknown, or does not fit.
         CheckpointError: The start model or the weights cannot be read, or `out` cannot be written.
         JobInterrupted: After Ctrl-C.
@@ -63,11 +69,24 @@ def train(
     (True, 7)
     """
     if config is not None:
-        if recipe is not None or model is not None:
+        if recipe is not None or model is not None or touches_only:
             raise BadInput("A configuration trains without recipe and start model; leave out either.")
         return train_matcher(recording, out, config, split=split, quiet=quiet)
-    if not any(grasp.photos for grasp in load_grasps(folder_of(recording))):
-        if recipe is not None or model is not None:
-            raise BadInput("A recording without photos has one way to be trained. Leave recipe and start model out.")
-        return train_on_touches(recording, out, init=init, split=split, quiet=quiet)
-    return train_best(recording, out, recipe=recipe, model=model, init=init, split=split, quiet=quiet)
+    require_writable(out)
+    recording, parts = folder_of(recording), sibling_file(out, ".parts")
+    grasps = load_grasps(recording)
+    if split is not None:
+        require_fit(split, grasps)
+        grasps = [grasp for grasp in grasps if grasp.object_id not in split.test]
+    if not touches_only and any(grasp.photos for grasp in grasps):
+        problem = pose(recording, grasps, parts, model=model, init=init, quiet=quiet)
+        fitted, licences = fit_best(recording, problem, recipe)
+    elif recipe is not None or model is not None:
+        raise BadInput("A model of touches only has one way to be trained. Leave recipe and start model out.")
+    else:
+        fitted, licences = fit_to_touches(recording, grasps, init, quiet=quiet)
+    made = made_from(recording, grasps, licences)
+    provenance = made | fitted.provenance | {LICENCES: made[LICENCES]}  # a start model has licences of its own
+    store_checkpoint(dataclasses.replace(fitted, provenance=provenance), out)
+    shutil.rmtree(parts, ignore_errors=True)
+    return load_checkpoint(out)

@@ -4,8 +4,9 @@ recording -> grasps -> split -> images or cached features -> `train_loop` -> can
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -16,22 +17,24 @@ from retrieval.console.interruption import interruption
 from retrieval.console.progress import Bar
 from retrieval.data.check.split import require_fit
 from retrieval.data.dataset import (
-    LICENCES,
     AnyRecording,
-    DataLicence,
     Grasp,
     Split,
-    data_digest,
     finger_count,
     folder_of,
     load_grasps,
     make_split,
-    recording_source,
 )
 from retrieval.data.pairs import PairBatch, PairSampler
 from retrieval.errors import JobInterrupted
 from retrieval.metrics.pairs import negative_log_likelihood, pair_accuracy, pair_auc
-from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable, store_checkpoint
+from retrieval.model.checkpoint import (
+    Checkpoint,
+    load_checkpoint,
+    require_writable,
+    store_checkpoint,
+    tensors_digest,
+)
 from retrieval.model.config import Config, TrainingConfig, named_config
 from retrieval.model.encode import default_device
 from retrieval.model.fusion import Matcher
@@ -52,6 +55,7 @@ from retrieval.training.features import (
 from retrieval.training.initial_weights import (
     TOWER_WEIGHTS,
     build_matcher,
+    made_from,
     training_licences,
     with_available_weights,
 )
@@ -80,9 +84,13 @@ def train_matcher(
     usable checkpoint; a second Ctrl-C stops immediately. Arguments and errors are those of `retrieval.train`, whose
     `config` this function takes.
     """
-    recording, (config, _) = folder_of(recording), named_config(config)
-    require_writable(out)
     distributed.start()
+    return prepare_run(folder_of(recording), out, named_config(config)[0], split).run(quiet)
+
+
+def prepare_run(recording: Path, out: Path, config: Config, split: Split | None = None) -> "Trainer":
+    """Return the run of `train_matcher`, with the weights that are available and the fingers of the recording."""
+    require_writable(out)
     grasps = load_grasps(recording)
     config = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, fingers=finger_count(grasps)))
     config = with_available_weights(config)
@@ -93,11 +101,11 @@ def train_matcher(
         )
     else:
         require_fit(split, grasps)
-    source, licences = recording_source(recording), training_licences(recording, settings)
-    return Trainer(config, split, grasps, out, source, licences=licences).run(quiet)
+    made = made_from(recording, grasps, training_licences(recording, settings))
+    return Trainer(config, split, grasps, out, made)
 
 
-_DATA_AND_CODE = ("data_digest", "code")
+_MADE_FROM = ("data_digest", "weights_digest", "code")
 
 
 class Trainer:
@@ -117,14 +125,14 @@ class Trainer:
         split: Split,
         grasps: list[Grasp],
         out: Path,
-        source: str,
+        provenance: Mapping[str, Any],
         known: Features | None = None,
-        licences: Sequence[DataLicence] = (),
+        weights: Mapping[str, Tensor] = MappingProxyType({}),
     ) -> None:
         """Prepare a run.
 
-        `known`: features of all grasps. They replace the images if the towers are frozen. `licences`: licences of the
-        data.
+        `provenance`: origin of the data (`made_from`). `known`: features of all grasps. They replace the images if the
+        towers are frozen. `weights`: weights that replace the initial ones of these names.
         """
         settings = config.training
         self.config, self.split, self.out = config, split, out
@@ -132,6 +140,7 @@ class Trainer:
         torch.manual_seed(settings.seed)
         self.has_images = known is None
         self.matcher = build_matcher(config.without_candidate_encoder()).to(self.device)
+        self.matcher.load_state_dict(weights, strict=False)
         self.sampler = self._sampler(split.select(grasps, "train"))
         self.losses = WeightedLosses(settings.weights, self.matcher, len(self.sampler.grasps)).to(self.device)
         self.modules = nn.ModuleDict({"matcher": self.matcher, "losses": self.losses})
@@ -158,9 +167,9 @@ class Trainer:
             distributed.synchronise_batch_norm(tower, self.device)
         towers = [module for module in self.matcher.modules() if isinstance(module, Tower)]
         self.provenance = {
-            "source": source,
-            LICENCES: [dataclasses.asdict(licence) for licence in licences],
-            "data_digest": known.digest if known else data_digest(grasps),
+            **provenance,
+            **({"data_digest": known.digest} if known else {}),
+            **({"weights_digest": tensors_digest(weights, "")} if weights else {}),
             **code_digest(*map(type, (*self.losses.terms, *towers))),
         }
 
@@ -187,7 +196,7 @@ class Trainer:
         """
         settings, touches = self.config.training, self.config.training.touches_per_batch
         quiet = quiet or distributed.rank() > 0
-        made_from = {name: self.provenance.get(name) for name in _DATA_AND_CODE}
+        made_from = {name: self.provenance.get(name) for name in _MADE_FROM}
         identity = {"config": self.config.to_dict(), "split": self.split.to_dict(), **made_from}
         state, interrupted = StateFile(state_path(self.out), identity, is_replaceable=replace), None
         try:
@@ -242,7 +251,7 @@ class Trainer:
         """
         if self.out.is_file() and not state_path(self.out).exists():
             stored = load_checkpoint(self.out)
-            same = all(stored.provenance.get(name) == self.provenance.get(name) for name in _DATA_AND_CODE)
+            same = all(stored.provenance.get(name) == self.provenance.get(name) for name in _MADE_FROM)
             if same and (stored.config, stored.split) == (self.config, self.split):
                 return stored
         return self.run(quiet, replace=True)

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import ClassVar
 
 from retrieval.data.dataset import DataLicence, Grasp, Split, make_split, recording_licence
-from retrieval.model.checkpoint import Checkpoint, tensors_digest
+from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
 from retrieval.training.features import Features
-from retrieval.training.initial_weights import TOWER_WEIGHTS, build_matcher, checkpoint_licences, training_licences
+from retrieval.training.initial_weights import build_matcher, checkpoint_licences, training_licences, weights_of
 from retrieval.training.linear import available_config, fit_linear
 from retrieval.training.selection import held_out_folds
 from retrieval.training.trainer import Trainer
@@ -149,14 +149,9 @@ class ContinuedHead(Recipe):
     def fit(self, features: Features, name: str, *, is_final: bool = False) -> Checkpoint:
         """Return the model of the step that is best on a part of the objects."""
         problem, start = self.problem, self.problem.start
-        training = dataclasses.replace(
-            start.config.training,
+        training = start.config.training.with_given_weights(
             iterations=self.steps,
             distil_steps=DISTIL_STEPS,
-            init="random",
-            init_touch="",
-            init_photo="",
-            start="",
             learning_rate=self.learning_rate,
             validate_every=max(1, self.steps // 10),
             freeze_towers=True,
@@ -166,12 +161,9 @@ class ContinuedHead(Recipe):
         known = set(features.grasp_ids)
         grasps = [grasp for grasp in problem.grasps if grasp.grasp_id in known]
         split = make_split(grasps, validation=VALIDATION_FRACTION, test=0, seed=training.seed)
-        weights = start.matcher.state_dict()
-        taken = {part: weight for part, weight in weights.items() if self.continues or part.startswith(TOWER_WEIGHTS)}
-        path = problem.folder / f"{name}-{tensors_digest(taken, '')[:12]}.safetensors"  # of equal initial weights
         config = config if is_final else config.without_candidate_encoder()
-        trainer = Trainer(config, split, grasps, path, "", features)
-        trainer.matcher.load_state_dict(taken, strict=False)
+        out, weights = problem.folder / f"{name}.safetensors", weights_of(start.matcher, head=self.continues)
+        trainer = Trainer(config, split, grasps, out, {"source": ""}, features, weights)
         fitted = trainer.run_or_reuse(problem.quiet)
         return dataclasses.replace(fitted, provenance={key: fitted.provenance[key] for key in ("step", "metrics")})
 

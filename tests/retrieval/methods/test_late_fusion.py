@@ -11,7 +11,7 @@ from retrieval.errors import BadInput
 from retrieval.methods.late_fusion import LateFusion
 from retrieval.methods.method import MethodSettings
 from retrieval.methods.retrieve_rerank import RetrieveRerank, merge_scores
-from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
+from retrieval.model.checkpoint import load_checkpoint
 from retrieval.training.features import encode_recording
 from retrieval.training.initial_weights import build_matcher
 from retrieval.training.trainer import Trainer, train_matcher
@@ -45,8 +45,8 @@ def fitted(parts, tmp_path_factory):
     return fit(LateFusion, parts, tmp_path_factory.mktemp("fits"))
 
 
-def fit(method, parts, folder, config=FROZEN):
-    fitted_method = method(MethodSettings(config, folder=folder))
+def fit(method, parts, folder, config=FROZEN, start=None):
+    fitted_method = method(MethodSettings(config, folder=folder, start=start))
     fitted_method.fit(*parts[:2])
     return fitted_method
 
@@ -140,9 +140,8 @@ def test_a_model_without_trained_embeddings_scores_every_photo(parts, tmp_path):
 def test_a_fit_from_a_checkpoint_is_not_worse_on_validation_objects_and_takes_its_candidate_encoder(parts, tmp_path):
     config = dataclasses.replace(FROZEN, matcher=dataclasses.replace(FROZEN.matcher, candidate_width=8))
     first = fit(RetrieveRerank, parts, tmp_path / "a", config)
-    store_checkpoint(first.checkpoint, tmp_path / "start.safetensors")
-    further = with_training(config, start=str(tmp_path / "start.safetensors"), learning_rate=1e-5, iterations=2)
-    second = fit(RetrieveRerank, parts, tmp_path / "b", further)
+    further = with_training(config, learning_rate=1e-5, iterations=2)
+    second = fit(RetrieveRerank, parts, tmp_path / "b", further, start=first.checkpoint)
     assert second.best_params["validation_auc"] >= first.best_params["validation_auc"]
     encoders = (each.checkpoint.matcher.candidate_encoder.state_dict() for each in (first, second))
     for ours, theirs in zip(*(encoder.values() for encoder in encoders), strict=True):

@@ -98,7 +98,7 @@ def test_an_interrupted_run_keeps_its_finished_batches(matcher, plain, encode, m
     same(resumed, plain)
 
 
-def test_a_variant_changes_only_its_modality(grasps, matcher, plain, encode):
+def test_a_variant_changes_only_its_modality(grasps, matcher, encode):
     whole, count = encode(matcher)
     assert count == 9 + 9
     for variant in ("low_pass", "no_contact"):
@@ -112,9 +112,8 @@ def test_a_variant_changes_only_its_modality(grasps, matcher, plain, encode):
     assert count > 0
     np.testing.assert_array_equal(margin.touch, whole.touch)
     assert np.abs(margin.photo - whole.photo).max() > 0.01
-    part, count = encode(matcher, items=grasps[:5], cache=None, touch_variant="low_pass", photo_features_from=plain)
-    assert count == 5
-    np.testing.assert_array_equal(part.photo, plain.photo[:5])
+    touches, count = encode(matcher, touch_variant="low_pass", photo_variant="none")
+    assert (count, touches.photo.shape) == (0, (9, 0))
 
 
 @pytest.mark.parametrize("size", [(240, 320), (32, 48), (7, 9), (1, 3)])

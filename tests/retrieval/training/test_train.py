@@ -81,7 +81,13 @@ def load(source, batch, step=0):
 
 def trainer_for(recording, out, config=TINY):
     grasps = load_grasps(recording)
-    return Trainer(config, make_split(grasps, validation=0.25, test=0.2, seed=0), grasps, out, source="test")
+    return Trainer(
+        config,
+        make_split(grasps, validation=0.25, test=0.2, seed=0),
+        grasps,
+        out,
+        {"source": "test", "data_digest": ""},
+    )
 
 
 def same_weights(left, right):
