@@ -15,10 +15,10 @@ This package imports only numpy; FAISS is imported when it is used.
 (0, 1.0)
 """
 
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from _touch_retrieval.lazy import lazy_names
 from _touch_retrieval.registry import Registry
 from indexes.errors import ParameterError
 
@@ -112,13 +112,5 @@ _MODULES = {
 
 __all__ = ["KINDS", "build", "kind_name", "load_kind", "open", *_MODULES]
 
-if not TYPE_CHECKING:  # with it, a type checker would accept every attribute
-
-    def __getattr__(name: str) -> Any:
-        if name not in _MODULES:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_MODULES})
+if not TYPE_CHECKING:  # with __getattr__, a type checker accepts every attribute name
+    __getattr__, __dir__ = lazy_names(__name__, _MODULES)

@@ -12,9 +12,9 @@ Public names are imported on first use, so `import retrieval` is fast. Each laye
 True
 """
 
-from importlib import import_module
-from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from _touch_retrieval.lazy import lazy_names
 
 if TYPE_CHECKING:
     from retrieval.data.check.recording import check_recording as check_recording
@@ -93,14 +93,5 @@ _MODULES = {
 
 __all__ = list(_MODULES)
 
-if not TYPE_CHECKING:  # with it, a type checker would accept any name
-
-    def __getattr__(name: str) -> Any:
-        if name not in _MODULES:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        module, _, attribute = _MODULES[name].partition(":")
-        return attrgetter(attribute)(import_module(f"{__name__}.{module}"))
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_MODULES})
+if not TYPE_CHECKING:  # with __getattr__, a type checker accepts every attribute name
+    __getattr__, __dir__ = lazy_names(__name__, _MODULES)

@@ -8,8 +8,9 @@ Public names are imported on first use, so `import robot` is cheap.
 'simulated rig'
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from _touch_retrieval.lazy import lazy_names
 
 if TYPE_CHECKING:
     from robot.collection import CollectSettings as CollectSettings
@@ -66,12 +67,4 @@ _MODULES = {
 __all__ = list(_MODULES)
 
 if not TYPE_CHECKING:  # with __getattr__, a type checker accepts every attribute name
-
-    def __getattr__(name: str) -> Any:
-        if name not in _MODULES:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_MODULES})
+    __getattr__, __dir__ = lazy_names(__name__, _MODULES)
