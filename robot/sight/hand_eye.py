@@ -36,7 +36,6 @@ _UNIT_RATIO = 5.0
 """If one extent exceeds the other by this factor, the smaller one has another unit: a motion keeps distances."""
 _SAME_MM = 10.0
 """Points within this distance are one point that was measured again."""
-_MAX_CLOCK_ERROR = timedelta(days=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,19 +63,15 @@ def fit_hand_eye(camera_mm: npt.ArrayLike, rig_mm: npt.ArrayLike, *, written: da
         written: Time of the calibration; now by default.
 
     Raises:
-        RobotConfigError: The points are too few, on one line, in metres or not finite.
+        RobotConfigError: The points are too few, on one line or in metres.
     """
     camera, rig = np.asarray(camera_mm, np.float64), np.asarray(rig_mm, np.float64)
-    if camera.shape != rig.shape or camera.ndim != 2 or camera.shape[1] != 3:
-        raise RobotConfigError(f"points must be two arrays of N x 3 mm, got {camera.shape} and {rig.shape}")
-    if not (np.isfinite(camera).all() and np.isfinite(rig).all()):
-        raise RobotConfigError("points must be finite numbers of mm; measure the others again")
     arms = [points - points.mean(0) for points in (camera, rig)]
     extents = [float(np.sqrt((arm**2).sum(1).mean())) for arm in arms]
-    for name, own, other in zip(("camera", "rig"), extents, extents[::-1], strict=True):
-        if own < _MIN_EXTENT_MM or own * _UNIT_RATIO < other:
+    for name, extent, other in zip(("camera", "rig"), extents, extents[::-1], strict=True):
+        if extent < _MIN_EXTENT_MM or extent * _UNIT_RATIO < other:
             raise RobotConfigError(
-                f"the {name} points must be in mm, but extend only {own:.3g}, and those of the other frame "
+                f"the {name} points must be in mm, but extend only {extent:.3g}, and those of the other frame "
                 f"{other:.3g}; if they are in metres, multiply them by 1000 (centimetres: 10, inches: 25.4), else "
                 "measure points that are farther apart"
             )
@@ -137,7 +132,7 @@ def load_hand_eye(path: Path, max_age_days: float) -> Points:
             f"{path} is not a hand-eye calibration: {error}; make it again with `retrieve rig calibrate`"
         ) from error
     age = datetime.now(UTC) - document.written.astimezone(UTC)
-    if age < -_MAX_CLOCK_ERROR:
+    if age < -timedelta(days=1):  # clocks differ
         raise RobotConfigError(f"{path} was written {-age.days} days in the future; set the clock, or calibrate again")
     if age > timedelta(days=max_age_days):
         raise RobotConfigError(
