@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from _touch_retrieval.documents import NonNegative, Positive, typed
+from _touch_retrieval.documents import Positive, typed
 from _touch_retrieval.registry import Registry
 from robot.devices import Camera, Device
 from robot.errors import RobotConfigError, UnknownName
@@ -77,9 +77,6 @@ DRIVERS: Mapping[str, Registry[type[Device]]] = {
 }
 """Drivers by role and name; installed packages register drivers of all roles in one group of entry points."""
 
-MAX_HAND_EYE_AGE_DAYS = 30.0
-"""Oldest accepted calibration, unless the camera's table sets `hand_eye_days`; a camera may be moved over time."""
-
 MIN_WAIT_S = 0.1
 """Shortest wait between a motion and the picture of its result: three frames of a gel at 30 frames/s."""
 
@@ -98,17 +95,16 @@ class Limits(TypedSettings):
 
 @dataclass(frozen=True)
 class ObjectSettings(TypedSettings):
-    """Position and size of every object (mm), for a rig without depth; error_mm: standard error of the position."""
+    """Position and size of every object (mm), for a rig without depth."""
 
     x_mm: float
     y_mm: float
     height_mm: Positive
     radius_mm: Positive
-    error_mm: NonNegative = 5.0
 
     def fit(self) -> CylinderFit:
         """Return the fit that a depth camera would have measured."""
-        return CylinderFit(**vars(self), method="given", half_mm=(self.radius_mm, self.radius_mm))
+        return CylinderFit(**vars(self), error_mm=5.0, method="given", half_mm=(self.radius_mm, self.radius_mm))
 
 
 class RealRig(Rig):
@@ -172,7 +168,7 @@ def load_driver(role: str, table: Mapping[str, Any], where: str, **arguments: An
 
 def _camera(table: Mapping[str, Any]) -> Camera:
     settings = dict(table)
-    file, days = settings.pop("hand_eye", None), settings.pop("hand_eye_days", MAX_HAND_EYE_AGE_DAYS)
+    file, days = settings.pop("hand_eye", None), settings.pop("hand_eye_days", 30.0)
     extrinsics = np.eye(4)
     if file is not None:
         path = Path(typed(file, str, "[camera]: hand_eye", error=RobotConfigError))
@@ -191,7 +187,7 @@ def _attempt(attempt: Mapping[str, Any], grasp: Mapping[str, Any], limits: Limit
     ceilings = dict.fromkeys(("travel_mm_s", "approach_mm_s"), limits.arm_speed_mm_s)
     ceilings["closing_mm_s"] = limits.jaw_speed_mm_s
     capped = {name: min(getattr(AttemptSettings, name), ceiling) for name, ceiling in ceilings.items()}
-    force_n = tuple(min(each, limits.force_n) for each in GraspSettings.force_n)
+    force_n = tuple(min(force_n, limits.force_n) for force_n in GraspSettings.force_n)
     settings = parse_attempt_settings({**capped, **attempt}, {"force_n": force_n, **grasp})
     limited = [(name, getattr(settings, name), ceiling) for name, ceiling in ceilings.items()]
     for name, value, ceiling in (*limited, ("force_n", settings.grasp.force_n[1], limits.force_n)):
