@@ -16,8 +16,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
 
-_WAIT_S = 60.0
-"""Longest wait for another process that writes to the same file."""
 _SCHEMA = """
     PRAGMA auto_vacuum = FULL;
     PRAGMA page_size = 16384;
@@ -106,13 +104,12 @@ class Cache:
 
     def keep(self, keys: Iterable[str]) -> None:
         """Delete all other entries, and give their room back to the disk."""
+        delete = "DELETE FROM entries WHERE key NOT IN (SELECT value FROM json_each(?))"
         with self._disk_errors(), self._connection:
-            stored = {key for (key,) in self._connection.execute("SELECT key FROM entries")}
-            unused = stored.difference(keys)
-            self._connection.executemany("DELETE FROM entries WHERE key = ?", ((key,) for key in unused))
+            self._connection.execute(delete, (json.dumps(list(keys)),))
 
     def _open(self) -> sqlite3.Connection:
-        connection = sqlite3.connect(self.path, timeout=_WAIT_S)
+        connection = sqlite3.connect(self.path, timeout=60.0)  # the wait for another process that writes to it
         try:
             connection.executescript(_SCHEMA)
             connection.execute("SELECT key, content, checksum FROM entries LIMIT 1").fetchone()

@@ -91,7 +91,7 @@ def check_fields(instance: Any, name: str, error: type[Exception] = ValueError) 
 @cache
 def _hints(kind: type) -> dict[str, Any]:
     hints = get_type_hints(kind, include_extras=True)
-    return {each.name: hints[each.name] for each in fields(kind) if each.init}
+    return {field.name: hints[field.name] for field in fields(kind) if field.init}
 
 
 def _require_known(document: Any, kind: Any, name: str, complete: bool) -> None:
@@ -101,11 +101,10 @@ def _require_known(document: Any, kind: Any, name: str, complete: bool) -> None:
     parts: Any = [document]
     kinds = get_args(kind)
     if kinds and get_origin(kind) not in (Union, UnionType):  # a list or a table of these types
-        parts = list(document.values()) if isinstance(document, Mapping) else document
-        parts = parts if isinstance(parts, list | tuple) else []
+        parts = document.values() if isinstance(document, Mapping) else document
     for part in parts:
-        for each in kinds:
-            _require_known(part, each, name, complete)
+        for inner_kind in kinds:
+            _require_known(part, inner_kind, name, complete)
     if not (isinstance(kind, type) and is_dataclass(kind) and isinstance(document, Mapping)):
         return
     known = _hints(kind)
@@ -145,11 +144,10 @@ def _error_message(message: str, document: Any, kind: Any, name: str) -> str:
         for key, number in _STEP.findall(place):
             document = document[key] if key else document[int(number)]
         got = repr(document)[:80]
-    return f"{where} must be {re.sub('`([^`]*)`', _in_words, required)}, got {got or 'another'}"
-
-
-def _in_words(kinds: re.Match[str]) -> str:
-    return " or ".join(_WORDS.get(kind, kind) for kind in kinds[1].split(" | "))
+    words = re.sub(
+        "`([^`]*)`", lambda kinds: " or ".join(_WORDS.get(word, word) for word in kinds[1].split(" | ")), required
+    )
+    return f"{where} must be {words}, got {got or 'another'}"
 
 
 def _choices(kind: Any, place: str) -> str:
@@ -157,7 +155,5 @@ def _choices(kind: Any, place: str) -> str:
     for key, _ in _STEP.findall(place):
         kind = _hints(kind)[key] if is_dataclass(kind) and isinstance(kind, type) else str
     kinds = (kind,) if get_origin(kind) is Literal else get_args(kind)
-    values = [repr(value) for each in kinds if get_origin(each) is Literal for value in get_args(each)]
-    return f"one of {', '.join(values)}" + (
-        " or a number" if any(get_origin(each) is Annotated for each in kinds) else ""
-    )
+    values = [repr(value) for part in kinds if get_origin(part) is Literal for value in get_args(part)]
+    return f"one of {', '.join(values)}" + " or a number" * any(get_origin(part) is Annotated for part in kinds)

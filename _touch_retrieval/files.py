@@ -87,10 +87,6 @@ def file_digest(path: Path) -> str:
 
 MAX_DEPTH = 64
 """Largest number of nested lists and objects. Recursive readers and writers of JSON fail at some larger depth."""
-MAX_FILE_BYTES = 512 * 2**20
-"""Largest file that is read as a whole."""
-MAX_JSON_BYTES = 64 * 2**20
-"""Default limit of a JSON file. A parsed document takes up to 25 times as much memory."""
 
 
 def open_regular(path: str | Path) -> BufferedReader:
@@ -105,7 +101,7 @@ def open_regular(path: str | Path) -> BufferedReader:
         raise
 
 
-def read_regular(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
+def read_regular(path: str | Path, max_bytes: int = 512 * 2**20) -> bytes:
     """Return the content of a regular file of at most `max_bytes` bytes. Raises OSError."""
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
@@ -117,9 +113,12 @@ def read_regular(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
     return data
 
 
-def read_json(path: str | Path, max_bytes: int = MAX_JSON_BYTES) -> Any:
-    """Return the JSON document in a regular file of at most `max_bytes` bytes. Raises OSError, ValueError."""
-    return parse_json(read_regular(path, max_bytes))
+def read_json(path: str | Path) -> Any:
+    """Return the JSON document in a regular file of at most 64 MiB, which takes up to 25 times as much memory.
+
+    Raises OSError, ValueError.
+    """
+    return parse_json(read_regular(path, 64 * 2**20))
 
 
 def parse_json(text: str | bytes, *, own: bool = False) -> Any:

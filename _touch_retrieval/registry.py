@@ -72,8 +72,10 @@ class Registry(dict[str, str], Generic[T]):
         try:
             return self._checked(name, _imported(place))
         except (ImportError, AttributeError) as error:
-            hint = "install its package, or add its folder to PYTHONPATH"
-            raise self._error(f"{self.noun} {name!r} cannot be imported: {error}; {hint}") from error
+            raise self._error(
+                f"{self.noun} {name!r} cannot be imported: {error}; install its package, or add its folder to "
+                "PYTHONPATH"
+            ) from error
 
     def name_of(self, choice: "str | T") -> str:
         """Return the name of a user's choice: a name, a `module:Class`, which is imported, or the object itself.
@@ -124,11 +126,11 @@ def code_digest(*classes: type) -> dict[str, str]:
     So an edited loss or method is fitted again. The source is that of the module, or of the class for a notebook.
     """
     sources = []
-    for each in classes:
-        if not each.__module__.startswith("retrieval."):
-            module = sys.modules[each.__module__]
+    for kind in classes:
+        if not kind.__module__.startswith("retrieval."):
+            module = sys.modules[kind.__module__]
             try:
-                sources.append(inspect.getsource(module if getattr(module, "__file__", None) else each))
+                sources.append(inspect.getsource(module if getattr(module, "__file__", None) else kind))
             except (OSError, TypeError):  # typed into an interpreter, without source
-                sources.append(each.__qualname__)
+                sources.append(kind.__qualname__)
     return {"code": hashlib.sha256("\n".join(sources).encode()).hexdigest()} if sources else {}

@@ -56,16 +56,16 @@ def read_numbers(data: bytes, columns: Sequence[str]) -> list[list[float]]:
     """
     rows, delimiter = _read_rows(decode_text(data), columns)
     marks = {mark for _, row in rows for column in columns for mark in ",." if mark in row[column]}
-    found = []
+    numbers = []
     for line, row in rows:
         for column in columns:
             try:
                 if len(marks) > 1:
                     raise ValueError("some numbers have a comma and some a point; remove separators of thousands")
-                found.append(_number(row[column], delimiter))
+                numbers.append(_number(row[column], delimiter))
             except ValueError as error:
                 raise ValueError(f"line {line}: {column}: {error}") from error
-    return [found[at : at + len(columns)] for at in range(0, len(found), len(columns))]
+    return [numbers[at : at + len(columns)] for at in range(0, len(numbers), len(columns))]
 
 
 def _number(text: str, delimiter: str) -> float:
@@ -82,7 +82,7 @@ def _read_rows(text: str, columns: Sequence[str]) -> tuple[list[tuple[int, dict[
     head, _, rest = text.partition("\n")
     if skipped := head.lower().startswith("sep="):  # a hint for Excel
         text, head = rest, rest.partition("\n")[0]
-    delimiter = next((each for each in ";\t|," if each in head), " ")
+    delimiter = next((mark for mark in ";\t|," if mark in head), " ")
     text = text.removeprefix("#")  # as numpy.savetxt begins it
     reader = csv.reader(io.StringIO(text), delimiter=delimiter, skipinitialspace=True, strict=True)
     try:

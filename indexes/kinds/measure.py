@@ -29,8 +29,13 @@ def measured_recall(index: VectorIndex, queries: Floats | None) -> dict[str, Any
         queries = sample_queries(index.vectors)
     exact = FaissIndex(index.vectors, FLAT)
     times = {"ms": query_ms(index, queries[:TIMED_QUERIES]), "exact_ms": query_ms(exact, queries[:TIMED_QUERIES])}
-    value = recall_against_exact(index, queries, RECALL_AT)
-    return {"value": value, "at": RECALL_AT, "queries": len(queries), "how": how, **times}
+    return {
+        "value": recall_against_exact(index, queries, RECALL_AT),
+        "at": RECALL_AT,
+        "queries": len(queries),
+        "how": how,
+        **times,
+    }
 
 
 def sample_queries(vectors: Floats) -> Floats:
@@ -42,8 +47,7 @@ def sample_queries(vectors: Floats) -> Floats:
     chosen = vectors[rng.integers(len(vectors), size=RECALL_QUERIES)].astype(np.float64)
     moves = rng.normal(size=chosen.shape)
     moved = chosen + NOISE * moves / np.linalg.norm(moves, axis=1, keepdims=True)
-    queries: Floats = (moved / np.linalg.norm(moved, axis=1, keepdims=True)).astype(np.float32)
-    return queries
+    return np.asarray(moved / np.linalg.norm(moved, axis=1, keepdims=True), np.float32)
 
 
 def recall_against_exact(index: VectorIndex, queries: Floats, k: int = 10) -> float:

@@ -204,8 +204,7 @@ class IndexStore:
                     files.remove_folder(self.path / f"gen-{number:06d}")
 
     def _numbers(self) -> list[int]:
-        found = (GENERATION.fullmatch(path.name) for path in self.path.iterdir())
-        return sorted(int(match[1]) for match in found if match)
+        return sorted(int(match[1]) for path in self.path.iterdir() if (match := GENERATION.fullmatch(path.name)))
 
     def _sweep(self) -> None:
         """Delete the unfinished files and folders of killed writers."""

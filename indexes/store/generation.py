@@ -165,5 +165,4 @@ def read_generation(folder: Path, *, verify: bool) -> Generation:
 
 
 def _open_array(path: Path) -> NDArray[Any]:
-    array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
-    return array
+    return np.asanyarray(np.load(path, mmap_mode="r", allow_pickle=False))

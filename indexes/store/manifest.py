@@ -97,12 +97,12 @@ def read_document(path: Path, version: int, kind: type[T]) -> T:
         raise CorruptIndex(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
     except ValueError as error:
         raise CorruptIndex(f"{path}: must be JSON, but is truncated or damaged ({error}); {AGAIN}") from error
-    found = content.get("format") if isinstance(content, dict) else None
-    if type(found) is not int:
-        raise CorruptIndex(f"{path}: must be a JSON object with a format version, got {found!r}; {AGAIN}")
-    if found != version:
-        age, remedy = ("newer", f"update the software, or {AGAIN}") if found > version else ("older", AGAIN)
-        raise UnsupportedFormat(f"{path}: has the {age} format {found}, but this software reads {version}; {remedy}")
+    stored = content.get("format") if isinstance(content, dict) else None
+    if type(stored) is not int:
+        raise CorruptIndex(f"{path}: must be a JSON object with a format version, got {stored!r}; {AGAIN}")
+    if stored != version:
+        age, remedy = ("newer", f"update the software, or {AGAIN}") if stored > version else ("older", AGAIN)
+        raise UnsupportedFormat(f"{path}: has the {age} format {stored}, but this software reads {version}; {remedy}")
     if content.pop("sha256", None) != content_digest(content):
         raise CorruptIndex(f"{path}: the content does not match its SHA-256: the file was altered; {AGAIN}")
     del content["format"]

@@ -88,9 +88,9 @@ def shard_number(object_id: str, shards: int) -> int:
 
 def shard_folder(object_id: str, manifest: ShardedManifest) -> str:
     """Return the folder of the shard that an object is in, or would be: another one stands in for an empty shard."""
-    folders, own = [shard.folder for shard in manifest.shards], shard_number(object_id, manifest.of)
-    full = [folder for folder in folders if folder.startswith(f"shard-{own:02d}-")]
-    return full[0] if full else folders[own % len(folders)]
+    folders, number = [shard.folder for shard in manifest.shards], shard_number(object_id, manifest.of)
+    full = [folder for folder in folders if folder.startswith(f"shard-{number:02d}-")]
+    return full[0] if full else folders[number % len(folders)]
 
 
 def write_sharded_manifest(folder: Path, manifest: ShardedManifest) -> None:
