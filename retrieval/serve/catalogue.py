@@ -28,6 +28,7 @@ IMAGE_RESPONSES: dict[int | str, dict[str, Any]] = {
 }
 MAX_PHOTO_PX = 4096
 """Maximum longer side, in pixels, of a photo that is converted to JPEG."""
+_thumbnail = lru_cache(512)(thumbnail)  # the digest of a photo's content identifies it there
 
 
 @router.get("/v1/catalogue")
@@ -49,14 +50,16 @@ def catalogue(
     """
     searcher = parts.generations.current
     name = name and resolve_object(searcher.shard, name)
-    found = searcher.shard.page(search.casefold().split(), name, offset, limit)
-    end = offset + len(found.photos)
+    page = searcher.shard.page(search.casefold().split(), name, offset, limit)
+    end = offset + len(page.photos)
     return {
         "generation": searcher.manifest.generation,
-        "total": found.total,
+        "total": page.total,
         "offset": offset,
-        "next": end if offset < end < found.total else None,
-        "items": [{"id": one.path, "object_id": one.object_id, "metadata": one.metadata} for one in found.photos],
+        "next": end if offset < end < page.total else None,
+        "items": [
+            {"id": photo.path, "object_id": photo.object_id, "metadata": photo.metadata} for photo in page.photos
+        ],
     }
 
 
@@ -82,17 +85,11 @@ def photo(
     try:
         data = read_bytes(path, listed.digest) if px is None else b""
         if not data.startswith(tuple(IMAGE_TYPES)):
-            data = _thumbnail(path, listed.digest, px or MAX_PHOTO_PX)
+            data = _thumbnail(path, px or MAX_PHOTO_PX, listed.digest)
     except ImageError as error:
         detail = f"The photo {photo!r} cannot be shown: {error.reason}. Run `retrieve build-index` again."
         raise HttpProblem("unknown", detail) from error
     return image_response(data, headers)
-
-
-@lru_cache(512)
-def _thumbnail(path: Path, digest: str, px: int) -> bytes:
-    """Return a photo as a small JPEG file; the digest of its content identifies it in the cache."""
-    return thumbnail(path, px, digest)
 
 
 def image_response(data: bytes, headers: Mapping[str, str] | None = None) -> Response:

@@ -94,7 +94,10 @@ class Client:
     ) -> list[QueryResult]:
         """Run `query` for each object, with its openings."""
         openings = [None] * len(objects) if opening_mm is None else opening_mm
-        return [self.query(touches, opening_mm=one, **options) for touches, one in zip(objects, openings, strict=True)]
+        return [
+            self.query(touches, opening_mm=opening, **options)
+            for touches, opening in zip(objects, openings, strict=True)
+        ]
 
     def enrol(
         self,
@@ -108,8 +111,8 @@ class Client:
         grasps = self._grasps(touches)
         name = quote(object_id, safe="").replace(".", "%2E")  # else "a/../b" would become "b"
         path = f"objects/{name}/touches"
-        found = _document(self._send("POST", path, json=_pictures(grasps, background, opening_mm)), "added")
-        return Enrolment(found["object_id"], found["touches"], len(found["added"]))
+        answer = _document(self._send("POST", path, json=_pictures(grasps, background, opening_mm)), "added")
+        return Enrolment(answer["object_id"], answer["touches"], len(answer["added"]))
 
     def photo(self, match: Match) -> bytes:
         """Return the file of a match's photo.
@@ -147,9 +150,9 @@ class Client:
 def _document(response: httpx.Response, *keys: str) -> dict[str, Any]:
     """Return the JSON object of a response, or raise RetrievalError if one of `keys` is missing."""
     with suppress(ValueError):  # not JSON
-        found = response.json()
-        if isinstance(found, dict) and all(key in found for key in keys):
-            return found
+        document = response.json()
+        if isinstance(document, dict) and all(key in document for key in keys):
+            return document
     raise RetrievalError(
         f"{response.url}: unexpected response ({response.status_code}); not a `retrieve serve` service."
     )

@@ -101,7 +101,7 @@ def problem_of(error: Exception) -> HttpProblem:
 
 def validation_message(errors: Any) -> str:
     """Return the first five validation errors of pydantic, each with its place, as one sentence."""
-    messages = [f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in list(errors)[:5]]
+    messages = [f"{'.'.join(map(str, error['loc']))}: {error['msg']}" for error in list(errors)[:5]]
     return "; ".join(messages) or "The request does not match the schema in /openapi.json."
 
 

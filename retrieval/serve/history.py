@@ -85,11 +85,14 @@ def history(
 ) -> dict[str, Any]:
     """Return one page of the answered queries, the newest first. next: offset of the next page, null at the end."""
     store = _require_history(parts).store
-    total, found = store.history(words=search.split()[:20], feedback=feedback, offset=offset, limit=limit)
-    end = offset + len(found)
-    following = end if offset < end < total else None
-    items = [_item(request, stored) for stored in found]
-    return {"total": total, "offset": offset, "next": following, "items": items}
+    total, queries = store.history(words=search.split()[:20], feedback=feedback, offset=offset, limit=limit)
+    end = offset + len(queries)
+    return {
+        "total": total,
+        "offset": offset,
+        "next": end if offset < end < total else None,
+        "items": [_item(request, stored) for stored in queries],
+    }
 
 
 @router.get("/v1/history/{name}")
@@ -153,7 +156,7 @@ def _resolve_feedback(
         return NONE, body.object_id, None
     if body.object_id is None:
         raise HttpProblem("bad-input", 'Feedback "object" requires object_id.')
-    shown = next((one["photo"] for one in results if one["object_id"] == body.object_id), None)
+    shown = next((match["photo"] for match in results if match["object_id"] == body.object_id), None)
     if shown is None:
         name = resolve_object(searcher.shard, body.object_id)
         photos = searcher.shard.page([], name, 0, 1).photos
@@ -170,9 +173,9 @@ def _read_photo(searcher: Searcher, photo: str) -> bytes | None:
     None if the file is gone or has changed, or if the row is a gel image of a reference touch: the feedback is stored,
     not recorded.
     """
-    (found,) = searcher.shard.photos([photo])
-    if found is None or found.is_touch:
+    (listed,) = searcher.shard.photos([photo])
+    if listed is None or listed.is_touch:
         return None
     with suppress(ImageError):
-        return read_bytes(searcher.catalogue / found.path, found.digest)
+        return read_bytes(searcher.catalogue / listed.path, listed.digest)
     return None

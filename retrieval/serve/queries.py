@@ -73,12 +73,12 @@ async def verify(request: Request, parts: Parts) -> DocumentResponse:
     parts.queue.require_capacity()
     body = await read_json(request, VerifyBody)
     pictures = RequestPictures(body.touches, body.background)
-    found = await parts.queue.submit(
+    decision = await parts.queue.submit(
         lambda searcher: searcher.verify(pictures.images, body.expect, far=body.far, background=pictures.frames),
         request,
         pictures,
     )
-    return DocumentResponse(found.to_dict())
+    return DocumentResponse(decision.to_dict())
 
 
 # Enrolment ------------------------------------------------------------------------------------------------------------
@@ -108,13 +108,13 @@ async def enrol(name: str, request: Request, parts: Parts) -> dict[str, Any]:
     _require_writable(parts)
     body = await read_json(request, EnrolBody)
     pictures = RequestPictures(body.touches, body.background)
-    found = await parts.queue.submit(
+    enrolment = await parts.queue.submit(
         lambda searcher: searcher.enrol(name, pictures.images, opening_mm=body.opening_mm, background=pictures.frames),
         request,
         pictures,
     )
     added = [content_digest(grasp[0]) for grasp in body.touches]
-    return {"object_id": found.object_id, "touches": found.touches, "added": added}
+    return {"object_id": enrolment.object_id, "touches": enrolment.touches, "added": added}
 
 
 @router.delete("/v1/objects/{name:path}/touches", tags=["catalogue"], summary="Forget enrolled touches of an object")
@@ -171,11 +171,10 @@ async def grasp(
     def encoded(images: list[bytes]) -> list[str]:
         return [base64.b64encode(data).decode("ascii") for data in images]
 
-    background = grasped.background and encoded(grasped.background)
     return {
         "object_id": grasped.object_id,
         "touches": encoded(grasped.touches),
-        "background": background,
+        "background": grasped.background and encoded(grasped.background),
         "opening_mm": grasped.opening_mm,
     }
 
@@ -189,8 +188,9 @@ def _object_ids(searcher: Searcher, name: str | None) -> list[str]:
             raise HttpProblem("unknown", f"The index has no object {name!r}. /v1/catalogue lists the objects.")
         return [name]
     step = max(1, photos // MAX_OBJECT_NAMES)
-    found = [photo for number in range(0, photos, step) for photo in shard.page([], None, number, 1).photos]
-    return sorted({photo.object_id for photo in found})
+    return sorted(
+        {photo.object_id for number in range(0, photos, step) for photo in shard.page([], None, number, 1).photos}
+    )
 
 
 @router.get(

@@ -75,8 +75,8 @@ def _seed(index: str | Path) -> int | None:
         first = IndexStore(folder).open(verify=False).rows[0].object_id
     except IndexesError:
         return None  # reported when the index is opened
-    found = _SIMULATED_OBJECT_ID.fullmatch(first)
-    return int(found[1]) if found else None
+    match = _SIMULATED_OBJECT_ID.fullmatch(first)
+    return int(match[1]) if match else None
 
 
 class _SimulatedGripper:

@@ -7,6 +7,7 @@ name the foreign host or origin, and are refused.
 import asyncio
 import hmac
 import logging
+from contextlib import suppress
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import urlsplit
 
@@ -25,23 +26,10 @@ COOKIE = "retrieve-token"
 _LOCAL_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
 _OPEN_PATHS = frozenset({"/healthz", "/readyz", "/v1/session", "/openapi.json"})
 """Paths that need no token, in addition to the files of the page, which contain no user data."""
-CONTENT_SECURITY_POLICY = "; ".join(
-    (
-        "default-src 'none'",
-        "script-src 'self'",
-        "style-src 'self'",
-        "img-src 'self' blob: data:",
-        "media-src 'self' blob:",
-        "connect-src 'self'",
-        "font-src 'self'",
-        "manifest-src 'self'",
-        "base-uri 'none'",
-        "form-action 'self'",
-        "frame-ancestors 'none'",
-    )
-)
 HEADERS = {
-    "content-security-policy": CONTENT_SECURITY_POLICY,
+    "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
+    "media-src 'self' blob:; connect-src 'self'; font-src 'self'; manifest-src 'self'; base-uri 'none'; "
+    "form-action 'self'; frame-ancestors 'none'",
     "x-content-type-options": "nosniff",
     "x-frame-options": "DENY",
     "referrer-policy": "no-referrer",
@@ -124,12 +112,10 @@ class Guard:
 def _request_tokens(headers: Headers) -> list[str]:
     """Return the tokens of a request: from the header (programs) and from the cookie (the page)."""
     scheme, _, value = headers.get("authorization", "").partition(" ")
-    found = [value.strip()] if scheme.lower() == "bearer" else []
-    try:
-        cookie = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
-    except CookieError:
-        return found
-    return [*found, *([cookie.value] if cookie else [])]
+    tokens = [value.strip()] if scheme.lower() == "bearer" else []
+    with suppress(CookieError):
+        tokens += [morsel.value for name, morsel in SimpleCookie(headers.get("cookie", "")).items() if name == COOKIE]
+    return tokens
 
 
 # Routes ---------------------------------------------------------------------------------------------------------------

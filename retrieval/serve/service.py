@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from threading import Event
 from typing import Annotated
 
@@ -65,23 +66,18 @@ class Service:
     ) -> None:
         self.settings, self.rig = settings, rig or LiveRig()
         self.generations, self.decoders = Generations(settings, shards), Decoders()
-        single = replace(settings, workers=1)
-        self.queue = self._queue(settings)
-        self.grasps = self._queue(replace(single, queue=MAX_RIG_GRASPS))
-        frames = replace(single, queue=MAX_FRAMES)
-        self.frames = {name: self._queue(frames) for name in self.rig.sensors}
+        queue = partial(Queue, self.generations, decoders=self.decoders)
+        self.queue = queue(settings)
+        self.grasps = queue(replace(settings, workers=1, queue=MAX_RIG_GRASPS))
+        self.frames = {name: queue(replace(settings, workers=1, queue=MAX_FRAMES)) for name in self.rig.sensors}
         self.history_writer = None
         if settings.history and recorder:
             self.history_writer = HistoryWriter(settings.history, recorder)
         self.stopping = Event()
 
-    def _queue(self, settings: ServiceSettings) -> Queue:
-        return Queue(self.generations, settings, self.decoders)
-
 
 async def _service(request: Request) -> Service:  # async, because FastAPI calls plain functions in a thread
-    found: Service = request.app.state.service
-    return found
+    return request.app.state.service  # type: ignore[no-any-return]
 
 
 Parts = Annotated[Service, Depends(_service)]

@@ -157,18 +157,18 @@ class HistoryStore:
             values.append(feedback)
         where = f"FROM queries LEFT JOIN feedback ON query = id WHERE {' AND '.join(conditions) or '1'}"
         total = self._read(f"SELECT COUNT(*) {where}", values)[0][0]
-        found = self._read(f"SELECT {_COLUMNS} {where} ORDER BY id DESC LIMIT ? OFFSET ?", [*values, limit, offset])
-        return total, [_stored_query(row) for row in found]
+        rows = self._read(f"SELECT {_COLUMNS} {where} ORDER BY id DESC LIMIT ? OFFSET ?", [*values, limit, offset])
+        return total, [_stored_query(row) for row in rows]
 
     def query(self, name: str) -> StoredQuery | None:
         """Return a query by its id, or None if it is missing."""
-        found = self._read(f"SELECT {_COLUMNS} FROM queries LEFT JOIN feedback ON query = id WHERE id = ?", [name])  # noqa: S608
-        return _stored_query(found[0]) if found else None
+        rows = self._read(f"SELECT {_COLUMNS} FROM queries LEFT JOIN feedback ON query = id WHERE id = ?", [name])  # noqa: S608
+        return _stored_query(rows[0]) if rows else None
 
     def pictures(self, name: str) -> dict[tuple[int, str], bytes]:
         """Return the files of all gel images of a query, by grasp (from 1; `BACKGROUND`: no contact) and finger."""
-        found = self._read("SELECT grasp, finger, data FROM pictures WHERE query = ? ORDER BY grasp, finger", [name])
-        return {(grasp, finger): data for grasp, finger, data in found}
+        text = "SELECT grasp, finger, data FROM pictures WHERE query = ? ORDER BY grasp, finger"
+        return {(grasp, finger): data for grasp, finger, data in self._read(text, [name])}
 
     # Feedback -------------------------------------------------------------------------------------------------
 
@@ -191,14 +191,15 @@ class HistoryStore:
             if before[0] is not None:
                 stored = f"{before[0]}, {before[1] or 'no object'}"
                 raise BadInput(f"This query has different feedback already: {stored}.")
-            row = (name, time.time(), feedback, object_id, photo)
-            database.execute("INSERT INTO feedback VALUES (?, ?, ?, ?, ?)", row)
+            database.execute(
+                "INSERT INTO feedback VALUES (?, ?, ?, ?, ?)", (name, time.time(), feedback, object_id, photo)
+            )
         return True
 
     def recordable(self) -> list[str]:
         """Return the queries with feedback on an object that has a photo, in the order of the feedback."""
-        found = self._read("SELECT query FROM feedback WHERE photo IS NOT NULL ORDER BY time, query")
-        return [name for (name,) in found]
+        text = "SELECT query FROM feedback WHERE photo IS NOT NULL ORDER BY time, query"
+        return [name for (name,) in self._read(text)]
 
     def feedback(self, name: str) -> tuple[str, bytes, dict[str, Any]]:
         """Return the object of a recordable query, its photo, and the query as its answer describes it."""

@@ -105,8 +105,13 @@ def _decoded(text: Any) -> bytes:
         raise ValueError(f"must be an image file in base64: {error}") from error
 
 
-_SCHEMA = {"type": "string", "contentEncoding": "base64", "description": "An image file in base64, or its data URL."}
-Base64Image = Annotated[bytes, PlainValidator(_decoded), WithJsonSchema(_SCHEMA)]
+Base64Image = Annotated[
+    bytes,
+    PlainValidator(_decoded),
+    WithJsonSchema(
+        {"type": "string", "contentEncoding": "base64", "description": "An image file in base64, or its data URL."}
+    ),
+]
 Grasps = Annotated[list[Annotated[list[Base64Image], Field(min_length=1)]], Field(min_length=1, max_length=MAX_GRASPS)]
 Openings = Annotated[
     list[Annotated[float, Field(gt=0)] | None] | None,
@@ -166,8 +171,7 @@ QUERY_BODY = {
 
 def json_body(model: type[BaseModel]) -> dict[str, Any]:
     """Return the OpenAPI description of a JSON body that the route parses itself, with `read_json`."""
-    content = {"application/json": {"schema": model.model_json_schema()}}
-    return {"requestBody": {"required": True, "content": content}}
+    return {"requestBody": {"required": True, "content": {"application/json": {"schema": model.model_json_schema()}}}}
 
 
 @dataclass(eq=False)
@@ -189,13 +193,13 @@ class RequestPictures:
 
     def named_files(self) -> list[tuple[str, bytes]]:
         """Return each file with its name for messages and answers."""
-        found = [
-            (f"grasp {number}, finger {_letter(place)}", data)
-            for number, grasp in enumerate(self.files, start=1)
-            for place, data in enumerate(grasp)
-        ]
-        return found + [
-            (f"background of finger {_letter(place)}", data) for place, data in enumerate(self.background or ())
+        return [
+            *(
+                (f"grasp {number}, finger {_letter(place)}", data)
+                for number, grasp in enumerate(self.files, start=1)
+                for place, data in enumerate(grasp)
+            ),
+            *((f"background of finger {_letter(place)}", data) for place, data in enumerate(self.background or ())),
         ]
 
     def set_images(self, images: Iterator[GelImage]) -> None:
@@ -227,8 +231,7 @@ async def read_json(request: Request, model: type[Body]) -> Body:
         raise HttpProblem(
             "unsupported-type", f"The body must be application/json, got {kind[:100] or 'no content-type'}."
         )
-    data = b"".join([chunk async for chunk in request.stream()])
-    return await run_in_threadpool(_parsed, data, model)
+    return await run_in_threadpool(_parsed, await request.body(), model)
 
 
 def _content_type(request: Request) -> str:
@@ -254,7 +257,7 @@ def _parsed(data: bytes, model: type[Body]) -> Body:
 
 def _invalid(error: ValidationError) -> HttpProblem:
     errors = error.errors(include_input=False, include_url=False, include_context=False)
-    is_malformed = any(one["type"] == "json_invalid" for one in errors)
+    is_malformed = any(detail["type"] == "json_invalid" for detail in errors)
     return HttpProblem("malformed" if is_malformed else "bad-input", validation_message(errors))
 
 
