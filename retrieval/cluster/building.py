@@ -23,9 +23,6 @@ from retrieval.indexing.sharded import ShardBuild, ShardJob, build_shard
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import default_device
 
-RELEASE_TIMEOUT_S = 60.0
-"""Longest wait for a lost process to release its shard's lock."""
-
 
 class ShardBuildWorker:
     """A process of the pool with the model, on a GPU if Ray assigned one."""
@@ -41,7 +38,7 @@ class ShardBuildWorker:
         return {"built": np.array([self._build(job) for job in batch["job"]], dtype=object)}
 
     def _build(self, job: ShardJob) -> ShardBuild | RetrievalError | IndexesError:
-        until = time.monotonic() + RELEASE_TIMEOUT_S
+        until = time.monotonic() + 60.0  # by then a lost process has released the lock of its shard
         while True:
             try:
                 return build_shard(job, self._checkpoint)

@@ -29,10 +29,7 @@ from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint
 from retrieval.search.opening import checkpoint_of, open_shard_of
 from retrieval.search.shard import Shards
 
-OWNERS = "touch-retrieval"
 APPLICATION = re.compile(r"shard-\d+-of-\d+-[0-9a-f]{16}-([0-9a-f]{8})")
-ONGOING_REQUESTS = 4
-"""Largest number of concurrent requests of a replica."""
 RETRY_S, MIN_RESULT_TIMEOUT_S = 0.05, 0.005
 """Pause before a call to a lost replica is repeated, and shortest timeout for a result that may be available."""
 
@@ -139,7 +136,8 @@ class Deployments:
     def __init__(self, ray: Any, settings: ReplicaSettings) -> None:
         self._ray, self._settings = ray, settings
         self._owner_id = secrets.token_hex(4)
-        self._owner = ray.remote(num_cpus=0)(OwnerActor).options(name=self._owner_id, namespace=OWNERS).remote()
+        actor = ray.remote(num_cpus=0)(OwnerActor)
+        self._owner = actor.options(name=self._owner_id, namespace="touch-retrieval").remote()
         self._users: Counter[str] = Counter()
         self._handles: dict[str, Any] = {}
         self._lock = threading.RLock()  # garbage collection calls `_release` on any thread, also during `open`
@@ -161,8 +159,11 @@ class Deployments:
         check_fingerprint(index, manifest.fingerprint, fingerprint(stored))
         # Which enrolled objects are in a shard depends on the shards that there are.
         folders = [entry.folder for entry in manifest.shards]
-        digests = {one.folder: hashlib.sha256(f"{one.sha256}{folders}".encode()).hexdigest() for one in manifest.shards}
-        names = {folder: f"{folder}-{digest[:16]}-{self._owner_id}" for folder, digest in digests.items()}
+        names = {
+            entry.folder: f"{entry.folder}-{hashlib.sha256(f'{entry.sha256}{folders}'.encode()).hexdigest()[:16]}-"
+            f"{self._owner_id}"
+            for entry in manifest.shards
+        }
         self._close_handles()
         with self._lock:
             self._deploy(names, str(Path(index).resolve()), manifest, str(stored.path.resolve()))
@@ -192,7 +193,7 @@ class Deployments:
             handle.shutdown()
 
     def _delete_orphans(self) -> None:
-        owners = {one["name"] for one in self._ray.util.list_named_actors(all_namespaces=True)}
+        owners = {actor["name"] for actor in self._ray.util.list_named_actors(all_namespaces=True)}
         for name in self._ray.serve.status().applications:
             match = APPLICATION.fullmatch(name)
             if match and match[1] not in owners:
@@ -205,7 +206,7 @@ class Deployments:
             ShardReplica,
             name="shard",
             num_replicas=settings.replicas,
-            max_ongoing_requests=ONGOING_REQUESTS,
+            max_ongoing_requests=4,
             ray_actor_options={"num_cpus": settings.cpus},
             health_check_period_s=2,
             health_check_timeout_s=10,

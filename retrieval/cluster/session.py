@@ -10,8 +10,6 @@ from typing import Any
 
 from retrieval.errors import BadInput, RetrievalError
 
-OBJECT_STORE_BYTES = 200 * 2**20
-"""Object store of a Ray that is started here; the transferred objects are small."""
 ADDRESS, LOOPBACK = "RAY_ADDRESS", "127.0.0.1"
 _SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",
@@ -59,7 +57,7 @@ def ray_session() -> Iterator[Any]:
     options: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False, "ignore_reinit_error": True}
     if not joined:
         options |= {
-            "object_store_memory": OBJECT_STORE_BYTES,
+            "object_store_memory": 200 * 2**20,  # the transferred objects are small
             "include_dashboard": False,
             "runtime_env": {"worker_process_setup_hook": "retrieval.cluster.session.on_loopback"},
         }

@@ -6,7 +6,6 @@ the recording must have the same path on every machine.
 
 import tempfile
 from pathlib import Path
-from typing import Any
 
 from retrieval.cluster.session import ray_session
 from retrieval.console.output import say
@@ -46,7 +45,7 @@ def train_on_ray(
         has_gpus = ray.cluster_resources().get("GPU", 0) >= workers
         say(f"training on {workers} ranks of Ray; their logs show the progress")
         trainer = TorchTrainer(
-            _rank,
+            lambda options: train_matcher(**options),  # in a process of Ray Train, which has joined the ranks
             train_loop_config=settings,
             scaling_config=ScalingConfig(num_workers=workers, use_gpu=has_gpus, resources_per_worker={"CPU": 1}),
             run_config=RunConfig(storage_path=notes, failure_config=FailureConfig(max_failures=MAX_RESTARTS)),
@@ -61,11 +60,6 @@ def train_on_ray(
             )
             raise _error_of_rank(error) or lost from error
     return load_checkpoint(out)
-
-
-def _rank(settings: dict[str, Any]) -> None:
-    """Train in a process of Ray Train, which has joined the ranks."""
-    train_matcher(**settings)
 
 
 def _error_of_rank(error: BaseException) -> RetrievalError | None:

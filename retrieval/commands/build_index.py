@@ -103,9 +103,8 @@ def build_index(
         _write_views(catalogue, out, report, checkpoint)
     if json:
         print_json(asdict(report))
-    if report.without_photo:
-        count = len(report.without_photo)
-        raise RetrievalError(f"the index is written, but {count} object(s) have no readable photo; see above")
+    if lost := len(report.without_photo):
+        raise RetrievalError(f"the index is written, but {lost} object(s) have no readable photo; see above")
 
 
 def _write_views(catalogue: Path, index: Path, report: "BuildReport", checkpoint: "Checkpoint") -> None:

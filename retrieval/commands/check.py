@@ -14,8 +14,7 @@ def check(recording: Recording, *, split: SplitFile = None, json: Json = False) 
 
     findings, licence = check_recording(recording, read_split(split)), recording_licence(recording)
     if json:
-        found = [dataclasses.asdict(finding) for finding in findings]
-        print_json({"findings": found, "licence": dataclasses.asdict(licence)})
+        print_json({"findings": list(map(dataclasses.asdict, findings)), "licence": dataclasses.asdict(licence)})
     for finding in findings:
         say(f"{finding.severity}: {finding.message}")
     say(f"licence of the data: {licence}")

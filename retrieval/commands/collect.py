@@ -98,5 +98,4 @@ def _print_motions(name: str, objects: int, seed: int) -> None:
     with make_dry_run(load_rig(name, seed=seed), show) as rig:
         runner = AttemptRunner(rig, seed, rig.attempt)
         for object_id in rig.object_ids(objects):
-            attempt = runner.run(object_id, 0)
-            say(f"{object_id}: {attempt.reason or 'nothing moved, nothing was recorded'}")
+            say(f"{object_id}: {runner.run(object_id, 0).reason or 'nothing moved, nothing was recorded'}")

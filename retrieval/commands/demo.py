@@ -7,7 +7,7 @@ grasps make up the catalogue, the touches of its last grasps are the queries. No
 import shlex
 import shutil
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 SEED = 20_000
 """Seed of the demo's objects; the shipped checkpoint was trained on other seeds."""
-JOBS = 2
-"""Simulated rigs that run in parallel."""
 PHOTOS, TOUCHES = 3, 3
 """Grasps of each object that provide a catalogue photo, and grasps that provide a query touch."""
 
@@ -45,10 +43,10 @@ def demo(
     if out.exists() and (others := {path.name for path in out.iterdir()} - demo_files):
         raise BadInput(f"{out} must be a new folder or that of an earlier demo, but it contains {sorted(others)[0]}")
     recording, catalogue, index = out / "recording", out / "catalog", out / "index"
-    grasps = PHOTOS + TOUCHES
-    _run(collect, rig="sim", objects=objects, grasps=grasps, seed=SEED, jobs=JOBS, out=recording, preview=True)
+    options = {"rig": "sim", "objects": objects, "grasps": PHOTOS + TOUCHES, "seed": SEED, "jobs": 2}
+    _run(collect, **options, out=recording, preview=True)
     queries = _split(load_grasps(recording), catalogue)
-    in_hand = example_object(queries)
+    in_hand = max(sorted(queries), key=lambda name: len(queries[name]))  # whatever its scores
     _run(build_index, catalogue, out=index)
     gelsight = [OptionValues(map(str, grasp.touches)) for grasp in queries[in_hand]]
     _run(query, gelsight=gelsight, index=str(index), html=out / "query.html", top=8)
@@ -84,11 +82,6 @@ def _split(grasps: Sequence["Grasp"], catalogue: Path) -> "dict[str, list[Grasp]
         for number, grasp in enumerate(object_grasps[:PHOTOS], start=1):
             shutil.copyfile(grasp.photo, catalogue / name / f"{number}{grasp.photo.suffix}")
     return {name: of_name[PHOTOS : PHOTOS + TOUCHES] for name, of_name in by_object.items() if len(of_name) > PHOTOS}
-
-
-def example_object(queries: "Mapping[str, Sequence[Grasp]]") -> str:
-    """Return the object on the demo's page, whatever its scores: the first by name of those with the most grasps."""
-    return max(sorted(queries), key=lambda name: len(queries[name]))
 
 
 def _accuracy_summary(index: Path, queries: "dict[str, list[Grasp]]") -> str:

@@ -164,8 +164,9 @@ def _data_sets(protocol: str, data: Path, imported: Path) -> tuple[list[str], di
             if data_set not in recordings:
                 recordings[data_set] = run_importer(data_set, data / data_set, imported / data_set).folder
         else:
-            expected = about.expects.replace("`", "")
-            skipped[name] = f"no folder {data_set}/ with {expected} and no recording of it was found"
+            skipped[name] = (
+                f"no folder {data_set}/ with {about.expects.replace('`', '')} and no recording of it was found"
+            )
             say(f"{name} is skipped: {skipped[name]}")
     if not recordings:
         raise BadInput(

@@ -87,25 +87,24 @@ def identify(
 
     with Searcher.open(path, model=model) as searcher:
         most = grasps or (5 if enrol is None else 3)
-        enough = confidence if enrol is None else math.inf
-        run = _Run(searcher, out, expect, 0.01 if far is None else far, enough, most)
+        run = _Run(searcher, out, expect, 0.01 if far is None else far, confidence if enrol is None else math.inf, most)
         if expect is not None:  # refuse it before the rig moves
             searcher.expected_object(expect, run.far)
         if enrol is not None:
             searcher.enrolled_name(enrol)
 
-        made = load_rig(rig, seed=seed)
-        if len(made.sensors) != searcher.reader.fingers:
+        loaded = load_rig(rig, seed=seed)
+        if len(loaded.sensors) != searcher.reader.fingers:
             raise BadInput(
                 f"the model of {path} takes {searcher.reader.fingers} gel image(s) of a grasp, but the rig {rig} "
-                f"has {len(made.sensors)} sensor(s); give --model, or another rig"
+                f"has {len(loaded.sensors)} sensor(s); give --model, or another rig"
             )
-        if made.info["rig"] != "sim":  # a simulated rig has names of its own
+        if loaded.info["rig"] != "sim":  # a simulated rig has names of its own
             object_id = object_id or enrol
         attempts: set[int] = set()  # total counts of attempts: at the start, then after each new attempt
         with resumable(out):
             (tally,) = collect(
-                lambda: made,
+                lambda: loaded,
                 out,
                 objects=[object_id] if object_id else 1,
                 seed=seed,
@@ -183,10 +182,13 @@ class _Run:
 
         shows = [check == CONTACT for check in self.answer.grasps]
         touches, openings_mm = list(compress(self.touches, shows)), list(compress(self.openings_mm, shows))
-        made = self.searcher.enrol(name, touches, opening_mm=openings_mm, background=self.background)
-        say(f"enrolled {made.added} of {len(shows)} grasps as touches of {made.object_id}; it has {made.touches} now")
+        enrolled = self.searcher.enrol(name, touches, opening_mm=openings_mm, background=self.background)
+        say(
+            f"enrolled {enrolled.added} of {len(shows)} grasps as touches of {enrolled.object_id}; it has "
+            f"{enrolled.touches} now"
+        )
         if json:
-            print_json(made._asdict())
+            print_json(enrolled._asdict())
 
     @property
     def sentence(self) -> str:

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from retrieval.model.config import Config
 
 DEFAULT_MODEL = "that of the index, else the shipped one"
-SPLIT = "JSON file with train, validation and test objects"
 
 Json = Annotated[bool, typer.Option("--json", help="print one JSON document on stdout")]
 Index = Annotated[str | None, typer.Option(help="index folder (default: ./index)")]
@@ -34,7 +33,7 @@ Init = Annotated[
     str | None, typer.Option(help="initial weights of the towers: random, imagenet, shipped, or a state dict file")
 ]
 Recording = Annotated[Path, typer.Argument(help="recording folder", show_default=False)]
-SplitFile = Annotated[Path | None, typer.Option(help=SPLIT)]
+SplitFile = Annotated[Path | None, typer.Option(help="JSON file with train, validation and test objects")]
 CheckpointOut = Annotated[Path, typer.Option(help="checkpoint to write (.safetensors)")]
 ReportOut = Annotated[Path, typer.Option(help="folder for results.json, report.md and report.html")]
 

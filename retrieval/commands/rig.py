@@ -27,11 +27,15 @@ def check(
     from robot.rig_check import check_rig
 
     if rig is None:
-        found = discover()
-        for device in found:
+        devices = discover()
+        for device in devices:
             for line in (f"# {device.kind}: {device.label}", *device.toml.splitlines(), ""):
                 show(line)
-        say(f"{len(found)} device(s) found; copy the lines above into a rig file" if found else "no device was found")
+        say(
+            f"{len(devices)} device(s) found; copy the lines above into a rig file"
+            if devices
+            else "no device was found"
+        )
         return
     rows = []
     for row in check_rig(load_rig(rig, seed=0), motion=not no_motion):
@@ -56,13 +60,13 @@ def calibrate(
     from robot.sight.hand_eye import SUSPECT_MM, fit_hand_eye, read_pairs
 
     require_output(out, ".json")
-    found = fit_hand_eye(*read_pairs(points))
-    mean_mm = float(found.residuals_mm.mean())
-    say(f"residuals: mean {mean_mm:.1f} mm, maximum {found.residuals_mm.max():.1f} mm")
+    calibration = fit_hand_eye(*read_pairs(points))
+    mean_mm = float(calibration.residuals_mm.mean())
+    say(f"residuals: mean {mean_mm:.1f} mm, maximum {calibration.residuals_mm.max():.1f} mm")
     if mean_mm > SUSPECT_MM:
         raise RetrievalError(
             f"nothing was written: the mean residual must be at most {SUSPECT_MM:g} mm; check that each camera point "
             "has its rig point and that no axis is mirrored (x right, y down, z forward), then measure the points again"
         )
-    found.save(out)
-    say(f"{out}: fitted to {len(found.residuals_mm)} points; set hand_eye to this file under [camera]")
+    calibration.save(out)
+    say(f"{out}: fitted to {len(calibration.residuals_mm)} points; set hand_eye to this file under [camera]")

@@ -98,8 +98,9 @@ def serve(
 
             if not is_sharded(path):
                 raise BadInput(f"{path} has no shards; build a sharded index with `retrieve build-index --shards`")
-            replica_settings = ReplicaSettings(replicas=replicas or 1, wait_s=shard_timeout or 5.0)
-            deployments = Deployments(stack.enter_context(ray_session()), replica_settings)
+            deployments = Deployments(
+                stack.enter_context(ray_session()), ReplicaSettings(replicas=replicas or 1, wait_s=shard_timeout or 5.0)
+            )
             stack.callback(deployments.close)
             open_shards = deployments.open
         app = create_app(settings, load_live_rig(rig, path), writer, open_shards)

@@ -99,15 +99,17 @@ def _train_gate(recording: Path, out: Path, iterations: int | None) -> None:
     licence = recording_licence(recording)
     say(f"licence of {licence.source}: {licence}")
     steps: dict[str, Any] = {} if iterations is None else {"iterations": iterations}
-    found = train_gate(recording, out, **steps)
-    trained = f"trained on {found['train_grasps']} grasps, {found['train_held']} of them held"
-    say(f"{out}: uses the frame {found['frame']} the grasp; {trained}")
+    result = train_gate(recording, out, **steps)
     say(
-        f"accuracy {found['accuracy']:.3f} (95 %: {found['interval'][0]:.3f} to {found['interval'][1]:.3f}) on "
-        f"{found['validation_grasps']} grasps of {found['validation_objects']} other objects; always predicting "
-        f"the more frequent class: {found['chance']:.3f}"
+        f"{out}: uses the frame {result['frame']} the grasp; trained on {result['train_grasps']} grasps, "
+        f"{result['train_held']} of them held"
     )
-    accepted = [f"{part} of {whole} {name}" for name, (part, whole) in found["accepted"].items()]
+    say(
+        f"accuracy {result['accuracy']:.3f} (95 %: {result['interval'][0]:.3f} to {result['interval'][1]:.3f}) on "
+        f"{result['validation_grasps']} grasps of {result['validation_objects']} other objects; always predicting "
+        f"the more frequent class: {result['chance']:.3f}"
+    )
+    accepted = [f"{part} of {whole} {name}" for name, (part, whole) in result["accepted"].items()]
     say(f"accepted: {', '.join(accepted)}")
 
 
