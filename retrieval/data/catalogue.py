@@ -154,10 +154,10 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
     by_object, by_photo = _read_metadata(root / METADATA_FILE, naming)
 
     def metadata_of(name: str, *paths: str) -> dict[str, Any]:
-        found = by_object.get(lookup_key(name), {})
+        metadata = by_object.get(lookup_key(name), {})
         for path in reversed(paths):
-            found = {**found, **by_photo.get(lookup_key(path), {})}
-        return found
+            metadata = {**metadata, **by_photo.get(lookup_key(path), {})}
+        return metadata
 
     photos: list[CataloguePhoto] = []
     gels: dict[tuple[str, str], list[tuple[str, str]]] = defaultdict(list)  # (touch, object) -> (finger, path)
@@ -173,7 +173,8 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
         elif (name := naming.object_of(path)) is None:
             why = ": the name is only a number" if naming.text == STEM else ""
             unfit.append(SkippedPhoto(path, f"does not fit --objects-from {naming.text}{why}"))
-        elif not _is_nearly_touch(path, naming):
+        # A picture outside every folder is a photo, and so is every picture if the file stem names the object.
+        elif "/" not in path or naming.text == STEM or not _NEARLY_TOUCH.fullmatch(PurePosixPath(path).stem):
             photos.append(CataloguePhoto(path, name, metadata_of(name, path)))
         elif (touch := _touch_name(path)) is None:
             skipped.append(SkippedPhoto(path, f"neither a photo nor a touch: {_TOUCH_NAMES}"))
@@ -294,21 +295,13 @@ def _list_files(folder: Path) -> tuple[list[str], list[SkippedPhoto], list[str]]
     return names, skipped, system
 
 
-def _is_nearly_touch(path: str, naming: Naming) -> bool:
-    """Whether a picture is named like a gel image, perhaps not exactly.
-
-    A picture outside every folder is a photo, and so is every picture if the file stem names the object.
-    """
-    return "/" in path and naming.text != STEM and bool(_NEARLY_TOUCH.fullmatch(PurePosixPath(path).stem))
-
-
 def _touch_name(path: str) -> tuple[str, str] | None:
     """Return a gel image's touch name (with its folder) and finger ("" for one finger); None if it is not exact."""
     place = PurePosixPath(path)
-    found = _TOUCH.fullmatch(place.stem)
-    if found is None or (found[2] is None and _NEARLY_FINGER.fullmatch(found[1])):
+    match = _TOUCH.fullmatch(place.stem)
+    if match is None or (match[2] is None and _NEARLY_FINGER.fullmatch(match[1])):
         return None
-    return f"{place.parent}/{found[1]}", found[2] or ""
+    return f"{place.parent}/{match[1]}", match[2] or ""
 
 
 def _no_photo_error(
@@ -321,8 +314,9 @@ def _no_photo_error(
         )
     others = f", only {len(ignored)} other file(s) such as {ignored[0]}" if ignored else ""
     left_out = "".join(f"; {item.path}: {item.reason}" for item in skipped[:1])
-    kinds = ", ".join(sorted(EXTENSIONS))
-    return DatasetError(f"no photo ({kinds}) in the catalogue {where}{others}{left_out}: {_LAYOUT}")
+    return DatasetError(
+        f"no photo ({', '.join(sorted(EXTENSIONS))}) in the catalogue {where}{others}{left_out}: {_LAYOUT}"
+    )
 
 
 def _read_metadata(file: Path, naming: Naming) -> tuple[dict[str, dict[str, Any]], dict[str, dict[str, Any]]]:

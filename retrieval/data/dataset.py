@@ -202,9 +202,10 @@ def recording_licence(folder: Path) -> DataLicence:
 def object_kinds(folder: Path) -> dict[str, str]:
     """Return the class of each object whose class a recording names in its recording.json."""
     objects = read_info(folder).get("objects")
-    entries = objects if isinstance(objects, dict) else {}
     return {
-        name: str(about["class"]) for name, about in entries.items() if isinstance(about, dict) and "class" in about
+        name: str(about["class"])
+        for name, about in (objects if isinstance(objects, dict) else {}).items()
+        if isinstance(about, dict) and "class" in about
     }
 
 
@@ -212,9 +213,9 @@ def finger_count(grasps: Sequence[Grasp]) -> int:
     """Return the number of gel images of each touch. Raises DatasetError if it differs between grasps."""
     examples = {len(grasp.touches): grasp.grasp_id for grasp in reversed(grasps)}
     if len(examples) > 1:
-        found = ", ".join(f"{name} has {count}" for count, name in examples.items())
+        counts = ", ".join(f"{name} has {count}" for count, name in examples.items())
         raise DatasetError(
-            f"every touch must have the same number of gel images; {found}; use a separate recording for each sensor"
+            f"every touch must have the same number of gel images; {counts}; use a separate recording for each sensor"
         )
     return next(iter(examples))
 
@@ -310,8 +311,7 @@ def linked_objects(grasps: Iterable[Grasp]) -> list[list[str]]:
         if other is not group:
             group |= other
             group_of.update(dict.fromkeys(group, group))
-    unique = {id(group): sorted(group) for group in group_of.values()}
-    return sorted(unique.values())
+    return sorted({id(group): sorted(group) for group in group_of.values()}.values())
 
 
 class ImageCache:

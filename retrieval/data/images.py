@@ -32,9 +32,6 @@ MAX_SIDE, MAX_ASPECT = 65_535, 200
 """Largest side in pixels (the limit of JPEG), and largest ratio of the longer to the shorter side."""
 MAX_BYTES = 512 * 2**20
 
-_JPEG_FORMATS = ("JPEG", "MPO")  # an MPO file is a JPEG picture with further ones behind it
-_FORMATS: tuple[str, ...] = ("BMP", "JPEG", "PNG", "TIFF", "WEBP")
-_NO_IMAGE = "not a PNG, JPEG, BMP, TIFF, WebP, AVIF or HEIC picture, or its header is damaged or of an unsupported kind"
 _EIGHT_BIT_MODES = frozenset({"1", "L", "P", "RGB", "RGBX", "CMYK", "YCbCr", "LA", "PA", "RGBA", "RGBa"})
 _STRIP = 1 << 20  # pixels
 _ORIENTATION, _BITS, _PHOTOMETRIC = 274, 258, 262
@@ -122,7 +119,11 @@ def _image_errors(name: str | Path) -> Iterator[None]:
     except ImageError:
         raise
     except UnidentifiedImageError:
-        raise ImageError(name, _NO_IMAGE) from None
+        raise ImageError(
+            name,
+            "not a PNG, JPEG, BMP, TIFF, WebP, AVIF or HEIC picture, or its header is damaged or of an unsupported "
+            "kind",
+        ) from None
     except Image.DecompressionBombError:
         raise ImageError(name, _too_large("far more")) from None
     except Exception as error:  # OSError, SyntaxError, struct.error, MemoryError, a closed file, ...
@@ -164,7 +165,7 @@ def _decoders(data: bytes, name: str | Path) -> tuple[str, ...]:
             raise ImageError(name, "an AVIF picture, and this Pillow was built without AVIF: pip install -U pillow")
         return ("AVIF",)
     if not brands & _HEIC_BRANDS:
-        return _FORMATS
+        return ("BMP", "JPEG", "PNG", "TIFF", "WEBP")
     try:
         from pillow_heif import register_heif_opener
     except ImportError:
@@ -180,13 +181,13 @@ def _apply_draft_mode(image: Image.Image, min_side: int | None) -> None:
     stores the whole picture.
     """
     width, height = image.size
-    if image.format not in _JPEG_FORMATS or width * height > MAX_DRAFT_PIXELS:
+    # An MPO file is a JPEG picture with further ones behind it.
+    if image.format not in ("JPEG", "MPO") or width * height > MAX_DRAFT_PIXELS:
         return
-    progressive = bool(image.info.get("progressive"))
-    if progressive and width * height > MAX_PIXELS:
+    if image.info.get("progressive") and width * height > MAX_PIXELS:
         return
-    by_side = [each for each in (1, 2, 4, 8) if min_side is not None and min(width, height) >= each * min_side]
-    by_pixels = [each for each in (1, 2, 4, 8) if -(-width // each) * -(-height // each) <= MAX_PIXELS]
+    by_side = [scale for scale in (1, 2, 4, 8) if min_side is not None and min(width, height) >= scale * min_side]
+    by_pixels = [scale for scale in (1, 2, 4, 8) if -(-width // scale) * -(-height // scale) <= MAX_PIXELS]
     if by_pixels and (scale := max(by_side[-1:] + by_pixels[:1])) > 1:
         image.draft(None, (width // scale, height // scale))
 
@@ -287,5 +288,4 @@ def _apply_orientation(image: Samples, orientation: int) -> Samples:
         image = image.swapaxes(0, 1)
     rows = -1 if orientation in (3, 4, 7, 8) else 1
     columns = -1 if orientation in (2, 3, 6, 7) else 1
-    upright: Samples = np.ascontiguousarray(image[::rows, ::columns])  # type: ignore[assignment]
-    return upright
+    return np.ascontiguousarray(image[::rows, ::columns])  # type: ignore[return-value]

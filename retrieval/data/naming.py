@@ -71,8 +71,8 @@ class Naming:
             return name.stem
         if self.text == STEM:
             return _NUMBER.sub("", name.stem) or None
-        found = self._pattern.fullmatch(path.removesuffix(name.suffix)) or self._pattern.fullmatch(path)
-        return found[OBJECT] if found else None
+        match = self._pattern.fullmatch(path.removesuffix(name.suffix)) or self._pattern.fullmatch(path)
+        return match[OBJECT] if match else None
 
     @cached_property
     def _pattern(self) -> re.Pattern[str]:
@@ -110,8 +110,8 @@ def naming_warnings(photos: Iterable[tuple[str, str]], naming: Naming) -> list[s
             f"below count as one object for each of these names; if those folders are the objects, use "
             "--objects-from '{shop}/{object}/{photo}'"
         )
-    if naming.text in (FOLDER, STEM) and (found := _views(names)):
-        views, similar = found
+    if naming.text in (FOLDER, STEM) and (recurring := _views(names)):
+        views, similar = recurring
         place = "{object}_{view}/{photo}" if any("/" in path for path in paths[similar[0]]) else "{object}_{view}"
         warnings.append(
             f"the names of {len(similar)} objects differ from another name only by {_some(views)}: {_some(similar)}; "
@@ -137,7 +137,9 @@ def _object_folders(paths: Mapping[str, Sequence[str]]) -> dict[str, set[str]]:
 
     That is so for two folders or more whose names the other objects do not have: views, such as front and back, recur.
     """
-    inner = {name: {path.split("/")[1] for path in own if path.count("/") > 1} for name, own in paths.items()}
+    inner = {
+        name: {path.split("/")[1] for path in of_object if path.count("/") > 1} for name, of_object in paths.items()
+    }
     often = Counter(folder for folders in inner.values() for folder in folders)
     return {name: folders for name, folders in inner.items() if sum(often[folder] == 1 for folder in folders) > 1}
 
@@ -146,8 +148,8 @@ def _views(names: Sequence[str]) -> tuple[list[str], list[str]] | None:
     """Return the last words that recur after two or more beginnings of names, and these names; None without such."""
     words_of: dict[str, dict[str, str]] = defaultdict(dict)  # beginning -> last word -> name
     for name in names:
-        if found := _LAST_WORD.fullmatch(_NUMBER.sub("", name)):
-            words_of[found[1]][found[2].casefold()] = name
+        if match := _LAST_WORD.fullmatch(_NUMBER.sub("", name)):
+            words_of[match[1]][match[2].casefold()] = name
     groups = [words for words in words_of.values() if len(words) > 1]
     often = Counter(word for words in groups for word in words)
     views = sorted(word for word, count in often.items() if count > 1)

@@ -36,7 +36,7 @@ def parse_openings(openings: Openings, grasps: int, of: str = "") -> list[float 
             f"{of}give one opening for each grasp, or none: got {len(given)} opening(s) for {grasps} grasp(s); None "
             "stands for a grasp without one"
         )
-    return [None if one is None else require_opening(one, f"{of}opening_mm") for one in given]
+    return [None if opening is None else require_opening(opening, f"{of}opening_mm") for opening in given]
 
 
 def require_opening(value: object, name: str) -> float:

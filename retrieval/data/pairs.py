@@ -79,8 +79,7 @@ class PairSampler:
 
     def evaluation_pairs(self) -> PairBatch:
         """Return fixed pairs for evaluation: every touch of the set with its positive and negative photos."""
-        touches = [(index, grasp) for index, part in enumerate(self.grasps) for grasp in part]
-        return self._pairs(touches, stream=(2,))
+        return self._pairs([(index, grasp) for index, part in enumerate(self.grasps) for grasp in part], stream=(2,))
 
     def _touch(self, turn: int) -> tuple[int, Grasp]:
         round_number, place = divmod(turn, len(self.objects))

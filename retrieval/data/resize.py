@@ -42,8 +42,7 @@ def to_float(image: npt.NDArray[Any]) -> RgbImage:
         return image
     if image.dtype not in (np.uint8, np.uint16):
         raise BadInput(f"samples must be uint8 or uint16, got {image.dtype}")
-    scaled: RgbImage = np.divide(image, np.iinfo(image.dtype).max, dtype=np.float32)
-    return scaled
+    return np.asarray(np.divide(image, np.iinfo(image.dtype).max, dtype=np.float32))
 
 
 def _shrink(image: Samples, axis: int, length: int) -> RgbImage:

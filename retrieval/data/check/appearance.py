@@ -55,8 +55,8 @@ def check_swapped_modalities(grasps: Sequence[Grasp], records: ImageRecords) -> 
     grasps = [grasp for grasp in grasps if grasp.photos]
     if len(grasps) < 3:
         return
-    touches = small_images(records, [one.touches[0] for one in grasps])
-    photos = small_images(records, [one.photo for one in grasps])
+    touches = small_images(records, [grasp.touches[0] for grasp in grasps])
+    photos = small_images(records, [grasp.photo for grasp in grasps])
     if _spread(photos) < _spread(touches) / 2:
         yield Finding(
             "error",
@@ -69,7 +69,8 @@ def check_swapped_modalities(grasps: Sequence[Grasp], records: ImageRecords) -> 
     centre = np.median(touches, axis=0)
     closer = distance(photos, centre) < distance(touches, centre) / 2
     names = [grasp.grasp_id for grasp, suspect in zip(grasps, closer, strict=True) if suspect]
-    whole = {one.sequence_id for one in grasps} - {one.sequence_id for one in grasps if one.grasp_id not in set(names)}
+    others = {grasp.sequence_id for grasp, suspect in zip(grasps, closer, strict=True) if not suspect}
+    whole = {grasp.sequence_id for grasp in grasps} - others
     where = f", throughout the sequence(s) {abbreviate_list(sorted(filter(None, whole)))}," if whole - {None} else ""
     yield from findings_for("error", "swapped", f"touch and photo look swapped{where}", names, grasps)
 
@@ -94,15 +95,15 @@ def check_fingers(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Fi
     for moment, selected in (("touch", grasps), ("no-contact frame", _with_backgrounds(grasps))):
         if len(selected) < _MIN_GRASPS:
             continue
-        files = [one.touches if moment == "touch" else one.backgrounds for one in selected]
+        files = [grasp.touches if moment == "touch" else grasp.backgrounds for grasp in selected]
         for a, b in combinations(fingers_of(selected), 2):
             which = f"fingers {ascii_lowercase[a]} and {ascii_lowercase[b]} look"
             frames = (small_images(records, [paths[finger] for paths in files]) for finger in (a, b))
-            found = swapped_fingers(*frames)
-            if found is None:
+            swapped = swapped_fingers(*frames)
+            if swapped is None:
                 yield Finding("note", "unchecked-fingers", f"{which} too similar to find swaps ({moment})")
                 continue
-            names = [selected[row].grasp_id for row in found]
+            names = [selected[row].grasp_id for row in swapped]
             yield from findings_for("error", "swapped-fingers", f"{which} swapped ({moment})", names, selected)
 
 
@@ -117,8 +118,8 @@ def check_moments(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Fi
         return
     suspects: set[str] = set()
     for finger in fingers_of(both):
-        before = small_images(records, [one.backgrounds[finger] for one in both])
-        during = small_images(records, [one.touches[finger] for one in both])
+        before = small_images(records, [grasp.backgrounds[finger] for grasp in both])
+        during = small_images(records, [grasp.touches[finger] for grasp in both])
         if _spread(before) > max(2 * _spread(during), _NOISE_TIMES * _MIN_NOISE):
             yield Finding(
                 "error",
@@ -144,7 +145,7 @@ def changed_layout(images: SmallImages) -> tuple[str, Rows] | None:
     sign, as in `swapped_fingers`. Grey or symmetric layouts cannot be checked. Of several changes the one is returned
     that brings the minority nearest to the other images. Of two halves, the one with the first image is right.
     """
-    found: dict[float, tuple[str, Rows]] = {}
+    changed: dict[float, tuple[str, Rows]] = {}  # by the ratio of distances after and before
     for change, index in CHANGES.items() if len(images) >= _MIN_GRASPS else ():
         rows = swapped_fingers(images, images[index])
         if rows is None or not len(rows):
@@ -156,8 +157,8 @@ def changed_layout(images: SmallImages) -> tuple[str, Rows] | None:
         centre = np.median(undone, axis=0)
         ratio = float(np.median(distance(undone[rows], centre) / distance(images[rows], centre)))
         if ratio <= _MAX_RATIO:
-            found[ratio] = change, rows
-    return found[min(found)] if found else None
+            changed[ratio] = change, rows
+    return changed[min(changed)] if changed else None
 
 
 def check_colour_layout(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
@@ -166,12 +167,12 @@ def check_colour_layout(grasps: Sequence[Grasp], records: ImageRecords) -> Itera
     Touches and no-contact frames of a finger are compared together.
     """
     for finger in fingers_of(grasps):
-        frames = [(one, "no-contact frame", one.backgrounds[finger]) for one in _with_backgrounds(grasps)]
+        frames = [(grasp, "no-contact frame", grasp.backgrounds[finger]) for grasp in _with_backgrounds(grasps)]
         frames += [(grasp, "touch", grasp.touches[finger]) for grasp in grasps]
-        found = changed_layout(small_images(records, [path for _, _, path in frames]))
-        if found is None:
+        changed = changed_layout(small_images(records, [path for _, _, path in frames]))
+        if changed is None:
             continue
-        change, rows = found
+        change, rows = changed
         for moment in ("touch", "no-contact frame"):
             names = [frames[row][0].grasp_id for row in rows if frames[row][1] == moment]
             text = f"{moment} of finger {ascii_lowercase[finger]} looks as if it had {change}, unlike the others,"

@@ -50,15 +50,15 @@ def check_drift(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Find
         yield Finding("note", "unchecked-light", f"{text}, and {_ADVICE}" if is_above_chance(by_order) else text)
         return
     small = np.array([[records[path].small for path in grasp.backgrounds] for grasp in different])
-    found = nearest_grasp_accuracy(small, _owners(different))
-    assert found is not None  # as for the order
+    by_frame = nearest_grasp_accuracy(small, _owners(different))
+    assert by_frame is not None  # as for the order
     text = (
-        f"the no-contact frames alone identify the object in {_percent(found)}, the order of their capture alone in "
-        f"{_percent(by_frame_order)} ({found.queries} different frames of {found.objects} objects)"
+        f"the no-contact frames alone identify the object in {_percent(by_frame)}, the order of their capture alone in "
+        f"{_percent(by_frame_order)} ({by_frame.queries} different frames of {by_frame.objects} objects)"
     )
-    if left_out := len({grasp.object_id for grasp in different}) - found.objects:
+    if left_out := len({grasp.object_id for grasp in different}) - by_frame.objects:
         text += f"; {left_out} object(s) with one no-contact frame for all grasps are left out"
-    if is_above_chance(found):
+    if is_above_chance(by_frame):
         yield Finding("warning", "drift", f"{text}: light or gel drifted, and {_ADVICE}")
     else:
         yield Finding("note", "drift", text)
@@ -73,7 +73,7 @@ def check_sessions(grasps: Sequence[Grasp]) -> Iterator[Finding]:
     if len(objects_of) == 1:
         text = "the recording has one session, or states none, so no result of it can separate touch from drift"
         yield Finding("note", "one-session", f"{text}: {remedy}")
-    elif not any(one & two for one, two in combinations(objects_of.values(), 2)):
+    elif all(first.isdisjoint(second) for first, second in combinations(objects_of.values(), 2)):
         text = f"no object is in two of the {len(objects_of)} sessions, so drift may identify the objects"
         yield Finding("warning", "separate-sessions", f"{text}: {remedy}")
 
@@ -86,16 +86,16 @@ def _by_order(grasps: Sequence[Grasp]) -> Summary | None:
     return nearest_grasp_accuracy(np.arange(len(grasps))[:, None], _owners(grasps)) if grasps else None
 
 
-def is_above_chance(found: Summary) -> bool:
+def is_above_chance(accuracy: Summary) -> bool:
     """Return whether an accuracy is far above chance (`_MAX_BY_DRIFT`), and significantly so."""
-    chance = found.chance[0]
-    deviation = np.sqrt(chance * (1 - chance) / found.queries)
-    return bool(found.value[0] > chance + max(_MAX_BY_DRIFT * (1 - chance), 5 * deviation))
+    chance = accuracy.chance[0]
+    deviation = np.sqrt(chance * (1 - chance) / accuracy.queries)
+    return bool(accuracy.value[0] > chance + max(_MAX_BY_DRIFT * (1 - chance), 5 * deviation))
 
 
-def _percent(found: Summary) -> str:
-    interval = f"[{100 * found.low[0]:.0f}, {100 * found.high[0]:.0f}]"
-    return f"{found.value[0]:.0%} {interval} (chance {found.chance[0]:.0%})"
+def _percent(accuracy: Summary) -> str:
+    low, high = 100 * accuracy.low[0], 100 * accuracy.high[0]
+    return f"{accuracy.value[0]:.0%} [{low:.0f}, {high:.0f}] (chance {accuracy.chance[0]:.0%})"
 
 
 def nearest_grasp_accuracy(

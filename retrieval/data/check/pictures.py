@@ -16,7 +16,6 @@ from retrieval.data.images import decode_rgb, read_bytes
 from retrieval.data.resize import resize
 from retrieval.errors import ImageError
 
-_SMALL = (6, 8)
 _FLAT = 3.5 / 255
 """Range of the samples of a single colour after JPEG compression, at most."""
 
@@ -92,13 +91,14 @@ def read_pictures(files: Collection[Path]) -> tuple[ImageRecords, dict[Path, str
         except ImageError as error:
             return error.reason
         is_flat = bool(np.ptp(image, axis=(0, 1)).max() <= _FLAT)
-        return ImageRecord(sha256(data).hexdigest(), is_flat, resize(image, _SMALL))
+        return ImageRecord(sha256(data).hexdigest(), is_flat, resize(image, (6, 8)))
 
-    found: dict[Path, ImageRecord | str] = {}
-    paths = sorted(files)
+    records, broken, paths = ImageRecords(), dict[Path, str](), sorted(files)
     with ThreadPoolExecutor(2) as pool, Bar("checking", len(paths), "images") as bar:
         for path, record in zip(paths, pool.map(read, paths), strict=True):
-            found[path] = record
+            if isinstance(record, str):
+                broken[path] = record
+            else:
+                records[path] = record
             bar.advance()
-    broken = {path: reason for path, reason in found.items() if isinstance(reason, str)}
-    return {path: record for path, record in found.items() if isinstance(record, ImageRecord)}, broken
+    return records, broken

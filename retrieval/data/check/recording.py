@@ -125,8 +125,13 @@ def _same_or_flat_images(attempts: Sequence[Attempt], records: ImageRecords) -> 
             (len(digests) < len(touches), "warning", "same-fingers", "two fingers have the same image"),
             (is_frozen, "error", "frozen-frame", "touch and no-contact frame are the same image"),
             (any(photo.is_flat for photo in photos), "error", "dead-frame", "the photo has a single colour"),
-            (any(one.is_flat for one in touches), "error", "dead-frame", "a touch has a single colour"),
-            (any(one.is_flat for one in backgrounds), "error", "dead-frame", "a no-contact frame has a single colour"),
+            (any(touch.is_flat for touch in touches), "error", "dead-frame", "a touch has a single colour"),
+            (
+                any(frame.is_flat for frame in backgrounds),
+                "error",
+                "dead-frame",
+                "a no-contact frame has a single colour",
+            ),
         ):
             if is_faulty:
                 names[severity, kind, text].append(grasp.grasp_id)
@@ -136,9 +141,9 @@ def _same_or_flat_images(attempts: Sequence[Attempt], records: ImageRecords) -> 
 
 def _repeated_touches(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
     """Find touches that several grasps of one object share byte for byte."""
-    keys = {one.grasp_id: {(one.object_id, records[path].digest) for path in one.touches} for one in grasps}
-    counts = Counter(key for its in keys.values() for key in its)
-    names = [name for name, its in keys.items() if any(counts[key] > 1 for key in its)]
+    keys = {grasp.grasp_id: {(grasp.object_id, records[path].digest) for path in grasp.touches} for grasp in grasps}
+    counts = Counter(key for of_grasp in keys.values() for key in of_grasp)
+    names = [name for name, of_grasp in keys.items() if any(counts[key] > 1 for key in of_grasp)]
     yield from findings_for(
         "warning", "repeated-touch", "another grasp of the object has the same touch", names, grasps
     )

@@ -21,7 +21,7 @@ def check_split(grasps: Sequence[Grasp], split: Split) -> Iterable[Finding]:
         if grasp.sequence_id is not None:
             sides[grasp.sequence_id] |= part_of.get(grasp.object_id, set())
     recorded = {grasp.object_id for grasp in grasps}
-    shared, cut = ({name for name, its in each.items() if len(its) > 1} for each in (part_of, sides))
+    shared, cut = ({name for name, in_parts in table.items() if len(in_parts) > 1} for table in (part_of, sides))
     for severity, kind, text, names in (
         ("error", "split-objects", "shares {} object(s)", shared),
         ("error", "split-sequences", "cuts {} sequence(s) in two, so that neighbouring frames are on both sides", cut),
@@ -29,8 +29,7 @@ def check_split(grasps: Sequence[Grasp], split: Split) -> Iterable[Finding]:
         ("warning", "split-absent", "leaves out {} object(s)", recorded - part_of.keys()),
     ):
         if names:
-            listed = abbreviate_list(sorted(names))
-            yield Finding(severity, kind, f"the split {text.format(len(names))}: {listed}")
+            yield Finding(severity, kind, f"the split {text.format(len(names))}: {abbreviate_list(sorted(names))}")
 
 
 def require_fit(split: Split, grasps: Sequence[Grasp]) -> None:
