@@ -147,10 +147,10 @@ def candidates_sentence(candidates: Mapping[str, Any] | None, photos: int) -> st
     if not candidates["queries"]:
         return f"The fusion head scores all {photos} photos."
     low, high = candidates["interval"]
-    found = round(candidates["top1_agreement"] * candidates["queries"])
+    hits = round(candidates["top1_agreement"] * candidates["queries"])
     scored = "scores every photo" if k >= photos else f"reranks the best {k} of {photos} photos"
     return (
-        f"The fusion head {scored}. The candidates contain the exhaustive top-1 for {found} of {candidates['queries']} "
+        f"The fusion head {scored}. The candidates contain the exhaustive top-1 for {hits} of {candidates['queries']} "
         f"validation touches (95 % interval {low:.3f} to {high:.3f}). Search and reranking take "
         f"{candidates['ms']:.3g} ms, scoring all photos {candidates['exhaustive_ms']:.3g} ms."
     )

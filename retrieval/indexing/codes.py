@@ -181,8 +181,7 @@ def touch_encoder(checkpoint: Checkpoint) -> Encoder:
             if len(paths) == 1:
                 reason += "; for a sensor with one finger give --model shipped-one-finger, or a model of your own"
             raise ImageError(paths[0], reason)
-        preprocess = checkpoint.config.preprocessing.touch
-        return [preprocess(decode_rgb(content, path), None) for content, path in zip(data, paths, strict=True)]
+        return list(map(checkpoint.config.preprocessing.touch, map(decode_rgb, data, paths)))
 
     @torch.inference_mode()
     def encode(touches: Sequence[Any], paths: Sequence[Paths]) -> NDArray[Any]:
@@ -235,9 +234,8 @@ def encode_enrolled(
         key = model_key(fingerprint(used))
         table.replace_codes(codes, key, previous and {key, model_key(previous)})
         usable = len(coded) + len(codes)
-    objects = len({touch.object_id for touch in touches})
-    counts = {"touches": len(touches), "objects": objects, "encoded": len(codes), "usable": usable}
-    return EnrolledCodes(counts, skipped)
+    counts = {"touches": len(touches), "objects": len({touch.object_id for touch in touches})}
+    return EnrolledCodes({**counts, "encoded": len(codes), "usable": usable}, skipped)
 
 
 def _encode_pictures(

@@ -88,7 +88,7 @@ def read_contents(catalogue: Catalogue, checkpoint: Checkpoint, cache: Cache, qu
     """
     if checkpoint.config.matcher.photo_tower == NO_TOWER:
         reason = "the model was fitted to touches only and compares no photos"
-        unused = [SkippedPhoto(photo.path, reason) for photo in catalogue.photos]
+        unused = (SkippedPhoto(photo.path, reason) for photo in catalogue.photos)
         catalogue = replace(catalogue, photos=(), skipped=(*catalogue.skipped, *unused))
     files = CatalogueFiles(catalogue, cache)
     references = _find_references(catalogue, checkpoint, files, cache, quiet)
@@ -134,12 +134,16 @@ def _find_references(
         if shows != CONTACT:
             skipped.append(SkippedPhoto(touch.paths[0], f"{shows}: not usable as a reference touch"))
             continue
-        digests = [files.digest(path) for path in touch.paths]
-        row = {"object_id": touch.object_id, "touch": list(touch.paths), "digests": digests}
-        rows.append(row | {"opening_mm": touch.opening_mm})
+        rows.append(
+            {
+                "object_id": touch.object_id,
+                "touch": list(touch.paths),
+                "digests": [files.digest(path) for path in touch.paths],
+                "opening_mm": touch.opening_mm,
+            }
+        )
         if touch.object_id not in photographed:
-            picture = CataloguePhoto(touch.paths[0], touch.object_id, touch.metadata)
-            pictures.setdefault(touch.object_id, picture)
+            pictures.setdefault(touch.object_id, CataloguePhoto(touch.paths[0], touch.object_id, touch.metadata))
     if not rows:
         return ReferenceTouches(keys=list(codes.keys.values()), skipped=skipped)
     listed = {"touches": rows, "touch_only": sorted(pictures)}

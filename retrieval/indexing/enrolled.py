@@ -182,10 +182,9 @@ class EnrolledTable:
         with self.lock() as touches:
             changed = []
             for touch in touches:
-                own = {name: code for name, code in touch.codes.items() if keep is None or name in keep}
-                if touch.path in codes:
-                    own[key] = codes[touch.path]
-                changed.append(msgspec.structs.replace(touch, codes=own))
+                kept = {name: code for name, code in touch.codes.items() if keep is None or name in keep}
+                new = {key: codes[touch.path]} if touch.path in codes else {}
+                changed.append(msgspec.structs.replace(touch, codes=kept | new))
             if changed != touches:
                 self.replace(changed)
 

@@ -85,15 +85,15 @@ def build_sharded(
     Raises:
         BadInput: The number of shards is out of range, or `out` is an index folder.
     """
-    own = Path(out)
+    root = Path(out)
     if not 1 <= shards <= MAX_SHARDS:
         raise BadInput(f"shards must be from 1 to {MAX_SHARDS}; got {shards}")
-    if (own / "CURRENT").is_file():
+    if (root / "CURRENT").is_file():
         raise BadInput(f"{out} is an index folder; give another folder for a sharded index of {shards} shards")
-    with writer_lock(own / "LOCK"):
+    with writer_lock(root / "LOCK"):
         before, unusable = None, ""
         try:
-            before = read_sharded_manifest(own)
+            before = read_sharded_manifest(root)
         except NoIndex:
             pass
         except (CorruptIndex, UnsupportedFormat) as error:
@@ -104,19 +104,19 @@ def build_sharded(
         catalogue = list_catalogue(folder, options.naming)
         if catalogue.touches:  # before any shard is built
             require_reference_calibration(checkpoint.without_cells() if options.cells is False else checkpoint)
-        _delete_old_shards(own, before, shards)
-        jobs = [ShardJob(own / name, part, options) for name, part in _split_catalogue(catalogue, shards)]
-        enrolled = encode_enrolled(own, checkpoint, options.cells)
+        _delete_old_shards(root, before, shards)
+        jobs = [ShardJob(root / name, part, options) for name, part in _split_catalogue(catalogue, shards)]
+        enrolled = encode_enrolled(root, checkpoint, options.cells)
         built = list(run(jobs, checkpoint)) if run else [build_shard(job, checkpoint) for job in jobs]
-        reports = sorted((one for one in built if isinstance(one, BuildReport)), key=lambda one: one.index)
-        unreadable = [one for one in built if isinstance(one, NoReadablePhoto)]
-        report = _report(own, catalogue, options, reports, unreadable)
-        manifest = _manifest(own, before, shards, checkpoint, catalogue, report, reports)
+        reports = sorted((result for result in built if isinstance(result, BuildReport)), key=lambda part: part.index)
+        unreadable = [result for result in built if isinstance(result, NoReadablePhoto)]
+        report = _report(root, catalogue, reports, unreadable)
+        manifest = _manifest(root, before, shards, checkpoint, catalogue, report, reports)
         if written := before is None or manifest.generation != before.generation:
-            write_sharded_manifest(own, manifest)
-        encode_enrolled(own, checkpoint, options.cells, before.fingerprint if before else None)
+            write_sharded_manifest(root, manifest)
+        encode_enrolled(root, checkpoint, options.cells, before.fingerprint if before else None)
         for entry in manifest.shards:
-            IndexStore(own / entry.folder).discard_before(entry.generation)
+            IndexStore(root / entry.folder).discard_before(entry.generation)
     return replace(
         report,
         generation=manifest.generation,
@@ -162,11 +162,7 @@ def _split_catalogue(catalogue: Catalogue, shards: int) -> Iterable[tuple[str, C
 
 
 def _report(
-    out: Path,
-    catalogue: Catalogue,
-    options: BuildOptions,
-    reports: Sequence[BuildReport],
-    unreadable: Sequence[NoReadablePhoto],
+    out: Path, catalogue: Catalogue, reports: Sequence[BuildReport], unreadable: Sequence[NoReadablePhoto]
 ) -> BuildReport:
     """Merge the reports of all shards. Raises NoReadablePhoto if no shard has a photo."""
     bad = [item for error in unreadable for item in error.skipped]
@@ -177,7 +173,7 @@ def _report(
     lost = {photo.object_id for photo in catalogue.photos if photo.path in paths}
     reason, same = Counter(report.reason for report in reports).most_common(1)[0]
     references = [report.references for report in reports if report.references]
-    sums = {key: sum(one[key] for one in references) for key in ("touches", "objects", "touch_only", "encoded")}
+    sums = {key: sum(counts[key] for counts in references) for key in ("touches", "objects", "touch_only", "encoded")}
     return replace(
         reports[0],
         **{name: sum(getattr(report, name) for report in reports) for name in ("photos", "objects", "embedded")},
@@ -196,7 +192,7 @@ def _report(
 
 
 def _manifest(
-    own: Path,
+    root: Path,
     before: ShardedManifest | None,
     shards: int,
     checkpoint: Checkpoint,
@@ -214,7 +210,7 @@ def _manifest(
     }
     if report.references is not None:
         about[REFERENCE_ROWS] = {key: report.references[key] for key in ("touches", "objects")}
-    made = ShardedManifest(
+    manifest = ShardedManifest(
         generation=f"sharded-{1 + int(before.generation.rpartition('-')[2]) if before else 1:06d}",
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         software=__version__,
@@ -224,16 +220,16 @@ def _manifest(
         of=shards,
         shards=[
             ShardEntry(
-                folder=Path(one.index).name,
-                generation=one.generation,
-                sha256=file_digest(Path(one.index, one.generation, MANIFEST)),
-                photos=one.photos,
-                objects=one.objects,
+                folder=Path(part.index).name,
+                generation=part.generation,
+                sha256=file_digest(Path(part.index, part.generation, MANIFEST)),
+                photos=part.photos,
+                objects=part.objects,
             )
-            for one in reports
+            for part in reports
         ],
     )
     if before is None:
-        return made
-    same = replace(made, generation=before.generation, created=before.created, software=before.software)
-    return before if before == same else made
+        return manifest
+    same = replace(manifest, generation=before.generation, created=before.created, software=before.software)
+    return before if before == same else manifest

@@ -98,11 +98,6 @@ class ScoredObjects(NamedTuple):
         order = np.lexsort((self.numbers[selected], -self.logits[selected]))  # numbers are in the order of names
         return np.asarray(selected[order[:top]])
 
-    def with_others(self, others: "ScoredObjects") -> "ScoredObjects":
-        """Return these objects and others together."""
-        numbers, logits, rows, photo_logits = (np.concatenate(pair) for pair in zip(self, others, strict=True))
-        return ScoredObjects(numbers, logits, rows, photo_logits)
-
 
 @dataclass(frozen=True)
 class _ReferenceTouch:
@@ -113,11 +108,6 @@ class _ReferenceTouch:
     digests: tuple[str, ...]
     opening_mm: float | None = None
     is_enrolled: bool = False
-
-
-def _enrolled_reference(touch: EnrolledTouch, object_id: str) -> _ReferenceTouch:
-    pictures = touch.pictures
-    return _ReferenceTouch(object_id, tuple(pictures), tuple(pictures.values()), touch.opening_mm, is_enrolled=True)
 
 
 @dataclass(frozen=True)
@@ -154,11 +144,11 @@ class Objects:
         self._calibration, self._opening = stored.references, stored.opening
         try:
             self._references = typed(documents.get(REFERENCE_ROWS, {"touches": [], "touch_only": []}), _References)
-            for one in self._references.touches:
-                if len(one.touch) != len(one.digests) or not all(map(is_inside, one.touch)):
+            for reference in self._references.touches:
+                if len(reference.touch) != len(reference.digests) or not all(map(is_inside, reference.touch)):
                     raise ValueError("a gel image is outside the catalogue or has no digest")
-                if one.opening_mm is not None:
-                    require_opening(one.opening_mm, "opening_mm")
+                if reference.opening_mm is not None:
+                    require_opening(reference.opening_mm, "opening_mm")
         except ValueError as error:
             raise CorruptIndex(
                 f"{generation.folder}: the list of reference touches is invalid ({error}); {AGAIN}"
@@ -181,18 +171,32 @@ class Objects:
         if enrolled and self._calibration:  # else touches cannot be compared, nor without codes of this model
             usable, partials = codes_of(enrolled, self._stored)
             codes = np.concatenate([codes, unit_embeddings(partials, self._columns)])
-            like = {name: self._rows.names_like(name) for name in {one.object_id for one in usable}}
-            spelled = {name: found[0] if len(found) == 1 else name for name, found in like.items()}  # by the catalogue
-            touches = [*touches, *(_enrolled_reference(one, spelled[one.object_id]) for one in usable)]
-        names = sorted({one.object_id for one in touches if one.is_enrolled and self._find(one.object_id) < 0})
+            like = {name: self._rows.names_like(name) for name in {touch.object_id for touch in usable}}
+            spelled = {name: names[0] if len(names) == 1 else name for name, names in like.items()}  # by the catalogue
+            touches = [
+                *touches,
+                *(
+                    _ReferenceTouch(
+                        spelled[touch.object_id],
+                        tuple(touch.pictures),
+                        tuple(touch.pictures.values()),
+                        touch.opening_mm,
+                        is_enrolled=True,
+                    )
+                    for touch in usable
+                ),
+            ]
+        names = sorted({touch.object_id for touch in touches if touch.is_enrolled and self._find(touch.object_id) < 0})
         self._enrolled_only = {name: self._rows.object_count + place for place, name in enumerate(names)}
         self.count = self._rows.object_count + len(names)
-        numbers = np.array([self.find(one.object_id) for one in touches], dtype=np.int64)
+        numbers = np.array([self.find(touch.object_id) for touch in touches], dtype=np.int64)
         order = np.argsort(numbers, kind="stable")
         order = order[numbers[order] >= 0]  # an object without a readable photo has no number
         self._touches = [touches[place] for place in order]
         self._codes = codes[order]
-        self._openings_mm = np.array([one.opening_mm for one in self._touches], dtype=np.float64)  # None becomes NaN
+        self._openings_mm = np.array(
+            [touch.opening_mm for touch in self._touches], dtype=np.float64
+        )  # None becomes NaN
         self._owners = numbers[order]
         self._touched, self._starts = np.unique(self._owners, return_index=True)
         self._touch_only = np.isin(np.arange(self.count), [self.find(name) for name in self._references.touch_only])
@@ -205,7 +209,9 @@ class Objects:
         """Return the objects that a person can mean by this name (`Rows.names_like`)."""
         if self.find(name) >= 0:
             return [name]
-        return self._rows.names_like(name) + [one for one in self._enrolled_only if lookup_key(one) == lookup_key(name)]
+        return self._rows.names_like(name) + [
+            enrolled for enrolled in self._enrolled_only if lookup_key(enrolled) == lookup_key(name)
+        ]
 
     @property
     def reference_counts(self) -> tuple[int, int]:
@@ -216,21 +222,21 @@ class Objects:
     def gel_images(self) -> dict[str, ListedPhoto]:
         """The gel images of the reference touches, by path; queries do not need them."""
         return {
-            path: ListedPhoto(one.object_id, path, {}, digest, is_touch=True, is_enrolled=one.is_enrolled)
-            for one in (*self._references.touches, *self._touches)
-            for path, digest in zip(one.touch, one.digests, strict=True)
+            path: ListedPhoto(reference.object_id, path, {}, digest, is_touch=True, is_enrolled=reference.is_enrolled)
+            for reference in (*self._references.touches, *self._touches)
+            for path, digest in zip(reference.touch, reference.digests, strict=True)
         }
 
     @property
     def enrolled_pictures(self) -> list[ListedPhoto]:
         """A gel image of each touch of the objects that only the table of enrolled touches has, by object."""
         start = np.searchsorted(self._owners, self._rows.object_count)
-        return [self.gel_images[one.touch[0]] for one in self._touches[start:]]
+        return [self.gel_images[reference.touch[0]] for reference in self._touches[start:]]
 
     @property
     def counts(self) -> tuple[int, int]:
         """Number of objects, and of enrolled touches."""
-        return self.count, sum(one.is_enrolled for one in self._touches)
+        return self.count, sum(reference.is_enrolled for reference in self._touches)
 
     def compare_references(self, partials: Floats, openings_mm: NDArray[np.float64] | None = None) -> ReferenceEvidence:
         """Compare grasps with the reference touches of all objects.
@@ -244,8 +250,7 @@ class Objects:
             cosines = unit_embeddings(partials, self._columns) @ self._codes.T
             similarities[self._touched] = reference_similarity(cosines, self._starts).sum(0)
             if self._opening is not None and openings_mm is not None and np.isfinite(openings_mm).any():
-                ratios = self._opening.log_ratios(openings_mm, self._openings_mm, self._starts)
-                openings[self._touched] = ratios.sum(0)
+                openings[self._touched] = self._opening.log_ratios(openings_mm, self._openings_mm, self._starts).sum(0)
                 compared = len(np.unique(self._owners[np.isfinite(self._openings_mm)]))
         return ReferenceEvidence(similarities, openings, compared)
 

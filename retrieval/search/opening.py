@@ -109,8 +109,7 @@ def open_index(
     if shards is not None:
         return shards(index, manifest, stored), stored
     check_fingerprint(index, manifest.fingerprint, fingerprint(stored))
-    opened = [open_shard_of(index, manifest, entry, stored) for entry in manifest.shards]
-    return Shards(manifest, opened), stored
+    return Shards(manifest, [open_shard_of(index, manifest, entry, stored) for entry in manifest.shards]), stored
 
 
 def open_shard_of(index: Path, manifest: ShardedManifest, entry: ShardEntry, stored: CheckpointInfo) -> FolderShard:

@@ -72,8 +72,7 @@ class Searcher:
         self.manifest, self.posterior = shard.manifest, checkpoint.posterior
         self.scorer = shard.scorer if isinstance(shard, FolderShard) else read_scorer(checkpoint)
         check = checkpoint.gel_check
-        compares_contact = check is not None and check.level_above is not None
-        self.reader = TouchReader(checkpoint.config, encoder, compares_contact)
+        self.reader = TouchReader(checkpoint.config, encoder, check is not None and check.level_above is not None)
         self.catalogue = Path(self.manifest.about["catalogue"])
         self._process = os.getpid()
 
@@ -207,12 +206,15 @@ class Searcher:
             raise BadInput(f"top and candidates must be whole numbers of 1 or more; got {top} and {candidates}")
         require_prior(none_prior)
         prefixes = [f"object {number}, " if len(objects) > 1 else "" for number in range(1, len(objects) + 1)]
-        parsed = [parse_grasps(one, opened.reader.fingers, of=of) for one, of in zip(objects, prefixes, strict=True)]
+        parsed = [
+            parse_grasps(touches, opened.reader.fingers, of=of) for touches, of in zip(objects, prefixes, strict=True)
+        ]
         given = [None] * len(objects) if opening_mm is None else opening_mm
         if len(given) != len(objects):
             raise BadInput(f"opening_mm needs an entry for each object: got {len(given)} for {len(objects)} objects")
         openings = [
-            parse_openings(one, len(grasps), of) for one, grasps, of in zip(given, parsed, prefixes, strict=True)
+            parse_openings(openings_mm, len(grasps), of)
+            for openings_mm, grasps, of in zip(given, parsed, prefixes, strict=True)
         ]
         if not parsed:
             return []
@@ -256,8 +258,7 @@ class Searcher:
         ((1, 2), (2,))
         """
         opened = self._snapshot()
-        grasps = parse_grasps(touches, opened.reader.fingers)
-        codes, _ = opened._encoded(grasps, background, Stopwatch())
+        codes, _ = opened._encoded(parse_grasps(touches, opened.reader.fingers), background, Stopwatch())
         return EncodedTouches(codes.embeddings, codes.partials)
 
     def verify(
@@ -367,7 +368,7 @@ class Searcher:
         with table.lock() as known:
             owners = {digest: touch.object_id for touch in known for digest in touch.pictures.values()}
             for touch, grasp in zip(new, grasps, strict=True):
-                if owner := next((owners[one] for one in touch.pictures.values() if one in owners), None):
+                if owner := next((owners[digest] for digest in touch.pictures.values() if digest in owners), None):
                     raise BadInput(
                         f"a picture of {_names(grasp)} is enrolled already, for {owner}; it counts once: give another "
                         f"grasp, or remove {owner} first"
@@ -433,7 +434,7 @@ class Searcher:
         probabilities, formula, more_grasps = None, None, None
         verdict = _fault(classes) or UNCALIBRATED
         if found is not None and posterior is not None:
-            logits = [one.logit for one in found.best]
+            logits = [ranked.logit for ranked in found.best]
             probabilities = posterior.probabilities_given(logits, found.mass, count, none_prior)
             verdict = MATCH if probabilities.objects.max() > probabilities.none else NONE_OF_THESE
             if verdict == NONE_OF_THESE and probabilities.objects_if_present[0] > CLEAR_PROBABILITY:
@@ -480,17 +481,17 @@ class Searcher:
             results=[
                 Match(
                     place + 1,
-                    one.photo.object_id,
-                    one.logit,
+                    ranked.photo.object_id,
+                    ranked.logit,
                     None if probabilities is None else float(probabilities.objects[place]),
-                    one.photo.path,
-                    one.photo.digest,
-                    one.photo.metadata,
-                    self.picture_file(one.photo),
-                    one.reference,
+                    ranked.photo.path,
+                    ranked.photo.digest,
+                    ranked.photo.metadata,
+                    self.picture_file(ranked.photo),
+                    ranked.reference,
                     None if probabilities is None else float(probabilities.objects_if_present[place]),
                 )
-                for place, one in enumerate(found.best if found else ())
+                for place, ranked in enumerate(found.best if found else ())
             ],
             more_grasps=more_grasps,
             opening_mm=openings_mm if has_openings else None,

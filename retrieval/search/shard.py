@@ -133,7 +133,8 @@ class FolderShard:
                 rows = np.concatenate([rows, rest])
                 logits = np.concatenate([logits, self._logits(query.partials, rest)])
                 scored = objects.score(rows, logits, evidence, grasps)
-            scored = scored.with_others(objects.score_enrolled_only(evidence, grasps))
+            enrolled = objects.score_enrolled_only(evidence, grasps)
+            scored = ScoredObjects(*(np.concatenate(pair) for pair in zip(scored, enrolled, strict=True)))
             mass = self._mass(objects, query.partials, scored, evidence)
         ranked = [self._ranked(objects, scored, place, query.partials) for place in scored.best(top).tolist()]
         counts = objects.reference_counts
@@ -198,11 +199,11 @@ class FolderShard:
         found = np.arange(len(rows))
         if object_id is not None:
             found = np.flatnonzero(rows.objects == rows.find_object(object_id))
-            enrolled = [one for one in enrolled if one.object_id == object_id]
+            enrolled = [picture for picture in enrolled if picture.object_id == object_id]
         if words:
             texts, keys = self._texts, [lookup_key(word) for word in words]
             found = np.array([row for row in found if all(key in texts[row] for key in keys)], dtype=np.int64)
-            enrolled = [one for one in enrolled if all(key in _searched(one.object_id) for key in keys)]
+            enrolled = [picture for picture in enrolled if all(key in _searched(picture.object_id) for key in keys)]
         photos = [listed_photo(rows[int(row)]) for row in found[offset : offset + limit]]
         start = max(0, offset - len(found))
         return Page(len(found) + len(enrolled), photos + enrolled[start : start + limit - len(photos)])
@@ -233,8 +234,8 @@ class FolderShard:
 
     def _logits(self, partials: Floats, rows: Rows) -> Floats:
         """Return the match logits of the rows, summed over grasps."""
-        every = len(rows) == self.generation.count
-        return self.scorer.logits(partials, StoredPartials(self.generation.arrays), None if every else rows)
+        some = None if len(rows) == self.generation.count else rows
+        return self.scorer.logits(partials, StoredPartials(self.generation.arrays), some)
 
     def _mass(
         self, objects: Objects, partials: Floats, scored: ScoredObjects, evidence: ReferenceEvidence
@@ -284,11 +285,11 @@ class Shards:
     def search(self, query: EncodedQuery, top: int, candidates: int | None) -> ShardResult:
         """As `FolderShard.search`; each shard reranks `candidates` photos."""
         results: list[ShardResult] = self.call(self.shards, "search", query, top, candidates)
-        best = [one for result in results for one in result.best]
+        best = [ranked for result in results for ranked in result.best]
         return ShardResult(
             sum(result.photos for result in results),
             sum(result.objects for result in results),
-            sorted(best, key=lambda one: (-one.logit, one.photo.object_id))[:top],
+            sorted(best, key=lambda ranked: (-ranked.logit, ranked.photo.object_id))[:top],
             EvidenceMass.merged([result.mass for result in results]),
             sum(result.compared_openings for result in results),
             (sum(result.references[0] for result in results), sum(result.references[1] for result in results)),
@@ -297,8 +298,8 @@ class Shards:
 
     def photos(self, paths: Sequence[str]) -> list[ListedPhoto | None]:
         """As `FolderShard.photos`."""
-        found = self.call(self.shards, "photos", list(paths))
-        return [next((photo for photo in photos if photo is not None), None) for photos in zip(*found, strict=True)]
+        of_shards = self.call(self.shards, "photos", list(paths))
+        return [next(filter(None, photos), None) for photos in zip(*of_shards, strict=True)]
 
     def counts(self) -> tuple[int, int]:
         """As `FolderShard.counts`."""
@@ -307,7 +308,7 @@ class Shards:
 
     def names_like(self, name: str) -> list[str]:
         """As `FolderShard.names_like`."""
-        names = [found for some in self.call(self.shards, "names_like", name) for found in some]
+        names = [like for names in self.call(self.shards, "names_like", name) for like in names]
         return [name] if name in names else names
 
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
@@ -315,9 +316,9 @@ class Shards:
         total, photos = 0, list[ListedPhoto]()
         for shard in self.shards:
             start, rest = max(0, offset - total), limit - len(photos)
-            (found,) = self.call([shard], "page", list(words), object_id, start, rest)
-            total += found.total
-            photos += found.photos
+            (page,) = self.call([shard], "page", list(words), object_id, start, rest)
+            total += page.total
+            photos += page.photos
         return Page(total, photos)
 
 
