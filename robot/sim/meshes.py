@@ -27,7 +27,7 @@ class MeshFolder:
             raise RobotConfigError(f"meshes must be a folder of STL, OBJ or PLY files, got {folder!r}")
         self._folder, self._seed, self._settings = folder, seed, settings
         files = sorted(Path(folder).iterdir())
-        self._paths = [each for each in files if each.suffix.lower().lstrip(".") in FORMATS and each.name[0] != "."]
+        self._paths = [path for path in files if path.suffix.lower().lstrip(".") in FORMATS and path.name[0] != "."]
         lines = (f"{path.name} {hashlib.sha256(path.read_bytes()).hexdigest()}\n" for path in self._paths)
         self.digest = hashlib.sha256("".join(lines).encode()).hexdigest()
 
@@ -65,11 +65,11 @@ def _resting_object(path: Path, seed: int, settings: GraspSettings) -> SimObject
     rated: list[tuple[int, float, SimObject]] = []
     for up in stable_up_directions(mesh.vertices, mesh.solid.center_mass):
         obj = mesh_object(path, mesh, seed, up=up)
-        found = grasps_of(obj.body, settings)
-        rated.append((len(found), -found.min_width_mm, obj))
-        if len(found) >= _ENOUGH_GRASPS:
+        grasps = grasps_of(obj.body, settings)
+        rated.append((len(grasps), -grasps.min_width_mm, obj))
+        if len(grasps) >= _ENOUGH_GRASPS:
             return obj
-    return max(rated, key=lambda each: each[:2])[2]
+    return max(rated, key=lambda pose: pose[:2])[2]
 
 
 @lru_cache(maxsize=16)

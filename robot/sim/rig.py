@@ -282,8 +282,7 @@ class SimArm(VirtualDevice, Arm):
         self._sim_state = sim_state
 
     def _move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
-        before = self._sim_state.pose.as_tuple()[:3]
-        self._sim_state.sleep(math.dist(before, pose.as_tuple()[:3]) / speed_mm_s)
+        self._sim_state.sleep(math.dist(self._sim_state.pose.as_tuple()[:3], pose.as_tuple()[:3]) / speed_mm_s)
         self._sim_state.pose = pose
         return pose
 
@@ -316,8 +315,7 @@ class SimGripper(VirtualDevice, Gripper):
 
     def _grasp(self, force_n: float, speed_mm_s: float) -> GripperState:
         sim_state = self._sim_state
-        grip = Grip(sim_state.pose, force_n, sim_state.opening_mm)
-        sim_state.scene = replace(sim_state.current_scene(), grip=grip)
+        sim_state.scene = replace(sim_state.current_scene(), grip=Grip(sim_state.pose, force_n, sim_state.opening_mm))
         sim_state.sleep(sim_state.opening_mm / speed_mm_s)
         return self._state()
 

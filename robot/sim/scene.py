@@ -227,8 +227,7 @@ class Pinch:
         placements = [self._rotated_placement(angle) for angle in turns]
         rays = [self._rays(side, _COARSE_GRID, placements) for side in SIDES.values()]
         starts, directions = (np.stack(parts, axis=1).reshape(-1, 3) for parts in zip(*rays, strict=True))
-        reach = self.scene.obj.body.cast(starts, directions)
-        return np.asarray(reach.reshape(len(turns), len(SIDES), -1).min(axis=2))
+        return np.asarray(self.scene.obj.body.cast(starts, directions).reshape(len(turns), len(SIDES), -1).min(axis=2))
 
     def _rays(self, side: float, grid: tuple[int, int], placements: Sequence[Placement]) -> tuple[Array, Array]:
         """Return starts and directions of parallel rays from the pad of a finger.
@@ -242,7 +241,7 @@ class Pinch:
         local = np.stack([np.full(yy.size, -side * _START_MM), yy.ravel(), zz.ravel()], axis=1)
         pose, rotations = self.grip.pose, np.stack([placement.rotation() for placement in placements])
         closing = pose.rotation()
-        middles = np.array([[pose.x_mm - each.x_mm, pose.y_mm - each.y_mm, pose.z_mm] for each in placements])
+        middles = np.array([[pose.x_mm - place.x_mm, pose.y_mm - place.y_mm, pose.z_mm] for place in placements])
         starts = (local @ closing.T + middles[:, None]) @ rotations
         directions = (side * closing[:, 0]) @ rotations
         return starts, np.broadcast_to(directions[:, None], starts.shape)

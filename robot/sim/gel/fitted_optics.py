@@ -24,8 +24,6 @@ from numpy.typing import NDArray
 from _touch_retrieval.documents import typed
 from robot.sim.gel.surface import Array, Field, Surface, resized
 
-_COARSE = 4  # image pixels per point of the smoothed maps; the shortest reach is many pixels
-
 Matrix = NDArray[np.float64]
 
 
@@ -98,7 +96,7 @@ class FittedOptics:
     def _neighbourhood(self, surface: Surface) -> list[Array]:
         """Return the smoothed displacement and its slopes at the pixels, for each reach."""
         field = surface.field
-        heights = surface.coarse(_COARSE)
+        heights = surface.coarse(4)  # the shortest reach is many pixels
         steps = [size / count for size, count in zip(field.size_mm, heights.shape, strict=True)]
         maps = []
         for reach in self.reaches_mm:
@@ -106,7 +104,7 @@ class FittedOptics:
             slopes = (np.gradient(smooth, np.float32(steps[axis]), axis=axis) for axis in (1, 0))
             maps += [smooth, *(slope.astype(np.float32) for slope in slopes)]
         limits = zip(maps, self.limits.lowest, self.limits.highest, strict=True)
-        return [resized(np.clip(one, low, high), (field.rows, field.cols)) for one, low, high in limits]
+        return [resized(np.clip(values, low, high), (field.rows, field.cols)) for values, low, high in limits]
 
 
 def normal_features(nx: Any, ny: Any, degree: int) -> list[Any]:
@@ -152,8 +150,8 @@ FITTED = "gelsight", "gelsight_mini"
 
 def fitted_document(name: str) -> dict[str, Any]:
     """Return the shipped file of a sensor of `FITTED`: source, settings, held-out results, model."""
-    content: dict[str, Any] = json.loads((resources.files("robot.sim.gel") / "fitted" / f"{name}.json").read_text())
-    return content
+    path = resources.files("robot.sim.gel") / "fitted" / f"{name}.json"
+    return json.loads(path.read_text())  # type: ignore[no-any-return]
 
 
 @lru_cache(maxsize=8)

@@ -37,11 +37,10 @@ def flaw_maps(flaws: Flaws, field: Field) -> tuple[Array, Array, Array]:
     """
     rng = np.random.default_rng([flaws.seed, 0x6E1])
     darkening = _specks(rng, flaws.specks, field) * _hairs(rng, flaws.hairs, field)
-    heights = _grains(rng, flaws.grains, field)
-    down, right = np.gradient(heights, field.pixel_mm)
+    down, right = np.gradient(_grains(rng, flaws.grains, field), field.pixel_mm)
     rough = rng.standard_normal((2, field.rows, field.cols), dtype=np.float32)
     # Skin is rough at many scales; a camera still resolves grains of two pixels.
-    rough = np.stack([cv2.GaussianBlur(one, (0, 0), 1.4) * np.float32(5.0 * flaws.texture) for one in rough])
+    rough = np.stack([cv2.GaussianBlur(noise, (0, 0), 1.4) * np.float32(5.0 * flaws.texture) for noise in rough])
     return darkening, (right + rough[0]).astype(np.float32), (down + rough[1]).astype(np.float32)
 
 
@@ -123,8 +122,8 @@ def marker_positions(markers: Markers, surface: Surface) -> Array:
     out = at_rest.copy()
     for axis, step in enumerate(steps):
         slope = np.gradient(smooth, axis=1 - axis) / np.float32(step)
-        found = cv2.remap(slope, pixels[:, :1], pixels[:, 1:], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        out[:, axis] -= np.clip(found[:, 0] * _SPREAD * _REACH_MM, -width, width)
+        at_dots = cv2.remap(slope, pixels[:, :1], pixels[:, 1:], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        out[:, axis] -= np.clip(at_dots[:, 0] * _SPREAD * _REACH_MM, -width, width)
     return out
 
 

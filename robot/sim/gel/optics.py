@@ -231,13 +231,14 @@ def _shadow_samples(
         led_x, led_y, led_z = bar.positions().mean(axis=0)
         away = np.hypot(led_x - x, led_y - y)
         unit_x, unit_y = (led_x - x) / away, (led_y - y) / away
-        samples = [
-            (
-                (columns + reach / steps[0] * unit_x).astype(np.float32),
-                (rows + reach / steps[1] * unit_y).astype(np.float32),
-                (reach * led_z / away).astype(np.float32),
-            )
-            for reach in _REACHES_MM
-        ]
-        out.append(samples)
+        out.append(
+            [
+                (
+                    (columns + reach / steps[0] * unit_x).astype(np.float32),
+                    (rows + reach / steps[1] * unit_y).astype(np.float32),
+                    (reach * led_z / away).astype(np.float32),
+                )
+                for reach in _REACHES_MM
+            ]
+        )
     return tuple(out)

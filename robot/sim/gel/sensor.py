@@ -247,8 +247,7 @@ def _draw_grey(rng: np.random.Generator) -> LedOptics:
     """Draw the optics of another maker: white lamps in other places, equal channels (before the sensor's tint)."""
     bars = tuple(_draw_bar(replace(bar, angle_rad=bar.angle_rad + math.radians(40)), rng) for bar in MINI_BARS)
     backdrop = _draw_backdrop(MINI_BACKDROPS[1], float(np.exp(0.04 * rng.standard_normal())), rng)
-    row = 0.55, 0.3, 0.15
-    return LedOptics(bars, (backdrop,) * 3, (row,) * 3, ambient=0.45, shadow=0.2)
+    return LedOptics(bars, (backdrop,) * 3, ((0.55, 0.3, 0.15),) * 3, ambient=0.45, shadow=0.2)
 
 
 def _draw_varied(rng: np.random.Generator) -> LedOptics:
@@ -357,9 +356,9 @@ def drift(sensor: GelSensor, seed: tuple[int, ...], hours: float) -> GelSensor:
     sizes, starts = _WAVE * rng.standard_normal((3, len(_PERIODS_H))), rng.uniform(size=(3, len(_PERIODS_H)))
     slow = np.exp((sizes * np.sin(2 * math.pi * (starts + hours / np.array(_PERIODS_H)))).sum(axis=1))
     begun = _begin_session(sensor, seed)
-    tint, own = begun.tint * slow, np.array(sensor.tint)
+    tint, before = begun.tint * slow, np.array(sensor.tint)
     if isinstance(sensor.optics, LedOptics) and len(set(sensor.optics.backdrops)) == 1:  # a grey camera: one gain
-        tint = own * (tint / own)[0]
+        tint = before * (tint / before)[0]
     return replace(begun, tint=tuple(tint.tolist()))
 
 

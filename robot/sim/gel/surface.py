@@ -100,5 +100,4 @@ def resized(image: Array, shape: tuple[int, int]) -> Array:
     if image.shape[:2] == shape:
         return image
     finer = image.shape[0] > shape[0] or image.shape[1] > shape[1]
-    out: Array = cv2.resize(image, shape[::-1], interpolation=cv2.INTER_AREA if finer else cv2.INTER_CUBIC)
-    return out
+    return np.asarray(cv2.resize(image, shape[::-1], interpolation=cv2.INTER_AREA if finer else cv2.INTER_CUBIC))

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Colours = NDArray[np.float32]
-_WAVES = 8
 
 
 @dataclass(frozen=True)
@@ -68,8 +67,8 @@ class Appearance:
 
 def _speckle(place: Colours) -> Colours:
     """Return a pattern of specks of about 4 mm, -1 to 1; finer ones would flicker between a camera's pixels."""
-    one = np.sin(place @ np.array([1.1, 0.5, 0.9], np.float32)) * np.sin(place @ np.array([-0.4, 1.0, 0.6], np.float32))
-    return np.asarray(one * np.sin(place @ np.array([0.7, -0.8, 1.2], np.float32)))
+    waves = np.array([[1.1, 0.5, 0.9], [-0.4, 1.0, 0.6], [0.7, -0.8, 1.2]], np.float32)
+    return np.asarray(np.prod([np.sin(place @ wave) for wave in waves], axis=0))
 
 
 def _over(below: Colours, above: tuple[float, float, float], opacity: Colours) -> Colours:
@@ -110,7 +109,7 @@ def _draw_paint(rng: np.random.Generator) -> Paint:
     scale = np.exp(rng.uniform(np.log(8), np.log(60)))
     axis = rng.standard_normal(3)
     axis /= np.linalg.norm(axis)
-    waves = rng.standard_normal((_WAVES, 3)) * 2.2 / scale
+    waves = rng.standard_normal((8, 3)) * 2.2 / scale
     if rng.random() < 0.4:
         waves = np.outer(rng.choice([1, 2, 3], 2), axis) * 2 * np.pi / (2 * scale)
     return Paint(

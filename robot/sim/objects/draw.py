@@ -20,8 +20,6 @@ from robot.sim.objects.relief import RELIEFS, Relief, draw_relief
 from robot.sim.objects.shapes import SHAPES
 
 STROKE_MM = 110.0  # stroke of the simulated gripper; every object fits into it
-SHELL_MM = 3.0
-MAX_SOLID_KG = 0.6
 # Random streams. A new purpose takes a new number, so that existing objects do not change.
 _SHAPE, _RELIEF, _MATERIAL, _APPEARANCE, _FAMILY_ORDER, _RELIEF_ORDER = range(6)
 
@@ -40,8 +38,8 @@ class SimObject:
     @cached_property
     def mass_kg(self) -> float:
         """Mass: solid if at most 0.6 kg, otherwise hollow with a wall of 3 mm, as for bottles and castings."""
-        solid, shell = (volume * 1e-9 * self.material.density_kg_m3 for volume in self.body.volumes_mm3(SHELL_MM))
-        return solid if solid <= MAX_SOLID_KG else min(solid, shell)
+        solid, shell = (volume * 1e-9 * self.material.density_kg_m3 for volume in self.body.volumes_mm3(3.0))
+        return solid if solid <= 0.6 else min(solid, shell)
 
     def labels(self) -> dict[str, float | bool | str]:
         """Return shape and relief as plain values, the properties that both touch and photo can show."""

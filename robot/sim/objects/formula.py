@@ -88,16 +88,16 @@ class _Tape:
         fixed += [number for number, (kind, *_) in enumerate(self._values) if kind == "constant"]
         row = {number: place for place, number in enumerate(fixed)}
         computed = [(number, value) for number, value in enumerate(self._values) if number not in row]
-        last_use = {each: number for number, (_, *inputs) in computed for each in inputs}
+        last_use = {operand: number for number, (_, *inputs) in computed for operand in inputs}
         code, free, count = [], list[int](), len(fixed)
         for number, (kind, *inputs) in computed:
             # A result never overwrites its own operands: the compiled loops are vectorised under that condition.
             row[number] = free.pop() if free else count
             count = max(count, row[number] + 1)
-            read = [row[each] for each in inputs]
+            read = [row[operand] for operand in inputs]
             code.append((OPERATIONS.index(kind), row[number], *read, *(read[:1] * (3 - len(read)))))
-            finished = {each for each in inputs if last_use[each] == number}
-            free += [row[each] for each in sorted(finished - set(fixed) - set(results))]
+            finished = {operand for operand in inputs if last_use[operand] == number}
+            free += [row[operand] for operand in sorted(finished - set(fixed) - set(results))]
         start = np.zeros(count, np.float32)
         for number in fixed:
             kind, value = self._values[number]

@@ -30,7 +30,6 @@ from robot.sim.objects.wall import bake_plain, ends_weight, level_of, smoothstep
 
 FORMATS = ("stl", "obj", "ply")
 MIN_THICKNESS_MM = 2.0
-_MAX_METRE_EXTENT = 2.0
 _CREASE_COSINE = 0.77
 _RAY_OFFSET_MM = 1.0
 Faces = NDArray[np.int64]
@@ -50,9 +49,9 @@ class Mesh:
         trimesh weights faces by their angle at the vertex (Thuermer and Wuethrich 1998), so the triangulation of a flat
         side has no effect.
         """
-        shared, own = self.solid.vertex_normals[self.faces], self.solid.face_normals[:, None, :]
-        is_smooth = np.sum(shared * own, axis=2, keepdims=True) > _CREASE_COSINE
-        return np.asarray(np.where(is_smooth, shared, own))
+        shared, of_face = self.solid.vertex_normals[self.faces], self.solid.face_normals[:, None, :]
+        is_smooth = np.sum(shared * of_face, axis=2, keepdims=True) > _CREASE_COSINE
+        return np.asarray(np.where(is_smooth, shared, of_face))
 
     @cached_property
     def solid(self) -> Any:
@@ -86,8 +85,7 @@ class MeshBody(Body):
         out = 0.0 if relief.engraved else relief.amplitude_mm
         outwards = np.array([out, out, 0.0])
         self.lower, self.upper = mesh.vertices.min(axis=0) - outwards, mesh.vertices.max(axis=0) + outwards
-        radius = float(np.mean(self.upper[:2] - self.lower[:2])) / 2
-        self.chart = CylindricalChart(radius, float(self.upper[2]))
+        self.chart = CylindricalChart(float(np.mean(self.upper[:2] - self.lower[:2])) / 2, float(self.upper[2]))
 
     @cached_property
     def wall(self) -> list[ReliefLevel]:
@@ -180,12 +178,11 @@ class MeshBody(Body):
         normals = self._nearest_sample_normals(points)
         reach = self.relief.amplitude_mm + 2 * _RAY_OFFSET_MM
         face, distance = self.first_faces(points + reach * normals, -normals)
-        found = np.flatnonzero(face >= 0)
+        hit = np.flatnonzero(face >= 0)
         depth = reach - distance
         near = np.abs(depth) < reach
-        face, found, depth = face[found][near], found[near], depth[near]
-        place = points[found] + depth[:, None] * normals[found]
-        normals[found] = self.mesh.normals_at(face, place)
+        face, hit, depth = face[hit][near], hit[near], depth[near]
+        normals[hit] = self.mesh.normals_at(face, points[hit] + depth[:, None] * normals[hit])
         return normals
 
     def _nearest_sample_normals(self, points: Vectors) -> Vectors:
@@ -221,7 +218,7 @@ def read_mesh(path: str | Path) -> Mesh:
     vertices, faces = vertices[first], number.reshape(-1)[faces]
     faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
     _check_closed(faces, file)
-    scale = 1000.0 if np.ptp(vertices, axis=0).max() < _MAX_METRE_EXTENT else 1.0
+    scale = 1000.0 if np.ptp(vertices, axis=0).max() < 2.0 else 1.0
     mesh = Mesh(vertices * scale, faces).rest_on_table(UP)
     thin = np.ptp(mesh.vertices, axis=0).min()
     if thin < MIN_THICKNESS_MM:

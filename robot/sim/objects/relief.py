@@ -244,8 +244,7 @@ def glyphs(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
         text = "".join(rng.choice(list("ABCDEFGHJKLMNPRSTUVWXYZ2345678O"), int(sheet.columns / (12 * size)) + 1))
         while len(text) > 1 and cv2.getTextSize(text, font, size, thick)[0][0] > sheet.columns - 6 * size:
             text = text[:-1]
-        place = (int((2 + row % 2 * 9) * size), int(line))
-        cv2.putText(canvas, text, place, font, size, 255, thick, cv2.LINE_AA)
+        cv2.putText(canvas, text, (int((2 + row % 2 * 9) * size), int(line)), font, size, 255, thick, cv2.LINE_AA)
     return sheet.blur(_fold_seam(np.ascontiguousarray(canvas[::-1])), _edge_blur_mm(relief))
 
 

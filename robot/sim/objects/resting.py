@@ -40,8 +40,7 @@ def stable_up_directions(vertices: Array, centre_of_mass: Array) -> list[Array]:
     for up in (candidates[number] for *_, number in reversed(stable)):
         if all(up @ other < _SAME_COSINE for other in poses):
             poses.append(up)
-    upright_first = sorted(poses, key=lambda up: bool(up @ UP < _SAME_COSINE))
-    return upright_first[:_MAX_POSES] or [UP]
+    return sorted(poses, key=lambda up: bool(up @ UP < _SAME_COSINE))[:_MAX_POSES] or [UP]  # upright ones first
 
 
 def tipping_angle(corners: Array, down: Array) -> float:

@@ -14,8 +14,6 @@ from robot.sim.objects.packets import ReliefLevel
 from robot.sim.objects.relief import Relief, Sheet
 from robot.sim.objects.shapes.shape import Chart, Floats, Points, Shape
 
-MIN_PIXEL_MM = 0.14
-_MAX_NODES = 1.2e6
 _LEVELS = 4
 _CELL_MM = 1.5
 
@@ -47,7 +45,7 @@ def bake_plain(chart: Chart, relief: Relief) -> list[ReliefLevel]:
 def _sheet(chart: Chart) -> Sheet:
     """Return nodes for a wall; columns and rows can be halved `_LEVELS` times."""
     width, height = chart.width_mm, chart.height_mm
-    pixel = max(MIN_PIXEL_MM, np.sqrt(width * height / _MAX_NODES))
+    pixel = max(0.14, np.sqrt(width * height / 1.2e6))  # in mm; at most 1.2 million nodes
     block = 2 ** (_LEVELS - 1)
     return Sheet(
         width, height, block * int(np.ceil(height / pixel / block)) + 1, block * int(np.ceil(width / pixel / block))
