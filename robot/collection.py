@@ -265,7 +265,7 @@ class _Collection:
             self._earlier[name] = whole[name].attempts - self.tallies[name].attempts
         self._seconds = log.attempts[-1].ended_s if log.attempts else 0.0
         self._pending: dict[str, deque[Callable[[], GraspAttempt]]] = defaultdict(deque)
-        self._progress, self._is_enough = progress, is_enough
+        self._progress, self._is_enough = progress or (lambda now: None), is_enough
         self._accepted: dict[str, list[RecordedGrasp]] = defaultdict(list)
         self._ended: set[str] = set()
         for grasp in read_recording(writer.folder).grasps if is_enough and writer.grasp_ids else ():
@@ -365,8 +365,6 @@ class _Collection:
             self.writer.update_info(skipped_objects=skipped)
 
     def _report(self) -> None:
-        if self._progress is None:
-            return
         tallies, target = [self.tallies[name] for name in self.names], self.settings.grasps
         open_tallies = [counts for counts in tallies if self._needs_attempt(counts.object_id, target)]
         self._progress(

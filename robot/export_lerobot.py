@@ -40,7 +40,6 @@ from robot.storage import decode_picture, storage_errors
 FPS = 1
 """Nominal, because steps have no fixed rate; readers require an integer."""
 _NUMBERS = {"chunk_index": 0, "file_index": 0}
-_CODEC = {"crf": "10", "g": "1", "bf": "0", "preset": "fast"}
 _STEP_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index", "moment")
 _FIELDS = {
     **dict.fromkeys(("grasp_id", "object_id", "sequence_id", "session", "outcome"), "string"),
@@ -48,8 +47,6 @@ _FIELDS = {
     **dict.fromkeys(("force_n", "opening_mm", "touch_skew_s", "time_s", "pose"), "float64"),
 }
 """Recorded fields of an episode, with the name of their type in pyarrow; a pose is a list."""
-_FACTS = ("source", "sensor", "rig", "licence", "terms", "citation", "background")
-"""Keys of recording.json that info.json repeats."""
 _WHAT = "LeRobot's format"
 
 
@@ -79,16 +76,16 @@ def export_lerobot(recording: Recording, out: Path, progress: Progress | None = 
                 f"every grasp must have the same fingers; {grasps[0].grasp_id} has {', '.join(fingers)}, "
                 f"{grasp.grasp_id} has {', '.join(sorted(grasp.touches))}"
             )
-    columns = {moment: [f"touch_{each}{suffix}" for each in fingers] for moment, suffix in MOMENT_SUFFIXES.items()}
+    columns = {moment: [f"touch_{finger}{suffix}" for finger in fingers] for moment, suffix in MOMENT_SUFFIXES.items()}
     recorded = {moment: [set(some) <= grasp.images().keys() for grasp in grasps] for moment, some in columns.items()}
-    moments = [moment for moment, each in recorded.items() if all(each)]
+    moments = [moment for moment, has_moment in recorded.items() if all(has_moment)]
     suffixes = [MOMENT_SUFFIXES[moment] for moment in moments]
     per_camera = {"photo": ["photo"] * len(moments)} if all(grasp.photo for grasp in grasps) else {}
-    per_camera |= {f"touch_{each}": [f"touch_{each}{suffix}" for suffix in suffixes] for each in fingers}
+    per_camera |= {f"touch_{finger}": [f"touch_{finger}{suffix}" for suffix in suffixes] for finger in fingers}
     first = grasps[0].images()
     cameras = [
-        _Camera(name, each, _read_picture(recording.folder / first[each[0]]).shape[:2])
-        for name, each in per_camera.items()
+        _Camera(name, of_camera, _read_picture(recording.folder / first[of_camera[0]]).shape[:2])
+        for name, of_camera in per_camera.items()
     ]
     numbers = [list(MOMENT_SUFFIXES).index(moment) for moment in moments]
     tasks = {name: number for number, name in enumerate(dict.fromkeys(grasp.object_id for grasp in grasps))}
@@ -126,12 +123,12 @@ def export_lerobot(recording: Recording, out: Path, progress: Progress | None = 
             stats[camera.key] = _stats(camera.summaries, len(camera.summaries) * math.prod(camera.size))
         for name, document in (("stats", stats), ("info", _info(recording, moments, cameras, len(tasks)))):
             (folder / "meta" / f"{name}.json").write_text(json.dumps(document, indent=4) + "\n", "utf-8")
-    recorded = {f"frames {moment} the touch": each for moment, each in recorded.items()}
+    recorded = {f"frames {moment} the touch": has_moment for moment, has_moment in recorded.items()}
     recorded["photos"] = [grasp.photo is not None for grasp in grasps]
     return tuple(
         f"the {what} are left out because some grasps do not have them"
-        for what, each in recorded.items()
-        if any(each) and not all(each)
+        for what, has_it in recorded.items()
+        if any(has_it) and not all(has_it)
     )
 
 
@@ -201,7 +198,9 @@ class _Camera:
         path = folder / VIDEO_PATH.format(video_key=self.key, **_NUMBERS)
         path.parent.mkdir(parents=True)
         with av.open(str(path), "w") as container:
-            stream = container.add_stream("libx264", rate=FPS, options=_CODEC)
+            stream = container.add_stream(
+                "libx264", rate=FPS, options={"crf": "10", "g": "1", "bf": "0", "preset": "fast"}
+            )
             stream.height, stream.width = self.size
             stream.pix_fmt = "yuv444p"
             self._encode = lambda frame: container.mux(stream.encode(frame))
@@ -275,5 +274,9 @@ def _info(recording: Recording, moments: Sequence[str], cameras: Sequence[_Camer
         "data_path": DATA_PATH,
         "video_path": VIDEO_PATH,
         "features": features,
-        "recording": {key: recording.info.get(key) for key in _FACTS} | {"moments": list(moments)},
+        "recording": {
+            key: recording.info.get(key)
+            for key in ("source", "sensor", "rig", "licence", "terms", "citation", "background")
+        }
+        | {"moments": list(moments)},
     }

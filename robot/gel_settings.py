@@ -42,7 +42,7 @@ def parse_gel_settings(tables: Mapping[str, Any], fingers: Iterable[str]) -> dic
     gels = {finger: GelSettings() for finger in sorted(fingers)}
     for finger, table in tables.items():
         if finger not in gels or not isinstance(table, Mapping):
-            known = ", ".join(f"[gel.{each}]" for each in gels)
+            known = ", ".join(f"[gel.{name}]" for name in gels)
             raise RobotConfigError(f"gel tables must name a finger with a sensor: {known}; got {finger!r}")
         gels[finger] = build(GelSettings, table, where=f"[gel.{finger}]")
     return gels

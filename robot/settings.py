@@ -39,7 +39,7 @@ def build(cls: type[_T], settings: Mapping[str, Any], *, where: str = "", **argu
         RobotConfigError: A setting is unknown, missing, of another type than annotated, or out of the class's range.
     """
     accepted = _keywords(cls)  # type: ignore[arg-type]  # a class is hashable
-    keywords = {name: each for name, each in accepted.items() if name not in arguments}
+    keywords = {name: keyword for name, keyword in accepted.items() if name not in arguments}
     known = ", ".join(sorted(keywords))
     if unknown := sorted(set(settings) - set(keywords)):
         raise RobotConfigError(f"{where or cls.__name__} has no setting {unknown[0]!r}; known settings: {known}")
@@ -81,10 +81,10 @@ def build_named(
 @functools.cache
 def _keywords(cls: type) -> dict[str, tuple[Any, bool]]:
     """Return the keyword arguments of a class, each with its annotated type and whether it is required."""
-    found: dict[str, tuple[Any, bool]] = {}
-    for each in filter(None, (getattr(cls, "Settings", None), cls)):
-        hints = typing.get_type_hints(each.__init__, include_extras=True)
-        for name, parameter in inspect.signature(each).parameters.items():
+    keywords: dict[str, tuple[Any, bool]] = {}
+    for source in filter(None, (getattr(cls, "Settings", None), cls)):
+        hints = typing.get_type_hints(source.__init__, include_extras=True)
+        for name, parameter in inspect.signature(source).parameters.items():
             if parameter.kind is not parameter.VAR_KEYWORD:
-                found[name] = hints.get(name, Any), parameter.default is parameter.empty
-    return found
+                keywords[name] = hints.get(name, Any), parameter.default is parameter.empty
+    return keywords

@@ -18,7 +18,6 @@ from _touch_retrieval.files import open_regular
 from _touch_retrieval.text import decode_text
 from robot.errors import RecordingError, RobotError, StorageError
 
-PART_SUFFIX = ".part"
 ImageSource = npt.NDArray[Any] | bytes | str | Path
 """Pixels, or the content or path of a PNG or JPEG file. Pixels: (H, W, 3) uint8 RGB; depth: (H, W) uint16."""
 
@@ -34,8 +33,9 @@ def storage_errors(folder: Path) -> Iterator[None]:
         raise StorageError(f"{folder} is being written by another process; wait for it or stop it") from error
     except OSError as error:
         reason = (error.strerror or str(error)).removeprefix("cannot be written: ")
-        where = error.filename or folder
-        raise StorageError(f"{where} could not be written: {reason}; earlier grasps are complete") from error
+        raise StorageError(
+            f"{error.filename or folder} could not be written: {reason}; earlier grasps are complete"
+        ) from error
 
 
 SYNC_THREADS = 8
@@ -48,7 +48,7 @@ def write_files(contents: Mapping[Path, bytes], threads: Executor) -> None:
     All files are written before the first is synced, and they are synced at the same time: the file system then writes
     its journal once, not file by file. The caller syncs the folder. An OSError names the file.
     """
-    parts = {path: path.with_name(path.name + PART_SUFFIX) for path in contents}
+    parts = {path: path.with_name(f"{path.name}.part") for path in contents}
     path: Path | None = None
     try:
         with contextlib.ExitStack() as files:

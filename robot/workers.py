@@ -46,8 +46,9 @@ class WorkerPool(Generic[T]):
         self._local_work, self._pool = local_work, None
         self.window = 1 if jobs == 1 else 4 * jobs
         if jobs > 1:
-            spawn = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(jobs, mp_context=spawn, initializer=_start_worker, initargs=(make,))
+            self._pool = ProcessPoolExecutor(
+                jobs, mp_context=multiprocessing.get_context("spawn"), initializer=_start_worker, initargs=(make,)
+            )
 
     def submit(self, object_id: str, number: int) -> Callable[[], T]:
         """Start an attempt at an object; return a callable that waits for its result.
@@ -91,8 +92,9 @@ def _result(future: Future[T], object_id: str, number: int) -> T:
     except BrokenProcessPool as error:
         raise RobotError(_DIED) from error
     except Exception as error:
-        reason = f"{type(error).__name__}: {error}"
-        raise RobotError(f"attempt {number} at {object_id} failed in a worker process: {reason}") from error
+        raise RobotError(
+            f"attempt {number} at {object_id} failed in a worker process: {type(error).__name__}: {error}"
+        ) from error
 
 
 # In the worker ----------------------------------------------------------------------------------------------

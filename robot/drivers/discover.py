@@ -46,7 +46,7 @@ def find_cameras(dev: Path = DEV, sys: Path = SYS) -> list[DiscoveredDevice]:
     """Return cameras by stable name, or by number on a system without stable names."""
     named = camera_names(dev)
     names = named or [str(dev / path.name) for path in sorted((sys / "class" / "video4linux").glob("video*"))]
-    found = []
+    cameras = []
     for name in names:
         folder = sys / "class" / "video4linux" / Path(name).resolve().name
         if not named and _text(folder / "index") not in ("", "0"):
@@ -55,8 +55,8 @@ def find_cameras(dev: Path = DEV, sys: Path = SYS) -> list[DiscoveredDevice]:
         words = f"{label} {Path(name).name}".lower().replace("_", " ")
         driver = next((driver for word, driver in _GEL_SENSORS.items() if word in words), "uvc")
         more = "" if named else "\nallow_index = true"
-        found.append(DiscoveredDevice("camera", name, label, f'driver = "{driver}"\ndevice = "{name}"{more}'))
-    return found
+        cameras.append(DiscoveredDevice("camera", name, label, f'driver = "{driver}"\ndevice = "{name}"{more}'))
+    return cameras
 
 
 def find_serial_ports(dev: Path = DEV) -> list[DiscoveredDevice]:
@@ -76,7 +76,8 @@ def _find_realsenses() -> list[DiscoveredDevice]:
     try:
         rs = import_module("pyrealsense2")
         info = rs.camera_info
-        names = [(each.get_info(info.serial_number), each.get_info(info.name)) for each in rs.context().query_devices()]
+        devices = rs.context().query_devices()
+        names = [(device.get_info(info.serial_number), device.get_info(info.name)) for device in devices]
     except ModuleNotFoundError:
         return []
     except Exception as error:  # a failing package must not hide the other devices

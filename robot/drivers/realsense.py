@@ -66,7 +66,7 @@ class RealSense(Camera):
         rs = import_package("pyrealsense2", "a RealSense camera", "realsense")
         with package_errors("realsense cannot be started"):
             serial = self._choose(
-                [str(each.get_info(rs.camera_info.serial_number)) for each in rs.context().query_devices()]
+                [str(device.get_info(rs.camera_info.serial_number)) for device in rs.context().query_devices()]
             )
             pipeline = rs.pipeline()
             config, size = rs.config(), (self._options.width, self._options.height)
@@ -150,9 +150,9 @@ class RealSense(Camera):
 
 def _undistortion(rs: Any, lens: Any) -> npt.NDArray[np.float32]:
     """Return the (H, W, 2) distorted pixel coordinates of each pixel of the undistorted picture."""
-    found = np.empty((lens.height, lens.width, 2), np.float32)
+    coordinates = np.empty((lens.height, lens.width, 2), np.float32)
     for row in range(lens.height):
         y = (row - lens.ppy) / lens.fy
         for column in range(lens.width):
-            found[row, column] = rs.rs2_project_point_to_pixel(lens, [(column - lens.ppx) / lens.fx, y, 1.0])
-    return found
+            coordinates[row, column] = rs.rs2_project_point_to_pixel(lens, [(column - lens.ppx) / lens.fx, y, 1.0])
+    return coordinates

@@ -28,8 +28,7 @@ class CylinderPlanner(GraspPlanner):
         (left, front, _), (right, back, top) = workspace.lower, workspace.upper
         region = Region((left - margin, front - margin, -1.0), (right + margin, back + margin, top))
         fit = rig.object_fit or fit_cylinder(image, rig.camera.extrinsics, region)
-        plan = plan_grasp(fit, settings, workspace, rig.gripper.stroke_mm, rng)
-        return replace(plan, fit=fit.to_dict())
+        return replace(plan_grasp(fit, settings, workspace, rig.gripper.stroke_mm, rng), fit=fit.to_dict())
 
 
 def plan_grasp(

@@ -86,7 +86,7 @@ def read_options(importer: Importer, words: Sequence[str]) -> dict[str, Any]:
         ImporterError: An option is unknown, or its value has another type.
     """
     known = options_of(importer)
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for word in words:
         name, equals, value = word.partition("=")
         if name not in known or not equals:
@@ -96,7 +96,7 @@ def read_options(importer: Importer, words: Sequence[str]) -> dict[str, Any]:
             )
         kind = known[name][0]
         try:
-            found[name] = msgspec.convert(value, kind, strict=False)
+            values[name] = msgspec.convert(value, kind, strict=False)
         except msgspec.ValidationError as error:
             raise ImporterError(f"option {name} must be of type {kind.__name__}, got {value!r}") from error
-    return found
+    return values

@@ -30,7 +30,6 @@ MOMENT_SUFFIXES = {"before": "_before", "during": "", "after": "_after"}
 
 _CELLS, _NOISE_LEVELS, _DARK_LEVELS = 8, 8, 10
 _UNLIKE_SHARE = 0.5
-_MAX_LEFT_OUT = 30
 
 
 def thumbnail(picture: Picture) -> Picture:
@@ -54,7 +53,7 @@ def first_usable(thumbnails: Sequence[Picture]) -> int | None:
     frames = frames[dark:]
     if len(frames) < 4:
         return dark
-    leading = max(1, min(_MAX_LEFT_OUT, len(frames) // 10)) + 1
+    leading = max(1, min(30, len(frames) // 10)) + 1
     later = frames[leading :: 1 + len(frames) // 1000]
     changed = ((np.abs(later - frame).max(-1) > _NOISE_LEVELS).mean((1, 2)) for frame in frames[:leading])
     unlike = np.sort(list(changed))  # (first frame, later frame), the most similar ones first
@@ -134,8 +133,8 @@ def _peak_contact_steps(steps: Iterable[Step], start: int) -> tuple[int, dict[st
     for step in remaining:
         if [touch.shape for touch in step[1]] != [frame.shape for frame in no_contact]:
             raise ImporterError("the gel images of its episode differ in size")
-        for each, picture in zip(thumbnails, (step[0], *step[1]), strict=True):
-            each.append(thumbnail(picture))
+        for of_camera, picture in zip(thumbnails, (step[0], *step[1]), strict=True):
+            of_camera.append(thumbnail(picture))
         change = sum(float(np.abs(touch - frame).mean()) for touch, frame in zip(step[1], no_contact, strict=True))
         if change > largest_change:
             strongest, largest_change = _copy_step(step), change

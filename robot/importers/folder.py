@@ -116,8 +116,8 @@ class _Pattern:
 
     def match(self, path: str) -> Words | None:
         """Return the words of a path that matches, with or without its suffix; the words of `*` are _1, _3, ..."""
-        found = self._expression.fullmatch(os.path.splitext(path)[0]) or self._expression.fullmatch(path)
-        return found.groupdict() if found else None
+        match = self._expression.fullmatch(os.path.splitext(path)[0]) or self._expression.fullmatch(path)
+        return match.groupdict() if match else None
 
 
 class _PatternMatches:

@@ -155,7 +155,11 @@ def import_items(
             if isinstance(item, Skip):
                 skip: Skip | None = item
             else:
-                finite = {key: value for key, value in item.fields.items() if not _is_infinite(value)}
+                finite = {
+                    key: value
+                    for key, value in item.fields.items()
+                    if not isinstance(value, float) or math.isfinite(value)
+                }
                 infinite += [key for key in item.fields if key not in finite]
                 skip = _append(writer, replace(item, fields=finite), names)
                 stored = writer.info.get("left_out", {})
@@ -179,8 +183,9 @@ def import_items(
                 f"{' ...' if len(left_out) > 5 else ''}; the next image is the first one used",
                 *notes,
             ]
-        counts = {reason: len(some) for reason, some in skipped.items()}
-        writer.update_info(objects=dict(objects), skipped=counts, notes=notes)
+        writer.update_info(
+            objects=dict(objects), skipped={reason: len(some) for reason, some in skipped.items()}, notes=notes
+        )
     recording = read_recording(out)
     return replace(recording, notes=(*recording.notes, *skips, *notes))
 
@@ -225,18 +230,14 @@ def _source_files(source: Path, out: Path, known: Mapping[str, list[Any]]) -> di
             name for name in folders if not is_system_name(name) and not os.path.samefile(Path(folder, name), out)
         ]
         paths += [path for name in names if not is_system_name(name) and (path := Path(folder, name)).is_file()]
-    found = {}
+    files = {}
     for path in sorted(paths):
         name = os.fsencode(path.relative_to(source) if path != source else path.name).decode(errors="backslashreplace")
         facts = [path.stat().st_size, path.stat().st_mtime_ns]
         stored = known.get(name, [])
         with contextlib.suppress(OSError):  # what cannot be read is no source
-            found[name] = stored if stored[:2] == facts else [*facts, file_digest(path)]
-    return found
-
-
-def _is_infinite(value: Any) -> bool:
-    return isinstance(value, float) and not math.isfinite(value)
+            files[name] = stored if stored[:2] == facts else [*facts, file_digest(path)]
+    return files
 
 
 def _readable(items: Iterable[Item | Skip]) -> Iterator[Item | Skip]:
@@ -301,8 +302,7 @@ def picture_bytes(column: str, source: Source) -> bytes:
     try:
         data, _ = file_content(column, _png_or_jpeg(image))
     except RecordingError as error:
-        required = "a readable picture of 8 bits (PNG, JPEG, BMP, TIFF, WebP)"
-        raise ImporterError(f"its {label} is not {required}") from error
+        raise ImporterError(f"its {label} is not a readable picture of 8 bits (PNG, JPEG, BMP, TIFF, WebP)") from error
     try:  # OpenCV fills what is missing with grey; what follows the picture, such as a film, is not read
         with Image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as picture:
             picture.draft(None, (1, 1))

@@ -144,7 +144,8 @@ class _LeRobotSource:
     def __init__(self, src: Path, touch: str, photo: str) -> None:
         self._av, self._arrow = import_extra("av", _WHAT), import_extra("pyarrow", _WHAT)
         self.src, self._info = src, _read_info(src / "meta" / "info.json")
-        kinds = {name: each.dtype for name, each in self._info.features.items() if each.dtype in ("video", "image")}
+        features = self._info.features.items()
+        kinds = {name: feature.dtype for name, feature in features if feature.dtype in ("video", "image")}
         self._kinds = kinds
         self.touch = (
             [name.strip() for name in touch.split(",")]

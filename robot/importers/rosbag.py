@@ -377,7 +377,7 @@ def _find_grasps(scan: _Scan, topics: _Topics, contact: float, settle_s: float) 
         return []
     # Everything is on the clock of the first finger: the other fingers' images nearest in time belong to its images.
     first = times[0]
-    numbers = [_nearest(own, first) for own in times]
+    numbers = [_nearest(of_finger, first) for of_finger in times]
     fingers = list(zip(topics.touch, numbers, strict=True))
     if topics.grasp:
         is_held = np.array([bool(scan.latest_value(topics.grasp, time_ns)) for time_ns in first.tolist()])
@@ -388,23 +388,23 @@ def _find_grasps(scan: _Scan, topics: _Topics, contact: float, settle_s: float) 
             return [reason]
     strength = np.sum([np.array(scan.changes[topic])[number] for topic, number in fingers], axis=0)
     photos = np.array(scan.times[topics.photo], np.int64)
-    clocks = [own[number] for own, number in zip(times, numbers, strict=True)]
-    found: list[_Grasp | str] = []
+    clocks = [of_finger[number] for of_finger, number in zip(times, numbers, strict=True)]
+    grasps: list[_Grasp | str] = []
     released = 0
     for start, stop in _intervals(first, is_held, int(settle_s * 1e9)):
         before = photos[(photos < first[start]) & ((photos >= first[released]) | (released == 0))]
         if start == released:
-            found.append("there is no gel image before its contact")
+            grasps.append("there is no gel image before its contact")
         elif not len(before):
-            found.append("there is no camera image between the previous grasp and its contact")
+            grasps.append("there is no camera image between the previous grasp and its contact")
         else:
             middle = (first[released] + first[start]) // 2
             rest = max(int(np.searchsorted(first, middle, "right")) - 1, released)
             peak = start + int(np.argmax(strength[start:stop]))
             no_contact, touch = (tuple(int(clock[at]) for clock in clocks) for at in (rest, peak))
-            found.append(_Grasp(int(before[-1]), no_contact, touch))
+            grasps.append(_Grasp(int(before[-1]), no_contact, touch))
         released = stop
-    return found
+    return grasps
 
 
 def _reference_error(changed: NDArray[np.float64], is_held: NDArray[np.bool_]) -> str:
@@ -443,7 +443,7 @@ def _items(
 ) -> Iterator[Item | Skip]:
     """Yield the grasps of a bag, in one more pass over its images; only those of one grasp are in memory."""
     places: dict[tuple[str, int], list[tuple[str, str]]] = defaultdict(list)
-    found: dict[str, tuple[str, dict[str, Any]]] = {}
+    facts_of: dict[str, tuple[str, dict[str, Any]]] = {}  # object and fields of a grasp
     with Bag(path) as bag:
         for number, grasp in enumerate(grasps, start=1):
             name = safe_name(bag.name, f"{number:03}")
@@ -456,7 +456,7 @@ def _items(
                 continue
             sequence = f"{bag.name}-{object_id}" if topics.object else bag.name
             facts = {"sequence_id": sequence, "time_s": (grasp.touch[0] - start_ns) / 1e9}
-            found[name] = str(object_id), {**facts, **_fields(grasp, scan, topics)}
+            facts_of[name] = str(object_id), {**facts, **_fields(grasp, scan, topics)}
             places[topics.photo, grasp.photo].append((name, "photo"))
             for finger, topic, rest, touch in zip(ascii_lowercase, topics.touch, *grasp[1:], strict=False):
                 places[topic, touch].append((name, f"touch_{finger}"))
@@ -467,14 +467,14 @@ def _items(
             for name, column in places.pop((topic, time_ns), ()):
                 images[name][column] = partial(lambda decode: picture_of(decode()), decode)
                 if len(images[name]) == 1 + 2 * len(topics.touch):
-                    object_id, fields = found.pop(name)
+                    object_id, fields = facts_of.pop(name)
                     yield Item(name, object_id, images.pop(name), fields, left_out)
 
 
 def _fields(grasp: _Grasp, scan: _Scan, topics: _Topics) -> dict[str, float]:
     """Return the time between the fingers' images, and opening and force at the touch, as far as they were recorded."""
-    found = {"touch_skew_s": (max(grasp.touch) - min(grasp.touch)) / 1e9} if len(grasp.touch) > 1 else {}
+    fields = {"touch_skew_s": (max(grasp.touch) - min(grasp.touch)) / 1e9} if len(grasp.touch) > 1 else {}
     number = scan.latest(topics.gripper, grasp.touch[0])
     if number is not None:
-        found |= {"opening_mm": scan.openings_mm[number], "force_n": scan.forces_n[number]}
-    return {key: value for key, value in found.items() if not np.isnan(value)}
+        fields |= {"opening_mm": scan.openings_mm[number], "force_n": scan.forces_n[number]}
+    return {key: value for key, value in fields.items() if not np.isnan(value)}

@@ -49,7 +49,7 @@ def read_attempts(folder: Path, grasp_ids: Set[str]) -> list[LoggedAttempt]:
 
 def _parse(path: Path, lines: Sequence[bytes], grasp_ids: Set[str]) -> list[LoggedAttempt]:
     attempts: list[LoggedAttempt] = []
-    made: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
     for number, line in enumerate(lines, start=1):
         try:
             attempt = typed(parse_object(line, RecordingError), LoggedAttempt, error=RecordingError)
@@ -59,12 +59,12 @@ def _parse(path: Path, lines: Sequence[bytes], grasp_ids: Set[str]) -> list[Logg
             if number == len(lines):
                 break
             raise RecordingError(f"{path}, line {number}: its grasp {attempt.grasp_id} is not in the recording")
-        if attempt.number != made[attempt.object_id]:
+        if attempt.number != counts[attempt.object_id]:
             raise RecordingError(
                 f"{path}, line {number}: attempts must be numbered in order, the next of {attempt.object_id} is "
-                f"{made[attempt.object_id]}, got {attempt.number}; restore the file"
+                f"{counts[attempt.object_id]}, got {attempt.number}; restore the file"
             )
-        made[attempt.object_id] += 1
+        counts[attempt.object_id] += 1
         attempts.append(attempt)
     return attempts
 
@@ -127,10 +127,10 @@ def acceptance_table(tallies: Sequence[Tally], grasps_target: int) -> str:
 
     Objects with fewer accepted grasps than `grasps_target` are marked "gave up", or show why they are ungraspable.
     """
-    width = max([len(each.object_id) for each in tallies] + [6])
+    width = max([len(counts.object_id) for counts in tallies] + [6])
     lines = [f"{'object':{width}}  accepted  of"]
-    for each in tallies:
-        gave_up = "  gave up" if each.accepted < grasps_target else ""
-        remark = f"  skipped: {each.skipped}" if each.skipped else gave_up
-        lines.append(f"{each.object_id:{width}}  {each.accepted:>8}  {each.attempts:>2}{remark}")
+    for counts in tallies:
+        gave_up = "  gave up" if counts.accepted < grasps_target else ""
+        remark = f"  skipped: {counts.skipped}" if counts.skipped else gave_up
+        lines.append(f"{counts.object_id:{width}}  {counts.accepted:>8}  {counts.attempts:>2}{remark}")
     return "\n".join(lines)

@@ -57,7 +57,6 @@ UNITS = {
     "touch_skew_s": "second between the fingers' images",
     "depth": "millimetre, uint16, 0 where unknown",
 }
-_FIXED_KEYS = ("source", "sensor", "units", "background")
 GRASP_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 
 
@@ -203,7 +202,7 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
         if not (self.folder / INFO_FILE).exists():
             self._write_info(expected)
         self.info = read_info(self.folder)
-        for key in _FIXED_KEYS:
+        for key in ("source", "sensor", "units", "background"):
             if (old := self.info.get(key)) != (new := expected.get(key)):
                 raise RecordingError(f"{self.folder} was recorded with {key} {old!r}, not {new!r}; give another folder")
         lines = self._lines.read()

@@ -18,7 +18,6 @@ _TABLE_TOLERANCE_MM = 6.0
 _MAX_SLOPE = 0.1
 _SAMPLES, _HYPOTHESES = 3000, 64
 _MIN_HEIGHT_MM, _MIN_PX, _MAX_POINTS = 5.0, 30, 900
-_FILTER_PX = 5
 
 
 @dataclass(frozen=True)
@@ -122,16 +121,15 @@ def find_object_points(
         PlanError: There is no object.
     """
     normal = np.array([-table.a, -table.b, 1.0])
-    start = float(normal @ rays.pose[:3, 3]) - table.c
-    above = np.asarray(depth_mm * rays.along(normal) + np.float32(start))  # the height of each pixel
+    camera_mm = np.float32(float(normal @ rays.pose[:3, 3]) - table.c)
+    above = np.asarray(depth_mm * rays.along(normal) + camera_mm)  # the height of each pixel
     min_height_mm = max(_MIN_HEIGHT_MM, 3.0 * table.noise_mm * rays.steepness)
     raised = (above > min_height_mm) & (above < _MAX_HEIGHT_MM)
     if region is not None:
         for axis in (0, 1):
             position = depth_mm * rays.along(np.eye(3)[axis]) + np.float32(rays.pose[axis, 3])
             raised &= (position >= region.lower[axis]) & (position <= region.upper[axis])
-    # The median filter removes single pixels.
-    candidates = cv2.medianBlur(raised.astype(np.uint8), _FILTER_PX)
+    candidates = cv2.medianBlur(raised.astype(np.uint8), 5)  # without single pixels
     _, labels, stats, _ = cv2.connectedComponentsWithStats(candidates, connectivity=8)
     sizes = stats[1:, cv2.CC_STAT_AREA]
     if sizes.max(initial=0) < _MIN_PX:

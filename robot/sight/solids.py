@@ -101,8 +101,8 @@ class Cuboid(Solid):
     def local_surface(self) -> tuple[Array, Array]:
         """Return points and normals of the four sides and the top."""
         u, v = _grid(np.linspace(-1, 1, 7), np.linspace(-1, 1, 7))
-        one, up = np.ones_like(u), 0.55 + 0.45 * v  # without the lowest tenth, next to the table
-        faces = [(one, u, up), (-one, u, up), (u, one, up), (u, -one, up), (u, v, one)]
+        end, up = np.ones_like(u), 0.55 + 0.45 * v  # without the lowest tenth, next to the table
+        faces = [(end, u, up), (-end, u, up), (u, end, up), (u, -end, up), (u, v, end)]
         points = np.concatenate([np.stack(face, axis=1) for face in faces]) * [*self.half, self.height]
         return points, np.repeat([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]], len(u), axis=0)
 
@@ -257,9 +257,9 @@ def _fit_visible_faces(local: Array, below: Array, low: Array, high: Array, eye:
         nearest = np.column_stack([gaps, np.abs(below)]).argmin(1)
         top = local[nearest == 4]
         for face, is_visible in enumerate((*(eye < low), *(eye > high))):
-            own = local[nearest == face, face % 2]
-            if is_visible and len(own) >= 10:
-                faces[face] = np.median(own)
+            places = local[nearest == face, face % 2]
+            if is_visible and len(places) >= 10:
+                faces[face] = np.median(places)
             elif not is_visible and len(top) >= 100:
                 faces[face] = np.quantile(top[:, face % 2], 0.005 if face < 2 else 0.995)
     return faces[:2], faces[2:]
@@ -283,8 +283,8 @@ def _best_yaw(plan: Array, side: Array, yaws: Array) -> float:
     return float(yaws[np.minimum(gap, 10.0).mean(-1).argmin()])
 
 
-def _subsample(points: Array, max_points: int = 300) -> Array:
-    return points[:: max(1, len(points) // max_points)]
+def _subsample(points: Array) -> Array:
+    return points[:: max(1, len(points) // 300)]
 
 
 def fit_lying_cylinder(points: Array, box: Cuboid, along_length: bool, eye: Array) -> LyingCylinder | None:

@@ -43,10 +43,10 @@ def encode(operation: Message) -> str:
 def decode(text: str | bytes) -> Message | None:
     """Return the operation in one websocket message, or None if it is invalid."""
     try:
-        found = msgspec.json.decode(text)
+        operation = msgspec.json.decode(text)
     except (msgspec.DecodeError, UnicodeError):
         return None
-    return found if isinstance(found, dict) and isinstance(found.get("op"), str) else None
+    return operation if isinstance(operation, dict) and isinstance(operation.get("op"), str) else None
 
 
 # The robot's messages -----------------------------------------------------------------------------------------
@@ -172,10 +172,10 @@ def _arm_joints(state: _JointState) -> Joints | None:
 
 def tip_of(message: Message, tip: str) -> Message:
     """Return the geometry_msgs/Pose of the named tip in an intera_core_msgs/EndpointStates."""
-    found = parse(message, _TipStates)
-    poses = dict(zip(found.names, found.states, strict=False))
+    tips = parse(message, _TipStates)
+    poses = dict(zip(tips.names, tips.states, strict=False))
     if tip not in poses:
-        known = ", ".join(found.names)
+        known = ", ".join(tips.names)
         raise DeviceError(f"the robot must report its tip {tip!r}, got {known}; set tip to one of these")
     return poses[tip].pose
 
@@ -210,10 +210,10 @@ def ik_answer(values: Message) -> Joints:
     """Parse the joints in the answer to `ik_request`; raise DeviceError if there is no solution."""
     answer = parse(values, _IKAnswer)
     kind = answer.result_type[0]
-    found = _arm_joints(answer.joints[0]) if kind > 0 else None
-    if found is None:
+    joints = _arm_joints(answer.joints[0]) if kind > 0 else None
+    if joints is None:
         raise DeviceError(f"IKService: {_IK_FAILURES.get(kind, f'no solution, result type {kind}')}")
-    return found
+    return joints
 
 
 # Poses of the hand --------------------------------------------------------------------------------------------
@@ -243,9 +243,9 @@ class Mount:
 
     def pose_of(self, tip: Mapping[str, Any]) -> Pose:
         """Return the pose of the fingertips for a tip's geometry_msgs/Pose; raise DeviceError if it is tilted."""
-        found = parse(tip, _TipPose)
-        place = np.array(msgspec.structs.astuple(found.position)) * 1000
-        quaternion = msgspec.structs.astuple(found.orientation)
+        pose = parse(tip, _TipPose)
+        place = np.array(msgspec.structs.astuple(pose.position)) * 1000
+        quaternion = msgspec.structs.astuple(pose.orientation)
         if abs(math.hypot(*quaternion) - 1.0) > 0.01:
             raise DeviceError(f"the robot's orientation must be a quaternion of length 1, got {quaternion}")
         turn = Rotation.from_quat(quaternion).as_matrix()

@@ -207,7 +207,7 @@ class RosbridgeLink:
 
 def _shorten(text: object) -> str:
     """Return the truncated text with unprintable characters escaped."""
-    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in str(text)[:_MAX_ERROR_CHARACTERS])
+    return "".join(char if char.isprintable() else repr(char)[1:-1] for char in str(text)[:_MAX_ERROR_CHARACTERS])
 
 
 # The arm ------------------------------------------------------------------------------------------------------

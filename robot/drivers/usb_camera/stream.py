@@ -46,7 +46,6 @@ _CLOSING_S = 5.0
 
 BACKOFF_S = 0.1, 5.0
 """First and longest wait before a lost stream is opened again."""
-_GRAB_LIMIT_S = 1
 _DAMAGED_IN_A_ROW = 10
 """Number of consecutive undecodable pictures that are skipped before the stream is considered lost."""
 
@@ -190,16 +189,18 @@ class CaptureStream:
         requested = {name: value for name in _PROPERTIES if (value := getattr(settings, name)) is not None}
         for name, value in requested.items():
             self._capture.set(_PROPERTIES[name].number, _PROPERTIES[name].to_camera(value))
-        actual = {name: self._read(each) for name, each in _PROPERTIES.items() if name != "led" or name in requested}
+        actual = {
+            name: self._read(setting) for name, setting in _PROPERTIES.items() if name != "led" or name in requested
+        }
         for name, value in requested.items():
             if not _PROPERTIES[name].is_applied(value, actual[name]):
                 reported = "no such setting" if actual[name] is None else _format_value(actual[name])
                 self.refused[name] = f"requested {_format_value(value)}, has {reported}"
         return actual
 
-    def _read(self, each: _Property) -> Any:
-        value = self._capture.get(each.number)
-        return None if value == -1 or not math.isfinite(value) else each.from_camera(value)
+    def _read(self, setting: _Property) -> Any:
+        value = self._capture.get(setting.number)
+        return None if value == -1 or not math.isfinite(value) else setting.from_camera(value)
 
     @contextlib.contextmanager
     def _errors(self) -> Any:
@@ -217,7 +218,7 @@ def _format_value(value: Any) -> str:
 
 def open_capture(device: str) -> Any:
     """Return OpenCV's capture of the camera at a path, resolved now, because the number behind a name may change."""
-    os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(_GRAB_LIMIT_S))
+    os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "1")  # in seconds
     if not Path(device).exists():
         raise DeviceError(f"{device} does not exist; is the camera plugged in?{_connected_cameras()}")
     return cv2.VideoCapture(os.path.realpath(device), cv2.CAP_V4L2)
