@@ -30,8 +30,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robot.errors import ImporterError, RecordingError
+from robot.extras import import_extra
 from robot.importers.episodes import MOMENT_SUFFIXES, Picture
-from robot.importers.importing import Progress, import_extra, picture_bytes
+from robot.importers.importing import Progress, picture_bytes
 from robot.importers.lerobot import DATA_PATH, EPISODES_PATH, VIDEO_PATH
 from robot.recording.folder import Recording
 from robot.recording.grasp import RecordedGrasp

@@ -31,8 +31,8 @@ from msgspec import Meta
 from _touch_retrieval.documents import Positive, typed
 from _touch_retrieval.registry import Registry
 from robot.devices import Actuator, Arm, Clock, Gripper
-from robot.drivers.packages import package_errors
 from robot.errors import DeviceError, RobotConfigError, UnknownName
+from robot.extras import package_errors
 from robot.readings import GripperState, Pose, Region
 
 ROBOTS: "Registry[Callable[..., Any]]" = Registry("robot", "robots", {}, error=UnknownName)

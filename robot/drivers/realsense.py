@@ -17,9 +17,9 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from robot.devices import Camera, Clock
-from robot.drivers.packages import import_package, package_errors
 from robot.drivers.usb_camera.stream import MAX_CAMERA_WAIT_S
 from robot.errors import DeviceError
+from robot.extras import import_extra, package_errors
 from robot.readings import RGBD, Intrinsics
 from robot.settings import TypedSettings
 
@@ -63,7 +63,7 @@ class RealSense(Camera):
         self._reported: dict[str, Any] = {}
 
     def _connect(self) -> None:
-        rs = import_package("pyrealsense2", "a RealSense camera", "realsense")
+        rs = import_extra("pyrealsense2", "a RealSense camera", "realsense", DeviceError)
         with package_errors("realsense cannot be started"):
             serial = self._choose(
                 [str(device.get_info(rs.camera_info.serial_number)) for device in rs.context().query_devices()]

@@ -21,6 +21,7 @@ from typing import Any
 import numpy.typing as npt
 
 from robot.errors import ImporterError
+from robot.extras import import_extra
 from robot.importers.importing import (
     NOT_STATED,
     DataSet,
@@ -28,7 +29,6 @@ from robot.importers.importing import (
     Item,
     Progress,
     Skip,
-    import_extra,
     import_items,
     natural_sort_key,
     numbered_files,

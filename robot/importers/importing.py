@@ -20,7 +20,6 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -340,13 +339,3 @@ def subfolders(parent: Path) -> list[Path]:
 def natural_sort_key(name: str) -> tuple[list[str | int], str]:
     """Return a sort key that compares digits as numbers."""
     return [int(part) if part.isascii() and part.isdigit() else part for part in re.split("([0-9]+)", name)], name
-
-
-def import_extra(name: str, purpose: str) -> Any:
-    """Import a package of the extra `importers`; raise ImporterError that names `purpose`, the format, without it."""
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise ImporterError(
-            f"{purpose} needs {name}, which is missing; run pip install 'touch-retrieval[importers]'"
-        ) from error

@@ -26,6 +26,7 @@ import msgspec
 
 from _touch_retrieval.text import decode_text
 from robot.errors import ImporterError
+from robot.extras import import_extra
 from robot.importers.episodes import Picture, Step, episode_images
 from robot.importers.importing import (
     NOT_STATED,
@@ -33,7 +34,6 @@ from robot.importers.importing import (
     Item,
     Progress,
     Skip,
-    import_extra,
     import_items,
 )
 from robot.recording.folder import Recording, safe_name

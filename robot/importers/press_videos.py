@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from _touch_retrieval.documents import Count, typed
 from robot.errors import ImporterError
+from robot.extras import import_extra
 from robot.importers.episodes import NO_USABLE_FRAME, first_usable, thumbnail
-from robot.importers.importing import DataSet, Item, Progress, Skip, import_extra, import_items
+from robot.importers.importing import DataSet, Item, Progress, Skip, import_items
 from robot.recording.folder import Recording, SharedImage, safe_name
 
 WHAT = "a video"

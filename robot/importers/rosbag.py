@@ -43,6 +43,7 @@ from numpy.typing import NDArray
 from _touch_retrieval.documents import NonNegative, typed
 from _touch_retrieval.names import is_system_name
 from robot.errors import ImporterError
+from robot.extras import import_extra
 from robot.grasping.gates import ContactAreaGate, GraspFrames
 from robot.importers.episodes import NO_USABLE_FRAME, first_usable, thumbnail
 from robot.importers.importing import (
@@ -52,7 +53,6 @@ from robot.importers.importing import (
     Progress,
     Skip,
     Source,
-    import_extra,
     import_items,
     numbered_files,
 )

@@ -32,7 +32,6 @@ import numpy as np
 from msgspec import Meta
 
 from robot.devices import Arm, Clock
-from robot.drivers.packages import import_package
 from robot.drivers.sawyer import codec
 from robot.drivers.sawyer.codec import (
     Joints,
@@ -46,6 +45,7 @@ from robot.drivers.sawyer.codec import (
     waypoints,
 )
 from robot.errors import DeviceError
+from robot.extras import import_extra
 from robot.readings import Pose, Region
 from robot.settings import TypedSettings
 
@@ -77,7 +77,7 @@ class RosbridgeLink:
 
     def open(self) -> None:
         """Connect, once only, or raise DeviceError; a closed link cannot be opened again."""
-        connect = import_package("websockets.sync.client", "rosbridge", "sawyer").connect
+        connect = import_extra("websockets.sync.client", "rosbridge", "sawyer", DeviceError).connect
         try:
             connection = connect(
                 self.url,

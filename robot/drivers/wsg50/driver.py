@@ -31,7 +31,6 @@ from typing import Annotated, Any, TypeVar
 from msgspec import Meta
 
 from robot.devices import Clock, Gripper
-from robot.drivers.packages import import_package
 from robot.drivers.wsg50 import codec
 from robot.drivers.wsg50.codec import (
     MAX_PAYLOAD,
@@ -47,6 +46,7 @@ from robot.drivers.wsg50.codec import (
     encode,
 )
 from robot.errors import DeviceError, RobotConfigError
+from robot.extras import import_extra
 from robot.readings import GripperState, GripperStatus
 from robot.settings import TypedSettings
 
@@ -109,7 +109,7 @@ class Link:
         """Open the port if it is closed; send nothing."""
         if self._port is not None:
             return
-        serial = import_package("serial", "a WSG-50", "gripper")
+        serial = import_extra("serial", "a WSG-50", "gripper", DeviceError)
         try:
             self._port = serial.serial_for_url(
                 self.name,

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, cKDTree
 
 from robot.errors import SceneError
+from robot.extras import import_extra
 from robot.sim.objects.appearance import draw_appearance
 from robot.sim.objects.body import Body, Vectors
 from robot.sim.objects.draw import SimObject
@@ -56,8 +57,7 @@ class Mesh:
     @cached_property
     def solid(self) -> Any:
         """The same as a `trimesh.Trimesh`, whose volume is positive if the faces point outwards."""
-        trimesh, _ = _import_packages()
-        return trimesh.Trimesh(self.vertices, self.faces, process=False)
+        return _import_package("trimesh").Trimesh(self.vertices, self.faces, process=False)
 
     def rest_on_table(self, up: Vectors) -> "Mesh":
         """Return the mesh turned until the unit direction `up` is vertical, centred, with its lowest point at z = 0."""
@@ -95,7 +95,7 @@ class MeshBody(Body):
     @cached_property
     def _caster(self) -> Any:
         """Embree's tree over the faces; it casts on one thread."""
-        return _import_packages()[1](self.mesh.solid)
+        return _import_package("trimesh.ray.ray_pyembree").RayMeshIntersector(self.mesh.solid)
 
     @cached_property
     def _samples(self) -> tuple[cKDTree, Vectors, Vectors]:
@@ -257,17 +257,8 @@ def object_prefix(file: Path) -> str:
     return f"mesh.{re.sub(r'[^A-Za-z0-9._]+', '_', file.stem)}-"
 
 
-def _import_packages() -> tuple[Any, Any]:
-    """Return trimesh and its ray caster on embree. Raise SceneError if one is missing."""
-    try:
-        import trimesh
-        from trimesh.ray.ray_pyembree import RayMeshIntersector
-    except ImportError as error:
-        raise SceneError(
-            f"meshes need trimesh and embreex; {error.name or error} is missing. "
-            "Run pip install 'touch-retrieval[mesh]'"
-        ) from error
-    return trimesh, RayMeshIntersector
+def _import_package(name: str) -> Any:
+    return import_extra(name, "a mesh", "mesh", SceneError)
 
 
 def _read(file: Path) -> tuple[Vectors, Faces]:
@@ -275,7 +266,8 @@ def _read(file: Path) -> tuple[Vectors, Faces]:
     kind = file.suffix.lower().lstrip(".")
     if kind not in FORMATS:
         raise SceneError(f"a mesh must be a file of {', '.join(FORMATS)}, got {file.name!r}")
-    trimesh, _ = _import_packages()
+    _import_package("trimesh.ray.ray_pyembree")  # the rig needs it later
+    trimesh = _import_package("trimesh")
     try:
         # From memory and without a resolver: the reader cannot open files that the mesh names.
         data = io.BytesIO(file.read_bytes())

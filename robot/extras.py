@@ -1,22 +1,22 @@
-"""Packages that only one driver needs: their import, and their exceptions as DeviceError."""
+"""Packages that only one driver or importer needs: their import, and their exceptions as DeviceError."""
 
 import contextlib
 from collections.abc import Iterator
 from importlib import import_module
 from typing import Any
 
-from robot.errors import DeviceError
+from robot.errors import DeviceError, ImporterError, RobotError
 
 
-def import_package(name: str, device: str, extra: str) -> Any:
-    """Import the module `name`, which `device` requires and `extra` installs; raise DeviceError if it is missing."""
+def import_extra(name: str, purpose: str, extra: str = "importers", error: type[RobotError] = ImporterError) -> Any:
+    """Import the module `name`, which `purpose` needs and `extra` installs; raise `error` without it."""
     try:
         return import_module(name)
-    except ImportError as error:
-        raise DeviceError(
-            f"{device} requires {name}, which is missing or incomplete ({error}); run pip install "
+    except ImportError as cause:
+        raise error(
+            f"{purpose} needs {name}, which is missing or incomplete ({cause}); run pip install "
             f"'touch-retrieval[{extra}]'"
-        ) from error
+        ) from cause
 
 
 @contextlib.contextmanager
