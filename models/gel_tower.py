@@ -31,6 +31,7 @@ from models.random_surfaces import RandomSurface, presses
 from retrieval.console.memory import keep_freed_memory
 from retrieval.console.output import say
 from retrieval.console.progress import Bar
+from retrieval.data.card import LIBRARY, card_header
 from retrieval.data.images import read_rgb
 from retrieval.data.resize import resize, to_float
 from retrieval.errors import JobInterrupted
@@ -279,6 +280,7 @@ class GelTowerTraining(Dataset[Batch]):
     def card(self, steps: int) -> str:
         """Return the text that describes the tower."""
         lines = (
+            *card_header("MIT", library_name=LIBRARY, datasets=["simulated-presses"]),
             "# gel-tower.safetensors",
             "",
             "Touch tower for real gels. Tower `mobilenet_v2`, output `stages`, from ImageNet weights.",

@@ -29,9 +29,10 @@ from models.labels import LabelTrainer
 from models.pictures import collect_pictures, load_object_labels, load_pictures
 from retrieval.commands.main import main as run_command
 from retrieval.console.memory import keep_freed_memory
-from retrieval.data.dataset import Grasp, Split, data_digest, load_grasps
+from retrieval.data.dataset import LICENCES, Grasp, Split, data_digest, load_grasps
 from retrieval.methods.late_fusion import frozen_matcher, trained_checkpoint
 from retrieval.methods.method import MethodSettings
+from retrieval.model.card import SHIPPED_DATA
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint, write_tensors
 from retrieval.model.config import Config, load_config
 from retrieval.model.encode import default_device, one_thread
@@ -318,9 +319,13 @@ def distilled(made: Checkpoint, train: Features, validation: Features) -> Checkp
 
 
 def store(made: Checkpoint, out: Path) -> None:
-    """Write a checkpoint as float16, without the paths of its first weights on this machine."""
+    """Write a checkpoint as float16, with its licence, without the paths of its first weights on this machine."""
     training = dataclasses.replace(made.config.training, init="imagenet", init_photo="", init_touch="")
-    made = dataclasses.replace(made, config=dataclasses.replace(made.config, training=training))
+    made = dataclasses.replace(
+        made,
+        config=dataclasses.replace(made.config, training=training),
+        provenance=made.provenance | {LICENCES: [dataclasses.asdict(SHIPPED_DATA)]},
+    )
     made.matcher.half()  # halves the file; loading converts the weights to float32
     store_checkpoint(made, out)
 

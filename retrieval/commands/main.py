@@ -35,7 +35,7 @@ _BAD_PATH_ERRNOS = {
 GROUPS = ("rig",)
 COMMANDS = (
     *("demo", "collect", "import", "export-recording", "check", "train", "build-index", "enrol", "query"),
-    *("verify", "identify", "export", "evaluate", "frontier", "serve", *GROUPS),
+    *("verify", "identify", "export", "push", "evaluate", "frontier", "serve", *GROUPS),
 )
 KEEP_FREED_MEMORY = {"train", "build-index", "evaluate"}
 """Commands that compute with large tensors until they end."""

@@ -26,7 +26,8 @@ IndexModel = Annotated[str | None, typer.Option(help="checkpoint (default: that 
 Model = Annotated[
     str | None,
     typer.Option(
-        help=f"checkpoint file, or shipped or shipped-one-finger for those of the package (default: {DEFAULT_MODEL})"
+        help="checkpoint file, hf://USER/NAME[@REVISION] on the Hugging Face Hub, or shipped or shipped-one-finger for "
+        f"those of the package (default: {DEFAULT_MODEL})"
     ),
 ]
 Init = Annotated[

@@ -19,8 +19,10 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from _touch_retrieval.files import write_atomically
-from retrieval.data.dataset import Split, stored_licences
+from retrieval.data.dataset import Split
+from retrieval.data.hub import local_file
 from retrieval.errors import BadInput, CheckpointError
+from retrieval.model.card import model_card
 from retrieval.model.checkpoint_info import (
     FORMAT,
     HEADER,
@@ -32,7 +34,6 @@ from retrieval.model.checkpoint_info import (
     unusable,
 )
 from retrieval.model.fusion import GelHead, Matcher
-from retrieval.model.verification import CARD_FAR
 from retrieval.version import __version__
 
 _QUERIES = "queries.touch_partials"
@@ -84,7 +85,9 @@ def store_checkpoint(checkpoint: Checkpoint, path: Path) -> None:
     if checkpoint.queries is not None:
         state[_QUERIES] = torch.from_numpy(checkpoint.queries)
     write_tensors(path, state, header)
-    write_atomically(sibling_file(path, ".md"), _model_card(path.name, checkpoint).encode(errors="replace"))
+    write_atomically(
+        sibling_file(path, ".md"), model_card(path.name, checkpoint, checkpoint.split).encode(errors="replace")
+    )
 
 
 def require_writable(path: Path) -> None:
@@ -108,11 +111,12 @@ def load_checkpoint(path: str | Path, *, digest: str | None = None) -> Checkpoin
     """Read a checkpoint.
 
     Args:
-        path: The .safetensors file.
+        path: The .safetensors file, or `hf://USER/NAME[@REVISION]` on the Hugging Face Hub.
         digest: SHA-256 (hex) of the file, if it was already verified. Digest and checksum are then not computed again.
 
     Raises:
         CheckpointError: The file is missing, damaged or unusable. The message names the remedy.
+        RetrievalError: The Hub cannot be reached, or does not have the file.
 
     >>> retrieval.load_checkpoint("model.safetensors").config.matcher.fingers
     2
@@ -120,7 +124,7 @@ def load_checkpoint(path: str | Path, *, digest: str | None = None) -> Checkpoin
     Traceback (most recent call last):
     retrieval.errors.CheckpointError: there is no checkpoint at none.safetensors; `retrieve train` makes one
     """
-    path = Path(path)
+    path = local_file(path)
     state, header = read_tensors(path, check=digest is None)
     info = checkpoint_info(path, header, digest)
     queries = state.pop(_QUERIES, None)
@@ -187,36 +191,3 @@ def tensors_digest(state: Mapping[str, Tensor], description: str) -> str:
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
         digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()
-
-
-def _model_card(name: str, checkpoint: Checkpoint) -> str:
-    config, provenance, split = checkpoint.config, checkpoint.provenance, checkpoint.split
-    lines = [
-        f"# {name}",
-        "",
-        f"Matches touches of {config.matcher.fingers} gel image(s) with photos. Tower `{config.matcher.tower}`, "
-        f"output `{config.matcher.tower_output}`.",
-        "",
-        f"* Trained on: {provenance['source']} (data digest `{provenance['data_digest'][:16]}`)",
-        f"* Best step: {provenance['step']} of {config.training.iterations}, seed {config.training.seed}",
-    ]
-    lines += [f"* Licence of the data of {each.source}: {each}" for each in stored_licences(provenance)]
-    if split:
-        lines.append(f"* Objects: {len(split.train)} train, {len(split.validation)} validation, {len(split.test)} test")
-    for key, value in provenance["metrics"].items():
-        lines.append(f"* {key.replace('_', ' ')}: {value:.4g}" if isinstance(value, float) else f"* {key}: {value}")
-    if posterior := checkpoint.posterior:
-        lines.append(
-            f"* Probabilities: fitted on {posterior.tests} sets of validation touches; slope {posterior.slope:.3f}, "
-            f"offset {posterior.offset:.3f}, dependence of grasps {posterior.dependence:.3f}"
-        )
-    if checkpoint.verification:
-        rate = checkpoint.verification.bounds(CARD_FAR).false_rejects
-        lines.append(
-            f"* Verification at a false-accept rate of {CARD_FAR:g}: false-reject rate {rate.value:.3f} "
-            f"[{rate.low:.3f}, {rate.high:.3f}]"
-        )
-    if check := checkpoint.gel_check:
-        rates = [f"{name.replace('_', ' ')} {value:.3f}" for name, value in check.rates.items()]
-        lines.append(f"* Check of gel images, on validation objects: {', '.join(rates)}")
-    return "\n".join(lines) + "\n"

@@ -9,6 +9,7 @@ from safetensors import SafetensorError, safe_open
 
 from _touch_retrieval.documents import typed
 from _touch_retrieval.files import file_digest, open_regular, parse_json
+from retrieval.data.hub import local_file
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.config import Config
 from retrieval.model.fusion_scorer import FusionScorer
@@ -89,12 +90,13 @@ def fingerprint(checkpoint: CheckpointInfo) -> dict[str, str]:
     return {"checkpoint": checkpoint.digest, "preprocessing": checkpoint.config.preprocessing.digest()}
 
 
-def read_checkpoint_info(path: Path) -> CheckpointInfo:
-    """Read the header of a checkpoint; its weights are neither read nor checked.
+def read_checkpoint_info(path: str | Path) -> CheckpointInfo:
+    """Read the header of a checkpoint, perhaps of one on the Hub; its weights are neither read nor checked.
 
     Raises:
         CheckpointError: The file is missing, or not a checkpoint of this version.
     """
+    path = local_file(path)
     return checkpoint_info(path, read_header(path))
 
 

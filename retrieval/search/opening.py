@@ -17,6 +17,7 @@ from indexes.store.sharded import (
     read_sharded_manifest,
     shard_folder,
 )
+from retrieval.data.hub import local_file
 from retrieval.errors import CheckpointError
 from retrieval.indexing.enrolled import EnrolledTable
 from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_checkpoint_info
@@ -32,7 +33,8 @@ def find_model(choice: str | None, index: str | Path = INDEX) -> tuple[Path, str
     """Return the checkpoint to use, and the reason.
 
     Args:
-        choice: A path or one of `SHIPPED_NAMES`; None for the checkpoint of `index`, else the shipped one.
+        choice: A path, an address on the Hub or one of `SHIPPED_NAMES`; None for the checkpoint of `index`, else the
+            shipped one.
         index: Index folder or sharded index.
 
     Raises:
@@ -41,7 +43,7 @@ def find_model(choice: str | None, index: str | Path = INDEX) -> tuple[Path, str
     if choice in SHIPPED_NAMES:
         return shipped_model(SHIPPED_NAMES[choice]), "shipped; trained on the simulated rig"
     if choice is not None:
-        return Path(choice), "given"
+        return local_file(choice), "given"
     manifest = None
     with suppress(IndexesError):  # an unusable index is ignored
         manifest = manifest_of(index)
@@ -130,7 +132,7 @@ def checkpoint_of(manifest: Manifest | ShardedManifest, model: str | Path | None
     Raises:
         CheckpointError: The checkpoint is missing or damaged.
     """
-    stored = read_checkpoint_info(Path(model) if model else model_of(manifest))
+    stored = read_checkpoint_info(model or model_of(manifest))
     if stored.digest != manifest.fingerprint.get("checkpoint"):
         from retrieval.model.checkpoint import load_checkpoint
 

@@ -16,20 +16,19 @@ from retrieval.data.dataset import (
     data_digest,
     recording_licence,
     recording_source,
-    stored_licences,
 )
 from retrieval.errors import CheckpointError
+from retrieval.model.card import SHIPPED_DATA, checkpoint_licences
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.model.checkpoint_info import CheckpointInfo, read_checkpoint_info
+from retrieval.model.checkpoint_info import read_checkpoint_info
 from retrieval.model.config import Config, TrainingConfig
 from retrieval.model.fusion import Matcher
-from retrieval.model.shipped import is_shipped, shipped_model
+from retrieval.model.shipped import shipped_model
 from retrieval.model.towers import TOWER_SEPARATOR
 from retrieval.model.towers.weights import GEL, SHIPPED
 
 TOWER_WEIGHTS = ("touch_tower.", "photo_tower.")
 """Prefixes of the names of the towers' weights in a matcher."""
-_SHIPPED = DataLicence("simulated objects of the shipped models", "MIT", "as touch-retrieval")
 
 
 def with_available_weights(config: Config) -> Config:
@@ -118,7 +117,7 @@ def training_licences(recording: Path, settings: TrainingConfig) -> list[DataLic
     else:
         inits = {settings.tower_init(init) for init in (settings.init_touch, settings.init_photo)}
         for name in sorted({part for init in inits for part in init.split(TOWER_SEPARATOR)} - {"random", "imagenet"}):
-            found.append(_SHIPPED if name in (SHIPPED, GEL) else DataLicence(name))
+            found.append(SHIPPED_DATA if name in (SHIPPED, GEL) else DataLicence(name))
     return list(dict.fromkeys(found))
 
 
@@ -129,9 +128,3 @@ def made_from(recording: Path, grasps: Iterable[Grasp], licences: Iterable[DataL
         LICENCES: [dataclasses.asdict(licence) for licence in dict.fromkeys(licences)],
         "data_digest": data_digest(grasps),
     }
-
-
-def checkpoint_licences(info: CheckpointInfo) -> list[DataLicence]:
-    """Return the licences that a checkpoint lists; for one of an older version, that its licence is not stated."""
-    unlisted = _SHIPPED if is_shipped(info.path) else DataLicence(str(info.provenance.get("source", info.path)))
-    return stored_licences(info.provenance) or [unlisted]

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import ClassVar
 
 from retrieval.data.dataset import DataLicence, Grasp, Split, make_split, recording_licence
+from retrieval.model.card import checkpoint_licences
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
 from retrieval.training.features import Features
-from retrieval.training.initial_weights import build_matcher, checkpoint_licences, training_licences, weights_of
+from retrieval.training.initial_weights import build_matcher, training_licences, weights_of
 from retrieval.training.linear import available_config, fit_linear
 from retrieval.training.selection import held_out_folds
 from retrieval.training.trainer import Trainer

@@ -8,10 +8,11 @@ import onnx
 import pytest
 
 from retrieval.data.dataset import DataLicence, recording_licence, stored_licences
+from retrieval.model.card import checkpoint_licences
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.export import touch_encoder_to_onnx
 from retrieval.model.shipped import shipped_model
-from retrieval.training.initial_weights import checkpoint_licences, training_licences
+from retrieval.training.initial_weights import training_licences
 from retrieval.training.trainer import train_matcher
 from tests.conftest import TINY
 
