@@ -60,9 +60,10 @@ class Registry(dict[str, str], Generic[T]):
         if place is None:
             place, (module, _, attribute) = name, name.partition(":")
             if not module or not attribute:
+                known = ", ".join(self.names()) or "(none installed)"
                 raise self._error(
-                    f"{self.noun} must be one of {', '.join(self.names())}; got {name!r}. Give module:Class for your "
-                    f"own, or install a package that adds one by an entry point of the group {self.group}"
+                    f"{self.noun} must be one of {known}; got {name!r}. Give module:Class for your own, or install a "
+                    f"package that adds one by an entry point of the group {self.group}"
                 )
             if not imports and module not in sys.modules:
                 raise self._error(

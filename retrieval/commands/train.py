@@ -21,6 +21,7 @@ from retrieval.training.recipes import RECIPES
 
 if TYPE_CHECKING:
     from retrieval.model.config import Config
+    from retrieval.training.loop import OnStep
 
 
 def train(
@@ -53,6 +54,10 @@ def train(
     ] = None,
     iterations: Iterations = None,
     split: SplitFile = None,
+    tracker: Annotated[
+        str | None,
+        typer.Option(help="report each step to a tracker that a package registers, or to module:function of yours"),
+    ] = None,
     cluster: Annotated[
         bool,
         typer.Option(
@@ -71,12 +76,14 @@ def train(
         raise BadInput("--cluster needs --config, and --workers needs --cluster")
     require_writable(out)
     if task == "grasp-success":
-        others = {"recipe": recipe, "model": model, "config": config, "split": split, "init": init}
+        others = {"recipe": recipe, "model": model, "config": config, "split": split, "init": init, "tracker": tracker}
         refuse_options("does not apply to --task grasp-success, which takes --iterations", **others)
         _train_gate(recording, out, iterations)
     elif config is not None:
         refuse_options("does not apply with --config", recipe=recipe, model=model, task=task != "match")
-        _train_with_config(recording, out, training_config(config, iterations, init=init), split, cluster, workers or 2)
+        refuse_options("does not apply with --cluster", tracker=cluster and tracker)
+        settings = training_config(config, iterations, init=init)
+        _train_with_config(recording, out, settings, split, cluster, workers or 2, tracker)
     else:
         refuse_options("needs --config", iterations=iterations)
         from retrieval.data.check.recording import check_gel_layout
@@ -86,10 +93,20 @@ def train(
         for finding in check_gel_layout(recording):
             say(f"{finding.severity}: {finding.message}")
         options: dict[str, Any] = {"recipe": recipe, "model": model, "init": init or "imagenet"}
+        options["on_step"] = _tracked(tracker, out)
         if task == "touches":
-            refuse_options("does not apply to --task touches", recipe=recipe, model=model)
+            refuse_options("does not apply to --task touches", recipe=recipe, model=model, tracker=tracker)
         made = train_model(recording, out, touches_only=task == "touches", split=read_split(split), **options)
         print_comparison(made)
+
+
+def _tracked(tracker: str | None, out: Path) -> "OnStep | None":
+    if tracker is None:
+        return None
+    from retrieval.training.trackers import TRACKERS
+
+    on_step: OnStep = TRACKERS.resolve(tracker)(out)
+    return on_step
 
 
 def _train_gate(recording: Path, out: Path, iterations: int | None) -> None:
@@ -114,7 +131,13 @@ def _train_gate(recording: Path, out: Path, iterations: int | None) -> None:
 
 
 def _train_with_config(
-    recording: Path, out: Path, settings: "Config", split: Path | None, cluster: bool, workers: int
+    recording: Path,
+    out: Path,
+    settings: "Config",
+    split: Path | None,
+    cluster: bool,
+    workers: int,
+    tracker: str | None,
 ) -> None:
     from retrieval.training import distributed
     from retrieval.training.initial_weights import training_licences
@@ -128,7 +151,8 @@ def _train_with_config(
 
             checkpoint = train_on_ray(recording, out, settings, workers=workers, split=read_split(split))
         else:
-            checkpoint = train_matcher(recording, out, settings, split=read_split(split))
+            on_step = _tracked(tracker, out)
+            checkpoint = train_matcher(recording, out, settings, split=read_split(split), on_step=on_step)
         if distributed.rank():
             return
     finally:

@@ -26,6 +26,7 @@ from retrieval.model.encode import one_thread
 from retrieval.model.shipped import shipped_model
 from retrieval.training.calibration import ScoredTouches, score_touches, with_calibrations, with_sensor_calibrations
 from retrieval.training.features import Features, encode_recording
+from retrieval.training.loop import OnStep
 from retrieval.training.recipes import RECIPES
 from retrieval.training.recipes.recipe import Problem, Recipe
 from retrieval.training.selection import (
@@ -118,11 +119,13 @@ def pose(
     model: str | Path | Checkpoint | None = None,
     init: str = "imagenet",
     quiet: bool = False,
+    on_step: OnStep | None = None,
 ) -> Problem:
     """Return the problem of grasps of a recording; unfinished parts are stored in `folder`."""
     fingers = finger_count(grasps)
     start = model if isinstance(model, Checkpoint) else load_checkpoint(model or shipped_model(min(fingers, 2)))
-    return Problem(grasps, fingers, start, init, object_kinds(recording), linked_objects(grasps), folder, quiet)
+    kinds, linked = object_kinds(recording), linked_objects(grasps)
+    return Problem(grasps, fingers, start, init, kinds, linked, folder, quiet, on_step)
 
 
 # Touches of held-out objects -------------------------------------------------------------------------------

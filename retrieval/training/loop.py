@@ -24,6 +24,9 @@ from retrieval.model.config import SCHEDULES
 from retrieval.training import distributed
 
 Batch = TypeVar("Batch")
+OnStep = Callable[[int, dict[str, float]], object]
+"""Called after each step with the number of completed steps, and `loss`, `learning_rate` and the metrics of a
+validation after this step; with 0 and the metrics alone before the first step. Its result is ignored."""
 RATE = "rate"
 """Key of a parameter group: the ratio of its learning rate to that of the plan; 1 without this key."""
 _MODULE, _OPTIMIZER, _BEST = "module.", "optimizer.", "best."
@@ -96,6 +99,7 @@ def train_loop(
     validate: Callable[[], dict[str, float]] | None = None,
     state: StateFile | None = None,
     step_context: Callable[[], AbstractContextManager[Any]] = nullcontext,
+    on_step: OnStep | None = None,
 ) -> BestStep:
     """Minimise the loss of batches, one batch a step, and leave the weights of the best step in `module`.
 
@@ -115,6 +119,7 @@ def train_loop(
         validate: Returns the metrics of `BestStep`, and leaves the module in training mode.
         state: Where an unfinished run is stored; None for a short run.
         step_context: Context of each step.
+        on_step: Called on the first rank.
 
     Raises:
         NumericalError: The loss is not finite; no parameter has changed in this step.
@@ -126,15 +131,18 @@ def train_loop(
         with suppress(CheckpointError) if state.is_replaceable else nullcontext():
             done, best, best_weights = _load(state, module, optimizer)
     is_stopped = False
+    tell: OnStep = on_step if on_step and not distributed.rank() else lambda *_: None
     with (
         interruption() if state else nullcontext(threading.Event()) as stop,
         Bar(title, plan.steps, "steps", done=done, quiet=quiet) as bar,
     ):
         if validate and not done and (metrics := validate()):
             best, best_weights = BestStep(0, metrics), _copied(module)
+            tell(0, metrics)
         for batch in batches(range(done, plan.steps)):
+            rate = plan.learning_rate * SCHEDULES[plan.schedule](done, plan.steps)
             for group in optimizer.param_groups:
-                group["lr"] = plan.learning_rate * group.get(RATE, 1.0) * SCHEDULES[plan.schedule](done, plan.steps)
+                group["lr"] = rate * group.get(RATE, 1.0)
             with step_context():
                 optimizer.zero_grad(set_to_none=True)
                 current = loss(done, batch)
@@ -151,8 +159,10 @@ def train_loop(
             bar.advance(note="".join([f"loss {value:.3f}", *scores[:1]]))
             # All ranks must stop after the same step, or the remaining ranks would wait forever.
             is_stopped = state is not None and distributed.any_rank(stop.is_set(), current.device)
+            values = {"loss": value, "learning_rate": rate}
             if is_stopped or done % plan.validate_every == 0 or done == plan.steps:
                 reached = BestStep(done, validate() if validate else {})
+                values |= reached.metrics
                 if not reached.metrics:
                     best = reached
                 elif not best.metrics or next(iter(reached.metrics.values())) > next(iter(best.metrics.values())):
@@ -161,6 +171,7 @@ def train_loop(
                     if not distributed.rank():
                         _save(state, module, optimizer, done, best, best_weights)
                     distributed.any_rank(False, current.device)  # all ranks wait here until the file is written
+            tell(done, values)
             if is_stopped:
                 break
     if best_weights:

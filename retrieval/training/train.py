@@ -11,6 +11,7 @@ from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writ
 from retrieval.model.config import Config
 from retrieval.training.choice import fit_best, pose
 from retrieval.training.initial_weights import made_from
+from retrieval.training.loop import OnStep
 from retrieval.training.recipes.recipe import Recipe
 from retrieval.training.touches import fit_to_touches
 from retrieval.training.trainer import train_matcher
@@ -27,6 +28,7 @@ def train(
     touches_only: bool = False,
     split: Split | None = None,
     quiet: bool = False,
+    on_step: OnStep | None = None,
 ) -> Checkpoint:
     """Train a model on a recording and write the checkpoint `out`.
 
@@ -46,6 +48,10 @@ def train(
         touches_only: Whether the model compares touches with touches, as always for a recording without photos.
         split: A split whose test objects are not used at all; with `config`, also the training and validation objects.
         quiet: No progress on stderr.
+        on_step: Called after each step of a head or tower: with the number of completed steps, and `loss`,
+            `learning_rate` and, after a validation, its metrics. Before the first step it gets 0 and the metrics. With
+            recipes it is told of the final fit only; the recipes `start` and `linear`, and models of touches only,
+            have no steps.
 
     Raises:
         DatasetError: The recording cannot be read.
@@ -71,7 +77,7 @@ def train(
     if config is not None:
         if recipe is not None or model is not None or touches_only:
             raise BadInput("A configuration trains without recipe and start model; leave out either.")
-        return train_matcher(recording, out, config, split=split, quiet=quiet)
+        return train_matcher(recording, out, config, split=split, quiet=quiet, on_step=on_step)
     require_writable(out)
     recording, parts = folder_of(recording), sibling_file(out, ".parts")
     grasps = load_grasps(recording)
@@ -79,7 +85,7 @@ def train(
         require_fit(split, grasps)
         grasps = [grasp for grasp in grasps if grasp.object_id not in split.test]
     if not touches_only and any(grasp.photos for grasp in grasps):
-        problem = pose(recording, grasps, parts, model=model, init=init, quiet=quiet)
+        problem = pose(recording, grasps, parts, model=model, init=init, quiet=quiet, on_step=on_step)
         fitted, licences = fit_best(recording, problem, recipe)
     elif recipe is not None or model is not None:
         raise BadInput("A model of touches only has one way to be trained. Leave recipe and start model out.")

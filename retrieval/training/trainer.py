@@ -61,6 +61,7 @@ from retrieval.training.initial_weights import (
 )
 from retrieval.training.loop import (
     RATE,
+    OnStep,
     Plan,
     StateFile,
     TrainingInterrupted,
@@ -77,6 +78,7 @@ def train_matcher(
     *,
     split: Split | None = None,
     quiet: bool = False,
+    on_step: OnStep | None = None,
 ) -> Checkpoint:
     """Train on a recording and write the checkpoint with the best validation score to `out`.
 
@@ -85,7 +87,7 @@ def train_matcher(
     `config` this function takes.
     """
     distributed.start()
-    return prepare_run(folder_of(recording), out, named_config(config)[0], split).run(quiet)
+    return prepare_run(folder_of(recording), out, named_config(config)[0], split).run(quiet, on_step=on_step)
 
 
 def prepare_run(recording: Path, out: Path, config: Config, split: Split | None = None) -> "Trainer":
@@ -185,10 +187,10 @@ class Trainer:
             share_photos=shared,
         )
 
-    def run(self, quiet: bool = False, *, replace: bool = False) -> Checkpoint:
+    def run(self, quiet: bool = False, *, replace: bool = False, on_step: OnStep | None = None) -> Checkpoint:
         """Train from the first step, or from that of the state file, to the last; write the checkpoint and return it.
 
-        `replace`: replace the state of another run, which is else an error.
+        `replace`: replace the state of another run, which is else an error. `on_step`: see `train_loop`.
 
         Raises:
             CheckpointError: The state file belongs to another run.
@@ -213,6 +215,7 @@ class Trainer:
                 validate=self.validate,
                 state=state,
                 step_context=self.features.step_context,
+                on_step=on_step,
             )
         except TrainingInterrupted as stopped:
             best, interrupted = stopped.best, f"{stopped} {self.out} can already rank photos."
@@ -243,7 +246,7 @@ class Trainer:
             raise JobInterrupted(interrupted or "Stopped by another rank; run the same command to continue.")
         return load_checkpoint(self.out)
 
-    def run_or_reuse(self, quiet: bool) -> Checkpoint:
+    def run_or_reuse(self, quiet: bool, *, on_step: OnStep | None = None) -> Checkpoint:
         """Return the finished checkpoint of this run, or run; files of another run are replaced.
 
         Raises:
@@ -254,7 +257,7 @@ class Trainer:
             same = all(stored.provenance.get(name) == self.provenance.get(name) for name in _MADE_FROM)
             if same and (stored.config, stored.split) == (self.config, self.split):
                 return stored
-        return self.run(quiet, replace=True)
+        return self.run(quiet, replace=True, on_step=on_step)
 
     def loss(self, step: int, loaded: LoadedBatch) -> Tensor:
         """Return the loss of a step and its prepared batch."""

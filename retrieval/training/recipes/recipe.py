@@ -16,6 +16,7 @@ from retrieval.model.fusion import Matcher
 from retrieval.training.features import Features
 from retrieval.training.initial_weights import build_matcher, training_licences, weights_of
 from retrieval.training.linear import available_config, fit_linear
+from retrieval.training.loop import OnStep
 from retrieval.training.selection import held_out_folds
 from retrieval.training.trainer import Trainer
 
@@ -40,6 +41,7 @@ class Problem:
         linked: Groups of objects that stay together, such as those of one sequence.
         folder: Folder of unfinished trainings, which continue there.
         quiet: No progress on stderr.
+        on_step: Told of the steps of the final fit (`retrieval.train`).
     """
 
     grasps: Sequence[Grasp]
@@ -50,6 +52,7 @@ class Problem:
     linked: Sequence[Sequence[str]]
     folder: Path
     quiet: bool
+    on_step: OnStep | None = None
 
 
 class Recipe(ABC):
@@ -165,7 +168,7 @@ class ContinuedHead(Recipe):
         config = config if is_final else config.without_candidate_encoder()
         out, weights = problem.folder / f"{name}.safetensors", weights_of(start.matcher, head=self.continues)
         trainer = Trainer(config, split, grasps, out, {"source": ""}, features, weights)
-        fitted = trainer.run_or_reuse(problem.quiet)
+        fitted = trainer.run_or_reuse(problem.quiet, on_step=problem.on_step if is_final else None)
         return dataclasses.replace(fitted, provenance={key: fitted.provenance[key] for key in ("step", "metrics")})
 
 

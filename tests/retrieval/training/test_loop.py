@@ -112,3 +112,19 @@ def test_a_replaceable_state_of_another_run_is_replaced(tmp_path):
         run(path, at=5, config={"seed": 0})
     replaceable = StateFile(path, {"config": {"seed": 1}}, is_replaceable=True)
     assert len(descend(Plan(6, 0.1), state=replaceable)[0]) == 6
+
+
+def test_a_callback_gets_loss_and_learning_rate_of_each_step_and_the_metrics_of_each_validation():
+    told = []
+    descend(
+        Plan(3, 0.1, "constant", validate_every=2),
+        validate=lambda: {"score": 0.5},
+        on_step=lambda step, values: told.append((step, {name: round(value, 6) for name, value in values.items()})),
+    )
+    rate, score = {"learning_rate": 0.1}, {"score": 0.5}
+    assert told == [
+        (0, score),
+        (1, {"loss": 0.0} | rate),
+        (2, {"loss": -0.1} | rate | score),
+        (3, {"loss": -0.2} | rate | score),
+    ]
