@@ -70,8 +70,8 @@ def test_time_against_the_number_of_photos(tmp_path):
     rng = np.random.default_rng(0)
     photos, touches = (rng.normal(size=(n, config.matcher.partial_width)).astype(np.float32) for n in (50, 19))
     crowd = scale.BlendedPhotos(checkpoint, matcher.head.scorer, photos, touches[:12], touches[12:])
-    size = scale.measure(crowd, 2000, ("flat", "IVF{lists},SQ8", "IVF{lists},PQ16"), tmp_path / "index", queries=5)
-    assert (size.photos, size.queries, size.held_out) == (2000, 5, 7)
+    size = scale.measure(crowd, 2000, ("flat", "IVF{lists},SQ8", "IVF{lists},PQ16"), tmp_path / "index")
+    assert (size.photos, size.queries, size.held_out) == (2000, 12, 7)
     for kind in ("flat", "IVF{lists},SQ8"):
         figures = size.kinds[kind]
         assert 0 <= figures["low"] <= figures["recall"] <= figures["high"] <= 1

@@ -176,7 +176,7 @@ class NewHead(ContinuedHead):
     """A new head with the late interaction of the start model, trained on its frozen towers."""
 
     label = "new head with late interaction on the start model's towers"
-    steps = 1500
+    steps = 1000
     touches_per_batch = 128
     learning_rate = 1e-3
     continues = False
