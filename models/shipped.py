@@ -19,13 +19,13 @@ import itertools
 import json
 import sys
 import zlib
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from models.labels import LabelTrainer
+from models.meshes import vary_meshes
 from models.pictures import collect_pictures, load_object_labels, load_pictures
 from retrieval.commands.main import main as run_command
 from retrieval.console.memory import keep_freed_memory
@@ -244,7 +244,7 @@ def collect_training(arguments: argparse.Namespace) -> int:
         for seed in range(first_seed, first_seed + seeds):
             settings: dict[str, Any] = {"rig": "sim", "gels": GELS_OF_RIG, "optics": optics}
             if has_meshes:
-                settings["meshes"] = str(vary_meshes(itertools.islice(meshes, objects), folder / "meshes", seed))
+                settings["meshes"] = str(vary_meshes(meshes, objects, folder / "meshes" / str(seed), seed))
             rig = folder / f"{seed}.toml"
             rig.write_text("".join(f"{key} = {json.dumps(value)}\n" for key, value in settings.items()))
             out = folder / RECORDINGS / str(seed)
@@ -252,19 +252,6 @@ def collect_training(arguments: argparse.Namespace) -> int:
                 return code
             collect_pictures("varied", varied_photos(out), objects=objects, seed=seed, rig=str(rig), jobs=jobs)
     return 0
-
-
-def vary_meshes(files: Iterable[Path], folder: Path, seed: int) -> Path:
-    """Write each mesh with a random size and other proportions into a folder of its own; return this folder."""
-    import trimesh
-
-    out, rng = folder / str(seed), np.random.default_rng(seed)
-    out.mkdir(parents=True, exist_ok=True)
-    for file in files:
-        mesh = trimesh.load_mesh(file)
-        mesh.apply_scale(np.exp(rng.uniform(np.log(0.5), np.log(1.6)) + rng.uniform(-0.35, 0.35, 3)))
-        mesh.export(out / file.name)
-    return out
 
 
 def collect_calibration(arguments: argparse.Namespace) -> int:
