@@ -63,9 +63,13 @@ def fit_hand_eye(camera_mm: npt.ArrayLike, rig_mm: npt.ArrayLike, *, written: da
         written: Time of the calibration; now by default.
 
     Raises:
-        RobotConfigError: The points are too few, on one line or in metres.
+        RobotConfigError: The points are too few, on one line, in metres or not finite.
     """
     camera, rig = np.asarray(camera_mm, np.float64), np.asarray(rig_mm, np.float64)
+    if camera.shape != rig.shape or camera.ndim != 2 or camera.shape[1] != 3:
+        raise RobotConfigError(f"points must be two arrays of N x 3 mm, got {camera.shape} and {rig.shape}")
+    if not (np.isfinite(camera).all() and np.isfinite(rig).all()):
+        raise RobotConfigError("points must be finite numbers of mm; measure the others again")
     arms = [points - points.mean(0) for points in (camera, rig)]
     extents = [float(np.sqrt((arm**2).sum(1).mean())) for arm in arms]
     for name, extent, other in zip(("camera", "rig"), extents, extents[::-1], strict=True):

@@ -72,8 +72,11 @@ LINE = [[t, 2 * t, 3 * t] for t in (0.0, 10.0, 20.0, 30.0, 40.0)]
 @pytest.mark.parametrize(
     ("camera", "rig", "message"),
     [
+        (cube()[:8], cube(), "got .8, 3. and .9, 3."),
         (LINE, cube()[:5], "the camera points must not lie on one line"),
         (cube()[:5], LINE, "the rig points must not lie on one line"),
+        ([*cube()[:5], [math.nan, 0, 0]], cube()[:6], "finite"),
+        (cube()[:, :2], cube()[:, :2], "N x 3"),
     ],
 )
 def test_insufficient_points_are_refused(camera, rig, message):
