@@ -77,6 +77,8 @@ DRIVERS: Mapping[str, Registry[type[Device]]] = {
 }
 """Drivers by role and name; installed packages register drivers of all roles in one group of entry points."""
 
+MAX_HAND_EYE_AGE_DAYS = 30.0
+"""Oldest accepted calibration, unless the camera's table sets `hand_eye_days`; a camera may be moved over time."""
 MIN_WAIT_S = 0.1
 """Shortest wait between a motion and the picture of its result: three frames of a gel at 30 frames/s."""
 
@@ -168,7 +170,7 @@ def load_driver(role: str, table: Mapping[str, Any], where: str, **arguments: An
 
 def _camera(table: Mapping[str, Any]) -> Camera:
     settings = dict(table)
-    file, days = settings.pop("hand_eye", None), settings.pop("hand_eye_days", 30.0)
+    file, days = settings.pop("hand_eye", None), settings.pop("hand_eye_days", MAX_HAND_EYE_AGE_DAYS)
     extrinsics = np.eye(4)
     if file is not None:
         path = Path(typed(file, str, "[camera]: hand_eye", error=RobotConfigError))

@@ -30,6 +30,7 @@ MOMENT_SUFFIXES = {"before": "_before", "during": "", "after": "_after"}
 
 _CELLS, _NOISE_LEVELS, _DARK_LEVELS = 8, 8, 10
 _UNLIKE_SHARE = 0.5
+_MAX_LEFT_OUT = 30
 
 
 def thumbnail(picture: Picture) -> Picture:
@@ -53,7 +54,7 @@ def first_usable(thumbnails: Sequence[Picture]) -> int | None:
     frames = frames[dark:]
     if len(frames) < 4:
         return dark
-    leading = max(1, min(30, len(frames) // 10)) + 1
+    leading = max(1, min(_MAX_LEFT_OUT, len(frames) // 10)) + 1
     later = frames[leading :: 1 + len(frames) // 1000]
     changed = ((np.abs(later - frame).max(-1) > _NOISE_LEVELS).mean((1, 2)) for frame in frames[:leading])
     unlike = np.sort(list(changed))  # (first frame, later frame), the most similar ones first

@@ -31,6 +31,7 @@ from robot.sim.objects.wall import bake_plain, ends_weight, level_of, smoothstep
 
 FORMATS = ("stl", "obj", "ply")
 MIN_THICKNESS_MM = 2.0
+_MAX_METRE_EXTENT = 2.0
 _CREASE_COSINE = 0.77
 _RAY_OFFSET_MM = 1.0
 Faces = NDArray[np.int64]
@@ -218,7 +219,7 @@ def read_mesh(path: str | Path) -> Mesh:
     vertices, faces = vertices[first], number.reshape(-1)[faces]
     faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
     _check_closed(faces, file)
-    scale = 1000.0 if np.ptp(vertices, axis=0).max() < 2.0 else 1.0
+    scale = 1000.0 if np.ptp(vertices, axis=0).max() < _MAX_METRE_EXTENT else 1.0
     mesh = Mesh(vertices * scale, faces).rest_on_table(UP)
     thin = np.ptp(mesh.vertices, axis=0).min()
     if thin < MIN_THICKNESS_MM:
