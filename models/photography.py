@@ -1,6 +1,6 @@
 """Photos of simulated objects as people take them: other cameras, grounds, light, and faults of pictures.
 
-    shot = shoot(obj, placement, how.camera, seed=3)
+    shot = shoot(scene, how.camera)
     photo = develop(shot, how, seed=3)
 
 `CONDITIONS` are fixed, for measurements; `draw` gives random ones, for training.
@@ -8,15 +8,15 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from robot.sim.camera import CameraView, Lighting, Picture, PinholeCamera, Placement, cast_camera_rays, photo
-from robot.sim.objects.draw import SimObject
+from robot.sim.camera import CameraView, Picture, PinholeCamera
+from robot.sim.scene import Scene
 
 RIG_CAMERA = PinholeCamera()
 Layer = NDArray[np.float32]
@@ -51,9 +51,8 @@ def _camera(**changes: Any) -> Photography:
     return Photography(camera=PinholeCamera(**changes))
 
 
-AS_THE_RIG = "as-the-rig"
 CONDITIONS = {
-    AS_THE_RIG: Photography(),
+    "as-the-rig": Photography(),
     "focal-500": _camera(focal_px=500.0),
     "focal-1300": _camera(focal_px=1300.0),
     "512-px": _camera(px=512, focal_px=1720.0),
@@ -82,10 +81,10 @@ class Shot:
     picture: Picture
 
 
-def shoot(obj: SimObject, placement: Placement, camera: PinholeCamera, seed: int) -> Shot:
-    """Return what a camera sees of an object on the table; `seed` determines light and noise."""
-    view = cast_camera_rays(obj, placement, camera)
-    return Shot(view, photo(view, Lighting.draw(np.random.default_rng([91, seed])), seed))
+def shoot(scene: Scene, camera: PinholeCamera) -> Shot:
+    """Return what a camera sees of a scene."""
+    scene = replace(scene, camera=camera)
+    return Shot(scene.view, scene.image("photo"))
 
 
 def develop(shot: Shot, how: Photography, seed: int) -> Picture:
@@ -129,7 +128,7 @@ def draw(rng: np.random.Generator) -> Photography:
 
 
 def draw_camera(rng: np.random.Generator) -> PinholeCamera:
-    """Draw a camera: 20 to 75 degrees high, in any roll, whose picture shows 110 to 400 mm about the object."""
+    """Draw a camera: 12 to 72 degrees high, in any roll, whose picture shows 130 to 380 mm about the object."""
     height, distance = math.radians(rng.uniform(12, 72)), rng.uniform(350, 1100)
     target = np.array([*rng.uniform(-15, 15, 2), rng.uniform(30, 90)])
     position = target + distance * np.array([0, -math.cos(height), math.sin(height)])

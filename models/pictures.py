@@ -181,6 +181,6 @@ def _photos(scene: Scene, number: int, conditions: Mapping[str, Photography] | N
     pictures = {}
     for name, how in conditions.items():
         if how.camera not in shots:
-            shots[how.camera] = shoot(scene.obj, scene.placement, how.camera, scene.seed)
+            shots[how.camera] = shoot(scene, how.camera)
         pictures[f"{name}-{number}"] = develop(shots[how.camera], how, scene.seed)
     return pictures

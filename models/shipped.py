@@ -152,7 +152,7 @@ def train_towers(folder: Path, **settings: Any) -> Trained:
 
 
 def grasps_with_varied_photos(recording: Path) -> list[Grasp]:
-    """Return the grasps of a recording, each with its own photo or, as likely, with one of the object's varied ones."""
+    """Return the grasps of a recording, each with its own photo or a varied one of the object, all equally likely."""
     varied: dict[str, list[Path]] = {}
     for picture in load_pictures(varied_photos(recording)):
         varied.setdefault(picture.object_id, []).append(picture.file)

@@ -140,12 +140,12 @@ class Scene:
             return self._touch(*touch)
         self.passes[name] += 1
         if name == "depth":
-            return cameras.depth(self._view, self._noise(0, 1))
-        return cameras.photo(self._view, Lighting.draw(np.random.default_rng([91, self.seed])), self._noise(0, 0))
+            return cameras.depth(self.view, self._noise(0, 1))
+        return cameras.photo(self.view, Lighting.draw(np.random.default_rng([91, self.seed])), self._noise(0, 0))
 
     @cached_property
-    def _view(self) -> cameras.CameraView:
-        """Geometry pass that photo and depth share."""
+    def view(self) -> cameras.CameraView:
+        """Geometry pass that photo and depth share: what each pixel shows."""
         self.passes["view"] += 1
         return cameras.cast_camera_rays(self.obj, self.placement, self.camera)
 
