@@ -2,7 +2,8 @@
 
     metadata.jsonl    a line for each object: object_id, its labels (`robot.sim.objects.draw.SimObject.labels`), and
                       the names of its pictures under "pictures": photo, or touch_a, touch_a_before, touch_b, ...; for
-                      several photos the names of their conditions with a number
+                      several photos the names of their conditions with a number, and for varied ones also a mask of
+                      the object's pixels (`MASK_PX` a side, white), varied-0_mask, ...
     images/           the pictures
 
 A photographed object takes a tenth of the time of a grasp, and a press a third. An object's line is written when its
@@ -20,10 +21,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from models.photography import CONDITIONS, Photography, Shot, develop, draw, shoot
+from models.photography import CONDITIONS, Shot, develop, draw, shoot
 from retrieval.console.progress import Bar
 from robot.recording.folder import read_info
 from robot.rig import load_rig
@@ -39,8 +41,11 @@ MIN_AMPLITUDE_MM = 0.05
 """Smaller amplitudes are raised to this one."""
 MAX_PRESSES = 3
 """Maximum number of presses of one object until the jaws meet it."""
-PHOTOS = 3
-"""Photos of an object in each condition, or in varied ones."""
+PHOTOS = {"varied": 2, "conditions": 3}
+"""Photos of an object, in varied conditions or in each condition."""
+MASK_PX = 128
+_PARTNERS = ("_before", "_mask")
+"""Ends of the names of pictures that belong to another one."""
 FIRST_PHOTO = 1000
 """Number of the placement in the first of several photos; smaller numbers are those of attempts."""
 IMAGES, METADATA = "images", "metadata.jsonl"
@@ -78,11 +83,21 @@ class ObjectLabels:
 
 @dataclass(frozen=True)
 class LabelledPicture:
-    """A photo, or one finger's gel image with its no-contact frame, and the labels of its object."""
+    """A photo, or one finger's gel image, and the labels of its object.
+
+    Attributes:
+        name: Name of the picture.
+        file: Its file.
+        before: File of the finger's no-contact frame.
+        mask: File of the mask of the object's pixels in a varied photo.
+        object_id: The object.
+        labels: Its labels.
+    """
 
     name: str
     file: Path
     before: Path | None
+    mask: Path | None
     object_id: str
     labels: ObjectLabels
 
@@ -98,8 +113,8 @@ def collect_pictures(
     """Photograph or press the first objects of a simulated rig, or continue; return all pictures.
 
     Args:
-        kind: "photo" (one picture of each object), "varied" (`PHOTOS` photos, taken as `photography.draw` decides),
-            "conditions" (`PHOTOS` in each of `CONDITIONS`) or "touch" (one of each finger).
+        kind: "photo" (one picture of each object), "varied" (`PHOTOS` taken as `photography.draw` decides, with
+            masks), "conditions" (`PHOTOS` in each of `CONDITIONS`) or "touch" (one of each finger).
         folder: The folder to write or continue. It must belong to the same kind, seed and rig.
         objects: Number of objects.
         seed: Seed of the rig.
@@ -141,9 +156,9 @@ def load_pictures(folder: Path) -> list[LabelledPicture]:
         row = json.loads(line)
         files = {name: folder / file for name, file in row["pictures"].items()}
         for name, file in files.items():
-            if not name.endswith("_before"):
-                before = files.get(f"{name}_before")
-                pictures.append(LabelledPicture(name, file, before, row["object_id"], ObjectLabels.from_dict(row)))
+            if not name.endswith(_PARTNERS):
+                partners = (files.get(name + end) for end in _PARTNERS)
+                pictures.append(LabelledPicture(name, file, *partners, row["object_id"], ObjectLabels.from_dict(row)))
     return pictures
 
 
@@ -166,20 +181,28 @@ def _worker(kind: str, rig: str, seed: int) -> Work[tuple[Pictures, Mapping[str,
 
     def several(object_id: str, number: int) -> tuple[Pictures, Mapping[str, Any]]:
         pictures = {}
-        for number in range(PHOTOS):
+        for number in range(PHOTOS[kind]):
             sim_rig.prepare(object_id, FIRST_PHOTO + number)
-            pictures |= _photos(sim_rig.sim_state.current_scene(), number, None if kind == "varied" else CONDITIONS)
+            take = _varied_photo if kind == "varied" else _photo_in_each_condition
+            pictures |= take(sim_rig.sim_state.current_scene(), number)
         return pictures, sim_rig.labels(object_id)
 
     return {"photo": photograph, "touch": press, "varied": several, "conditions": several}[kind]
 
 
-def _photos(scene: Scene, number: int, conditions: Mapping[str, Photography] | None) -> Pictures:
-    """Return the photo of a scene in each condition, or in a drawn one, by the name of the condition and the number."""
-    conditions = conditions or {"varied": draw(np.random.default_rng([95, scene.seed]))}
+def _varied_photo(scene: Scene, number: int) -> Pictures:
+    how = draw(np.random.default_rng([95, scene.seed]))
+    shot = shoot(scene, how.camera)
+    mask = shot.view.is_object.reshape(how.camera.px, how.camera.px).astype(np.float32)
+    levels = np.rint(255 * cv2.resize(mask, (MASK_PX, MASK_PX), interpolation=cv2.INTER_AREA)).astype(np.uint8)
+    name, photo = f"varied-{number}", develop(shot, how, scene.seed)
+    return {name: photo, f"{name}_mask": np.repeat(levels[..., None], 3, axis=2)}
+
+
+def _photo_in_each_condition(scene: Scene, number: int) -> Pictures:
     shots: dict[PinholeCamera, Shot] = {}
     pictures = {}
-    for name, how in conditions.items():
+    for name, how in CONDITIONS.items():
         if how.camera not in shots:
             shots[how.camera] = shoot(scene, how.camera)
         pictures[f"{name}-{number}"] = develop(shots[how.camera], how, scene.seed)

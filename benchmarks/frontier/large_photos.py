@@ -61,12 +61,12 @@ def decoders(settings: Preprocessing) -> Iterator[tuple[Tradeoff, Decoder]]:
     fixed = "a fixed fraction"
     yield (
         Tradeoff(fixed, "whole", 0.0, is_default=not settings.reduced),
-        lambda data: plain.photo_from_bytes(data, _NAME),
+        lambda data: plain.photo_from_bytes(data, _NAME).views,
     )
     for fraction in FRACTIONS:
         yield Tradeoff(fixed, f"1/{fraction}", 0.0), partial(at, fraction)
     chosen = Tradeoff("reduced", "what the views need", 0.0, is_default=settings.reduced)
-    yield chosen, lambda data: needed.photo_from_bytes(data, _NAME)
+    yield chosen, lambda data: needed.photo_from_bytes(data, _NAME).views
 
 
 def _panels(

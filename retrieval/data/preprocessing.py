@@ -8,15 +8,17 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from msgspec import Meta
 
 from _touch_retrieval.documents import check_fields
 from retrieval.data.images import decode, picture_size, read_bytes, read_rgb
-from retrieval.data.resize import RgbImage, resize
-from retrieval.data.views import VIEWS, find_object, min_photo_side, min_photo_side_for_crop, tile_views
+from retrieval.data.object_finder import INPUT_PX, FoundObject, find_object, network_digest, whole_photo
+from retrieval.data.photo_faults import photo_faults
+from retrieval.data.resize import RgbImage, Samples, resize
+from retrieval.data.views import OVERSAMPLING, VIEWS, sufficient_side, tile_views
 from retrieval.errors import BadInput, ConfigError, NumericalError
 
 PREPROCESSING_VERSION = 2
@@ -35,6 +37,19 @@ The arithmetic is float32: a uint8 subtraction wraps, and turns 1 grey level dar
 
 Side = Annotated[int, Meta(ge=1, le=4096)]
 """Side of a square in pixels."""
+
+
+class PreparedPhoto(NamedTuple):
+    """A photo as a tower takes it.
+
+    Attributes:
+        views: The tiled views (photo_px, views * photo_px, 3).
+        faults: What makes its object harder to recognise (`retrieval.data.photo_faults.FAULTS`); empty for a model that
+            takes the whole photo only.
+    """
+
+    views: RgbImage
+    faults: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -73,6 +88,8 @@ class Preprocessing:
         content = {"version": PREPROCESSING_VERSION, **self.to_dict()}
         if self.views == ("whole",):  # keeps the digest of checkpoints without this setting
             del content["views"]
+        else:
+            content["object_finder"] = network_digest()
         if not self.reduced:  # as above
             del content["reduced"]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
@@ -88,17 +105,27 @@ class Preprocessing:
         _require_finite(image, "photo")
         return tile_views(image, self.views, self.photo_px)
 
-    def photo_from_bytes(self, data: bytes, name: str | Path) -> RgbImage:
-        """Return the tiled views of the photo in the bytes of a file, called `name`. Raises ImageError."""
-        if not self.reduced:
-            return tile_views(decode(data, name), self.views, self.photo_px)
-        image = decode(data, name, min_photo_side(self.views, self.photo_px))
-        short, box = min(image.shape[:2]), None
-        if "crop" in self.views and short < min(picture_size(data, name)):
-            box = find_object(image)
-            if (more := min_photo_side_for_crop(box, short, self.photo_px)) > short:
-                image, box = decode(data, name, more), None
-        return tile_views(image, self.views, self.photo_px, box)
+    def photo_from_bytes(self, data: bytes, name: str | Path) -> PreparedPhoto:
+        """Prepare the photo in the bytes of a file, called `name`, and examine it. Raises ImageError."""
+        image, found = self._decode_photo(data, name)
+        return PreparedPhoto(
+            tile_views(image, self.views, self.photo_px, found),
+            () if self.views == ("whole",) else photo_faults(image, found),
+        )
+
+    def _decode_photo(self, data: bytes, name: str | Path) -> tuple[Samples, FoundObject]:
+        """Return a photo in the size that its views need, and its object."""
+        needs_object = self.views != ("whole",)
+        first_side = max(OVERSAMPLING * self.photo_px, INPUT_PX if needs_object else 0)
+        image = decode(data, name, first_side if self.reduced else None)
+        if not needs_object:
+            return image, whole_photo(image)
+        found, short = find_object(image), min(image.shape[:2])
+        enough = sufficient_side(self.views, self.photo_px, found, short)
+        if self.reduced and short < min(enough, *picture_size(data, name)):
+            image = decode(data, name, enough)
+            found = found.scaled(min(image.shape[:2]) / short)
+        return image, found
 
     def touch(self, image: RgbImage, reference: RgbImage | None = None) -> RgbImage:
         """Return a gel image (H, W, 3) in 0..1 as (touch_px, touch_px, 3), with the background subtracted.
@@ -131,7 +158,8 @@ class Preprocessing:
 
     def load_photo(self, path: str | Path) -> RgbImage:
         """Read a photo as (photo_px, views * photo_px, 3) float32. Raises ImageError."""
-        return self.photo_from_bytes(read_bytes(path), path)
+        image, found = self._decode_photo(read_bytes(path), path)
+        return tile_views(image, self.views, self.photo_px, found)
 
     def load_touch(self, path: str | Path, reference: str | Path | None = None) -> RgbImage:
         """Read one finger's gel image as (touch_px, touch_px, 3) float32.

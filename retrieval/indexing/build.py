@@ -263,6 +263,18 @@ def _shared_photos(rows: Sequence[Row]) -> list[str]:
     ]
 
 
+def _hard_photos(contents: IndexContents) -> list[str]:
+    """Return a warning if objects are hard to recognise in photos that were encoded now."""
+    if not contents.faults:
+        return []
+    counts = Counter(fault for faults in contents.faults.values() for fault in faults)
+    return [
+        f"objects are hard to recognise in {len(contents.faults)} of {contents.encoded} new photos: "
+        f"{', '.join(f'{count} {fault}' for fault, count in counts.most_common())}; for example "
+        f"{abbreviate_list(sorted(contents.faults), MAX_EXAMPLES)}. See docs/catalogue.md, a good photo"
+    ]
+
+
 def _report(
     out: Path,
     catalogue: Catalogue,
@@ -285,7 +297,7 @@ def _report(
         objects=len(names),
         objects_from=options.naming.text,
         examples=[(name, first_photo[name]) for name in shown],
-        warnings=_shared_photos(rows),
+        warnings=[*_shared_photos(rows), *_hard_photos(contents)],
         embedded=contents.encoded,
         skipped=contents.skipped,
         ignored=[name for name in catalogue.ignored if not (catalogue.folder / name).resolve().is_relative_to(inside)],

@@ -116,7 +116,8 @@ class Encoder(NamedTuple):
         what: Plural of the items.
         layout: Type of a code.
         model: Group of the codes in the cache: a digest of model, preprocessing and layout.
-        decode: Returns the model's input from the bytes of an item's files and their paths; raises ImageError.
+        decode: Returns the model's input from the bytes of an item's files and their paths, and the faults of a photo;
+            raises ImageError.
         start: Returns, for a number of items to encode, the function that returns the codes (B,) of inputs with these
             paths; several threads call it at once.
     """
@@ -124,7 +125,7 @@ class Encoder(NamedTuple):
     what: str
     layout: np.dtype[Any]
     model: str
-    decode: Callable[[Sequence[bytes], Paths], Any]
+    decode: Callable[[Sequence[bytes], Paths], tuple[Any, Sequence[str]]]
     start: Callable[[int], Callable[[Sequence[Any], Sequence[Paths]], NDArray[Any]]]
 
     def key(self, digests: Iterable[str]) -> str:
@@ -174,14 +175,14 @@ def touch_encoder(checkpoint: Checkpoint) -> Encoder:
     matcher, check, fingers = checkpoint.matcher, checkpoint.gel_check, checkpoint.config.matcher.fingers
     layout = np.dtype([("partial", "<f2", (checkpoint.config.matcher.touch_partial_width,)), ("shows", "u1")])
 
-    def decode(data: Sequence[bytes], paths: Paths) -> list[Any]:
+    def decode(data: Sequence[bytes], paths: Paths) -> tuple[list[Any], Sequence[str]]:
         if len(paths) != fingers:
             ends = " and ".join(f"_{letter}" for letter in "abcdefghij"[:fingers])
             reason = f"the touch has {len(paths)} gel image(s), the model takes {fingers}: names end in {ends}"
             if len(paths) == 1:
                 reason += "; for a sensor with one finger give --model shipped-one-finger, or a model of your own"
             raise ImageError(paths[0], reason)
-        return list(map(checkpoint.config.preprocessing.touch, map(decode_rgb, data, paths)))
+        return list(map(checkpoint.config.preprocessing.touch, map(decode_rgb, data, paths))), ()
 
     @torch.inference_mode()
     def encode(touches: Sequence[Any], paths: Sequence[Paths]) -> NDArray[Any]:
@@ -267,11 +268,13 @@ class Codes:
         keys: Key of the code of each item that could be read and decoded.
         skipped: Items that could not.
         encoded: Number of items that were encoded now.
+        faults: Faults of the photos among them that have some, by path.
     """
 
     keys: dict[Paths, str] = field(default_factory=dict)
     skipped: list[SkippedPhoto] = field(default_factory=list)
     encoded: int = 0
+    faults: dict[str, Sequence[str]] = field(default_factory=dict)
 
 
 def find_codes(items: Sequence[Paths], encoder: Encoder, files: CatalogueFiles, cache: Cache, quiet: bool) -> Codes:
@@ -300,8 +303,10 @@ def find_codes(items: Sequence[Paths], encoder: Encoder, files: CatalogueFiles, 
             found.keys[paths] = key = encoder.key(record.digest for record in records)
             if taken.setdefault(key, paths) is paths:  # no other thread encodes this content
                 try:
-                    inputs.append(encoder.decode(contents, paths))
+                    prepared, faults = encoder.decode(contents, paths)
+                    inputs.append(prepared)
                     new[key] = paths
+                    found.faults |= {paths[0]: faults} if faults else {}
                 except ImageError as error:
                     unusable[key] = error.reason
         codes = encode(inputs, list(new.values())) if new else ()

@@ -63,6 +63,7 @@ class IndexContents:
         references: The reference touches.
         encoded: Number of photos that were encoded now.
         skipped: Photos and touches that could not be used.
+        faults: Faults (`retrieval.data.photo_faults`) of the photos that were encoded now and have some, by path.
     """
 
     rows: list[Row]
@@ -71,6 +72,7 @@ class IndexContents:
     references: ReferenceTouches
     encoded: int
     skipped: list[SkippedPhoto]
+    faults: dict[str, Sequence[str]]
 
     def blocks(self, cache: Cache) -> Iterator[dict[str, NDArray[Any]]]:
         """Yield the codes of the rows in blocks: arrays by name, such as "embeddings" (n, d)."""
@@ -93,7 +95,7 @@ def read_contents(catalogue: Catalogue, checkpoint: Checkpoint, cache: Cache, qu
     files = CatalogueFiles(catalogue, cache)
     references = _find_references(catalogue, checkpoint, files, cache, quiet)
     photos = sorted([*catalogue.photos, *references.pictures], key=lambda photo: photo.path)
-    encoder = photo_encoder(checkpoint)
+    encoder, gel_images = photo_encoder(checkpoint), {picture.path for picture in references.pictures}
     codes = find_codes([(photo.path,) for photo in photos], encoder, files, cache, quiet)
     files.save()
     if not codes.keys:
@@ -106,6 +108,7 @@ def read_contents(catalogue: Catalogue, checkpoint: Checkpoint, cache: Cache, qu
         references,
         codes.encoded,
         [*catalogue.skipped, *codes.skipped, *references.skipped],
+        {path: faults for path, faults in codes.faults.items() if path not in gel_images},
     )
 
 

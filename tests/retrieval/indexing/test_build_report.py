@@ -1,9 +1,12 @@
 """The report of `build-index`: object names, warnings and skipped files."""
 
+import dataclasses
 import json
 import shutil
 
+import numpy as np
 import pytest
+from PIL import Image, ImageFilter
 
 from indexes.store.folder import IndexStore
 from retrieval.commands.main import main
@@ -83,3 +86,17 @@ def test_objects_without_a_readable_photo_are_listed_and_give_exit_code_1(tmp_pa
     assert "2 of 3 objects are not in the index, because none of their images can be read: ball, cup" in printed.err
     assert "the index is written, but 2 object(s) have no readable photo" in printed.err
     assert objects(index) == {"mug/0.jpg": "mug"}
+
+
+def test_new_photos_that_are_unlike_training_photos_give_a_warning(tmp_path, checkpoint, index):
+    own, rng = tmp_path / "own", np.random.default_rng(0)
+    crops = dataclasses.replace(checkpoint.config.preprocessing, views=("crop",))
+    checkpoint = dataclasses.replace(checkpoint, config=dataclasses.replace(checkpoint.config, preprocessing=crops))
+    for name in ("mug", "cup"):
+        photo = np.full((256, 256, 3), 60, np.uint8)
+        photo[60:200, 100:180] = rng.integers(120, 220, (140, 80, 1))
+        own.mkdir(exist_ok=True)
+        Image.fromarray(photo).filter(ImageFilter.GaussianBlur(3 * (name == "mug"))).save(own / f"{name}.png")
+    report = build_index(own, checkpoint, index, quiet=True)
+    assert ["1 of 2" in line and "1 blurred; for example mug.png" in line for line in report.warnings] == [True]
+    assert build_index(own, checkpoint, index, quiet=True).warnings == []  # no photo is new
