@@ -5,7 +5,7 @@
 
 Each object of the recording is photographed three times in each condition; all photos of a catalogue are in the same
 one, and the touches are unchanged. It prints top-1 of one touch among one photo of each of 10 and of 100 objects, with
-95 % intervals over objects, for each model.
+95 % intervals over objects, for each model. A touch that the gel check refuses gives no evidence.
 """
 
 import argparse
@@ -24,6 +24,7 @@ from retrieval.metrics.measure import Measure
 from retrieval.metrics.table import ScoreTable
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.search.opening import find_model
+from retrieval.training.calibration import refused_touches
 from retrieval.training.features import encode_recording
 
 CANDIDATES = (10, 100)
@@ -58,12 +59,14 @@ def measures(
     """Return top-1 by condition and number of candidates."""
     features = encode_recording(grasps, checkpoint.matcher, checkpoint.config, folder, photo_variant="none")
     touches = checkpoint.matcher.touch_encoding(torch.from_numpy(features.touch_rows)).partial
+    refused = refused_touches(checkpoint, torch.from_numpy(features.touch_rows))
     names = sorted(set(features.object_ids))
     of_condition: dict[str, dict[int, Measure]] = {}
     for condition in CONDITIONS:
         shown = [photo for photo in photos if photo.name.rpartition("-")[0] == condition and photo.object_id in names]
         owner = np.array([names.index(photo.object_id) for photo in shown])
         scores = all_scores(checkpoint, touches, photo_partials(checkpoint, [photo.file for photo in shown]))
+        scores[refused] = np.median(scores)
         scored = ScoreTable(scores, features.owner, owner, np.zeros(scores.shape, np.bool_))
         of_condition[condition] = {k: top1(scored, k, photos=1) for k in CANDIDATES if k <= len(names)}
     return of_condition

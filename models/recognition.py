@@ -7,7 +7,8 @@ each. PHOTOS is a folder to which one photo of each of 1,000 further objects of 
 is one to five grasps of an object. Every candidate has photos that were not taken in these grasps. Top-1 accuracies are
 means over draws of the other candidates; intervals resample the touched objects. A model with late interaction is also
 scored without its cells, as in an index of `build-index --no-cells`. Differences are to the first model, on the same
-queries. It writes FOLDER/recognition.json, and reuses the features of RECORDING.
+queries. A touch that the gel check refuses gives no evidence. It writes FOLDER/recognition.json, and reuses the
+features of RECORDING.
 """
 
 import argparse
@@ -21,7 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.special import gammaln
+from scipy.special import gammaln, softmax
 
 from models.pictures import collect_pictures
 from retrieval.console.progress import Bar
@@ -36,6 +37,12 @@ from retrieval.model.encode import batches, photo_features
 from retrieval.model.posterior import Posterior
 from retrieval.report import numbers
 from retrieval.search.opening import find_model
+from retrieval.training.calibration import (
+    IdentificationTrials,
+    refused_touches,
+    score_grasps,
+    verification_sequences,
+)
 from retrieval.training.distil import feature_partials
 from retrieval.training.features import encode_recording
 
@@ -47,6 +54,8 @@ SETS = 4
 CATALOGUE = 100
 """Objects for "none of these"; each catalogue leaves one of them out."""
 DRAWS = 4
+SURE, STATED_FAR = 0.9, 0.1
+"""Smallest stated probability, and false-accept rate, that are compared with what happens."""
 DISTRACTORS, SEED = 1000, 181_000
 """Photo-only objects, and the seed of their object set."""
 interval = partial(numbers.interval, write="{:.3f}".format)
@@ -70,6 +79,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, _, file in (choice.partition("=") for choice in arguments.model):
         checkpoint = load_checkpoint(find_model(file)[0])
         found[name] = measures(checkpoint, grasps, arguments.distractors, arguments.out / "features")
+        print(f"{name}: {statements(checkpoint, grasps, arguments.out / 'features')}")
         if checkpoint.config.matcher.cell_dim:
             pooled = checkpoint.without_cells()
             found[f"{name}, no cells"] = measures(pooled, grasps, arguments.distractors, arguments.out / "features")
@@ -102,6 +112,7 @@ def measures(
         others = photo_partials(checkpoint, [picture.file for picture in pictures])
     photo_owner = np.concatenate([owner, objects + np.arange(len(others))])
     scores = all_scores(checkpoint, touches, torch.cat([photos, others]))
+    scores[refused_touches(checkpoint, torch.from_numpy(features.touch_rows))] = np.median(scores)
     found: dict[str, Measure] = {}
     for count, shown in QUERIES:
         queries = grasp_sets(owner, count, shown)
@@ -119,6 +130,45 @@ def measures(
             weighted = replace(small, scores=checkpoint.posterior.weight(count) * small.scores)
             found[f"none of these, AUROC, {what}"] = reject(Posterior(1.0, checkpoint.posterior.offset), weighted).auroc
     return found
+
+
+def statements(checkpoint: Checkpoint, grasps: Sequence[Grasp], cache: Path) -> str:
+    """Return how well stated probabilities and a stated false-accept rate hold on these objects.
+
+    The catalogue has all objects but one (at most 1,000), with all photos but the query's own. The probability is that
+    of one grasp, at even odds of "none of these". The rates are those of a claim within four grasps.
+    """
+    posterior, calibration = checkpoint.posterior, checkpoint.verification
+    if posterior is None or calibration is None:
+        return "the model states no probabilities or error rates"
+    features = encode_recording(grasps, checkpoint.matcher, checkpoint.config, cache)
+    touches, photo_rows = (torch.from_numpy(part) for part in (features.touch_rows, features.photo))
+    photos = {grasp.photo: row for grasp, row in zip(grasps, photo_rows, strict=True)}
+    scored = score_grasps(checkpoint.matcher, grasps, touches, photos)
+    assert scored is not None
+    checked = scored.without_evidence(refused_touches(checkpoint, touches))
+    sets = scored.draw_sets(1, None, np.random.default_rng(0))
+    trials = IdentificationTrials.of(checked, sets)
+    present = trials.catalogues[-1][:, :-1]
+    ratios = np.take_along_axis(trials.log_ratios(posterior), present, 1) - np.log(present.shape[1])
+    stated = softmax(np.column_stack([np.zeros(len(ratios)), ratios]), axis=1)[:, 1:]
+    sure = stated.max(1) >= SURE
+    bounds = calibration.bounds(STATED_FAR)
+    claims, genuine = verification_sequences(scored, posterior), verification_sequences(checked, posterior)
+    assert claims is not None
+    assert genuine is not None
+    measured = {
+        f"stated {SURE} and more is right": (stated.argmax(1)[sure] == 0, scored.touch_owner[sets[sure, 0]]),
+        f"false accepts at a stated {STATED_FAR}": ((claims.impostor >= bounds.accept).mean(1), claims.owner),
+        "false rejects": (genuine.ratios.max(1) < bounds.accept, genuine.owner),
+    }
+    parts = []
+    for what, (values, owner) in measured.items():
+        if not len(values):
+            continue
+        cell = summarise([Measure(np.asarray(values, float)[:, None], owner, np.zeros(1), "")])
+        parts.append(f"{what}: {interval(cell.value[0], cell.low[0], cell.high[0])} of {len(values)}")
+    return "; ".join(parts)
 
 
 def top1(table: ScoreTable, k: int, photos: int) -> Measure:

@@ -22,6 +22,7 @@ from retrieval.model import verification
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import default_device
 from retrieval.model.fusion import Matcher
+from retrieval.model.gel_check import CONTACT
 from retrieval.model.opening import OpeningCalibration
 from retrieval.model.posterior import MAX_GRASPS, SLOPE_BOUNDS, Posterior
 from retrieval.model.references import ReferenceCalibration, reference_similarity, unit_embeddings
@@ -91,6 +92,11 @@ class ScoredTouches:
         """Whether a posterior can be fitted: to three objects, and a touch with another photo of its object."""
         same = self.touch_owner[:, None] == self.photo_owner
         return len(np.unique(self.photo_owner)) >= MIN_OBJECTS and bool((same & ~self.own).any())
+
+    def without_evidence(self, refused: NDArray[np.bool_]) -> "ScoredTouches":
+        """Return these touches; those that the gel check refuses (T,) have the median logit with every photo."""
+        logits = np.where(refused[:, None], np.median(self.logits), self.logits)
+        return dataclasses.replace(self, logits=logits)
 
     def draw_sets(self, grasps: int, draws: int | None, rng: np.random.Generator) -> Numbers:
         """Return `draws` random sets (S, grasps) of each object that has so many touches and a photo of another grasp.
@@ -301,7 +307,7 @@ def fit_references(*parts: ScoredTouches, seed: int = 0) -> ReferenceCalibration
 
 
 def _reference_trials(part: ScoredTouches, max_references: int) -> tuple[ScoredTouches, ScoredTouches] | None:
-    """Return C of the other touches with each object, and their match logits with photos.
+    """Return C of the other touches with each object, and their match logits with one photo of each, its first one.
 
     At most `max_references` touches of each object are references. None for too few objects, or without embeddings.
     """
@@ -313,7 +319,8 @@ def _reference_trials(part: ScoredTouches, max_references: int) -> tuple[ScoredT
     cosines = part.touch_embeddings[queries] @ part.touch_embeddings[np.concatenate(references)].T
     near = reference_similarity(cosines, np.cumsum([0, *(len(some) for some in references[:-1])]))
     number = {int(part.touch_owner[mine[0]]): place for place, (mine, _) in enumerate(sets)}
-    known = np.flatnonzero(np.isin(part.photo_owner, list(number)))
+    names, first = np.unique(part.photo_owner, return_index=True)
+    known = first[np.isin(names, list(number))]
     photo_owner = np.array([number[int(name)] for name in part.photo_owner[known]], np.int64)
     shared = np.ix_(queries, known)
     return (
@@ -450,9 +457,15 @@ def verification_sequences(
 
 
 def fit_verification(
-    parts: Sequence[ScoredTouches], posterior: Posterior, seed: int = 0
+    parts: Sequence[ScoredTouches],
+    posterior: Posterior,
+    seed: int = 0,
+    refused: Sequence[NDArray[np.bool_]] | None = None,
 ) -> VerificationCalibration | None:
     """Return the calibration from validation objects, which are compared only within a part.
+
+    `refused`: whether the gel check refuses each touch of each part. Refused touches raise the false rejects, and do
+    not lower the false accepts.
 
     None if fewer than `MIN_OBJECTS` objects have sequences (`verification_sequences`), or if their pairs do not support
     `CARD_FAR`.
@@ -462,7 +475,11 @@ def fit_verification(
     if not supports_calibration(sizes):
         return None
     impostors = np.concatenate([each.impostor.ravel() for each in found])
-    ratios = np.concatenate([each.ratios for each in found])
+    genuine = found
+    if refused is not None:
+        checked = (part.without_evidence(touches) for part, touches in zip(parts, refused, strict=True))
+        genuine = [each for part in checked if (each := verification_sequences(part, posterior, seed)) is not None]
+    ratios = np.concatenate([each.ratios for each in genuine])
     return VerificationCalibration(
         sizes,
         _quantiles(impostors, 1 - np.array(LEVELS)),
@@ -505,10 +522,17 @@ def calibrate_checkpoint(
         for pooled in ((False, True) if matcher.config.cell_dim else (False,))
         if (each := score_grasps(matcher, grasps, touches, photos, pooled=pooled)) is not None
     ]
-    if scored:
-        checkpoint = with_calibrations(checkpoint, scored[:1], scored[1:], seed=seed)
     checkpoint = dataclasses.replace(checkpoint, opening=fit_opening([*train, *validation]))
-    return with_gel_check(checkpoint, source, train, validation, foreign=foreign, max_grasps=max_grasps, quiet=quiet)
+    checkpoint = with_gel_check(
+        checkpoint, source, train, validation, foreign=foreign, max_grasps=max_grasps, quiet=quiet
+    )
+    if not scored:
+        return checkpoint
+    checkpoint = with_calibrations(checkpoint, scored[:1], scored[1:], seed=seed)
+    assert checkpoint.posterior is not None
+    refused = [refused_touches(checkpoint, touches)]
+    verification = fit_verification(scored[:1], checkpoint.posterior, seed, refused)
+    return dataclasses.replace(checkpoint, verification=verification)
 
 
 def with_calibrations(
@@ -566,6 +590,15 @@ def with_gel_check(
     matcher.gel_head = fit_gel_head(fitting, PENALTY * FOREIGN_COUNT / foreign)
     check = fit_gel_check(matcher.gel_head, test, contact_levels(validation))
     return dataclasses.replace(checkpoint, gel_check=check)
+
+
+@torch.inference_mode()
+def refused_touches(checkpoint: Checkpoint, touches: Tensor) -> NDArray[np.bool_]:
+    """Return (T,) whether the gel check refuses touches with these features (T, fingers * F); none without a check."""
+    readings = checkpoint.matcher.gel_readings(touches)
+    if checkpoint.gel_check is None or readings is None:
+        return np.zeros(len(touches), np.bool_)
+    return np.not_equal(checkpoint.gel_check.classify(readings.cpu().numpy()), CONTACT)
 
 
 def with_sensor_calibrations(

@@ -262,3 +262,20 @@ def test_the_document_of_a_calibration_gives_the_same_calibration(fitted):
     assert typed(document, VerificationCalibration, "verification", complete=True) == fitted
     with pytest.raises(BadInput, match="verification must have"):
         VerificationCalibration(**document | {"impostors": [1.0]})
+
+
+def test_a_refused_touch_is_no_evidence_for_an_object():
+    scored = scored_objects(30, seed=0)
+    refused = np.arange(len(scored.touch_owner)) % 20 == 0
+    logits = scored.without_evidence(refused).logits
+    assert np.unique(logits[refused]).tolist() == [np.median(scored.logits)]
+    np.testing.assert_array_equal(logits[~refused], scored.logits[~refused])
+
+
+def test_refused_touches_are_false_rejects():
+    scored = scored_objects(100, seed=0)
+    every = fit_verification([scored], POSTERIOR).bounds(0.1)
+    refused = np.random.default_rng(0).random(len(scored.touch_owner)) < 0.2
+    checked = fit_verification([scored], POSTERIOR, refused=[refused]).bounds(0.1)
+    assert (checked.accept, checked.false_accepts) == (every.accept, every.false_accepts)
+    assert checked.accepted[0] == pytest.approx(0.8 * every.accepted[0], abs=0.03)
