@@ -4,7 +4,7 @@
         collect grasps of procedural objects and of meshes on simulated rigs, and photos of them by other cameras, on
         other grounds and with faults; train the shipped towers further, and a head for two fingers and one for one
         finger; calibrate both, and store them in FOLDER
-    python -m models.shipped calibrate FOLDER
+    python -m models.shipped calibrate FOLDER --meshes MESHES
         calibrate the shipped checkpoints again; keep their weights
     python -m models.shipped score FOLDER
         collect other objects into FOLDER/recording, and evaluate the shipped checkpoint on them: FOLDER/report; with
@@ -19,6 +19,7 @@ import itertools
 import json
 import sys
 import zlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,45 +39,54 @@ from retrieval.model.config import Config, load_config
 from retrieval.model.encode import default_device, one_thread
 from retrieval.model.shipped import SHIPPED, shipped_model
 from retrieval.training import distil
-from retrieval.training.calibration import calibrate_checkpoint, fit_verification, score_grasps
+from retrieval.training.calibration import calibrate_checkpoint, fit_verification, refused_touches, score_grasps
 from retrieval.training.features import Features, FrozenFeatures, encode_recording, features_by_image, recorded_features
 
 RIGS = Path(__file__).parent
-RIG, GELS_RIG = (RIGS / f"shipped_{name}.toml" for name in ("rig", "gels"))
+RIG = RIGS / "shipped_rig.toml"
 
 
 class Part(NamedTuple):
-    """Rigs of training grasps, one for each seed: optics of its gels, and its objects, procedural or meshes."""
+    """One recording: optics of its gels, procedural objects or meshes, and numbers of objects, grasps and gel pairs."""
 
     optics: str
     has_meshes: bool
-    first_seed: int
-    seeds: int
+    seed: int
     objects: int
+    grasps: int = 2
+    gels: int = 4  # with more, a rig computes the properties of a gel again for nearly every object
 
 
 PARTS = (
-    Part("led", False, 113_000, 6, 250),
-    Part("varied", False, 123_000, 6, 200),
-    Part("gelsight", False, 124_000, 1, 250),
-    Part("gelsight_mini", False, 125_000, 1, 250),
-    Part("led", True, 126_000, 3, 260),
-    Part("varied", True, 127_000, 2, 260),
+    *(Part("led", False, 113_000 + number, 200) for number in range(3)),
+    *(Part("varied", False, 123_000 + number, 200) for number in range(2)),
+    Part("gelsight", False, 124_000, 150),
+    Part("gelsight_mini", False, 125_000, 150),
+    *(Part("led", True, 126_000 + number, 200) for number in range(2)),
+    Part("varied", True, 127_000, 200),
 )
 RECORDINGS, CALIBRATION = "recordings", "calibration"
 """Folders of the recordings."""
-GELS_OF_RIG = 4
-"""Pairs of gels of a training rig: with more, it computes the properties of a gel again for nearly every object."""
-SEED_VALIDATED, SEED_VERIFIED, SEED_GELS, SEED_SCORED = 150_000, 130_000, 140_000, 30_000
-"""Seeds of other object sets. The demo has its own (retrieval.commands.demo.SEED), the benchmark has 0."""
+CALIBRATED = {
+    "validation": (Part("led", False, 150_000, 80, 6, gels=25), Part("led", True, 151_000, 50, 6, gels=25)),
+    "verification": (Part("led", False, 130_000, 100, 5, gels=25), Part("led", True, 131_000, 50, 5, gels=25)),
+    "gels": (
+        Part("led", False, 140_000, 300, 1, gels=200),
+        Part("varied", False, 141_000, 200, 1, gels=200),
+        Part("gelsight", False, 142_000, 50, 1, gels=25),
+        Part("gelsight_mini", False, 143_000, 50, 1, gels=25),
+    ),
+}
+"""Recordings that choose the step and calibrate the model; that fit the bounds of verifications; and that fit, besides,
+the check of gel images, which must accept gels that it was not fitted to."""
+CALIBRATION_MESHES = 5
+"""One of this many meshes is for calibration only."""
+SEED_SCORED = 30_000
+"""Seed of the scored objects. The demo has its own (retrieval.commands.demo.SEED), the benchmark has 0."""
 TOWERS, HEADS = RIGS / "shipped_towers.toml", RIGS / "shipped_heads.toml"
 """Configurations of the training of the towers and of the heads. The last step of the towers is used: the head that is
 trained together with them does not tell which step has the best towers."""
-GRASPS, VALIDATED, VERIFIED, GELS = 2, (100, 8), (150, 5), (400, 2)
-"""Grasps of each training object; objects that choose the step and calibrate the model, and grasps of each; objects on
-which the bounds of verifications are fitted, and grasps of each; further objects for the check of gel images, and
-grasps of each."""
-HEAD_STEPS = 1000
+HEAD_STEPS = 400
 FOREIGN = 8000
 """Number of non-gel pictures for training its check of touches: more than in an ordinary training."""
 DISTIL_STEPS = 4000
@@ -90,13 +100,14 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     jobs = parser.add_subparsers(dest="job", required=True)
     make = jobs.add_parser("make", help="collect and train the checkpoints that come with the package")
-    make.add_argument("--meshes", type=Path, required=True, help="folder of closed meshes (STL)")
     calibrate_job = jobs.add_parser("calibrate", help="calibrate the shipped checkpoints again; keep their weights")
     score = jobs.add_parser("score", help="evaluate a checkpoint on other objects")
     score.add_argument("--objects", type=int, default=120)
     score.add_argument("--grasps", type=int, default=8)
     score.add_argument("--model", type=Path, help="another checkpoint than the shipped one")
     score.add_argument("--fingers", type=int, choices=tuple(SHIPPED), default=2, help="gel images of a touch")
+    for job in (make, calibrate_job):
+        job.add_argument("--meshes", type=Path, required=True, help="folder of at least 250 closed meshes (STL)")
     for job in (make, calibrate_job, score):
         job.add_argument("folder", type=Path)
         job.add_argument("--jobs", type=int, default=2)
@@ -121,9 +132,10 @@ def make_shipped(arguments: argparse.Namespace) -> int:
 
 
 class Trained(NamedTuple):
-    """Trained towers, as a configuration of heads, and the training and validation grasps with their features."""
+    """Trained towers, the configuration of heads on them, and training and validation grasps with their features."""
 
     folder: Path
+    towers: Checkpoint
     config: Config
     grasps: tuple[list[Grasp], list[Grasp]]
     features: tuple[Features, Features]
@@ -131,9 +143,9 @@ class Trained(NamedTuple):
 
 def train_towers(folder: Path, **settings: Any) -> Trained:
     """Train both towers further, with the head of two fingers; `settings` change those of TOWERS."""
-    parts = sorted((folder / RECORDINGS).iterdir())
-    train = [grasp for part in parts for grasp in grasps_with_varied_photos(part)]
-    validation = grasps_with_varied_photos(folder / CALIBRATION / "validation")
+    parts = [folder / RECORDINGS / str(part.seed) for part in PARTS]
+    train = [grasp for part in parts for grasp in grasps_of_each_photo(part)]
+    validation = calibration_grasps(folder, "validation")
     config = load_config(TOWERS)
     training = dataclasses.replace(config.training, start=str(shipped_model(2)), **settings)
     trainer = LabelTrainer(
@@ -144,19 +156,23 @@ def train_towers(folder: Path, **settings: Any) -> Trained:
         {"source": "simulated rigs", "data_digest": data_digest(train)},
         labels={name: labels for part in parts for name, labels in load_object_labels(part).items()},
     )
-    config = head_config(folder, trainer.run_or_reuse(quiet=False))
+    towers = trainer.run_or_reuse(quiet=False)
+    config = head_config(folder, towers)
     features, validated = (
         encode_recording(grasps, frozen_matcher(config), config, folder / "features") for grasps in (train, validation)
     )
-    return Trained(folder, config, (train, validation), (features, validated))
+    return Trained(folder, towers, config, (train, validation), (features, validated))
+
+
+def calibration_grasps(folder: Path, name: str) -> list[Grasp]:
+    """Return the grasps of one of CALIBRATED."""
+    recordings = (folder / CALIBRATION / name / str(part.seed) for part in CALIBRATED[name])
+    return [grasp for recording in recordings for grasp in grasps_with_varied_photos(recording)]
 
 
 def grasps_with_varied_photos(recording: Path) -> list[Grasp]:
     """Return the grasps of a recording, each with its own photo or a varied one of the object, all equally likely."""
-    varied: dict[str, list[Path]] = {}
-    for picture in load_pictures(varied_photos(recording)):
-        varied.setdefault(picture.object_id, []).append(picture.file)
-    grasps = []
+    varied, grasps = photos_by_object(recording), []
     for grasp in load_grasps(recording):
         choices = [grasp.photo, *varied[grasp.object_id]]
         drawn = np.random.default_rng(zlib.crc32(grasp.grasp_id.encode())).integers(len(choices))
@@ -164,9 +180,27 @@ def grasps_with_varied_photos(recording: Path) -> list[Grasp]:
     return grasps
 
 
+def grasps_of_each_photo(recording: Path) -> list[Grasp]:
+    """Return the grasps of a recording with their own photos, and again with the varied photos of their objects."""
+    varied = {name: itertools.cycle(files) for name, files in photos_by_object(recording).items()}
+    grasps = []
+    for grasp in load_grasps(recording):
+        again = f"{grasp.grasp_id}-varied"
+        grasps += [grasp, dataclasses.replace(grasp, grasp_id=again, photo_file=next(varied[grasp.object_id]))]
+    return grasps
+
+
+def photos_by_object(recording: Path) -> dict[str, list[Path]]:
+    """Return the varied photos of each object of a recording."""
+    files: dict[str, list[Path]] = {}
+    for picture in load_pictures(varied_photos(recording)):
+        files.setdefault(picture.object_id, []).append(picture.file)
+    return files
+
+
 def varied_photos(recording: Path) -> Path:
-    """Return the folder of the varied photos of a recording's objects, next to it."""
-    return recording.parent.parent / "photos" / recording.name
+    """Return the folder of the varied photos of a recording's objects."""
+    return recording.with_name(f"{recording.name}-photos")
 
 
 def head_config(folder: Path, towers: Checkpoint) -> Config:
@@ -187,9 +221,16 @@ def tower_weights(folder: Path, made: Checkpoint) -> dict[str, str]:
 
 
 def train_head(trained: Trained) -> Checkpoint:
-    """Train a head on the features of the towers, for its number of fingers."""
-    folder = trained.folder / f"{trained.config.matcher.fingers}-fingers"
-    settings = MethodSettings(trained.config, folder=folder, quiet=False)
+    """Train a head further on the features of the towers, for its number of fingers.
+
+    That of two fingers begins as it was trained with the towers, that of one finger as the shipped one.
+    """
+    fingers, start = trained.config.matcher.fingers, trained.towers
+    if fingers == 1:
+        start = load_checkpoint(shipped_model(1))
+        for name in ("touch_tower", "photo_tower"):
+            getattr(start.matcher, name).load_state_dict(getattr(trained.towers.matcher, name).state_dict())
+    settings = MethodSettings(trained.config, folder=trained.folder / f"{fingers}-fingers", start=start, quiet=False)
     made = trained_checkpoint(settings, *trained.features)
     train, validation = trained.grasps
     about = {"source": "simulated rigs", "data_digest": data_digest([*train, *validation])}
@@ -236,36 +277,48 @@ def each_finger_features(features: Features) -> Features:
 
 
 def collect_training(arguments: argparse.Namespace) -> int:
-    """Collect the training grasps, one recording for each seed, and varied photos of their objects."""
-    folder, jobs = arguments.folder, arguments.jobs
-    folder.mkdir(parents=True, exist_ok=True)
-    meshes = itertools.cycle(sorted(arguments.meshes.glob("*.stl")))
-    for optics, has_meshes, first_seed, seeds, objects in PARTS:
-        for seed in range(first_seed, first_seed + seeds):
-            settings: dict[str, Any] = {"rig": "sim", "gels": GELS_OF_RIG, "optics": optics}
-            if has_meshes:
-                settings["meshes"] = str(vary_meshes(meshes, objects, folder / "meshes" / str(seed), seed))
-            rig = folder / f"{seed}.toml"
-            rig.write_text("".join(f"{key} = {json.dumps(value)}\n" for key, value in settings.items()))
-            out = folder / RECORDINGS / str(seed)
-            if code := collect(out, rig, objects, GRASPS, seed, jobs):
-                return code
-            collect_pictures("varied", varied_photos(out), objects=objects, seed=seed, rig=str(rig), jobs=jobs)
-    return 0
+    """Collect the training recordings."""
+    return collect_parts(arguments, PARTS, arguments.folder / RECORDINGS, mesh_files(arguments)[0])
 
 
 def collect_calibration(arguments: argparse.Namespace) -> int:
-    """Collect the grasps of the validation objects, and those that `calibrated` needs besides."""
-    folder, jobs = arguments.folder / CALIBRATION, arguments.jobs
-    for name, rig, (objects, grasps), seed in (
-        ("validation", RIG, VALIDATED, SEED_VALIDATED),
-        ("verification", RIG, VERIFIED, SEED_VERIFIED),
-        ("gels", GELS_RIG, GELS, SEED_GELS),
-    ):
-        if code := collect(folder / name, rig, objects, grasps, seed, jobs):
+    """Collect the recordings of CALIBRATED."""
+    meshes = mesh_files(arguments)[1]
+    for name, parts in CALIBRATED.items():
+        if code := collect_parts(arguments, parts, arguments.folder / CALIBRATION / name, meshes):
             return code
-        collect_pictures("varied", varied_photos(folder / name), objects=objects, seed=seed, rig=str(rig), jobs=jobs)
     return 0
+
+
+def mesh_files(arguments: argparse.Namespace) -> tuple[Iterator[Path], Iterator[Path]]:
+    """Return the meshes for training, and others for calibration, again and again."""
+    files = sorted(arguments.meshes.glob("*.stl"))
+    calibrated = files[::CALIBRATION_MESHES]
+    return itertools.cycle(sorted(set(files) - set(calibrated))), itertools.cycle(calibrated)
+
+
+def collect_parts(arguments: argparse.Namespace, parts: Sequence[Part], out: Path, meshes: Iterator[Path]) -> int:
+    """Collect varied photos and grasps of all parts."""
+    folder, jobs = arguments.folder, arguments.jobs
+    out.mkdir(parents=True, exist_ok=True)
+    rigs = [write_rig(folder, part, meshes) for part in parts]
+    for part, rig in zip(parts, rigs, strict=True):
+        photos = varied_photos(out / str(part.seed))
+        collect_pictures("varied", photos, objects=part.objects, seed=part.seed, rig=str(rig), jobs=jobs)
+    for part, rig in zip(parts, rigs, strict=True):
+        if code := collect(out / str(part.seed), rig, part.objects, part.grasps, part.seed, jobs):
+            return code
+    return 0
+
+
+def write_rig(folder: Path, part: Part, meshes: Iterator[Path]) -> Path:
+    """Write the rig of a recording, with the next of the meshes in random sizes, and return its file."""
+    rig = folder / f"{part.seed}.toml"
+    settings: dict[str, Any] = {"rig": "sim", "gels": part.gels, "optics": part.optics}
+    if part.has_meshes:
+        settings["meshes"] = str(vary_meshes(meshes, part.objects, folder / "meshes" / str(part.seed), part.seed))
+    rig.write_text("".join(f"{key} = {json.dumps(value)}\n" for key, value in settings.items()))
+    return rig
 
 
 def calibrate_shipped(arguments: argparse.Namespace) -> int:
@@ -280,20 +333,23 @@ def calibrate_shipped(arguments: argparse.Namespace) -> int:
 
 def calibrated(made: Checkpoint, folder: Path, fingers: int) -> Checkpoint:
     """Return a checkpoint with its gel check, posterior, calibration of reference touches and bounds."""
-    parts = [grasps_with_varied_photos(folder / CALIBRATION / name) for name in ("validation", "verification", "gels")]
+    parts = [calibration_grasps(folder, name) for name in CALIBRATED]
     if fingers == 1:
         parts = [[each_finger(grasp)[0] for grasp in part] for part in parts]
     validation, verification, gels = parts
     every, device = [*validation, *verification, *gels], default_device()
     features = encode_recording(every, made.matcher, made.config, folder / "features")
     source = FrozenFeatures(made.config, features_by_image(every, features, device))
-    known = [*verification, *gels]
-    made = calibrate_checkpoint(made, source, known, validation, foreign=FOREIGN, max_grasps=len(every))
+    names = sorted({grasp.object_id for grasp in gels})
+    fitting, others = ([grasp for grasp in gels if grasp.object_id in names[side::2]] for side in (0, 1))
+    held_out = [*validation, *others]
+    made = calibrate_checkpoint(made, source, fitting, held_out, foreign=FOREIGN, max_grasps=len(every))
     touches, photos = recorded_features(made.matcher, source, verification)
     trials = score_grasps(made.matcher, verification, touches, photos)
     assert trials is not None
     assert made.posterior is not None
-    return dataclasses.replace(made, verification=fit_verification([trials], made.posterior))
+    refused = [refused_touches(made, touches)]
+    return dataclasses.replace(made, verification=fit_verification([trials], made.posterior, refused=refused))
 
 
 def distilled(made: Checkpoint, train: Features, validation: Features) -> Checkpoint:
