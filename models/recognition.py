@@ -155,13 +155,11 @@ def statements(checkpoint: Checkpoint, grasps: Sequence[Grasp], cache: Path) -> 
     sure = stated.max(1) >= SURE
     bounds = calibration.bounds(STATED_FAR)
     claims, genuine = verification_sequences(scored, posterior), verification_sequences(checked, posterior)
-    assert claims is not None
-    assert genuine is not None
-    measured = {
-        f"stated {SURE} and more is right": (stated.argmax(1)[sure] == 0, scored.touch_owner[sets[sure, 0]]),
-        f"false accepts at a stated {STATED_FAR}": ((claims.impostor >= bounds.accept).mean(1), claims.owner),
-        "false rejects": (genuine.ratios.max(1) < bounds.accept, genuine.owner),
-    }
+    measured = {f"stated {SURE} and more is right": (stated.argmax(1)[sure] == 0, scored.touch_owner[sets[sure, 0]])}
+    if claims is not None and genuine is not None:  # enough grasps of an object
+        false_accepts, false_rejects = claims.impostor >= bounds.accept, genuine.ratios.max(1) < bounds.accept
+        measured[f"false accepts at a stated {STATED_FAR}"] = false_accepts.mean(1), claims.owner
+        measured["false rejects"] = false_rejects, genuine.owner
     parts = []
     for what, (values, owner) in measured.items():
         if not len(values):

@@ -7,7 +7,9 @@
     catalog/metadata.jsonl          optional: one JSON object per line, with `file_name` (a photo's path in the
                                     catalogue) or `object_id` (all its photos) and any other keys; a photo's
                                     value of a key takes precedence over its object's; `opening_mm` in the line
-                                    of a touch's gel image, or of the object, is the opening of the jaws
+                                    of a touch's gel image, or of the object, is the opening of the jaws; `field_mm`
+                                    is what a photo shows along its shorter side, at the object's distance, and a
+                                    line with this key alone is for all photos
 
 A picture is recognised by its extension, or by its content if it has no extension of a picture. Hidden files and those
 of systems and network drives are left out (`_touch_retrieval.names`). A photo's path in the catalogue, with forward
@@ -40,6 +42,10 @@ from retrieval.data.text import is_utf8
 from retrieval.errors import BadInput, DatasetError
 
 METADATA_FILE = "metadata.jsonl"
+FIELD_RANGE_MM = (10.0, 10_000.0)
+"""Fields of photos that are accepted."""
+_ALL_PHOTOS = ""
+"""Name of the object whose metadata are those of all photos."""
 ENROLLED = "enrolled"
 """Folder in an index with the pictures of enrolled touches; in a catalogue around the index they are no photos."""
 UNSUPPORTED_EXTENSIONS = frozenset(
@@ -64,11 +70,19 @@ class SkippedPhoto:
 
 @dataclass(frozen=True, slots=True)
 class CataloguePhoto:
-    """One photo of a catalogue: its path relative to the catalogue, its object, and the user's own keys and values."""
+    """One photo of a catalogue.
+
+    Attributes:
+        path: Its path relative to the catalogue.
+        object_id: Its object.
+        metadata: The user's own keys and values.
+        field_mm: Its field, from these metadata.
+    """
 
     path: str
     object_id: str
     metadata: dict[str, Any] = field(default_factory=dict, hash=False)
+    field_mm: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +168,7 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
     by_object, by_photo = _read_metadata(root / METADATA_FILE, naming)
 
     def metadata_of(name: str, *paths: str) -> dict[str, Any]:
-        metadata = by_object.get(lookup_key(name), {})
+        metadata = {**by_object.get(_ALL_PHOTOS, {}), **by_object.get(lookup_key(name), {})}
         for path in reversed(paths):
             metadata = {**metadata, **by_photo.get(lookup_key(path), {})}
         return metadata
@@ -175,7 +189,8 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
             unfit.append(SkippedPhoto(path, f"does not fit --objects-from {naming.text}{why}"))
         # A picture outside every folder is a photo, and so is every picture if the file stem names the object.
         elif "/" not in path or naming.text == STEM or not _NEARLY_TOUCH.fullmatch(PurePosixPath(path).stem):
-            photos.append(CataloguePhoto(path, name, metadata_of(name, path)))
+            metadata = metadata_of(name, path)
+            photos.append(CataloguePhoto(path, name, metadata, _field_mm(metadata, path)))
         elif (touch := _touch_name(path)) is None:
             skipped.append(SkippedPhoto(path, f"neither a photo nor a touch: {_TOUCH_NAMES}"))
         else:
@@ -198,7 +213,7 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
     catalogue = Catalogue(root, tuple(photos), tuple(ignored), (*skipped, *unfit), touches=tuple(touches))
     unknown = [
         *sorted(by_photo.keys() - set(map(lookup_key, catalogue.paths))),
-        *sorted(by_object.keys() - set(map(lookup_key, catalogue.object_ids))),
+        *sorted(by_object.keys() - {_ALL_PHOTOS, *map(lookup_key, catalogue.object_ids)}),
     ]
     notes = [f"{METADATA_FILE} names {name}, which is not in the catalogue" for name in unknown]
     return replace(catalogue, notes=(*notes, *_notes_on_files(catalogue, names, system)))
@@ -345,11 +360,26 @@ def _read_metadata(file: Path, naming: Naming) -> tuple[dict[str, dict[str, Any]
     return by_object, by_photo
 
 
+def _field_mm(metadata: dict[str, Any], path: str) -> float | None:
+    """Return the field of a photo; None if it is unknown. Raises DatasetError."""
+    if (value := metadata.get("field_mm")) is None:
+        return None
+    low, high = FIELD_RANGE_MM
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+        raise DatasetError(
+            f"{METADATA_FILE}: field_mm of {path} must be the millimetres that the photo shows along its shorter side, "
+            f"from {low:g} to {high:g}; got {value!r:.40}"
+        )
+    return float(value)
+
+
 def _parse_line(line: str, naming: Naming) -> tuple[str, bool, dict[str, Any]]:
     """Return (photo path or object_id, whether it is a photo, the other keys)."""
     row = parse_json(line)
     if not isinstance(row, dict):
         raise ValueError("must be one JSON object a line, in braces")
+    if row.keys() == {"field_mm"}:
+        return _ALL_PHOTOS, False, row
     keys = [key for key in ("file_name", "object_id") if key in row]
     if not keys:
         raise ValueError(

@@ -18,7 +18,7 @@ from retrieval.data.images import decode, picture_size, read_bytes, read_rgb
 from retrieval.data.object_finder import INPUT_PX, FoundObject, find_object, network_digest, whole_photo
 from retrieval.data.photo_faults import photo_faults
 from retrieval.data.resize import RgbImage, Samples, resize
-from retrieval.data.views import OVERSAMPLING, VIEWS, sufficient_side, tile_views
+from retrieval.data.views import FIELD_MM, OVERSAMPLING, VIEWS, sufficient_side, tile_views
 from retrieval.errors import BadInput, ConfigError, NumericalError
 
 PREPROCESSING_VERSION = 2
@@ -105,15 +105,18 @@ class Preprocessing:
         _require_finite(image, "photo")
         return tile_views(image, self.views, self.photo_px)
 
-    def photo_from_bytes(self, data: bytes, name: str | Path) -> PreparedPhoto:
-        """Prepare the photo in the bytes of a file, called `name`, and examine it. Raises ImageError."""
-        image, found = self._decode_photo(data, name)
+    def photo_from_bytes(self, data: bytes, name: str | Path, field_mm: float = FIELD_MM) -> PreparedPhoto:
+        """Prepare the photo in the bytes of a file, called `name`, and examine it. Raises ImageError.
+
+        `field_mm`: what the photo shows along its shorter side, at the object's distance.
+        """
+        image, found = self._decode_photo(data, name, field_mm)
         return PreparedPhoto(
-            tile_views(image, self.views, self.photo_px, found),
+            tile_views(image, self.views, self.photo_px, found, field_mm),
             () if self.views == ("whole",) else photo_faults(image, found),
         )
 
-    def _decode_photo(self, data: bytes, name: str | Path) -> tuple[Samples, FoundObject]:
+    def _decode_photo(self, data: bytes, name: str | Path, field_mm: float = FIELD_MM) -> tuple[Samples, FoundObject]:
         """Return a photo in the size that its views need, and its object."""
         needs_object = self.views != ("whole",)
         first_side = max(OVERSAMPLING * self.photo_px, INPUT_PX if needs_object else 0)
@@ -121,7 +124,7 @@ class Preprocessing:
         if not needs_object:
             return image, whole_photo(image)
         found, short = find_object(image), min(image.shape[:2])
-        enough = sufficient_side(self.views, self.photo_px, found, short)
+        enough = sufficient_side(self.views, self.photo_px, found, short, field_mm)
         if self.reduced and short < min(enough, *picture_size(data, name)):
             image = decode(data, name, enough)
             found = found.scaled(min(image.shape[:2]) / short)

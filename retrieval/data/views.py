@@ -2,12 +2,12 @@
 
     whole   the photo, resized to a square
     crop    a square around the object, a little larger than it
-    zoom    a square around the object's middle, whose side is a multiple of the root of the object's visible area
+    zoom    a square of 83 mm around the object's middle
     grey    the zoom without its colours
 
-At the towers' resolution, the relief that touches a gel is a few pixels wide in a photo. `zoom` shows it larger, at a
-scale that does not depend on distance, focal length or roll of the camera. `grey` drops the colour, which carries no
-tactile information.
+At the towers' resolution, the relief that touches a gel is a few pixels wide in a photo. `zoom` shows it larger, and
+at one scale, since a gel shows the pitch of a relief in millimetres: where the field of the photo is unknown, it is
+taken to be that of the simulated rig. `grey` drops the colour, which carries no tactile information.
 """
 
 import math
@@ -20,7 +20,9 @@ from retrieval.data.object_finder import FoundObject, find_object, whole_photo
 from retrieval.data.resize import RgbImage, Samples, resize, to_float
 
 _CROP_MARGIN = 1.12
-_ZOOM = 1.25
+_ZOOM_MM = 83.125
+FIELD_MM = 190.0
+"""Field of a photo, in millimetres along its shorter side at the object's distance, where it is unknown."""
 
 
 def crop_square(image: Samples, found: FoundObject, side: float) -> Samples:
@@ -34,33 +36,33 @@ def crop_square(image: Samples, found: FoundObject, side: float) -> Samples:
     return whole
 
 
-def _crop(image: Samples, found: FoundObject) -> Samples:
+def _crop(image: Samples, found: FoundObject, field_mm: float) -> Samples:
     return crop_square(image, found, _CROP_MARGIN * found.side)
 
 
-def _zoom(image: Samples, found: FoundObject) -> Samples:
-    return crop_square(image, found, _ZOOM * math.sqrt(found.area))
+def _zoom(image: Samples, found: FoundObject, field_mm: float) -> Samples:
+    return crop_square(image, found, _ZOOM_MM / field_mm * min(image.shape[:2]))
 
 
-def _grey(image: Samples, found: FoundObject) -> Samples:
-    grey: RgbImage = to_float(_zoom(image, found)).mean(axis=2, keepdims=True)
+def _grey(image: Samples, found: FoundObject, field_mm: float) -> Samples:
+    grey: RgbImage = to_float(_zoom(image, found, field_mm)).mean(axis=2, keepdims=True)
     return grey
 
 
-VIEWS: dict[str, Callable[[Samples, FoundObject], Samples]] = {
-    "whole": lambda image, found: image,
+VIEWS: dict[str, Callable[[Samples, FoundObject, float], Samples]] = {
+    "whole": lambda image, found, field_mm: image,
     "crop": _crop,
     "zoom": _zoom,
     "grey": _grey,
 }
-"""Name of a view -> function of a photo (H, W, 3) and its object; returns (h, w, 3), or (h, w, 1) without colour."""
+"""Name of a view -> function of a photo (H, W, 3), its object and its field; returns (h, w, 3), or (h, w, 1)."""
 
 
 OVERSAMPLING = 2
 """Pixels of a reduced photo, along a side, for each pixel of a tower's input."""
 
 
-def sufficient_side(names: Sequence[str], px: int, found: FoundObject, short: int) -> int:
+def sufficient_side(names: Sequence[str], px: int, found: FoundObject, short: int, field_mm: float) -> int:
     """Return the shorter side in pixels of a photo that is sufficient for these views.
 
     Args:
@@ -68,13 +70,16 @@ def sufficient_side(names: Sequence[str], px: int, found: FoundObject, short: in
         px: Side of a view.
         found: The object in the photo at another size.
         short: Shorter side of the photo at that size.
+        field_mm: Field of the photo.
     """
-    sides = {"whole": short, "crop": _CROP_MARGIN * found.side, "zoom": _ZOOM * math.sqrt(found.area)}
+    sides = {"whole": short, "crop": _CROP_MARGIN * found.side, "zoom": _ZOOM_MM / field_mm * short}
     smallest = min(sides["zoom" if name == "grey" else name] for name in names)
     return math.ceil(OVERSAMPLING * px * short / max(smallest, 1))
 
 
-def tile_views(image: Samples, names: Sequence[str], px: int, found: FoundObject | None = None) -> RgbImage:
+def tile_views(
+    image: Samples, names: Sequence[str], px: int, found: FoundObject | None = None, field_mm: float = FIELD_MM
+) -> RgbImage:
     """Return the views of a photo (H, W, 3), side by side: (px, len(names) * px, 3).
 
     The object is searched for if `found` is None and a view needs it.
@@ -83,5 +88,5 @@ def tile_views(image: Samples, names: Sequence[str], px: int, found: FoundObject
         found = whole_photo(image) if set(names) == {"whole"} else find_object(image)
     tiles = np.empty((px, len(names) * px, 3), np.float32)
     for number, name in enumerate(names):
-        tiles[:, number * px : (number + 1) * px] = resize(VIEWS[name](image, found), (px, px))
+        tiles[:, number * px : (number + 1) * px] = resize(VIEWS[name](image, found, field_mm), (px, px))
     return tiles

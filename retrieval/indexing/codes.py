@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import msgspec
@@ -27,6 +28,7 @@ from retrieval.console.progress import Bar
 from retrieval.data.catalogue import Catalogue, SkippedPhoto
 from retrieval.data.images import decode_rgb, read_bytes
 from retrieval.data.loading import map_in_order
+from retrieval.data.views import FIELD_MM
 from retrieval.errors import ImageError, NumericalError, RetrievalError
 from retrieval.indexing.enrolled import EnrolledTable, EnrolledTouch, codes_of, model_key, to_code
 from retrieval.model.checkpoint import Checkpoint
@@ -116,6 +118,7 @@ class Encoder(NamedTuple):
         what: Plural of the items.
         layout: Type of a code.
         model: Group of the codes in the cache: a digest of model, preprocessing and layout.
+        variant: End of the key of an item in the cache: what its code depends on besides its files.
         decode: Returns the model's input from the bytes of an item's files and their paths, and the faults of a photo;
             raises ImageError.
         start: Returns, for a number of items to encode, the function that returns the codes (B,) of inputs with these
@@ -125,16 +128,17 @@ class Encoder(NamedTuple):
     what: str
     layout: np.dtype[Any]
     model: str
+    variant: Callable[[Paths], str]
     decode: Callable[[Sequence[bytes], Paths], tuple[Any, Sequence[str]]]
     start: Callable[[int], Callable[[Sequence[Any], Sequence[Paths]], NDArray[Any]]]
 
-    def key(self, digests: Iterable[str]) -> str:
+    def key(self, paths: Paths, digests: Iterable[str]) -> str:
         """Return the key in the cache of an item whose files have these digests."""
-        return f"{self.model}/{'-'.join(digests)}"
+        return f"{self.model}/{'-'.join(digests)}{self.variant(paths)}"
 
 
-def photo_encoder(checkpoint: Checkpoint) -> Encoder:
-    """Return the encoder of photos."""
+def photo_encoder(checkpoint: Checkpoint, fields_mm: Mapping[str, float] = MappingProxyType({})) -> Encoder:
+    """Return the encoder of photos; `fields_mm` are the known fields, by path."""
     settings, photo_from_bytes = checkpoint.config.matcher, checkpoint.config.preprocessing.photo_from_bytes
     stored = stored_layout(settings.pooled_width, settings.partial_width)
     layout = np.dtype(
@@ -165,7 +169,8 @@ def photo_encoder(checkpoint: Checkpoint) -> Encoder:
         "photos",
         layout,
         _model(checkpoint, layout),
-        lambda data, paths: photo_from_bytes(data[0], paths[0]),
+        lambda paths: f"-{fields_mm[paths[0]]:g}" if paths[0] in fields_mm else "",
+        lambda data, paths: photo_from_bytes(data[0], paths[0], fields_mm.get(paths[0], FIELD_MM)),
         start,
     )
 
@@ -193,7 +198,7 @@ def touch_encoder(checkpoint: Checkpoint) -> Encoder:
             records["shows"] = [SHOWS.index(shows) for shows in check.classify(readings.cpu().numpy())]
         return records
 
-    return Encoder("touches", layout, _model(checkpoint, layout), decode, lambda count: encode)
+    return Encoder("touches", layout, _model(checkpoint, layout), lambda paths: "", decode, lambda count: encode)
 
 
 class EnrolledCodes(NamedTuple):
@@ -284,7 +289,7 @@ def find_codes(items: Sequence[Paths], encoder: Encoder, files: CatalogueFiles, 
         NumericalError: A partial activation exceeds float16.
     """
     found, taken = Codes(), dict[str, Paths | None].fromkeys(cache.keys(encoder.model))
-    known = {paths: encoder.key(map(files.digest, paths)) for paths in items}
+    known = {paths: encoder.key(paths, map(files.digest, paths)) for paths in items}
     found.keys = {paths: key for paths, key in known.items() if key in taken}
     unread = [paths for paths in items if paths not in found.keys]
     if not unread:
@@ -300,7 +305,7 @@ def find_codes(items: Sequence[Paths], encoder: Encoder, files: CatalogueFiles, 
             except ImageError as error:
                 found.skipped.append(SkippedPhoto(paths[0], error.reason))
                 continue
-            found.keys[paths] = key = encoder.key(record.digest for record in records)
+            found.keys[paths] = key = encoder.key(paths, (record.digest for record in records))
             if taken.setdefault(key, paths) is paths:  # no other thread encodes this content
                 try:
                     prepared, faults = encoder.decode(contents, paths)

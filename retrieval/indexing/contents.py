@@ -95,7 +95,8 @@ def read_contents(catalogue: Catalogue, checkpoint: Checkpoint, cache: Cache, qu
     files = CatalogueFiles(catalogue, cache)
     references = _find_references(catalogue, checkpoint, files, cache, quiet)
     photos = sorted([*catalogue.photos, *references.pictures], key=lambda photo: photo.path)
-    encoder, gel_images = photo_encoder(checkpoint), {picture.path for picture in references.pictures}
+    fields_mm = {photo.path: photo.field_mm for photo in photos if photo.field_mm is not None}
+    encoder, gel_images = photo_encoder(checkpoint, fields_mm), {picture.path for picture in references.pictures}
     codes = find_codes([(photo.path,) for photo in photos], encoder, files, cache, quiet)
     files.save()
     if not codes.keys:

@@ -213,3 +213,26 @@ def test_objects_may_have_only_touches_and_these_have_metadata(tmp_path):
     found = list_catalogue(write_metadata(fill(tmp_path, "mug/touch_1.png"), {"object_id": "mug", "shelf": 3}))
     assert (len(found.photos), found.object_ids, found.notes) == (0, ("mug",), ())
     assert found.touches[0].metadata == {"shelf": 3}
+
+
+def test_the_field_of_a_photo_is_its_own_its_objects_or_that_of_all_photos(tmp_path):
+    fill(tmp_path, "mug/0.jpg", "mug/1.jpg", "cup/0.jpg", "tin/0.jpg")
+    write_metadata(
+        tmp_path,
+        {"field_mm": 320},
+        {"object_id": "mug", "field_mm": 200},
+        {"file_name": "mug/1.jpg", "field_mm": 150.5},
+        {"object_id": "tin", "price": 5},
+    )
+    catalogue = list_catalogue(tmp_path)
+    fields = {photo.path: photo.field_mm for photo in catalogue.photos}
+    assert fields == {"cup/0.jpg": 320, "mug/0.jpg": 200, "mug/1.jpg": 150.5, "tin/0.jpg": 320}
+    assert catalogue.notes == ()
+
+
+@pytest.mark.parametrize("value", ["0.2", "5", '"190"', "true", "1e5"])
+def test_a_field_that_is_no_length_in_millimetres_is_refused(tmp_path, value):
+    fill(tmp_path, "mug/0.jpg")
+    (tmp_path / "metadata.jsonl").write_text(f'{{"field_mm": {value}}}')
+    with pytest.raises(DatasetError, match=r"field_mm of mug/0\.jpg must be the millimetres"):
+        list_catalogue(tmp_path)

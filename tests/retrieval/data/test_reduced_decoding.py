@@ -58,8 +58,8 @@ def test_a_small_object_needs_a_second_larger_decoding_and_a_large_one_does_not(
     for side, fraction, sizes in (
         (1024, 0.6, [(128, 128), (256, 256)]),  # the crop has 1.12 * 0.6 of 128, 86 pixels, and 128 are required
         (1024, 0.96, [(128, 128)]),
-        (1024, 0.12, [(128, 128), (1024, 1024)]),
-        (200, 0.12, [(200, 200)]),  # the file has no more pixels
+        (1024, 0.2, [(128, 128), (1024, 1024)]),
+        (200, 0.2, [(200, 200)]),  # the file has no more pixels
     ):
         decoded.clear()
         settings.photo_from_bytes(with_object(side, fraction), "x")

@@ -12,7 +12,7 @@ from retrieval.commands.main import main
 from retrieval.data.object_finder import FoundObject, find_object
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import resize
-from retrieval.data.views import VIEWS, crop_square, tile_views
+from retrieval.data.views import FIELD_MM, VIEWS, crop_square, tile_views
 from retrieval.model.config import MatcherConfig
 from retrieval.model.fusion import Matcher
 
@@ -96,7 +96,7 @@ def test_a_square_is_cut_out_exactly_at_any_position(side, middle):
 def test_the_grey_view_is_the_zoom_without_its_colours_to_the_bit():
     image = photo()
     found = FoundObject(90, 80, 140, 150, 50 * 70)
-    zoom = VIEWS["zoom"](image, found)
+    zoom = VIEWS["zoom"](image, found, FIELD_MM)
     expected = resize(np.repeat(zoom.mean(axis=2, keepdims=True), 3, axis=2), (48, 48))
     np.testing.assert_array_equal(tile_views(image, ("grey",), 48, found), expected)
 
@@ -110,19 +110,18 @@ def test_views_are_tiled_side_by_side():
     assert blue[2] > blue[1] > blue[0]  # windows of about 105, 157 and 256 pixels
 
 
-@pytest.mark.parametrize("view", ["crop", "zoom"])
-def test_a_view_has_the_same_scale_at_any_distance_of_the_camera(view):
-    def widths(box):
-        left, top, right, bottom = box
-        tile = VIEWS[view](photo(box=box), FoundObject(*map(float, box), (right - left) * (bottom - top)))
-        return (resize(tile, (100, 100))[50, :, 2] > 0.65).sum()
+def test_the_crop_has_the_same_scale_at_any_distance_of_the_camera():
+    def width(box):
+        tile = tile_views(photo(box=box), ("crop",), 100, FoundObject(*map(float, box), 0.0))
+        return int((tile[50, :, 2] > 0.65).sum())
 
-    assert abs(int(widths((100, 60, 150, 200))) - int(widths((115, 95, 140, 165)))) <= 2
+    assert abs(width((100, 60, 150, 200)) - width((115, 95, 140, 165))) <= 2
 
 
-def test_the_zoom_does_not_depend_on_the_roll_of_the_camera():
-    upright, lying = FoundObject(100, 60, 150, 200, 7000), FoundObject(60, 100, 200, 150, 7000)
-    assert VIEWS["zoom"](photo(), upright).shape == VIEWS["zoom"](photo(), lying).shape
+@pytest.mark.parametrize(("field_mm", "px"), [(FIELD_MM, 112), (380, 56), (95, 224)])
+def test_the_zoom_has_one_scale_in_millimetres(field_mm, px):
+    for found in (FoundObject(110, 90, 150, 170, 3000), FoundObject(70, 20, 190, 230, 20000)):
+        assert VIEWS["zoom"](photo(), found, field_mm).shape == (px, px, 3)
 
 
 def test_a_photos_features_are_those_of_its_views_side_by_side():

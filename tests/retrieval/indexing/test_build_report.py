@@ -100,3 +100,19 @@ def test_new_photos_that_are_unlike_training_photos_give_a_warning(tmp_path, che
     report = build_index(own, checkpoint, index, quiet=True)
     assert ["1 of 2" in line and "1 blurred; for example mug.png" in line for line in report.warnings] == [True]
     assert build_index(own, checkpoint, index, quiet=True).warnings == []  # no photo is new
+
+
+def test_a_stated_field_changes_the_zoom_and_embeds_the_photo_again(tmp_path, checkpoint, index):
+    zooms = dataclasses.replace(checkpoint.config.preprocessing, views=("zoom",))
+    checkpoint = dataclasses.replace(checkpoint, config=dataclasses.replace(checkpoint.config, preprocessing=zooms))
+    own, photo = tmp_path / "own", np.random.default_rng(0).integers(0, 255, (256, 256, 3), np.uint8)
+    own.mkdir()
+    for name in ("mug", "cup"):
+        Image.fromarray(photo if name == "mug" else photo[::-1]).save(own / f"{name}.png")
+    assert build_index(own, checkpoint, index, quiet=True).embedded == 2
+    before = IndexStore(index).open().arrays["partials"][:]
+    (own / "metadata.jsonl").write_text('{"file_name": "mug.png", "field_mm": 400}')
+    report = build_index(own, checkpoint, index, quiet=True)
+    assert (report.written, report.embedded) == (True, 1)
+    after = IndexStore(index).open().arrays["partials"][:]
+    assert (before == after).all(axis=1).tolist() == [True, False]  # cup, mug
