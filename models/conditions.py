@@ -4,11 +4,13 @@
     python -m models.conditions grasps/ --rig models/shipped_rig.toml --seed 918273 --photos photos/ --model shipped
 
 Each object of the recording is photographed three times in each condition; all photos of a catalogue are in the same
-one, and the touches are unchanged. It prints top-1 of one touch among one photo of each of 10 and of 100 objects, with
-95 % intervals over objects, for each model. A touch that the gel check refuses gives no evidence.
+one, and the touches are unchanged. The field of photos is unknown to the model, or stated. It prints top-1 of one touch
+among one photo of each of 10 and of 100 objects, with 95 % intervals over objects, for each model. A touch that the gel
+check refuses gives no evidence.
 """
 
 import argparse
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,6 +21,7 @@ from models.photography import CONDITIONS
 from models.pictures import LabelledPicture, collect_pictures
 from models.recognition import all_scores, interval, photo_partials, top1
 from retrieval.data.dataset import Grasp, load_grasps
+from retrieval.data.views import FIELD_MM
 from retrieval.metrics.intervals import summarise
 from retrieval.metrics.measure import Measure
 from retrieval.metrics.table import ScoreTable
@@ -30,6 +33,8 @@ from retrieval.training.features import encode_recording
 CANDIDATES = (10, 100)
 AS_THE_RIG, *CHANGED, _ = CONDITIONS
 MEAN = "mean of the changed ones"
+OTHER_FIELD = 0.1
+"""Logarithm of the ratio of fields from which a condition is also measured with its field stated."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -62,13 +67,18 @@ def measures(
     refused = refused_touches(checkpoint, torch.from_numpy(features.touch_rows))
     names = sorted(set(features.object_ids))
     of_condition: dict[str, dict[int, Measure]] = {}
-    for condition in CONDITIONS:
+    for condition, how in CONDITIONS.items():
         shown = [photo for photo in photos if photo.name.rpartition("-")[0] == condition and photo.object_id in names]
         owner = np.array([names.index(photo.object_id) for photo in shown])
-        scores = all_scores(checkpoint, touches, photo_partials(checkpoint, [photo.file for photo in shown]))
-        scores[refused] = np.median(scores)
-        scored = ScoreTable(scores, features.owner, owner, np.zeros(scores.shape, np.bool_))
-        of_condition[condition] = {k: top1(scored, k, photos=1) for k in CANDIDATES if k <= len(names)}
+        fields = {condition: FIELD_MM}
+        if abs(math.log(how.camera.field_mm / FIELD_MM)) > OTHER_FIELD:
+            fields[f"{condition}, its field stated"] = how.camera.field_mm
+        for name, field_mm in fields.items():
+            partials = photo_partials(checkpoint, [photo.file for photo in shown], field_mm)
+            scores = all_scores(checkpoint, touches, partials)
+            scores[refused] = np.median(scores)
+            scored = ScoreTable(scores, features.owner, owner, np.zeros(scores.shape, np.bool_))
+            of_condition[name] = {k: top1(scored, k, photos=1) for k in CANDIDATES if k <= len(names)}
     return of_condition
 
 

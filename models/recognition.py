@@ -28,6 +28,7 @@ from models.pictures import collect_pictures
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.data.loading import map_in_order, worker_pool
+from retrieval.data.views import FIELD_MM
 from retrieval.evaluation.reject import reject
 from retrieval.metrics.intervals import compare, summarise
 from retrieval.metrics.measure import Measure
@@ -206,11 +207,11 @@ def grasp_sets(owner: NDArray[np.int64], count: int, photos: int) -> NDArray[np.
 
 
 @torch.inference_mode()
-def photo_partials(checkpoint: Checkpoint, files: Sequence[Path]) -> torch.Tensor:
-    """Return partial activations (N, partial) of photos."""
-    encoded = []
+def photo_partials(checkpoint: Checkpoint, files: Sequence[Path], field_mm: float = FIELD_MM) -> torch.Tensor:
+    """Return partial activations (N, partial) of photos with this field."""
+    encoded, load_photo = [], partial(checkpoint.config.preprocessing.load_photo, field_mm=field_mm)
     with Bar("encode photos", len(files), "photos") as bar, worker_pool() as pool:
-        for images in batches(map_in_order(pool, checkpoint.config.preprocessing.load_photo, files), 32):
+        for images in batches(map_in_order(pool, load_photo, files), 32):
             features = photo_features(checkpoint.matcher, images)
             encoded.append(checkpoint.matcher.photo_encoding(features).partial)
             bar.advance(len(images))

@@ -116,7 +116,7 @@ class Preprocessing:
             () if self.views == ("whole",) else photo_faults(image, found),
         )
 
-    def _decode_photo(self, data: bytes, name: str | Path, field_mm: float = FIELD_MM) -> tuple[Samples, FoundObject]:
+    def _decode_photo(self, data: bytes, name: str | Path, field_mm: float) -> tuple[Samples, FoundObject]:
         """Return a photo in the size that its views need, and its object."""
         needs_object = self.views != ("whole",)
         first_side = max(OVERSAMPLING * self.photo_px, INPUT_PX if needs_object else 0)
@@ -159,10 +159,10 @@ class Preprocessing:
         _require_finite(touch, "touch")
         return touch
 
-    def load_photo(self, path: str | Path) -> RgbImage:
+    def load_photo(self, path: str | Path, field_mm: float = FIELD_MM) -> RgbImage:
         """Read a photo as (photo_px, views * photo_px, 3) float32. Raises ImageError."""
-        image, found = self._decode_photo(read_bytes(path), path)
-        return tile_views(image, self.views, self.photo_px, found)
+        image, found = self._decode_photo(read_bytes(path), path, field_mm)
+        return tile_views(image, self.views, self.photo_px, found, field_mm)
 
     def load_touch(self, path: str | Path, reference: str | Path | None = None) -> RgbImage:
         """Read one finger's gel image as (touch_px, touch_px, 3) float32.

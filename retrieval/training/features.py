@@ -30,6 +30,7 @@ from retrieval.data.loading import map_in_order, worker_count, worker_pool
 from retrieval.data.pairs import PairBatch
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import RgbImage, resize
+from retrieval.data.views import FIELD_MM
 from retrieval.errors import DatasetError, NumericalError, RetrievalError
 from retrieval.model.checkpoint import tensors_digest
 from retrieval.model.config import Config
@@ -357,7 +358,7 @@ class _LowPassPreprocessing(Preprocessing):
 
 
 class _MarginPreprocessing(Preprocessing):
-    def load_photo(self, path: str | Path) -> RgbImage:
+    def load_photo(self, path: str | Path, field_mm: float = FIELD_MM) -> RgbImage:
         return self.photo(photo_margin(read_rgb(path)))
 
 

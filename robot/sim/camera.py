@@ -80,6 +80,11 @@ class PinholeCamera:
     target_mm: tuple[float, float, float] = (0.0, 0.0, 80.0)
     roll_rad: float = 0.0
 
+    @property
+    def field_mm(self) -> float:
+        """What the picture shows along a side, at the distance of `target_mm`."""
+        return math.dist(self.target_mm, self.position_mm) * self.px / self.focal_px
+
     @cached_property
     def to_rig(self) -> Array:
         """Transform (4, 4) from camera frame to rig frame."""
