@@ -21,10 +21,11 @@ def vary_meshes(files: Iterator[Path], count: int, out: Path, seed: int) -> Path
         file = next(files)
         mesh = trimesh.load_mesh(file)
         mesh.apply_scale(np.exp(rng.uniform(*np.log(SIZES)) + rng.uniform(-STRETCH, STRETCH, 3)))
-        mesh.export(out / file.name)
+        varied = out / f"{count}-{file.name}"
+        mesh.export(varied)
         try:
-            mesh_object(out / file.name, read_mesh(out / file.name), seed)
+            mesh_object(varied, read_mesh(varied), seed)
             count -= 1
         except SceneError:  # such as too thin
-            (out / file.name).unlink()
+            varied.unlink()
     return out

@@ -107,7 +107,7 @@ def main(argv: list[str] | None = None) -> int:
     score.add_argument("--model", type=Path, help="another checkpoint than the shipped one")
     score.add_argument("--fingers", type=int, choices=tuple(SHIPPED), default=2, help="gel images of a touch")
     for job in (make, calibrate_job):
-        job.add_argument("--meshes", type=Path, required=True, help="folder of at least 250 closed meshes (STL)")
+        job.add_argument("--meshes", type=Path, required=True, help="folder of closed meshes (STL)")
     for job in (make, calibrate_job, score):
         job.add_argument("folder", type=Path)
         job.add_argument("--jobs", type=int, default=2)
