@@ -24,12 +24,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from models.pictures import LabelledPicture, load_pictures
-from models.recognition import interval
+from models.recognition import mean_interval
 from retrieval.console.progress import Bar
 from retrieval.data.images import read_rgb
 from retrieval.data.object_finder import INPUT_PX, FoundObject, ObjectFinder
-from retrieval.metrics.intervals import summarise
-from retrieval.metrics.measure import Measure
 
 STEPS, PHOTOS_PER_STEP, LEARNING_RATE = 2500, 24, 3e-3
 WIDTHS = (16, 32, 64, 96)
@@ -45,16 +43,16 @@ class MaskNetwork(nn.Module):
     It maps photos (B, 3, INPUT_PX, INPUT_PX) in 0..1 to logits (B, 1, INPUT_PX / 2, INPUT_PX / 2) of the object.
     """
 
-    def __init__(self, widths: Sequence[int] = WIDTHS) -> None:
+    def __init__(self) -> None:
         """Create random weights."""
         super().__init__()
-        self.enter = nn.Sequential(_convolution(3, widths[0], stride=2), _convolution(widths[0], widths[0]))
-        pairs = list(itertools.pairwise(widths))
+        self.enter = nn.Sequential(_convolution(3, WIDTHS[0], stride=2), _convolution(WIDTHS[0], WIDTHS[0]))
+        pairs = list(itertools.pairwise(WIDTHS))
         self.down = nn.ModuleList(
             nn.Sequential(_convolution(fine, coarse, stride=2), _convolution(coarse, coarse)) for fine, coarse in pairs
         )
         self.up = nn.ModuleList(_convolution(fine + coarse, fine) for fine, coarse in pairs[::-1])
-        self.leave = nn.Conv2d(widths[0], 1, 1)
+        self.leave = nn.Conv2d(WIDTHS[0], 1, 1)
 
     def forward(self, photos: Tensor) -> Tensor:
         """Return the logits of photos."""
@@ -157,11 +155,9 @@ def score(finder: ObjectFinder, pictures: Sequence[LabelledPicture]) -> str:
         true = FoundObject(*edges.tolist(), mask.mean() * width * height)
         overlaps.append(overlap(finder.find(photo), true))
         owner.append(names.index(picture.object_id))
-    lines = []
-    for what, values in (("overlap", np.array(overlaps)), (f"below {GOOD_OVERLAP}", np.array(overlaps) < GOOD_OVERLAP)):
-        cell = summarise([Measure(values[:, None].astype(float), np.array(owner), np.array([0.0]), "")])
-        lines.append(f"{what}: {interval(cell.value[0], cell.low[0], cell.high[0])} of {len(values)} photos")
-    return "\n".join(lines)
+    rows = {"overlap": np.array(overlaps), f"below {GOOD_OVERLAP}": np.array(overlaps) < GOOD_OVERLAP}
+    means = {what: mean_interval(values, np.array(owner)) for what, values in rows.items()}
+    return "\n".join(f"{what}: {mean} of {len(overlaps)} photos" for what, mean in means.items())
 
 
 def overlap(one: FoundObject, other: FoundObject) -> float:

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaln, softmax
 
 from models.pictures import collect_pictures
@@ -165,9 +165,14 @@ def statements(checkpoint: Checkpoint, grasps: Sequence[Grasp], cache: Path) -> 
     for what, (values, owner) in measured.items():
         if not len(values):
             continue
-        cell = summarise([Measure(np.asarray(values, float)[:, None], owner, np.zeros(1), "")])
-        parts.append(f"{what}: {interval(cell.value[0], cell.low[0], cell.high[0])} of {len(values)}")
+        parts.append(f"{what}: {mean_interval(values, owner)} of {len(values)}")
     return "; ".join(parts)
+
+
+def mean_interval(values: ArrayLike, owner: NDArray[np.int64]) -> str:
+    """Return the mean of values (N,) with its interval over their objects (N,)."""
+    cell = summarise([Measure(np.asarray(values, float)[:, None], owner, np.zeros(1), "")])
+    return interval(cell.value[0], cell.low[0], cell.high[0])
 
 
 def top1(table: ScoreTable, k: int, photos: int) -> Measure:

@@ -96,9 +96,7 @@ def whole_photo(photo: Samples) -> FoundObject:
     return FoundObject(0.0, 0.0, width, height, width * height)
 
 
-@lru_cache(maxsize=1)
-def _finder() -> ObjectFinder:
-    return ObjectFinder()
+_FINDER = ObjectFinder()
 
 
 @lru_cache(maxsize=1)
@@ -109,4 +107,4 @@ def network_digest() -> str:
 
 def find_object(photo: Samples) -> FoundObject:
     """Return the object in a photo (H, W, 3), or the whole photo if none is found."""
-    return _finder().find(photo)
+    return _FINDER.find(photo)

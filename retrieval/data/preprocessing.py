@@ -15,10 +15,10 @@ from msgspec import Meta
 
 from _touch_retrieval.documents import check_fields
 from retrieval.data.images import decode, picture_size, read_bytes, read_rgb
-from retrieval.data.object_finder import INPUT_PX, FoundObject, find_object, network_digest, whole_photo
+from retrieval.data.object_finder import FoundObject, find_object, network_digest, whole_photo
 from retrieval.data.photo_faults import photo_faults
 from retrieval.data.resize import RgbImage, Samples, resize
-from retrieval.data.views import FIELD_MM, OVERSAMPLING, VIEWS, sufficient_side, tile_views
+from retrieval.data.views import FIELD_MM, VIEWS, min_photo_side, min_photo_side_for_crop, tile_views
 from retrieval.errors import BadInput, ConfigError, NumericalError
 
 PREPROCESSING_VERSION = 2
@@ -118,15 +118,13 @@ class Preprocessing:
 
     def _decode_photo(self, data: bytes, name: str | Path, field_mm: float) -> tuple[Samples, FoundObject]:
         """Return a photo in the size that its views need, and its object."""
-        needs_object = self.views != ("whole",)
-        first_side = max(OVERSAMPLING * self.photo_px, INPUT_PX if needs_object else 0)
-        image = decode(data, name, first_side if self.reduced else None)
-        if not needs_object:
+        image = decode(data, name, min_photo_side(self.views, self.photo_px, field_mm) if self.reduced else None)
+        if self.views == ("whole",):
             return image, whole_photo(image)
         found, short = find_object(image), min(image.shape[:2])
-        enough = sufficient_side(self.views, self.photo_px, found, short, field_mm)
-        if self.reduced and short < min(enough, *picture_size(data, name)):
-            image = decode(data, name, enough)
+        more = min_photo_side_for_crop(found, short, self.photo_px)
+        if self.reduced and "crop" in self.views and short < min(more, *picture_size(data, name)):
+            image = decode(data, name, more)
             found = found.scaled(min(image.shape[:2]) / short)
         return image, found
 

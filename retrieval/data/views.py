@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
-from retrieval.data.object_finder import FoundObject, find_object, whole_photo
+from retrieval.data.object_finder import INPUT_PX, FoundObject, find_object, whole_photo
 from retrieval.data.resize import RgbImage, Samples, resize, to_float
 
 _CROP_MARGIN = 1.12
@@ -62,19 +62,18 @@ OVERSAMPLING = 2
 """Pixels of a reduced photo, along a side, for each pixel of a tower's input."""
 
 
-def sufficient_side(names: Sequence[str], px: int, found: FoundObject, short: int, field_mm: float) -> int:
-    """Return the shorter side in pixels of a photo that is sufficient for these views.
+def min_photo_side(names: Sequence[str], px: int, field_mm: float) -> int:
+    """Return the smallest shorter side in pixels of a photo that is sufficient for these views and the object search.
 
-    Args:
-        names: The views.
-        px: Side of a view.
-        found: The object in the photo at another size.
-        short: Shorter side of the photo at that size.
-        field_mm: Field of the photo.
+    The view `crop` is not considered, since it depends on the object (`min_photo_side_for_crop`).
     """
-    sides = {"whole": short, "crop": _CROP_MARGIN * found.side, "zoom": _ZOOM_MM / field_mm * short}
-    smallest = min(sides["zoom" if name == "grey" else name] for name in names)
-    return math.ceil(OVERSAMPLING * px * short / max(smallest, 1))
+    zooms = {"zoom", "grey"}.intersection(names)
+    return math.ceil(max(INPUT_PX, OVERSAMPLING * px, OVERSAMPLING * px * field_mm / _ZOOM_MM if zooms else 0))
+
+
+def min_photo_side_for_crop(found: FoundObject, short: int, px: int) -> int:
+    """Return the side that is sufficient for the view `crop`, from the object at the shorter side `short`."""
+    return math.ceil(OVERSAMPLING * px * short / (_CROP_MARGIN * max(found.side, 1)))
 
 
 def tile_views(

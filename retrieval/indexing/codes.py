@@ -118,19 +118,19 @@ class Encoder(NamedTuple):
         what: Plural of the items.
         layout: Type of a code.
         model: Group of the codes in the cache: a digest of model, preprocessing and layout.
-        variant: End of the key of an item in the cache: what its code depends on besides its files.
         decode: Returns the model's input from the bytes of an item's files and their paths, and the faults of a photo;
             raises ImageError.
         start: Returns, for a number of items to encode, the function that returns the codes (B,) of inputs with these
             paths; several threads call it at once.
+        variant: End of the key of an item in the cache: what its code depends on besides its files.
     """
 
     what: str
     layout: np.dtype[Any]
     model: str
-    variant: Callable[[Paths], str]
     decode: Callable[[Sequence[bytes], Paths], tuple[Any, Sequence[str]]]
     start: Callable[[int], Callable[[Sequence[Any], Sequence[Paths]], NDArray[Any]]]
+    variant: Callable[[Paths], str] = lambda paths: ""
 
     def key(self, paths: Paths, digests: Iterable[str]) -> str:
         """Return the key in the cache of an item whose files have these digests."""
@@ -169,9 +169,9 @@ def photo_encoder(checkpoint: Checkpoint, fields_mm: Mapping[str, float] = Mappi
         "photos",
         layout,
         _model(checkpoint, layout),
-        lambda paths: f"-{fields_mm[paths[0]]:g}" if paths[0] in fields_mm else "",
         lambda data, paths: photo_from_bytes(data[0], paths[0], fields_mm.get(paths[0], FIELD_MM)),
         start,
+        lambda paths: f"-{fields_mm[paths[0]]:g}" if paths[0] in fields_mm else "",
     )
 
 
@@ -198,7 +198,7 @@ def touch_encoder(checkpoint: Checkpoint) -> Encoder:
             records["shows"] = [SHOWS.index(shows) for shows in check.classify(readings.cpu().numpy())]
         return records
 
-    return Encoder("touches", layout, _model(checkpoint, layout), lambda paths: "", decode, lambda count: encode)
+    return Encoder("touches", layout, _model(checkpoint, layout), decode, lambda count: encode)
 
 
 class EnrolledCodes(NamedTuple):
@@ -311,7 +311,8 @@ def find_codes(items: Sequence[Paths], encoder: Encoder, files: CatalogueFiles, 
                     prepared, faults = encoder.decode(contents, paths)
                     inputs.append(prepared)
                     new[key] = paths
-                    found.faults |= {paths[0]: faults} if faults else {}
+                    if faults:
+                        found.faults[paths[0]] = faults
                 except ImageError as error:
                     unusable[key] = error.reason
         codes = encode(inputs, list(new.values())) if new else ()

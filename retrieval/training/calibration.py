@@ -528,11 +528,8 @@ def calibrate_checkpoint(
     )
     if not scored:
         return checkpoint
-    checkpoint = with_calibrations(checkpoint, scored[:1], scored[1:], seed=seed)
-    assert checkpoint.posterior is not None
     refused = [refused_touches(checkpoint, touches)]
-    verification = fit_verification(scored[:1], checkpoint.posterior, seed, refused)
-    return dataclasses.replace(checkpoint, verification=verification)
+    return with_calibrations(checkpoint, scored[:1], scored[1:], seed=seed, refused=refused)
 
 
 def with_calibrations(
@@ -541,17 +538,19 @@ def with_calibrations(
     pooled: Sequence[ScoredTouches],
     *,
     seed: int = 0,
+    refused: Sequence[NDArray[np.bool_]] | None = None,
 ) -> Checkpoint:
     """Return the checkpoint with calibrations on touches of objects outside the fit, of one matcher or several.
 
     `pooled` are the touches without late interaction, for an index without cells; empty for a model without cells.
+    `refused` is as for `fit_verification`.
     """
     posterior = fit_posterior(*scored, seed=seed)
     return dataclasses.replace(
         checkpoint,
         posterior=posterior,
         references=fit_references(*scored, seed=seed),
-        verification=fit_verification(scored, posterior, seed),
+        verification=fit_verification(scored, posterior, seed, refused),
         pooled_posterior=fit_posterior(*pooled, seed=seed) if pooled else checkpoint.pooled_posterior,
         pooled_references=fit_references(*pooled, seed=seed) if pooled else checkpoint.pooled_references,
     )

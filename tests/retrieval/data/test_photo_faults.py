@@ -1,4 +1,4 @@
-"""Photos that are unlike training photos."""
+"""Faults of a photo that make its object harder to recognise."""
 
 import cv2
 import numpy as np

@@ -40,9 +40,11 @@ def test_other_formats_are_not_reduced_and_a_rotated_photo_is_turned_upright():
     assert decode(jpeg(1200, 1600, exif=exif(6)), "x", 300).shape == (400, 300, 3)  # a quarter turn
 
 
-def test_a_whole_photo_is_decoded_with_twice_as_many_pixels_as_its_view(decoded):
-    Preprocessing(photo_px=64, reduced=True).photo_from_bytes(jpeg(1024, 1024), "x")
-    assert decoded == [(128, 128)]
+@pytest.mark.parametrize(("views", "side"), [(("whole",), 128), (("zoom",), 256), (("whole", "grey"), 256)])
+def test_views_are_cut_from_twice_as_many_pixels_as_they_have(views, side, decoded):
+    """A tower has 32 pixels: 64 of the whole photo (and 128 for the object search), or 64 in 7/16 of the side."""
+    Preprocessing(photo_px=32, views=views, reduced=True).photo_from_bytes(jpeg(1024, 1024), "x")
+    assert decoded == [(side, side)]
 
 
 def with_object(side, fraction):

@@ -88,7 +88,7 @@ def test_objects_without_a_readable_photo_are_listed_and_give_exit_code_1(tmp_pa
     assert objects(index) == {"mug/0.jpg": "mug"}
 
 
-def test_new_photos_that_are_unlike_training_photos_give_a_warning(tmp_path, checkpoint, index):
+def test_new_photos_in_which_objects_are_hard_to_recognise_give_a_warning(tmp_path, checkpoint, index):
     own, rng = tmp_path / "own", np.random.default_rng(0)
     crops = dataclasses.replace(checkpoint.config.preprocessing, views=("crop",))
     checkpoint = dataclasses.replace(checkpoint, config=dataclasses.replace(checkpoint.config, preprocessing=crops))
