@@ -34,6 +34,10 @@ MIN_THICKNESS_MM = 2.0
 _MAX_METRE_EXTENT = 2.0
 _CREASE_COSINE = 0.77
 _RAY_OFFSET_MM = 1.0
+_SIDES = 8
+_SIDE_RAD = 2 * np.pi / _SIDES
+_BLEND = 0.35, 0.65
+"""Where, between two planes that project relief, the first begins to give way to the second, and where it has."""
 Faces = NDArray[np.int64]
 
 
@@ -90,7 +94,7 @@ class MeshBody(Body):
 
     @cached_property
     def wall(self) -> list[ReliefLevel]:
-        """The relief on a cylinder around the mesh, from fine to coarse; empty for a smooth mesh."""
+        """The relief on an unrolled cylinder of the mesh's size, from fine to coarse; empty for a smooth mesh."""
         return bake_plain(self.chart, self.relief)
 
     @cached_property
@@ -153,12 +157,24 @@ class MeshBody(Body):
         return lift
 
     def _height(self, points: Vectors, normals: Vectors, step_mm: float) -> Vectors:
-        """Return relief in mm, faded at foot and top and where the surface turns away from the cylinder."""
+        """Return relief in mm, faded at foot and top and where the surface turns up or down.
+
+        The relief is projected from the two nearest of `_SIDES` vertical planes onto the surface, so that its pitch is
+        right on a side of any shape, and blended between them. The planes touch the cylinder of `wall`.
+        """
         x, y, z = np.ascontiguousarray(points.T, np.float32)
-        height: Floats = level_of(self.wall, step_mm).at(*self.chart.locate(x, y, z))
-        radius = np.maximum(np.hypot(x, y), 1e-6)
-        facing = (x * normals[:, 0] + y * normals[:, 1]) / radius
-        weight = smoothstep(facing, 0.3, 0.75) * np.clip(2.2 * radius / self.chart.radius_mm - 0.2, 0, 1)
+        across, along = normals.T[:2].astype(np.float32)
+        plane, beyond = np.divmod(np.arctan2(across, -along), np.float32(_SIDE_RAD))
+        level = level_of(self.wall, step_mm)
+
+        def projected(plane: Floats) -> Floats:
+            angle = plane * np.float32(_SIDE_RAD)
+            s = np.cos(angle) * x + np.sin(angle) * y + (angle + np.float32(np.pi)) * np.float32(self.chart.radius_mm)
+            return level.at(np.mod(s, np.float32(self.chart.width_mm)), z)
+
+        share = smoothstep(beyond / _SIDE_RAD, *_BLEND)
+        height = (1 - share) * projected(plane) + share * projected(plane + 1)
+        weight = smoothstep(np.hypot(across, along), 0.3, 0.75)
         fade = max(1.5, 0.8 * self.relief.amplitude_mm)
         return np.asarray(height * weight * ends_weight(z, self.chart.height_mm, fade), np.float64)
 

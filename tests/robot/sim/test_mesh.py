@@ -10,6 +10,9 @@ import pytest
 from robot.collection import CollectSettings, collect
 from robot.errors import RecordingError, RobotConfigError, SceneError
 from robot.rig import load_rig
+from robot.sim.objects.mesh import Mesh, MeshBody
+from robot.sim.objects.relief import Relief
+from robot.sim.objects.resting import UP
 from tests.meshes import ball, box, load_mesh_object, saved, solid
 
 CUBE = box(40, 40, 40)
@@ -129,6 +132,18 @@ def test_relief_moves_hits_by_its_height_and_tilts_normals(tmp_path):
     assert np.ptp(lift) > 0.6 * amplitude
     points = origins + textured.cast(origins, directions)[:, None] * directions
     assert np.abs(textured.normals(points) - smooth.normals(points)).max() > 0.1
+
+
+def test_relief_keeps_its_pitch_and_height_along_the_side_of_a_long_box():
+    long_box = box(200, 24, 40)
+    body = MeshBody(Mesh(long_box.vertices, long_box.faces).rest_on_table(UP), Relief("ribs", 1.0, 5.0))
+    x = np.arange(-95, 95, 0.1)
+    origins = np.stack([x, 0 * x - 60, 0 * x + 20], axis=1)
+    height = 60 - 12 - body.cast(origins, np.tile([0.0, 1, 0], (len(x), 1)))
+    crests = 1 + np.flatnonzero((height[1:-1] > height[:-2]) & (height[1:-1] >= height[2:]) & (height[1:-1] > 0.5))
+    np.testing.assert_allclose(np.diff(x[crests]), 5.0, atol=0.25)
+    assert len(crests) == 39
+    np.testing.assert_allclose(height[crests], 1.0, atol=0.05)
 
 
 def test_the_mass_is_that_of_the_volume_or_of_a_shell(globe):
