@@ -108,7 +108,7 @@ def develop(shot: Shot, how: Photography, seed: int) -> Picture:
 
 
 def draw(rng: np.random.Generator) -> Photography:
-    """Draw how a training photo is taken; a third of them with the rig's camera."""
+    """Draw how a training photo is taken; a third of them with the rig's camera, and most of them rolled."""
     brightness, warmth = math.exp(rng.normal(0, 0.3)), rng.normal(0, 0.12)
     grounds: tuple[Callable[[], Any], ...] = (
         lambda: "table",
@@ -117,7 +117,7 @@ def draw(rng: np.random.Generator) -> Photography:
         lambda: tuple(rng.uniform(0, 1, 3).tolist()),
     )
     return Photography(
-        camera=RIG_CAMERA if rng.random() < 1 / 3 else draw_camera(rng),
+        camera=replace(RIG_CAMERA if rng.random() < 1 / 3 else draw_camera(rng), roll_rad=draw_roll(rng)),
         ground=grounds[rng.choice(4, p=[0.5, 0.2, 0.2, 0.1])](),
         gains=(brightness * (1 + warmth), brightness, brightness * (1 - warmth)),
         blur_px=float(rng.choice([0, rng.uniform(0.3, 2.0)])),
@@ -128,14 +128,18 @@ def draw(rng: np.random.Generator) -> Photography:
 
 
 def draw_camera(rng: np.random.Generator) -> PinholeCamera:
-    """Draw a camera: 12 to 72 degrees high, in any roll, whose picture shows 130 to 380 mm about the object."""
+    """Draw an upright camera: 12 to 72 degrees high, whose picture shows 130 to 380 mm about the object."""
     height, distance = math.radians(rng.uniform(12, 72)), rng.uniform(350, 1100)
     target = np.array([*rng.uniform(-15, 15, 2), rng.uniform(30, 90)])
     position = target + distance * np.array([0, -math.cos(height), math.sin(height)])
     px, shown_mm = int(rng.choice([256, 320, 400])), math.exp(rng.uniform(math.log(130), math.log(380)))
-    roll = rng.choice([0.0, rng.normal(0, 0.2), rng.uniform(0, 2 * math.pi)], p=[0.4, 0.3, 0.3])
     x, y, z = position.tolist()
-    return PinholeCamera(px, px * distance / shown_mm, (x, y, max(z, 40.0)), tuple(target.tolist()), float(roll))
+    return PinholeCamera(px, px * distance / shown_mm, (x, y, max(z, 40.0)), tuple(target.tolist()))
+
+
+def draw_roll(rng: np.random.Generator) -> float:
+    """Draw the roll of a camera in radians: none, a small one, or any."""
+    return float(rng.choice([0.0, rng.normal(0, 0.3), rng.uniform(0, 2 * math.pi)], p=[0.3, 0.3, 0.4]))
 
 
 def _behind(view: CameraView, levels: Layer, ground: Layer) -> Layer:

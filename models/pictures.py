@@ -3,7 +3,8 @@
     metadata.jsonl    a line for each object: object_id, its labels (`robot.sim.objects.draw.SimObject.labels`), and
                       the names of its pictures under "pictures": photo, or touch_a, touch_a_before, touch_b, ...; for
                       several photos the names of their conditions with a number, and for varied ones also a mask of
-                      the object's pixels (`MASK_PX` a side, white), varied-0_mask, ...
+                      the object's pixels (`MASK_PX` a side, white), varied-0_mask, ..., and under "field_mm" the
+                      millimetres that each of these photos shows along a side
     images/           the pictures
 
 A photographed object takes a tenth of the time of a grasp, and a press a third. An object's line is written when its
@@ -25,7 +26,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from models.photography import CONDITIONS, Shot, develop, draw, shoot
+from models.photography import CONDITIONS, Photography, Shot, develop, draw, shoot
 from retrieval.console.progress import Bar
 from robot.recording.folder import read_info
 from robot.rig import load_rig
@@ -41,7 +42,7 @@ MIN_AMPLITUDE_MM = 0.05
 """Smaller amplitudes are raised to this one."""
 MAX_PRESSES = 3
 """Maximum number of presses of one object until the jaws meet it."""
-PHOTOS = {"varied": 2, "conditions": 3}
+PHOTOS = {"varied": 3, "conditions": 3}
 """Photos of an object, in varied conditions or in each condition."""
 MASK_PX = 128
 _PARTNERS = ("_before", "_mask")
@@ -92,6 +93,7 @@ class LabelledPicture:
         mask: File of the mask of the object's pixels in a varied photo.
         object_id: The object.
         labels: Its labels.
+        field_mm: What a varied photo shows along a side, in millimetres.
     """
 
     name: str
@@ -100,6 +102,7 @@ class LabelledPicture:
     mask: Path | None
     object_id: str
     labels: ObjectLabels
+    field_mm: float | None
 
 
 def load_object_labels(recording: Path) -> dict[str, ObjectLabels]:
@@ -158,7 +161,8 @@ def load_pictures(folder: Path) -> list[LabelledPicture]:
         for name, file in files.items():
             if not name.endswith(_PARTNERS):
                 partners = (files.get(name + end) for end in _PARTNERS)
-                pictures.append(LabelledPicture(name, file, *partners, row["object_id"], ObjectLabels.from_dict(row)))
+                about = row["object_id"], ObjectLabels.from_dict(row), row.get("field_mm", {}).get(name)
+                pictures.append(LabelledPicture(name, file, *partners, *about))
     return pictures
 
 
@@ -180,18 +184,22 @@ def _worker(kind: str, rig: str, seed: int) -> Work[tuple[Pictures, Mapping[str,
         return next((pictures for pictures in tries if pictures), {}), sim_rig.labels(object_id)
 
     def several(object_id: str, number: int) -> tuple[Pictures, Mapping[str, Any]]:
-        pictures = {}
+        pictures, fields = {}, {}
         for number in range(PHOTOS[kind]):
             sim_rig.prepare(object_id, FIRST_PHOTO + number)
-            take = _varied_photo if kind == "varied" else _photo_in_each_condition
-            pictures |= take(sim_rig.sim_state.current_scene(), number)
-        return pictures, sim_rig.labels(object_id)
+            scene = sim_rig.sim_state.current_scene()
+            if kind == "conditions":
+                pictures |= _photo_in_each_condition(scene, number)
+            else:
+                how = draw(np.random.default_rng([95, scene.seed]))
+                pictures |= _varied_photo(scene, how, number)
+                fields[f"varied-{number}"] = how.camera.field_mm
+        return pictures, {**sim_rig.labels(object_id), **({"field_mm": fields} if fields else {})}
 
     return {"photo": photograph, "touch": press, "varied": several, "conditions": several}[kind]
 
 
-def _varied_photo(scene: Scene, number: int) -> Pictures:
-    how = draw(np.random.default_rng([95, scene.seed]))
+def _varied_photo(scene: Scene, how: Photography, number: int) -> Pictures:
     shot = shoot(scene, how.camera)
     mask = shot.view.is_object.reshape(how.camera.px, how.camera.px).astype(np.float32)
     levels = np.rint(255 * cv2.resize(mask, (MASK_PX, MASK_PX), interpolation=cv2.INTER_AREA)).astype(np.uint8)

@@ -15,11 +15,12 @@ An interrupted job continues. Accuracy on simulated touches does not predict acc
 
 import argparse
 import dataclasses
+import hashlib
 import itertools
 import json
 import sys
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,6 +32,9 @@ from models.pictures import collect_pictures, load_object_labels, load_pictures
 from retrieval.commands.main import main as run_command
 from retrieval.console.memory import keep_freed_memory
 from retrieval.data.dataset import LICENCES, Grasp, Split, data_digest, load_grasps
+from retrieval.data.preprocessing import Preprocessing
+from retrieval.data.resize import RgbImage
+from retrieval.data.views import FIELD_MM
 from retrieval.methods.late_fusion import frozen_matcher, trained_checkpoint
 from retrieval.methods.method import MethodSettings
 from retrieval.model.card import SHIPPED_DATA
@@ -40,7 +44,14 @@ from retrieval.model.encode import default_device, one_thread
 from retrieval.model.shipped import SHIPPED, shipped_model
 from retrieval.training import distil
 from retrieval.training.calibration import calibrate_checkpoint, fit_verification, refused_touches, score_grasps
-from retrieval.training.features import Features, FrozenFeatures, encode_recording, features_by_image, recorded_features
+from retrieval.training.features import (
+    Features,
+    FrozenFeatures,
+    TrainedFeatures,
+    encode_recording,
+    features_by_image,
+    recorded_features,
+)
 
 RIGS = Path(__file__).parent
 RIG = RIGS / "shipped_rig.toml"
@@ -58,12 +69,12 @@ class Part(NamedTuple):
 
 
 PARTS = (
-    *(Part("led", False, 113_000 + number, 200) for number in range(3)),
-    *(Part("varied", False, 123_000 + number, 200) for number in range(2)),
-    Part("gelsight", False, 124_000, 150),
-    Part("gelsight_mini", False, 125_000, 150),
-    *(Part("led", True, 126_000 + number, 200) for number in range(2)),
-    Part("varied", True, 127_000, 200),
+    *(Part("led", False, 113_000 + number, 200) for number in range(8)),
+    *(Part("varied", False, 123_000 + number, 200) for number in range(4)),
+    *(Part("gelsight", False, 124_000 + number, 200) for number in range(2)),
+    Part("gelsight_mini", False, 125_000, 200),
+    *(Part("led", True, 126_000 + number, 200) for number in range(4)),
+    *(Part("varied", True, 127_000 + number, 200) for number in range(2)),
 )
 RECORDINGS, CALIBRATION = "recordings", "calibration"
 """Folders of the recordings."""
@@ -131,6 +142,30 @@ def make_shipped(arguments: argparse.Namespace) -> int:
     return 0
 
 
+class StatedFields(Preprocessing):
+    """Preprocessing in which the field of every second varied photo is stated."""
+
+    def __init__(self, settings: Preprocessing, recordings: Iterable[Path]) -> None:
+        """Read the fields of the varied photos of some recordings."""
+        super().__init__(**settings.to_dict())
+        pictures = [picture for recording in recordings for picture in load_pictures(varied_photos(recording))]
+        self.fields = {each.file: each.field_mm for each in pictures if zlib.crc32(str(each.file.name).encode()) % 2}
+
+    def load_photo(self, path: str | Path, field_mm: float = FIELD_MM) -> RgbImage:
+        """Read a photo with its stated field."""
+        return super().load_photo(path, self.fields.get(Path(path)) or field_mm)
+
+    def digest(self) -> str:
+        """Return the SHA-256 of settings and fields."""
+        fields = {file.name: field for file, field in self.fields.items()}
+        return hashlib.sha256(json.dumps([super().digest(), fields], sort_keys=True).encode()).hexdigest()
+
+
+def with_stated_fields(config: Config, recordings: Iterable[Path]) -> Config:
+    """Return a configuration that reads the varied photos of recordings as `StatedFields`."""
+    return dataclasses.replace(config, preprocessing=StatedFields(config.preprocessing, recordings))
+
+
 class Trained(NamedTuple):
     """Trained towers, the configuration of heads on them, and training and validation grasps with their features."""
 
@@ -156,18 +191,25 @@ def train_towers(folder: Path, **settings: Any) -> Trained:
         {"source": "simulated rigs", "data_digest": data_digest(train)},
         labels={name: labels for part in parts for name, labels in load_object_labels(part).items()},
     )
+    trainer.features = TrainedFeatures(with_stated_fields(config, parts), trainer.device)
     towers = trainer.run_or_reuse(quiet=False)
     config = head_config(folder, towers)
+    stated = with_stated_fields(config, [*parts, *calibration_recordings(folder, "validation")])
     features, validated = (
-        encode_recording(grasps, frozen_matcher(config), config, folder / "features") for grasps in (train, validation)
+        encode_recording(grasps, frozen_matcher(config), stated, folder / "features") for grasps in (train, validation)
     )
     return Trained(folder, towers, config, (train, validation), (features, validated))
 
 
 def calibration_grasps(folder: Path, name: str) -> list[Grasp]:
     """Return the grasps of one of CALIBRATED."""
-    recordings = (folder / CALIBRATION / name / str(part.seed) for part in CALIBRATED[name])
+    recordings = calibration_recordings(folder, name)
     return [grasp for recording in recordings for grasp in grasps_with_varied_photos(recording)]
+
+
+def calibration_recordings(folder: Path, name: str) -> list[Path]:
+    """Return the recordings of one of CALIBRATED."""
+    return [folder / CALIBRATION / name / str(part.seed) for part in CALIBRATED[name]]
 
 
 def grasps_with_varied_photos(recording: Path) -> list[Grasp]:
@@ -181,13 +223,16 @@ def grasps_with_varied_photos(recording: Path) -> list[Grasp]:
 
 
 def grasps_of_each_photo(recording: Path) -> list[Grasp]:
-    """Return the grasps of a recording with their own photos, and again with the varied photos of their objects."""
-    varied = {name: itertools.cycle(files) for name, files in photos_by_object(recording).items()}
-    grasps = []
-    for grasp in load_grasps(recording):
-        again = f"{grasp.grasp_id}-varied"
-        grasps += [grasp, dataclasses.replace(grasp, grasp_id=again, photo_file=next(varied[grasp.object_id]))]
-    return grasps
+    """Return the grasps of a recording with their own photos, and again with each varied photo of their objects."""
+    grasps = load_grasps(recording)
+    of_object: dict[str, list[Grasp]] = {}
+    for grasp in grasps:
+        of_object.setdefault(grasp.object_id, []).append(grasp)
+    return grasps + [
+        dataclasses.replace(grasp, grasp_id=f"{grasp.grasp_id}-{file.stem}", photo_file=file)
+        for name, files in photos_by_object(recording).items()
+        for file, grasp in zip(files, itertools.cycle(of_object.get(name, [])))
+    ]
 
 
 def photos_by_object(recording: Path) -> dict[str, list[Path]]:
@@ -338,7 +383,9 @@ def calibrated(made: Checkpoint, folder: Path, fingers: int) -> Checkpoint:
         parts = [[each_finger(grasp)[0] for grasp in part] for part in parts]
     validation, verification, gels = parts
     every, device = [*validation, *verification, *gels], default_device()
-    features = encode_recording(every, made.matcher, made.config, folder / "features")
+    recordings = [part for name in CALIBRATED for part in calibration_recordings(folder, name)]
+    stated = with_stated_fields(made.config, recordings)
+    features = encode_recording(every, made.matcher, stated, folder / "features")
     source = FrozenFeatures(made.config, features_by_image(every, features, device))
     names = sorted({grasp.object_id for grasp in gels})
     fitting, others = ([grasp for grasp in gels if grasp.object_id in names[side::2]] for side in (0, 1))

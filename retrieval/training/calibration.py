@@ -586,15 +586,16 @@ def with_gel_check(
         )
         for number, (grasps, count) in enumerate(((train, foreign), (validation, foreign // 2)))
     )
-    matcher.gel_head = fit_gel_head(fitting, PENALTY * FOREIGN_COUNT / foreign)
-    check = fit_gel_check(matcher.gel_head, test, contact_levels(validation))
+    head = fit_gel_head(fitting, PENALTY * FOREIGN_COUNT / foreign)
+    check = fit_gel_check(head, test, contact_levels(validation))
+    matcher.gel_head = head.to(default_device())
     return dataclasses.replace(checkpoint, gel_check=check)
 
 
 @torch.inference_mode()
 def refused_touches(checkpoint: Checkpoint, touches: Tensor) -> NDArray[np.bool_]:
     """Return (T,) whether the gel check refuses touches with these features (T, fingers * F); none without a check."""
-    readings = checkpoint.matcher.gel_readings(touches)
+    readings = checkpoint.matcher.gel_readings(touches.to(next(checkpoint.matcher.parameters()).device))
     if checkpoint.gel_check is None or readings is None:
         return np.zeros(len(touches), np.bool_)
     return np.not_equal(checkpoint.gel_check.classify(readings.cpu().numpy()), CONTACT)

@@ -24,7 +24,13 @@ from retrieval.metrics.measure import Measure, pooled
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import one_thread
 from retrieval.model.shipped import shipped_model
-from retrieval.training.calibration import ScoredTouches, score_touches, with_calibrations, with_sensor_calibrations
+from retrieval.training.calibration import (
+    ScoredTouches,
+    refused_touches,
+    score_touches,
+    with_calibrations,
+    with_sensor_calibrations,
+)
 from retrieval.training.features import Features, encode_recording
 from retrieval.training.loop import OnStep
 from retrieval.training.recipes import RECIPES
@@ -67,8 +73,10 @@ def fit_best(
         fitted = recipes[best].fit(features, "final", is_final=True)
         parts = [part for part in held_out[best] if part.touches.has_trials]
         pooled_parts = [part.pooled for part in parts if part.pooled is not None]
-        fitted = with_calibrations(fitted, [part.touches for part in parts], pooled_parts)
         fitted = with_sensor_calibrations(fitted, problem.grasps, features, quiet=problem.quiet)
+        refused = np.array(features.grasp_ids)[refused_touches(fitted, torch.from_numpy(features.touch_rows))]
+        is_refused = [np.isin(part.grasp_ids, refused) for part in parts]
+        fitted = with_calibrations(fitted, [part.touches for part in parts], pooled_parts, refused=is_refused)
     table = _table(
         accuracies, identification(low_pass), _groups(comparison.folds), across_sessions=comparison.across_sessions
     )
@@ -139,11 +147,13 @@ class HeldOut:
         touches: The touches, with match logits.
         pooled: The same without late interaction; None for a model without cells.
         object_ids: The objects, by their numbers in `touches`.
+        grasp_ids: The grasp of each touch.
     """
 
     touches: ScoredTouches
     pooled: ScoredTouches | None
     object_ids: tuple[str, ...]
+    grasp_ids: tuple[str, ...]
 
 
 class Comparison:
@@ -193,7 +203,8 @@ class Comparison:
         ]
         if self.across_sessions:
             scored = [dataclasses.replace(touches, touch_group=sessions) for touches in scored]
-        return HeldOut(scored[0], scored[1] if has_cells else None, tuple(sorted(set(features.object_ids))))
+        objects = tuple(sorted(set(features.object_ids)))
+        return HeldOut(scored[0], scored[1] if has_cells else None, objects, features.grasp_ids)
 
 
 def objects_of_two_sessions(grasps: Sequence[Grasp]) -> set[str]:

@@ -452,16 +452,15 @@ def _encoded_once(
             digests = [[file_digest(path) for path in files(item)] for item in items] if store else []
         except OSError as error:
             raise DatasetError(f"{error.filename} cannot be read ({error.strerror}); run `retrieve check`") from error
-        keys = [cache_key("features", _FORMAT, *made_by, each) for each in digests]
-        stored = store.get_all(keys) if store else {}
-        found = {row: stored[key] for row, key in enumerate(keys) if key in stored}
-        missing = [row for row in range(len(items)) if row not in found]
-        bar.advance(len(found))
+        keys = [cache_key("features", _FORMAT, *made_by, each) for each in digests] or list(range(len(items)))
+        found = dict(store.get_all(keys)) if store else {}
+        missing = list({key: row for row, key in enumerate(keys) if key not in found}.values())
+        bar.advance(len(items) - len(missing))
         images = map_in_order(pool, load, [items[row] for row in missing], _BATCH)
         for rows, batch in zip(batches(missing, _BATCH), batches(images, _BATCH), strict=True):
-            encoded = {row: each.tobytes() for row, each in zip(rows, encode(batch).cpu().numpy(), strict=True)}
+            encoded = {keys[row]: each.tobytes() for row, each in zip(rows, encode(batch).cpu().numpy(), strict=True)}
             if store:
-                store.add({keys[row]: content for row, content in encoded.items()})
+                store.add(encoded)
             found |= encoded
             bar.advance(len(rows))
-    return np.stack([np.frombuffer(found[row], np.float32) for row in range(len(items))])
+    return np.stack([np.frombuffer(found[key], np.float32) for key in keys])

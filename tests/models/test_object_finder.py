@@ -27,7 +27,8 @@ def test_the_overlap_is_intersection_over_union():
 
 def test_varied_photos_have_masks_and_train_a_network(tmp_path):
     photos = collect_pictures("varied", tmp_path, objects=2, seed=3)
-    assert [photo.mask is None for photo in photos] == [False] * 4
+    assert [photo.mask is None for photo in photos] == [False] * 6
+    assert all(120 < photo.field_mm < 400 for photo in photos)
     file = tmp_path / "network.onnx"
     file.write_bytes(to_onnx(train(photos, steps=2)))
-    assert "of 4 photos" in score(ObjectFinder(file), photos)
+    assert "of 6 photos" in score(ObjectFinder(file), photos)
