@@ -74,7 +74,7 @@ PARTS = (
     *(Part("gelsight", False, 124_000 + number, 200) for number in range(2)),
     Part("gelsight_mini", False, 125_000, 200),
     *(Part("led", True, 126_000 + number, 200) for number in range(4)),
-    *(Part("varied", True, 127_000 + number, 200) for number in range(2)),
+    Part("varied", True, 127_000, 200),
 )
 RECORDINGS, CALIBRATION = "recordings", "calibration"
 """Folders of the recordings."""
@@ -213,12 +213,12 @@ def calibration_recordings(folder: Path, name: str) -> list[Path]:
 
 
 def grasps_with_varied_photos(recording: Path) -> list[Grasp]:
-    """Return the grasps of a recording, each with its own photo or a varied one of the object, all equally likely."""
+    """Return the grasps of a recording, half of them with their own photo, the others with a varied one of the object."""
     varied, grasps = photos_by_object(recording), []
     for grasp in load_grasps(recording):
-        choices = [grasp.photo, *varied[grasp.object_id]]
-        drawn = np.random.default_rng(zlib.crc32(grasp.grasp_id.encode())).integers(len(choices))
-        grasps.append(dataclasses.replace(grasp, photo_file=choices[drawn]))
+        rng = np.random.default_rng(zlib.crc32(grasp.grasp_id.encode()))
+        file = grasp.photo if rng.random() < 0.5 else varied[grasp.object_id][rng.integers(len(varied[grasp.object_id]))]
+        grasps.append(dataclasses.replace(grasp, photo_file=file))
     return grasps
 
 

@@ -452,7 +452,7 @@ def _encoded_once(
             digests = [[file_digest(path) for path in files(item)] for item in items] if store else []
         except OSError as error:
             raise DatasetError(f"{error.filename} cannot be read ({error.strerror}); run `retrieve check`") from error
-        keys = [cache_key("features", _FORMAT, *made_by, each) for each in digests] or list(range(len(items)))
+        keys = [cache_key("features", _FORMAT, *made_by, each) for each in digests] or [*map(str, range(len(items)))]
         found = dict(store.get_all(keys)) if store else {}
         missing = list({key: row for row, key in enumerate(keys) if key not in found}.values())
         bar.advance(len(items) - len(missing))

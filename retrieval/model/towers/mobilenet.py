@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -29,14 +30,41 @@ _STEM_LAYERS = 7
 class _StridedDepthwise(nn.Conv2d):
     """A strided depthwise convolution in float32: on a CPU its gradient takes ten times as long in bfloat16."""
 
-    def forward(self, x: Tensor) -> Tensor:
+    def _conv_forward(self, x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
         with without_autocast(x):
-            return super().forward(x.to(self.weight.dtype))
+            convolved: Tensor = super()._conv_forward(x.to(weight.dtype), weight, bias)
+            return convolved
+
+
+class _Layers(nn.Sequential):
+    """Layers in order; in training a convolution takes over a frozen batch normalisation, which would take as long."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        layers = list(self)
+        while layers:
+            layer, *layers = layers
+            if isinstance(layer, nn.Conv2d) and layers and _is_frozen(layers[0]):
+                x, layers = _convolve_and_normalise(x, layer, layers[0]), layers[1:]
+            else:
+                x = layer(x)
+        return x
+
+
+def _is_frozen(layer: nn.Module) -> bool:
+    """Whether a layer is a batch normalisation that keeps its statistics in training."""
+    return isinstance(layer, nn.BatchNorm2d) and not layer.training and torch.is_grad_enabled()
+
+
+def _convolve_and_normalise(x: Tensor, convolution: nn.Conv2d, normalisation: Any) -> Tensor:
+    scale = normalisation.weight * torch.rsqrt(normalisation.running_var + normalisation.eps)
+    bias = normalisation.bias - normalisation.running_mean * scale
+    convolved: Tensor = convolution._conv_forward(x, convolution.weight * scale[:, None, None, None], bias)
+    return convolved
 
 
 def _convolution(inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> nn.Sequential:
     kind = _StridedDepthwise if stride > 1 and groups > 1 else nn.Conv2d
-    return nn.Sequential(
+    return _Layers(
         kind(inputs, outputs, kernel, stride, padding=kernel // 2, groups=groups, bias=False),
         nn.BatchNorm2d(outputs),
         nn.ReLU6(inplace=True),
@@ -55,7 +83,7 @@ class InvertedResidual(nn.Module):
             nn.Conv2d(hidden, outputs, 1, bias=False),
             nn.BatchNorm2d(outputs),
         ]
-        self.conv = nn.Sequential(*layers)
+        self.conv = _Layers(*layers)
         self.has_shortcut = stride == 1 and inputs == outputs
 
     def forward(self, x: Tensor) -> Tensor:

@@ -249,10 +249,19 @@ def without_autocast(images: Tensor) -> AbstractContextManager[Any]:
     return torch.autocast(kind, enabled=False) if torch.is_autocast_enabled(kind) else nullcontext()
 
 
+_ROUNDINGS = 4
+"""A map's rounding, after several layers, in units of that of one number."""
+
+
 def stage_statistics(maps: Iterable[Tensor]) -> Tensor:
     """Return mean, standard deviation and maximum over each map (B, C, H, W), concatenated: (B, 3 * all C)."""
     parts = []
     for x in maps:
+        rounding = torch.finfo(x.dtype).eps
+        x = x.float()
         # Not the root of the variance, whose slope is infinite if a map is constant; the slope of `std` is 0 then.
-        parts += [x.mean((2, 3)), x.std((2, 3), correction=0), x.amax((2, 3))]
+        deviation = x.std((2, 3), correction=0)
+        # A deviation below the map's rounding is noise, and so is its gradient, which is as long as any other.
+        is_noise = deviation <= _ROUNDINGS * rounding * x.abs().amax((2, 3))
+        parts += [x.mean((2, 3)), torch.where(is_noise, deviation.detach(), deviation), x.amax((2, 3))]
     return torch.cat(parts, dim=1)

@@ -203,6 +203,17 @@ def test_stage_statistics_are_those_of_each_map_concatenated():
     torch.testing.assert_close(stage_statistics([first, second]), expected)
 
 
+@pytest.mark.parametrize(("kind", "has_gradient"), [(torch.float32, True), (torch.bfloat16, False)])
+def test_a_nearly_constant_map_has_no_gradient_if_its_deviation_is_only_rounding(kind, has_gradient):
+    """In bfloat16 such maps had most of the gradient of a tower, and a training of the shipped towers failed."""
+    torch.manual_seed(0)
+    maps = (5 + 0.04 * torch.rand(2, 3, 4, 4)).to(kind).requires_grad_()
+    deviations = stage_statistics([maps])[:, 3:6]
+    assert deviations.min() > 0
+    deviations.sum().backward()
+    assert bool(maps.grad.any()) == has_gradient
+
+
 @pytest.mark.parametrize(
     ("name", "first", "second"),
     [("mobilenet_v2", "features.2", "features.3.conv.0.0"), ("small", "stages.2", "stages.3")],
@@ -215,6 +226,26 @@ def test_first_layers_of_a_tower_stay_in_float32_where_others_multiply_in_bfloat
     with torch.autocast("cpu", torch.bfloat16):
         tower(torch.rand(2, 3, 32, 32))
     assert types == [torch.float32, torch.bfloat16]
+
+
+def test_a_frozen_normalisation_in_training_gives_the_output_and_the_gradients_of_its_layers():
+    torch.manual_seed(2)
+    block, maps = InvertedResidual(8, 8, stride=1, expansion=2), torch.rand(2, 8, 6, 6)
+    for module in block.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            for values in (module.running_mean, module.running_var, module.weight.data, module.bias.data):
+                values.uniform_(0.5, 1.5)
+
+    def gradients(output):
+        return torch.autograd.grad(output.square().sum(), list(block.parameters()))
+
+    block.eval()
+    plain = maps
+    for layer in block.modules():
+        if not list(layer.children()):
+            plain = layer(plain)
+    torch.testing.assert_close(block(maps), maps + plain)
+    torch.testing.assert_close(gradients(block(maps)), gradients(maps + plain))
 
 
 def test_group_norms_and_strided_depthwise_convolutions_compute_in_float32_under_autocast():
