@@ -83,13 +83,13 @@ CALIBRATED = {
     "verification": (Part("led", False, 130_000, 100, 5, gels=25), Part("led", True, 131_000, 50, 5, gels=25)),
     "gels": (
         Part("led", False, 140_000, 300, 1, gels=200),
-        Part("varied", False, 141_000, 200, 1, gels=200),
         Part("gelsight", False, 142_000, 50, 1, gels=25),
         Part("gelsight_mini", False, 143_000, 50, 1, gels=25),
     ),
+    "varied_gels": (Part("varied", False, 141_000, 200, 1, gels=200),),
 }
-"""Recordings that choose the step and calibrate the model; that fit the bounds of verifications; and that fit, besides,
-the check of gel images, which must accept gels that it was not fitted to."""
+"""Recordings that choose the step and calibrate the model; that fit the bounds of verifications; that fit, besides, the
+check of gel images, and choose its thresholds by gels that it was not fitted to; and that only fit this check."""
 CALIBRATION_MESHES = 5
 """One of this many meshes is for calibration only."""
 SEED_SCORED = 30_000
@@ -100,6 +100,8 @@ trained together with them does not tell which step has the best towers."""
 HEAD_STEPS = 400
 FOREIGN = 8000
 """Number of non-gel pictures for training its check of touches: more than in an ordinary training."""
+FOREIGN_MARGIN = -1.0
+"""Margin of its threshold, lower than for gels of one kind: otherwise too many photos would be taken for gel images."""
 DISTIL_STEPS = 4000
 """Training steps of its candidate encoder, more than the preset's: it is trained once and used by everyone."""
 FITTED = 10
@@ -194,7 +196,7 @@ def train_towers(folder: Path, **settings: Any) -> Trained:
     trainer.features = TrainedFeatures(with_stated_fields(config, parts), trainer.device)
     towers = trainer.run_or_reuse(quiet=False)
     config = head_config(folder, towers)
-    stated = with_stated_fields(config, [*parts, *calibration_recordings(folder, "validation")])
+    stated = with_stated_fields(config, parts)
     features, validated = (
         encode_recording(grasps, frozen_matcher(config), stated, folder / "features") for grasps in (train, validation)
     )
@@ -203,23 +205,8 @@ def train_towers(folder: Path, **settings: Any) -> Trained:
 
 def calibration_grasps(folder: Path, name: str) -> list[Grasp]:
     """Return the grasps of one of CALIBRATED."""
-    recordings = calibration_recordings(folder, name)
-    return [grasp for recording in recordings for grasp in grasps_with_varied_photos(recording)]
-
-
-def calibration_recordings(folder: Path, name: str) -> list[Path]:
-    """Return the recordings of one of CALIBRATED."""
-    return [folder / CALIBRATION / name / str(part.seed) for part in CALIBRATED[name]]
-
-
-def grasps_with_varied_photos(recording: Path) -> list[Grasp]:
-    """Return the grasps of a recording, half of them with their own photo, the others with a varied one of the object."""
-    varied, grasps = photos_by_object(recording), []
-    for grasp in load_grasps(recording):
-        rng = np.random.default_rng(zlib.crc32(grasp.grasp_id.encode()))
-        file = grasp.photo if rng.random() < 0.5 else varied[grasp.object_id][rng.integers(len(varied[grasp.object_id]))]
-        grasps.append(dataclasses.replace(grasp, photo_file=file))
-    return grasps
+    recordings = (folder / CALIBRATION / name / str(part.seed) for part in CALIBRATED[name])
+    return [grasp for recording in recordings for grasp in load_grasps(recording)]
 
 
 def grasps_of_each_photo(recording: Path) -> list[Grasp]:
@@ -323,7 +310,7 @@ def each_finger_features(features: Features) -> Features:
 
 def collect_training(arguments: argparse.Namespace) -> int:
     """Collect the training recordings."""
-    return collect_parts(arguments, PARTS, arguments.folder / RECORDINGS, mesh_files(arguments)[0])
+    return collect_parts(arguments, PARTS, arguments.folder / RECORDINGS, mesh_files(arguments)[0], has_varied=True)
 
 
 def collect_calibration(arguments: argparse.Namespace) -> int:
@@ -342,12 +329,14 @@ def mesh_files(arguments: argparse.Namespace) -> tuple[Iterator[Path], Iterator[
     return itertools.cycle(sorted(set(files) - set(calibrated))), itertools.cycle(calibrated)
 
 
-def collect_parts(arguments: argparse.Namespace, parts: Sequence[Part], out: Path, meshes: Iterator[Path]) -> int:
-    """Collect varied photos and grasps of all parts."""
+def collect_parts(
+    arguments: argparse.Namespace, parts: Sequence[Part], out: Path, meshes: Iterator[Path], *, has_varied: bool = False
+) -> int:
+    """Collect grasps of all parts, and perhaps varied photos of their objects."""
     folder, jobs = arguments.folder, arguments.jobs
     out.mkdir(parents=True, exist_ok=True)
     rigs = [write_rig(folder, part, meshes) for part in parts]
-    for part, rig in zip(parts, rigs, strict=True):
+    for part, rig in zip(parts, rigs, strict=True) if has_varied else ():
         photos = varied_photos(out / str(part.seed))
         collect_pictures("varied", photos, objects=part.objects, seed=part.seed, rig=str(rig), jobs=jobs)
     for part, rig in zip(parts, rigs, strict=True):
@@ -381,16 +370,22 @@ def calibrated(made: Checkpoint, folder: Path, fingers: int) -> Checkpoint:
     parts = [calibration_grasps(folder, name) for name in CALIBRATED]
     if fingers == 1:
         parts = [[each_finger(grasp)[0] for grasp in part] for part in parts]
-    validation, verification, gels = parts
-    every, device = [*validation, *verification, *gels], default_device()
-    recordings = [part for name in CALIBRATED for part in calibration_recordings(folder, name)]
-    stated = with_stated_fields(made.config, recordings)
-    features = encode_recording(every, made.matcher, stated, folder / "features")
+    validation, verification, gels, varied = parts
+    every, device = [*validation, *verification, *gels, *varied], default_device()
+    features = encode_recording(every, made.matcher, made.config, folder / "features")
     source = FrozenFeatures(made.config, features_by_image(every, features, device))
     names = sorted({grasp.object_id for grasp in gels})
     fitting, others = ([grasp for grasp in gels if grasp.object_id in names[side::2]] for side in (0, 1))
     held_out = [*validation, *others]
-    made = calibrate_checkpoint(made, source, fitting, held_out, foreign=FOREIGN, max_grasps=len(every))
+    made = calibrate_checkpoint(
+        made,
+        source,
+        [*fitting, *varied],
+        held_out,
+        foreign=FOREIGN,
+        foreign_margin=FOREIGN_MARGIN,
+        max_grasps=len(every),
+    )
     touches, photos = recorded_features(made.matcher, source, verification)
     trials = score_grasps(made.matcher, verification, touches, photos)
     assert trials is not None

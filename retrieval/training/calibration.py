@@ -29,6 +29,7 @@ from retrieval.model.references import ReferenceCalibration, reference_similarit
 from retrieval.model.verification import LEVELS, QUANTILES, VerificationCalibration, supports_calibration
 from retrieval.training.features import Features, FeatureSource, FrozenFeatures, features_by_image, recorded_features
 from retrieval.training.gel_check import (
+    MARGIN,
     PENALTY,
     GelCheckFeatures,
     contact_levels,
@@ -503,14 +504,15 @@ def calibrate_checkpoint(
     validation: Sequence[Grasp],
     *,
     foreign: int = FOREIGN_COUNT,
+    foreign_margin: float = MARGIN,
     max_grasps: int = MAX_CALIBRATION_GRASPS,
     quiet: bool = False,
 ) -> Checkpoint:
     """Return the checkpoint with calibrations and a gel check, if there are enough validation grasps.
 
     A posterior needs three validation objects, and a touch with a second photo of its object. At most `max_grasps`
-    grasps of each part are used, and `foreign` foreign pictures for fitting. The checkpoint's matcher is reused and
-    modified.
+    grasps of each part are used, and `foreign` foreign pictures for fitting, whose threshold has this margin
+    (`fit_gel_check`). The checkpoint's matcher is reused and modified.
     """
     seed, matcher = checkpoint.config.training.seed, checkpoint.matcher
     grasps = _sample_grasps(validation, seed, max_grasps)
@@ -524,7 +526,14 @@ def calibrate_checkpoint(
     ]
     checkpoint = dataclasses.replace(checkpoint, opening=fit_opening([*train, *validation]))
     checkpoint = with_gel_check(
-        checkpoint, source, train, validation, foreign=foreign, max_grasps=max_grasps, quiet=quiet
+        checkpoint,
+        source,
+        train,
+        validation,
+        foreign=foreign,
+        foreign_margin=foreign_margin,
+        max_grasps=max_grasps,
+        quiet=quiet,
     )
     if not scored:
         return checkpoint
@@ -563,6 +572,7 @@ def with_gel_check(
     validation: Sequence[Grasp],
     *,
     foreign: int = FOREIGN_COUNT,
+    foreign_margin: float = MARGIN,
     max_grasps: int = MAX_CALIBRATION_GRASPS,
     quiet: bool = False,
 ) -> Checkpoint:
@@ -587,7 +597,7 @@ def with_gel_check(
         for number, (grasps, count) in enumerate(((train, foreign), (validation, foreign // 2)))
     )
     head = fit_gel_head(fitting, PENALTY * FOREIGN_COUNT / foreign)
-    check = fit_gel_check(head, test, contact_levels(validation))
+    check = fit_gel_check(head, test, contact_levels(validation), foreign_margin)
     matcher.gel_head = head.to(default_device())
     return dataclasses.replace(checkpoint, gel_check=check)
 

@@ -164,16 +164,22 @@ def _largest_level(images: Sequence[Path], frames: Sequence[Path]) -> float:
 
 
 @torch.inference_mode()
-def fit_gel_check(head: GelHead, test: GelCheckFeatures, levels: tuple[Sequence[float], Sequence[float]]) -> GelCheck:
+def fit_gel_check(
+    head: GelHead,
+    test: GelCheckFeatures,
+    levels: tuple[Sequence[float], Sequence[float]],
+    foreign_margin: float = MARGIN,
+) -> GelCheck:
     """Return the check with thresholds from validation pictures and `contact_levels`, and the fractions it rejects.
 
-    The logit of a grasp is the highest logit of its fingers.
+    The logit of a grasp is the highest logit of its fingers. `foreign_margin` is that of the threshold of foreign
+    pictures.
     """
     touch, no_contact = head(test.touch).numpy(), head(test.no_contact).numpy()  # (G, fingers, 2)
     foreign = head(test.foreign[:, None]).numpy()
     gels = np.concatenate([touch, no_contact])[..., 0].max(1)
     check = GelCheck(
-        foreign_above=float(np.quantile(gels, 1 - FALSE_ALARM_RATE)) + MARGIN,
+        foreign_above=float(np.quantile(gels, 1 - FALSE_ALARM_RATE)) + foreign_margin,
         contact_above=contact_threshold(no_contact[..., 1].max(1) + MARGIN, touch[..., 1].max(1))
         if len(no_contact)
         else None,
