@@ -194,7 +194,7 @@ def _worker(kind: str, rig: str, seed: int) -> Work[tuple[Pictures, Mapping[str,
                 how = draw(np.random.default_rng([95, scene.seed]))
                 pictures |= _varied_photo(scene, how, number)
                 fields[f"varied-{number}"] = how.camera.field_mm
-        return pictures, {**sim_rig.labels(object_id), **({"field_mm": fields} if fields else {})}
+        return pictures, {**sim_rig.labels(object_id), "field_mm": fields}
 
     return {"photo": photograph, "touch": press, "varied": several, "conditions": several}[kind]
 

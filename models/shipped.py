@@ -151,7 +151,7 @@ class StatedFields(Preprocessing):
         """Read the fields of the varied photos of some recordings."""
         super().__init__(**settings.to_dict())
         pictures = [picture for recording in recordings for picture in load_pictures(varied_photos(recording))]
-        self.fields = {each.file: each.field_mm for each in pictures if zlib.crc32(str(each.file.name).encode()) % 2}
+        self.fields = {each.file: each.field_mm for each in pictures if zlib.crc32(each.file.name.encode()) % 2}
 
     def load_photo(self, path: str | Path, field_mm: float = FIELD_MM) -> RgbImage:
         """Read a photo with its stated field."""
@@ -161,11 +161,6 @@ class StatedFields(Preprocessing):
         """Return the SHA-256 of settings and fields."""
         fields = {file.name: field for file, field in self.fields.items()}
         return hashlib.sha256(json.dumps([super().digest(), fields], sort_keys=True).encode()).hexdigest()
-
-
-def with_stated_fields(config: Config, recordings: Iterable[Path]) -> Config:
-    """Return a configuration that reads the varied photos of recordings as `StatedFields`."""
-    return dataclasses.replace(config, preprocessing=StatedFields(config.preprocessing, recordings))
 
 
 class Trained(NamedTuple):
@@ -193,13 +188,13 @@ def train_towers(folder: Path, **settings: Any) -> Trained:
         {"source": "simulated rigs", "data_digest": data_digest(train)},
         labels={name: labels for part in parts for name, labels in load_object_labels(part).items()},
     )
-    trainer.features = TrainedFeatures(with_stated_fields(config, parts), trainer.device)
+    stated = StatedFields(config.preprocessing, parts)
+    trainer.features = TrainedFeatures(dataclasses.replace(config, preprocessing=stated), trainer.device)
     towers = trainer.run_or_reuse(quiet=False)
     config = head_config(folder, towers)
-    stated = with_stated_fields(config, parts)
-    features, validated = (
-        encode_recording(grasps, frozen_matcher(config), stated, folder / "features") for grasps in (train, validation)
-    )
+    matcher, cache = frozen_matcher(config), folder / "features"
+    features = encode_recording(train, matcher, dataclasses.replace(config, preprocessing=stated), cache)
+    validated = encode_recording(validation, matcher, config, cache)
     return Trained(folder, towers, config, (train, validation), (features, validated))
 
 
@@ -309,8 +304,14 @@ def each_finger_features(features: Features) -> Features:
 
 
 def collect_training(arguments: argparse.Namespace) -> int:
-    """Collect the training recordings."""
-    return collect_parts(arguments, PARTS, arguments.folder / RECORDINGS, mesh_files(arguments)[0], has_varied=True)
+    """Collect the training recordings, and varied photos of their objects."""
+    folder = arguments.folder
+    if code := collect_parts(arguments, PARTS, folder / RECORDINGS, mesh_files(arguments)[0]):
+        return code
+    for part in PARTS:
+        rig, photos = rig_file(folder, part), varied_photos(folder / RECORDINGS / str(part.seed))
+        collect_pictures("varied", photos, objects=part.objects, seed=part.seed, rig=str(rig), jobs=arguments.jobs)
+    return 0
 
 
 def collect_calibration(arguments: argparse.Namespace) -> int:
@@ -329,16 +330,11 @@ def mesh_files(arguments: argparse.Namespace) -> tuple[Iterator[Path], Iterator[
     return itertools.cycle(sorted(set(files) - set(calibrated))), itertools.cycle(calibrated)
 
 
-def collect_parts(
-    arguments: argparse.Namespace, parts: Sequence[Part], out: Path, meshes: Iterator[Path], *, has_varied: bool = False
-) -> int:
-    """Collect grasps of all parts, and perhaps varied photos of their objects."""
+def collect_parts(arguments: argparse.Namespace, parts: Sequence[Part], out: Path, meshes: Iterator[Path]) -> int:
+    """Collect grasps of all parts."""
     folder, jobs = arguments.folder, arguments.jobs
     out.mkdir(parents=True, exist_ok=True)
     rigs = [write_rig(folder, part, meshes) for part in parts]
-    for part, rig in zip(parts, rigs, strict=True) if has_varied else ():
-        photos = varied_photos(out / str(part.seed))
-        collect_pictures("varied", photos, objects=part.objects, seed=part.seed, rig=str(rig), jobs=jobs)
     for part, rig in zip(parts, rigs, strict=True):
         if code := collect(out / str(part.seed), rig, part.objects, part.grasps, part.seed, jobs):
             return code
@@ -347,12 +343,17 @@ def collect_parts(
 
 def write_rig(folder: Path, part: Part, meshes: Iterator[Path]) -> Path:
     """Write the rig of a recording, with the next of the meshes in random sizes, and return its file."""
-    rig = folder / f"{part.seed}.toml"
+    rig = rig_file(folder, part)
     settings: dict[str, Any] = {"rig": "sim", "gels": part.gels, "optics": part.optics}
     if part.has_meshes:
         settings["meshes"] = str(vary_meshes(meshes, part.objects, folder / "meshes" / str(part.seed), part.seed))
     rig.write_text("".join(f"{key} = {json.dumps(value)}\n" for key, value in settings.items()))
     return rig
+
+
+def rig_file(folder: Path, part: Part) -> Path:
+    """Return the file of the rig of a recording."""
+    return folder / f"{part.seed}.toml"
 
 
 def calibrate_shipped(arguments: argparse.Namespace) -> int:

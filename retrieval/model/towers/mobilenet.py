@@ -56,6 +56,7 @@ def _is_frozen(layer: nn.Module) -> bool:
 
 
 def _convolve_and_normalise(x: Tensor, convolution: nn.Conv2d, normalisation: Any) -> Tensor:
+    """Return the normalised convolution; PyTorch's own fusion returns weights without gradients."""
     scale = normalisation.weight * torch.rsqrt(normalisation.running_var + normalisation.eps)
     bias = normalisation.bias - normalisation.running_mean * scale
     convolved: Tensor = convolution._conv_forward(x, convolution.weight * scale[:, None, None, None], bias)

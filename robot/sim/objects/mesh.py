@@ -163,8 +163,8 @@ class MeshBody(Body):
         right on a side of any shape, and blended between them. The planes touch the cylinder of `wall`.
         """
         x, y, z = np.ascontiguousarray(points.T, np.float32)
-        across, along = normals.T[:2].astype(np.float32)
-        plane, beyond = np.divmod(np.arctan2(across, -along), np.float32(_SIDE_RAD))
+        normal_x, normal_y = normals.T[:2].astype(np.float32)
+        plane, beyond = np.divmod(np.arctan2(normal_x, -normal_y), np.float32(_SIDE_RAD))
         level = level_of(self.wall, step_mm)
 
         def projected(plane: Floats) -> Floats:
@@ -174,7 +174,7 @@ class MeshBody(Body):
 
         share = smoothstep(beyond / _SIDE_RAD, *_BLEND)
         height = (1 - share) * projected(plane) + share * projected(plane + 1)
-        weight = smoothstep(np.hypot(across, along), 0.3, 0.75)
+        weight = smoothstep(np.hypot(normal_x, normal_y), 0.3, 0.75)
         fade = max(1.5, 0.8 * self.relief.amplitude_mm)
         return np.asarray(height * weight * ends_weight(z, self.chart.height_mm, fade), np.float64)
 
