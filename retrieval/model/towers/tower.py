@@ -258,7 +258,7 @@ def stage_statistics(maps: Iterable[Tensor]) -> Tensor:
     parts = []
     for x in maps:
         rounding = torch.finfo(x.dtype).eps
-        x = x.float()
+        x = x.to(torch.promote_types(x.dtype, torch.float32))
         # Not the root of the variance, whose slope is infinite if a map is constant; the slope of `std` is 0 then.
         deviation = x.std((2, 3), correction=0)
         # A deviation below the map's rounding is noise, and so is its gradient, which is as long as any other.

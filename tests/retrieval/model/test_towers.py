@@ -201,6 +201,7 @@ def test_stage_statistics_are_those_of_each_map_concatenated():
     second = torch.full((1, 1, 1, 3), 7.0)  # constant
     expected = torch.tensor([[3.0, 5**0.5, 6.0, 7.0, 0.0, 7.0]])
     torch.testing.assert_close(stage_statistics([first, second]), expected)
+    torch.testing.assert_close(stage_statistics([first.double(), second.double()]), expected.double())
 
 
 @pytest.mark.parametrize(("kind", "has_gradient"), [(torch.float32, True), (torch.bfloat16, False)])
