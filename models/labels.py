@@ -1,7 +1,6 @@
-"""Training of towers that also predict the relief and the shape of an object, from the features of each tower."""
+"""Prediction of the relief and the shape of an object from the features of a tower."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -9,12 +8,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from models.pictures import FAMILIES, SIZES, ObjectLabels
-from retrieval.data.pairs import PairBatch
-from retrieval.training.trainer import Trainer
 
 SMOOTHING, DROPOUT = 0.05, 0.2
-LABEL_WEIGHT = 0.5
-"""Weight of the loss of the labels in a `LabelTrainer`."""
 
 
 class LabelHead(nn.Module):
@@ -60,25 +55,3 @@ class LabelHead(nn.Module):
             rows = torch.tensor([names.index(each.families[index]) for each in labels], device=logits.device)
             loss = loss + functional.cross_entropy(logits, rows, label_smoothing=SMOOTHING)
         return loss
-
-
-class LabelTrainer(Trainer):
-    """A trainer with a label head for each tower: on each finger's features, and on those of all views of a photo."""
-
-    def __init__(self, *arguments: Any, labels: Mapping[str, ObjectLabels], **options: Any) -> None:
-        """Prepare a run like `Trainer`, with the labels of all training objects."""
-        super().__init__(*arguments, **options)
-        self.labels = [labels[name] for name in self.sampler.objects]
-        heads = nn.ModuleList(LabelHead(count, self.labels) for count in self.matcher.pooled_counts).to(self.device)
-        self.modules["label_heads"] = heads
-        self.optimizer.add_param_group({"params": list(heads.parameters())})
-
-    def feature_loss(self, batch: PairBatch, touch: Tensor, photo: Tensor) -> Tensor:
-        """Return the loss of the trainer, plus the weighted losses of both label heads."""
-        loss = super().feature_loss(batch, touch, photo)
-        fingers, counts, heads = self.matcher.config.fingers, self.matcher.pooled_counts, self.modules["label_heads"]
-        touched, shown = ([self.labels[row] for row in part] for part in (batch.touch_objects, batch.photo_objects))
-        each_finger = touch.reshape(len(touch) * fingers, -1)[:, : counts[0]]
-        repeated = [label for label in touched for _ in range(fingers)]
-        label_loss = heads[0].loss(each_finger, repeated) + heads[1].loss(photo[:, : counts[1]], shown)
-        return loss + LABEL_WEIGHT * label_loss

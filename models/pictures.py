@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 
 from models.photography import CONDITIONS, Photography, Shot, develop, draw, shoot
 from retrieval.console.progress import Bar
-from robot.recording.folder import read_info
 from robot.rig import load_rig
 from robot.sim.camera import PinholeCamera
 from robot.sim.rig import SimRig
@@ -103,11 +102,6 @@ class LabelledPicture:
     object_id: str
     labels: ObjectLabels
     field_mm: float | None
-
-
-def load_object_labels(recording: Path) -> dict[str, ObjectLabels]:
-    """Return the labels of the objects of a simulated recording, from its recording.json."""
-    return {name: ObjectLabels.from_dict(row) for name, row in read_info(recording).get("objects", {}).items()}
 
 
 def collect_pictures(

@@ -1,9 +1,9 @@
 """The checkpoints of the package: their training, and their accuracy on unseen objects.
 
     python -m models.shipped make FOLDER --meshes MESHES
-        collect grasps of procedural objects and of meshes on simulated rigs, and photos of them by other cameras, on
-        other grounds and with faults; train the shipped towers further, and a head for two fingers and one for one
-        finger; calibrate both, and store them in FOLDER
+        collect grasps of procedural objects and of meshes on simulated rigs, the same grasps by other sensors, and
+        photos of the objects by other cameras, on other grounds and with faults; train the shipped towers further,
+        calibrate the checkpoints for two fingers and for one with them, and store both in FOLDER
     python -m models.shipped calibrate FOLDER --meshes MESHES
         calibrate the shipped checkpoints again; keep their weights
     python -m models.shipped score FOLDER
@@ -25,33 +25,32 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
-from models.labels import LabelTrainer
+from models.invariance import InvariantTrainer, References
 from models.meshes import vary_meshes
-from models.pictures import collect_pictures, load_object_labels, load_pictures
+from models.pictures import collect_pictures, load_pictures
 from retrieval.commands.main import main as run_command
 from retrieval.console.memory import keep_freed_memory
 from retrieval.data.dataset import LICENCES, Grasp, Split, data_digest, load_grasps
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import RgbImage
 from retrieval.data.views import FIELD_MM
-from retrieval.methods.late_fusion import frozen_matcher, trained_checkpoint
-from retrieval.methods.method import MethodSettings
 from retrieval.model.card import SHIPPED_DATA
-from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint, write_tensors
-from retrieval.model.config import Config, load_config
-from retrieval.model.encode import default_device, one_thread
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
+from retrieval.model.config import load_config
+from retrieval.model.encode import default_device
 from retrieval.model.shipped import SHIPPED, shipped_model
 from retrieval.training import distil
 from retrieval.training.calibration import calibrate_checkpoint, fit_verification, refused_touches, score_grasps
 from retrieval.training.features import (
-    Features,
     FrozenFeatures,
     TrainedFeatures,
     encode_recording,
     features_by_image,
     recorded_features,
 )
+from retrieval.training.gel_check import ForeignPictures
 
 RIGS = Path(__file__).parent
 RIG = RIGS / "shipped_rig.toml"
@@ -67,15 +66,22 @@ class Part(NamedTuple):
     grasps: int = 2
     gels: int = 4  # with more, a rig computes the properties of a gel again for nearly every object
 
+    @property
+    def name(self) -> str:
+        """Name of its folder and of its rig's file."""
+        return f"{self.seed}-{self.optics}"
+
 
 PARTS = (
     *(Part("led", False, 113_000 + number, 200) for number in range(8)),
-    *(Part("varied", False, 123_000 + number, 200) for number in range(4)),
-    *(Part("gelsight", False, 124_000 + number, 200) for number in range(2)),
-    Part("gelsight_mini", False, 125_000, 200),
-    *(Part("led", True, 126_000 + number, 200) for number in range(4)),
-    Part("varied", True, 127_000, 200),
+    *(Part("led", True, 126_000 + number, 200) for number in range(2)),
 )
+OTHER_SENSORS = (
+    *(Part("varied", False, 113_000 + number, 200, gels=40) for number in (0, 1, 4)),
+    *(Part("gelsight", False, 113_005 + number, 200) for number in range(2)),
+    Part("gelsight_mini", False, 113_007, 200),
+)
+"""Recordings of the same grasps of the same objects: the seeds are those of PARTS."""
 RECORDINGS, CALIBRATION = "recordings", "calibration"
 """Folders of the recordings."""
 CALIBRATED = {
@@ -89,21 +95,19 @@ CALIBRATED = {
     "varied_gels": (Part("varied", False, 141_000, 200, 1, gels=200),),
 }
 """Recordings that choose the step and calibrate the model; that fit the bounds of verifications; that fit, besides, the
-check of gel images, and choose its thresholds by gels that it was not fitted to; and that only fit this check."""
+check of gel images, and choose its thresholds by gels that it was not fitted to; and that only fit this check, with
+varied photos of their objects as pictures that are no gels."""
 CALIBRATION_MESHES = 5
 """One of this many meshes is for calibration only."""
 SEED_SCORED = 30_000
 """Seed of the scored objects. The demo has its own (retrieval.commands.demo.SEED), the benchmark has 0."""
-TOWERS, HEADS = RIGS / "shipped_towers.toml", RIGS / "shipped_heads.toml"
-"""Configurations of the training of the towers and of the heads. The last step of the towers is used: the head that is
-trained together with them does not tell which step has the best towers."""
-HEAD_STEPS = 400
-FOREIGN = 8000
-"""Number of non-gel pictures for training its check of touches: more than in an ordinary training."""
-FOREIGN_MARGIN = -1.0
-"""Margin of its threshold, lower than for gels of one kind: otherwise too many photos would be taken for gel images."""
-DISTIL_STEPS = 4000
-"""Training steps of its candidate encoder, more than the preset's: it is trained once and used by everyone."""
+TOWERS = RIGS / "shipped_towers.toml"
+"""Configuration of the training of the towers."""
+TRAINED_SHARE = 0.7
+"""Share of the trained weights in the towers; the rest are those of the start model."""
+FOREIGN = ForeignPictures(8000, margin=-3.0, has_false_colours=False)
+"""Foreign pictures of its check of touches: more than in an ordinary training. The margin is lower than for gels of one
+kind: otherwise too many photos would be taken for gel images."""
 FITTED = 10
 """Scored objects for calibration, and as many training objects for other fits; the rest are the test set."""
 
@@ -130,16 +134,13 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def make_shipped(arguments: argparse.Namespace) -> int:
-    """Collect, train the towers and both heads, and calibrate; continue an interrupted run."""
+    """Collect, train the towers, and calibrate both checkpoints with them; continue an interrupted run."""
     folder = arguments.folder
     if code := collect_training(arguments) or collect_calibration(arguments):
         return code
-    last = train_towers(folder)
+    towers = train_towers(folder)
     for fingers, name in SHIPPED.items():
-        trained = for_fingers(last, fingers)
-        made = distilled(train_head(trained), *trained.features)
-        if made.queries is not None:  # the file stays below 12 MB
-            made = dataclasses.replace(made, queries=made.queries[::2])
+        made = with_towers(load_checkpoint(shipped_model(fingers)), towers)
         store(calibrated(made, folder, fingers), folder / name)
     return 0
 
@@ -163,58 +164,102 @@ class StatedFields(Preprocessing):
         return hashlib.sha256(json.dumps([super().digest(), fields], sort_keys=True).encode()).hexdigest()
 
 
-class Trained(NamedTuple):
-    """Trained towers, the configuration of heads on them, and training and validation grasps with their features."""
+class TrainingImages(NamedTuple):
+    """Grasps for training, and the rig's images that are the references of their images (`models.invariance`).
 
-    folder: Path
-    towers: Checkpoint
-    config: Config
-    grasps: tuple[list[Grasp], list[Grasp]]
-    features: tuple[Features, Features]
+    Attributes:
+        grasps: Grasps by the rig's sensors and by others, each with a photo of the rig or a varied one.
+        rig_grasps: The grasp by the rig's sensors, for each grasp id.
+        rig_photos: A photo of the object by the rig, for each photo file.
+    """
+
+    grasps: list[Grasp]
+    rig_grasps: dict[str, Grasp]
+    rig_photos: dict[Path, Path]
 
 
-def train_towers(folder: Path, **settings: Any) -> Trained:
-    """Train both towers further, with the head of two fingers; `settings` change those of TOWERS."""
-    parts = [folder / RECORDINGS / str(part.seed) for part in PARTS]
-    train = [grasp for part in parts for grasp in grasps_of_each_photo(part)]
-    validation = calibration_grasps(folder, "validation")
-    config = load_config(TOWERS)
-    training = dataclasses.replace(config.training, start=str(shipped_model(2)), **settings)
-    trainer = LabelTrainer(
+def train_towers(folder: Path, **settings: Any) -> Checkpoint:
+    """Train both towers further, below the shipped head of two fingers; `settings` change those of TOWERS."""
+    images, parts = training_images(folder), [recording_of(folder, part) for part in PARTS]
+    start, config = load_checkpoint(shipped_model(2)), load_config(TOWERS)
+    training = dataclasses.replace(config.training, start=str(start.path), **settings)
+    trainer = InvariantTrainer(
         dataclasses.replace(config, training=training),
-        split_of(train, []),
-        train,
+        split_of(images.grasps, []),
+        images.grasps,
         folder / "towers.safetensors",
-        {"source": "simulated rigs", "data_digest": data_digest(train)},
-        labels={name: labels for part in parts for name, labels in load_object_labels(part).items()},
+        {"source": "simulated rigs", "data_digest": data_digest(images.grasps)},
+        references=references(start, images, folder / "features"),
     )
     stated = StatedFields(config.preprocessing, parts)
     trainer.features = TrainedFeatures(dataclasses.replace(config, preprocessing=stated), trainer.device)
-    towers = trainer.run_or_reuse(quiet=False)
-    config = head_config(folder, towers)
-    matcher, cache = frozen_matcher(config), folder / "features"
-    features = encode_recording(train, matcher, dataclasses.replace(config, preprocessing=stated), cache)
-    validated = encode_recording(validation, matcher, config, cache)
-    return Trained(folder, towers, config, (train, validation), (features, validated))
+    return averaged(start, trainer.run_or_reuse(quiet=False))
+
+
+def averaged(start: Checkpoint, trained: Checkpoint) -> Checkpoint:
+    """Return the trained model with weights averaged with those of the start model (Wortsman et al., CVPR 2022).
+
+    It is as good as the trained model with other cameras and sensors, and nearly as good as the start model on the rig.
+    """
+    before = start.matcher.state_dict()
+    weights = {
+        name: before[name].lerp(after, TRAINED_SHARE) if after.is_floating_point() else after
+        for name, after in trained.matcher.state_dict().items()
+    }
+    trained.matcher.load_state_dict(weights)
+    return trained
+
+
+def training_images(folder: Path) -> TrainingImages:
+    """Return the images of all recordings for training: each object's touches and photos in turn."""
+    images = TrainingImages([], {}, {})
+    for part in PARTS:
+        recording = recording_of(folder, part)
+        touches, photos = touches_by_object(load_grasps(recording)), photos_by_object(recording)
+        known = {grasp.grasp_id: grasp for own in touches.values() for grasp in own}
+        for name, own in touches.items():
+            files = [grasp.photo for grasp in own]
+            images.rig_photos.update({file: file for file in files} | dict.fromkeys(photos.get(name, []), files[0]))
+            photos[name] = files + photos.get(name, [])
+        for other in OTHER_SENSORS:
+            if other.seed == part.seed:
+                for grasp in load_grasps(recording_of(folder, other)):
+                    if grasp.grasp_id in known:
+                        touches[grasp.object_id].append(grasp)
+        for name, own in touches.items():
+            for turn in range(max(len(own), len(photos[name]))):
+                grasp, file = own[turn % len(own)], photos[name][turn % len(photos[name])]
+                named = dataclasses.replace(grasp, grasp_id=f"{grasp.grasp_id}-{turn}", photo_file=file)
+                images.grasps.append(named)
+                images.rig_grasps[named.grasp_id] = known[grasp.grasp_id]
+    return images
+
+
+def references(start: Checkpoint, images: TrainingImages, cache: Path) -> References:
+    """Return the partial activations of the rig's images by the start model, for each training image."""
+    rig = list({grasp.grasp_id: grasp for grasp in images.rig_grasps.values()}.values())
+    features = encode_recording(rig, start.matcher, start.config, cache)
+    touches, photos = distil.feature_partials(start.matcher, features)
+    of_grasp = dict(zip((grasp.grasp_id for grasp in rig), touches, strict=True))
+    of_photo = dict(zip((grasp.photo for grasp in rig), photos, strict=True))
+    return {
+        **{name: of_grasp[grasp.grasp_id] for name, grasp in images.rig_grasps.items()},
+        **{file: of_photo[photo] for file, photo in images.rig_photos.items()},
+    }
 
 
 def calibration_grasps(folder: Path, name: str) -> list[Grasp]:
     """Return the grasps of one of CALIBRATED."""
-    recordings = (folder / CALIBRATION / name / str(part.seed) for part in CALIBRATED[name])
+    recordings = (folder / CALIBRATION / name / part.name for part in CALIBRATED[name])
     return [grasp for recording in recordings for grasp in load_grasps(recording)]
 
 
-def grasps_of_each_photo(recording: Path) -> list[Grasp]:
-    """Return the grasps of a recording with their own photos, and again with each varied photo of their objects."""
-    grasps = load_grasps(recording)
-    of_object: dict[str, list[Grasp]] = {}
+def touches_by_object(grasps: Iterable[Grasp]) -> dict[str, list[Grasp]]:
+    """Return the grasps of each object."""
+    found: dict[str, list[Grasp]] = {}
     for grasp in grasps:
-        of_object.setdefault(grasp.object_id, []).append(grasp)
-    return grasps + [
-        dataclasses.replace(grasp, grasp_id=f"{grasp.grasp_id}-{file.stem}", photo_file=file)
-        for name, files in photos_by_object(recording).items()
-        for file, grasp in zip(files, itertools.cycle(of_object.get(name, [])))
-    ]
+        found.setdefault(grasp.object_id, []).append(grasp)
+    return found
 
 
 def photos_by_object(recording: Path) -> dict[str, list[Path]]:
@@ -225,54 +270,27 @@ def photos_by_object(recording: Path) -> dict[str, list[Path]]:
     return files
 
 
+def recording_of(folder: Path, part: Part) -> Path:
+    """Return the folder of a recording for training."""
+    return folder / RECORDINGS / part.name
+
+
 def varied_photos(recording: Path) -> Path:
     """Return the folder of the varied photos of a recording's objects."""
     return recording.with_name(f"{recording.name}-photos")
 
 
-def head_config(folder: Path, towers: Checkpoint) -> Config:
-    """Return the configuration of a head on the trained towers, and write the weights that it names."""
-    config = load_config(HEADS)
-    training = dataclasses.replace(config.training.with_iterations(HEAD_STEPS), **tower_weights(folder, towers))
-    return dataclasses.replace(config, training=training)
-
-
-def tower_weights(folder: Path, made: Checkpoint) -> dict[str, str]:
-    """Write the towers of a checkpoint into `folder`; return the settings that name them as initial weights."""
-    files = {}
-    for side, tower in (("touch", made.matcher.touch_tower), ("photo", made.matcher.photo_tower)):
-        file = folder / f"trained-{side}-tower.safetensors"
-        write_tensors(file, tower.state_dict(), {"from": made.digest})
-        files[f"init_{side}"] = str(file)
-    return files
-
-
-def train_head(trained: Trained) -> Checkpoint:
-    """Train a head further on the features of the towers, for its number of fingers.
-
-    That of two fingers begins as it was trained with the towers, that of one finger as the shipped one.
-    """
-    fingers, start = trained.config.matcher.fingers, trained.towers
-    if fingers == 1:
-        start = load_checkpoint(shipped_model(1))
-        for name in ("touch_tower", "photo_tower"):
-            getattr(start.matcher, name).load_state_dict(getattr(trained.towers.matcher, name).state_dict())
-    settings = MethodSettings(trained.config, folder=trained.folder / f"{fingers}-fingers", start=start, quiet=False)
-    made = trained_checkpoint(settings, *trained.features)
-    train, validation = trained.grasps
-    about = {"source": "simulated rigs", "data_digest": data_digest([*train, *validation])}
-    return dataclasses.replace(made, provenance=made.provenance | about, split=split_of(train, validation))
-
-
-def for_fingers(trained: Trained, fingers: int) -> Trained:
-    """Return the trained towers for heads of one finger, whose grasps are the touches of each finger, or of two."""
-    matcher = dataclasses.replace(trained.config.matcher, fingers=fingers)
-    trained = trained._replace(config=dataclasses.replace(trained.config, matcher=matcher))
-    if fingers == 2:
-        return trained
-    train, validation = ([one for grasp in part for one in each_finger(grasp)] for part in trained.grasps)
-    features, validated = map(each_finger_features, trained.features)
-    return trained._replace(grasps=(train, validation), features=(features, validated))
+def with_towers(made: Checkpoint, towers: Checkpoint) -> Checkpoint:
+    """Return a checkpoint with other towers. Its head stays: training it further made the rig's accuracy worse."""
+    for side in ("touch_tower", "photo_tower"):
+        getattr(made.matcher, side).load_state_dict(getattr(towers.matcher, side).state_dict())
+    training = made.config.training.with_iterations(towers.config.training.iterations)
+    return dataclasses.replace(
+        made,
+        config=dataclasses.replace(made.config, training=training),
+        provenance=made.provenance | towers.provenance,
+        split=towers.split,
+    )
 
 
 def split_of(train: list[Grasp], validation: list[Grasp]) -> Split:
@@ -280,37 +298,13 @@ def split_of(train: list[Grasp], validation: list[Grasp]) -> Split:
     return Split(0, *(tuple(sorted({grasp.object_id for grasp in part})) for part in (train, validation, [])))
 
 
-def each_finger(grasp: Grasp) -> list[Grasp]:
-    """Return the touch of each finger as a separate grasp."""
-    return [
-        dataclasses.replace(
-            grasp,
-            grasp_id=f"{grasp.grasp_id}-{finger}",
-            touches=grasp.touches[row : row + 1],
-            backgrounds=grasp.backgrounds[row : row + 1],
-        )
-        for row, finger in enumerate("ab")
-    ]
-
-
-def each_finger_features(features: Features) -> Features:
-    """Return the features of `each_finger` of all grasps."""
-    return Features(
-        tuple(f"{name}-{finger}" for name in features.grasp_ids for finger in "ab"),
-        tuple(name for name in features.object_ids for _ in "ab"),
-        features.touch.reshape(-1, 1, features.touch.shape[2]),
-        features.photo.repeat(2, axis=0),
-    )
-
-
 def collect_training(arguments: argparse.Namespace) -> int:
-    """Collect the training recordings, and varied photos of their objects."""
+    """Collect the training recordings, those by other sensors, and varied photos of the objects."""
     folder = arguments.folder
-    if code := collect_parts(arguments, PARTS, folder / RECORDINGS, mesh_files(arguments)[0]):
+    if code := collect_parts(arguments, (*PARTS, *OTHER_SENSORS), folder / RECORDINGS, mesh_files(arguments)[0]):
         return code
     for part in PARTS:
-        rig, photos = rig_file(folder, part), varied_photos(folder / RECORDINGS / str(part.seed))
-        collect_pictures("varied", photos, objects=part.objects, seed=part.seed, rig=str(rig), jobs=arguments.jobs)
+        collect_varied_photos(arguments, part, recording_of(folder, part))
     return 0
 
 
@@ -320,7 +314,15 @@ def collect_calibration(arguments: argparse.Namespace) -> int:
     for name, parts in CALIBRATED.items():
         if code := collect_parts(arguments, parts, arguments.folder / CALIBRATION / name, meshes):
             return code
+    for part in CALIBRATED["varied_gels"]:
+        collect_varied_photos(arguments, part, arguments.folder / CALIBRATION / "varied_gels" / part.name)
     return 0
+
+
+def collect_varied_photos(arguments: argparse.Namespace, part: Part, recording: Path) -> None:
+    """Photograph the objects of a recording with other cameras, on other grounds and with faults."""
+    rig, photos = str(rig_file(arguments.folder, part)), varied_photos(recording)
+    collect_pictures("varied", photos, objects=part.objects, seed=part.seed, rig=rig, jobs=arguments.jobs)
 
 
 def mesh_files(arguments: argparse.Namespace) -> tuple[Iterator[Path], Iterator[Path]]:
@@ -336,7 +338,7 @@ def collect_parts(arguments: argparse.Namespace, parts: Sequence[Part], out: Pat
     out.mkdir(parents=True, exist_ok=True)
     rigs = [write_rig(folder, part, meshes) for part in parts]
     for part, rig in zip(parts, rigs, strict=True):
-        if code := collect(out / str(part.seed), rig, part.objects, part.grasps, part.seed, jobs):
+        if code := collect(out / part.name, rig, part.objects, part.grasps, part.seed, jobs):
             return code
     return 0
 
@@ -346,14 +348,14 @@ def write_rig(folder: Path, part: Part, meshes: Iterator[Path]) -> Path:
     rig = rig_file(folder, part)
     settings: dict[str, Any] = {"rig": "sim", "gels": part.gels, "optics": part.optics}
     if part.has_meshes:
-        settings["meshes"] = str(vary_meshes(meshes, part.objects, folder / "meshes" / str(part.seed), part.seed))
+        settings["meshes"] = str(vary_meshes(meshes, part.objects, folder / "meshes" / part.name, part.seed))
     rig.write_text("".join(f"{key} = {json.dumps(value)}\n" for key, value in settings.items()))
     return rig
 
 
 def rig_file(folder: Path, part: Part) -> Path:
     """Return the file of the rig of a recording."""
-    return folder / f"{part.seed}.toml"
+    return folder / f"{part.name}.toml"
 
 
 def calibrate_shipped(arguments: argparse.Namespace) -> int:
@@ -367,10 +369,14 @@ def calibrate_shipped(arguments: argparse.Namespace) -> int:
 
 
 def calibrated(made: Checkpoint, folder: Path, fingers: int) -> Checkpoint:
-    """Return a checkpoint with its gel check, posterior, calibration of reference touches and bounds."""
+    """Return a checkpoint with its gel check, posterior, calibration of reference touches, bounds and queries."""
     parts = [calibration_grasps(folder, name) for name in CALIBRATED]
+    parts[-1] = with_varied_photos(folder, parts[-1])
     if fingers == 1:
-        parts = [[each_finger(grasp)[0] for grasp in part] for part in parts]
+        parts = [
+            [dataclasses.replace(each, touches=each.touches[:1], backgrounds=each.backgrounds[:1]) for each in part]
+            for part in parts
+        ]
     validation, verification, gels, varied = parts
     every, device = [*validation, *verification, *gels, *varied], default_device()
     features = encode_recording(every, made.matcher, made.config, folder / "features")
@@ -384,24 +390,27 @@ def calibrated(made: Checkpoint, folder: Path, fingers: int) -> Checkpoint:
         [*fitting, *varied],
         held_out,
         foreign=FOREIGN,
-        foreign_margin=FOREIGN_MARGIN,
         max_grasps=len(every),
     )
+    touches, _ = recorded_features(made.matcher, source, validation)
+    with torch.inference_mode():
+        queries = distil.select_queries(made.matcher.touch_encoding(touches).partial, seed=0)
     touches, photos = recorded_features(made.matcher, source, verification)
     trials = score_grasps(made.matcher, verification, touches, photos)
     assert trials is not None
     assert made.posterior is not None
     refused = [refused_touches(made, touches)]
-    return dataclasses.replace(made, verification=fit_verification([trials], made.posterior, refused=refused))
+    verification = fit_verification([trials], made.posterior, refused=refused)
+    assert made.split is not None
+    split = dataclasses.replace(made.split, validation=split_of([], validation).validation)
+    return dataclasses.replace(made, verification=verification, queries=queries, split=split)
 
 
-def distilled(made: Checkpoint, train: Features, validation: Features) -> Checkpoint:
-    """Return a checkpoint with the preset's candidate encoder."""
-    training = dataclasses.replace(made.config.training, distil_steps=DISTIL_STEPS)
-    config = dataclasses.replace(made.config.with_candidate_encoder_of(load_config(HEADS)), training=training)
-    with one_thread():  # like training on frozen features
-        partials = (distil.feature_partials(made.matcher, part) for part in (train, validation))
-        return distil.with_candidate_encoder(made, config, *partials)
+def with_varied_photos(folder: Path, grasps: Sequence[Grasp]) -> list[Grasp]:
+    """Return the grasps that only fit the gel check, each with a varied photo of its object."""
+    recordings = (folder / CALIBRATION / "varied_gels" / part.name for part in CALIBRATED["varied_gels"])
+    photos = {name: files for recording in recordings for name, files in photos_by_object(recording).items()}
+    return [dataclasses.replace(grasp, photo_file=photos[grasp.object_id][0]) for grasp in grasps]
 
 
 def store(made: Checkpoint, out: Path) -> None:

@@ -29,8 +29,9 @@ from retrieval.model.references import ReferenceCalibration, reference_similarit
 from retrieval.model.verification import LEVELS, QUANTILES, VerificationCalibration, supports_calibration
 from retrieval.training.features import Features, FeatureSource, FrozenFeatures, features_by_image, recorded_features
 from retrieval.training.gel_check import (
-    MARGIN,
+    FOREIGN,
     PENALTY,
+    ForeignPictures,
     GelCheckFeatures,
     contact_levels,
     fit_gel_check,
@@ -58,8 +59,6 @@ MAX_CALIBRATION_GRASPS = 400
 """Largest number of grasps from each part of the split."""
 MIN_GRASPS = 20
 """Number of validation grasps that the gel check needs; thresholds from fewer grasps would reject too many touches."""
-FOREIGN_COUNT = 700
-"""Number of foreign pictures for fitting; half as many others are drawn for validation."""
 _SETS = 4
 _NO_EMBEDDINGS = np.zeros((0, 0), np.float32)
 
@@ -503,16 +502,15 @@ def calibrate_checkpoint(
     train: Sequence[Grasp],
     validation: Sequence[Grasp],
     *,
-    foreign: int = FOREIGN_COUNT,
-    foreign_margin: float = MARGIN,
+    foreign: ForeignPictures = FOREIGN,
     max_grasps: int = MAX_CALIBRATION_GRASPS,
     quiet: bool = False,
 ) -> Checkpoint:
     """Return the checkpoint with calibrations and a gel check, if there are enough validation grasps.
 
     A posterior needs three validation objects, and a touch with a second photo of its object. At most `max_grasps`
-    grasps of each part are used, and `foreign` foreign pictures for fitting, whose threshold has this margin
-    (`fit_gel_check`). The checkpoint's matcher is reused and modified.
+    grasps of each part are used. `foreign` are the foreign pictures of the gel check. The checkpoint's matcher is
+    reused and modified.
     """
     seed, matcher = checkpoint.config.training.seed, checkpoint.matcher
     grasps = _sample_grasps(validation, seed, max_grasps)
@@ -531,7 +529,6 @@ def calibrate_checkpoint(
         train,
         validation,
         foreign=foreign,
-        foreign_margin=foreign_margin,
         max_grasps=max_grasps,
         quiet=quiet,
     )
@@ -571,8 +568,7 @@ def with_gel_check(
     train: Sequence[Grasp],
     validation: Sequence[Grasp],
     *,
-    foreign: int = FOREIGN_COUNT,
-    foreign_margin: float = MARGIN,
+    foreign: ForeignPictures = FOREIGN,
     max_grasps: int = MAX_CALIBRATION_GRASPS,
     quiet: bool = False,
 ) -> Checkpoint:
@@ -585,19 +581,20 @@ def with_gel_check(
     if len(validation) < MIN_GRASPS:
         matcher.gel_head = None
         return dataclasses.replace(checkpoint, gel_check=None)
+    half = dataclasses.replace(foreign, count=foreign.count // 2)
     fitting, test = (
         GelCheckFeatures.of(
             matcher,
             settings,
             grasps,
             recorded_features(matcher, source, grasps, quiet=quiet)[0],
-            count,
+            pictures,
             seed + number,
         )
-        for number, (grasps, count) in enumerate(((train, foreign), (validation, foreign // 2)))
+        for number, (grasps, pictures) in enumerate(((train, foreign), (validation, half)))
     )
-    head = fit_gel_head(fitting, PENALTY * FOREIGN_COUNT / foreign)
-    check = fit_gel_check(head, test, contact_levels(validation), foreign_margin)
+    head = fit_gel_head(fitting, PENALTY * FOREIGN.count / foreign.count)
+    check = fit_gel_check(head, test, contact_levels(validation), foreign.margin)
     matcher.gel_head = head.to(default_device())
     return dataclasses.replace(checkpoint, gel_check=check)
 

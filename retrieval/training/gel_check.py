@@ -40,6 +40,26 @@ _MAX_PHOTOS, _PHOTO_PX = 400, 256
 """Largest number of photos, and of gel images, for foreign pictures; shorter side of these photos in pixels."""
 
 
+@dataclass(frozen=True)
+class ForeignPictures:
+    """The foreign pictures of a gel check.
+
+    Attributes:
+        count: Their number for fitting; half as many others test the check.
+        margin: Margin of their threshold in log-odds (`MARGIN`).
+        has_false_colours: Whether gel images in false colours are foreign. They are not if the gels have lamps of many
+            makes.
+    """
+
+    count: int = 700
+    margin: float = MARGIN
+    has_false_colours: bool = True
+
+
+FOREIGN = ForeignPictures()
+"""The foreign pictures of a user's own training."""
+
+
 @dataclass(frozen=True, eq=False)
 class GelCheckFeatures:
     """Features of the touch tower, on the CPU.
@@ -58,9 +78,15 @@ class GelCheckFeatures:
 
     @classmethod
     def of(
-        cls, matcher: Matcher, settings: Preprocessing, grasps: Sequence[Grasp], touches: Tensor, count: int, seed: int
+        cls,
+        matcher: Matcher,
+        settings: Preprocessing,
+        grasps: Sequence[Grasp],
+        touches: Tensor,
+        foreign: ForeignPictures,
+        seed: int,
     ) -> "GelCheckFeatures":
-        """Encode no-contact frames of grasps and `count` foreign pictures, drawn from a seed.
+        """Encode no-contact frames of grasps and foreign pictures, drawn from a seed.
 
         `touches` are the features (G, fingers * F) of the grasps' touches, perhaps with cells.
         """
@@ -70,8 +96,9 @@ class GelCheckFeatures:
         sample = [grasps[row] for row in rows]
         # Whole photos, not the model's views of them: a photo given instead of a gel image is mostly background.
         photos = [_small_photo(path) for grasp in sample for path in grasp.photos]
-        gels = [settings.load_touch(grasp.touches[0], *grasp.backgrounds[:1]) for grasp in sample]
-        names, drawn = zip(*draw_foreign(count, settings.touch_px, photos, gels, seed), strict=True)
+        recoloured = sample if foreign.has_false_colours else []
+        gels = [settings.load_touch(grasp.touches[0], *grasp.backgrounds[:1]) for grasp in recoloured]
+        names, drawn = zip(*draw_foreign(foreign.count, settings.touch_px, photos, gels, seed), strict=True)
         pooled = matcher.touch_tower.feature_count
 
         def of_fingers(features: Tensor) -> Tensor:
@@ -168,18 +195,17 @@ def fit_gel_check(
     head: GelHead,
     test: GelCheckFeatures,
     levels: tuple[Sequence[float], Sequence[float]],
-    foreign_margin: float = MARGIN,
+    margin: float = MARGIN,
 ) -> GelCheck:
     """Return the check with thresholds from validation pictures and `contact_levels`, and the fractions it rejects.
 
-    The logit of a grasp is the highest logit of its fingers. `foreign_margin` is that of the threshold of foreign
-    pictures.
+    The logit of a grasp is the highest logit of its fingers. `margin` is that of the threshold of foreign pictures.
     """
     touch, no_contact = head(test.touch).numpy(), head(test.no_contact).numpy()  # (G, fingers, 2)
     foreign = head(test.foreign[:, None]).numpy()
     gels = np.concatenate([touch, no_contact])[..., 0].max(1)
     check = GelCheck(
-        foreign_above=float(np.quantile(gels, 1 - FALSE_ALARM_RATE)) + foreign_margin,
+        foreign_above=float(np.quantile(gels, 1 - FALSE_ALARM_RATE)) + margin,
         contact_above=contact_threshold(no_contact[..., 1].max(1) + MARGIN, touch[..., 1].max(1))
         if len(no_contact)
         else None,

@@ -26,8 +26,8 @@ from retrieval.training.initial_weights import downloaded_or
 PRESET = "linear"
 PUBLISHED_TOWER = "mobilenet_v2"
 """Backbone of the published tower and of the gel tower."""
-SHIPPED_PHOTO_PX = 160
-"""Size of the photos of the shipped photo tower, which replaces a published one without weights."""
+SHIPPED_TOWER, SHIPPED_PHOTO_PX = "mobilenet_v2_stride16", 160
+"""Backbone and photo size of the shipped photo tower, which replaces a published one without weights."""
 NO_WEIGHTS = "random"
 """Value of `init` to use no published tower."""
 
@@ -43,7 +43,7 @@ def linear_config(fingers: int, init: str = "imagenet") -> Config:
     config = load_config(PRESET)
     matcher, training = dataclasses.replace(config.matcher, fingers=fingers), config.training
     if init == NO_WEIGHTS:
-        matcher = dataclasses.replace(matcher, tower=PUBLISHED_TOWER)
+        matcher = dataclasses.replace(matcher, tower=PUBLISHED_TOWER, photo_tower=SHIPPED_TOWER)
         training = dataclasses.replace(training, init=NO_WEIGHTS, init_touch=GEL, init_photo=SHIPPED)
         preprocessing = dataclasses.replace(config.preprocessing, photo_px=SHIPPED_PHOTO_PX)
         return Config(matcher, training, preprocessing)

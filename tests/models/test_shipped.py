@@ -22,10 +22,16 @@ from robot.rig import load_rig
 
 
 @pytest.mark.slow
-def test_towers_learn_varied_photos_and_meshes_and_get_a_head_for_each_number_of_fingers(tmp_path, monkeypatch):
-    parts = shipped.Part("led", False, 1, 6), shipped.Part("varied", True, 2, 4)
-    calibrated = {"validation": (shipped.Part("led", False, 3, 3, 3), shipped.Part("led", True, 4, 1, 3))}
-    for name, value in {"PARTS": parts, "CALIBRATED": calibrated, "HEAD_STEPS": 2}.items():
+def test_towers_learn_varied_photos_meshes_and_other_sensors_for_both_checkpoints(tmp_path, monkeypatch):
+    settings = {
+        "PARTS": (shipped.Part("led", False, 1, 6), shipped.Part("led", True, 2, 3)),
+        "OTHER_SENSORS": (shipped.Part("varied", False, 1, 6),),
+        "CALIBRATED": {
+            "validation": (shipped.Part("led", False, 3, 3, 3), shipped.Part("led", True, 4, 1, 3)),
+            "varied_gels": (),
+        },
+    }
+    for name, value in settings.items():
         monkeypatch.setattr(shipped, name, value)
     meshes = tmp_path / "meshes"
     meshes.mkdir()
@@ -34,17 +40,26 @@ def test_towers_learn_varied_photos_and_meshes_and_get_a_head_for_each_number_of
     arguments = argparse.Namespace(folder=tmp_path / "made", meshes=meshes, jobs=1)
     assert (shipped.collect_training(arguments), shipped.collect_calibration(arguments)) == (0, 0)
     steps = {"iterations": 2, "validate_every": 2, "touches_per_batch": 4}
-    trained = shipped.train_towers(tmp_path / "made", **steps)
-    train = trained.grasps[0]
-    assert any(grasp.object_id.startswith("mesh") for grasp in train)
-    photos = {grasp.photo.name for grasp in train}
-    assert sum("varied" in name for name in photos) == len(photos) - 20 == 30  # three varied ones of each object
-    before = load_checkpoint(shipped_model(2)).matcher.touch_tower.state_dict()["features.17.conv.2.weight"]
+    towers = shipped.train_towers(tmp_path / "made", **steps)
+    images = shipped.training_images(tmp_path / "made")
+    assert any(grasp.object_id.startswith("mesh") for grasp in images.grasps)
+    assert {grasp.touches[0].parts[-3] for grasp in images.grasps} == {"1-led", "2-led", "1-varied"}
+    assert sum("varied" in name for name in {grasp.photo.name for grasp in images.grasps}) == 27  # three of each object
+    for grasp in images.grasps:  # the references are the rig's images of the same press and of the same object
+        assert grasp.touches[0].name == images.rig_grasps[grasp.grasp_id].touches[0].name
+        assert grasp.touches[0].parts[-3][0] == images.rig_grasps[grasp.grasp_id].touches[0].parts[-3][0]
+        assert images.rig_photos[grasp.photo].name.startswith(grasp.object_id)
+        assert images.rig_photos[grasp.photo].parts[-3].endswith("-led")
+    weights = "features.13.conv.2.weight"
     for fingers in (1, 2):
-        made = shipped.train_head(shipped.for_fingers(trained, fingers))
+        shipped_towers = load_checkpoint(shipped_model(fingers))
+        before = shipped_towers.matcher.touch_tower.state_dict()[weights].clone()
+        made = shipped.with_towers(shipped_towers, towers)
         assert made.config.matcher.fingers == fingers
-        assert made.split == shipped.split_of(*trained.grasps)
-        assert not torch.equal(made.matcher.touch_tower.state_dict()["features.17.conv.2.weight"], before)
+        assert len(made.split.train) == 9
+        after, trained = (each.matcher.touch_tower.state_dict()[weights] for each in (made, towers))
+        assert torch.equal(after, trained)
+        assert not torch.equal(after, before)
 
 
 def test_a_stopped_collection_of_pictures_continues(tmp_path):

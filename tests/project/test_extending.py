@@ -75,7 +75,10 @@ def test_a_package_outside_the_repository_works_in_training_evaluation_index_and
     bare = {**installed, "PYTHONPATH": str(ROOT)}
     code, _, output = retrieve("retrieve build-index catalog/ --model model.safetensors --out other", workplace, bare)
     assert code == 2
-    assert "tower must be one of mobilenet_v2, none, resnet18, resnet50, small; got 'patches'" in output
+    assert (
+        "tower must be one of mobilenet_v2, mobilenet_v2_stride16, none, resnet18, resnet50, small; got 'patches'"
+        in output
+    )
     assert "touch_retrieval.towers" in output
 
 

@@ -15,6 +15,7 @@ TOWERS: Registry[Any] = Registry(
     "towers",
     {
         "mobilenet_v2": "retrieval.model.towers.mobilenet:MobileNetV2",
+        "mobilenet_v2_stride16": "retrieval.model.towers.mobilenet:MobileNetV2Stride16",
         "none": "retrieval.model.towers.none:NoTower",
         "resnet18": "retrieval.model.towers.resnet:ResNet18",
         "resnet50": "retrieval.model.towers.resnet:ResNet50",

@@ -1,12 +1,13 @@
 """MobileNetV2, width 1.0 (Sandler et al., CVPR 2018), with the key names of torchvision's checkpoints."""
 
 import re
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Mapping
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
+from retrieval.errors import ConfigError
 from retrieval.model.towers.tower import Tower, stage_statistics, without_autocast
 
 # Expansion, output channels, blocks, first stride: table 2 of the paper.
@@ -19,12 +20,10 @@ _STAGES = (
     (6, 160, 3, 2),
     (6, 320, 1, 1),
 )
-# Layers that end the stages of 32, 64, 96 and 320 channels, at strides 8, 16, 16 and 32.
-_STAGE_OUTPUTS = {6: 32, 10: 64, 13: 96, 17: 320}
 _FLOAT32_LAYERS = 3
 """Layers up to stride 4, computed in float32."""
 _STEM_LAYERS = 7
-"""Layers up to the first stage of `_STAGE_OUTPUTS`."""
+"""Layers up to the first of the stages."""
 
 
 class _StridedDepthwise(nn.Conv2d):
@@ -100,7 +99,9 @@ class MobileNetV2(Tower):
     """
 
     cell_channels = 64 + 96
-    optional_prefixes = ("classifier.", "features.18.")
+    stages: ClassVar[Mapping[int, int]] = {6: 32, 10: 64, 13: 96, 17: 320}
+    """Channels of the stages by their last layer; at strides 8, 16, 16 and 32."""
+    optional_prefixes: ClassVar[tuple[str, ...]] = ("classifier.", "features.18.")
     url = "https://download.pytorch.org/models/mobilenet_v2-b0353104.pth"
 
     def __init__(self, output: str) -> None:
@@ -112,7 +113,8 @@ class MobileNetV2(Tower):
                 layers.append(InvertedResidual(inputs, outputs, first_stride if block == 0 else 1, expansion))
                 inputs = outputs
         if output == "stages":
-            self.feature_count = 3 * sum(_STAGE_OUTPUTS.values())
+            layers = layers[: max(self.stages) + 1]
+            self.feature_count = 3 * sum(self.stages.values())
         else:
             layers.append(_convolution(inputs, 1280, 1))
             self.feature_count = 1000 if output == "classes" else 1280
@@ -155,7 +157,7 @@ class MobileNetV2(Tower):
         x = self._first(images)
         for number, layer in enumerate(list(self.features)[_FLOAT32_LAYERS:], start=_FLOAT32_LAYERS):
             x = layer(x)
-            if number in _STAGE_OUTPUTS:
+            if number in self.stages:
                 yield x
 
     @staticmethod
@@ -170,6 +172,21 @@ class MobileNetV2(Tower):
                 key = f"features.{block}.conv.{(_NESTED_FIRST if block == 1 else _NESTED)[layer]}.{name}"
             renamed[key] = value
         return renamed
+
+
+class MobileNetV2Stride16(MobileNetV2):
+    """MobileNetV2 up to stride 16, with the output "stages" only: 576 features, 0.54 million parameters.
+
+    In the towers that ship, the layers beyond gave the same features for every image.
+    """
+
+    stages: ClassVar[Mapping[int, int]] = {6: 32, 10: 64, 13: 96}
+    optional_prefixes: ClassVar[tuple[str, ...]] = ("classifier.", *(f"features.{layer}." for layer in range(14, 19)))
+
+    def __init__(self, output: str) -> None:
+        if output != "stages":
+            raise ConfigError(f'the tower mobilenet_v2_stride16 has only the tower_output "stages"; got {output!r}')
+        super().__init__(output)
 
 
 # A flat block lists conv, bn, relu of the expansion (absent in the first block) and the depthwise step, then conv, bn.

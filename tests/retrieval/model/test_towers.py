@@ -11,7 +11,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from retrieval.errors import BadInput, CheckpointError, NumericalError
+from retrieval.errors import BadInput, CheckpointError, ConfigError, NumericalError
 from retrieval.model.towers.mobilenet import InvertedResidual
 from retrieval.model.towers.tower import Tower, build_tower, stage_statistics
 from retrieval.model.towers.weights import download, read_state
@@ -194,6 +194,17 @@ def test_real_imagenet_weights_load_in_their_older_key_layout():
     # ReLU6 after the last convolution, averaged.
     assert features.min() >= 0
     assert features.max() <= 6
+
+
+def test_a_tower_up_to_stride_16_takes_the_weights_of_the_whole_one_and_gives_its_first_features():
+    torch.manual_seed(1)
+    whole, short = build_tower("mobilenet_v2", "stages").eval(), build_tower("mobilenet_v2_stride16", "stages").eval()
+    short.load(whole.state_dict(), "the whole tower")
+    images = torch.rand(2, 3, 64, 64)
+    with torch.inference_mode():
+        assert torch.equal(short(images), whole(images)[:, : 3 * (32 + 64 + 96)])
+    with pytest.raises(ConfigError, match="only the tower_output"):
+        build_tower("mobilenet_v2_stride16", "pooled")
 
 
 def test_stage_statistics_are_those_of_each_map_concatenated():

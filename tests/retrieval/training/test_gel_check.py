@@ -13,6 +13,7 @@ from retrieval.model.fusion import Matcher
 from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
 from retrieval.training.gel_check import (
     SYNTHETIC_KINDS,
+    ForeignPictures,
     GelCheckFeatures,
     contact_levels,
     contact_threshold,
@@ -107,9 +108,13 @@ def test_the_gel_head_of_a_matcher_with_cells_reads_the_features_without_them(re
     matcher, settings = Matcher(config).eval(), Preprocessing(touch_px=32, photo_px=32)
     grasps = load_grasps(recording)[:6]
     images = [[settings.load_touch(path) for path in grasp.touches] for grasp in grasps]
-    found = GelCheckFeatures.of(matcher, settings, grasps, touch_features(matcher, images), 8, seed=0)
+    found = GelCheckFeatures.of(matcher, settings, grasps, touch_features(matcher, images), ForeignPictures(8), seed=0)
     pooled = matcher.touch_tower.feature_count
     assert pooled < matcher.touch_tower.output_count
     assert [part.shape[-1] for part in (found.touch, found.no_contact, found.foreign)] == [pooled] * 3
     expected = touch_features(matcher, images).view(6, 2, -1)[..., :pooled]
     assert torch.equal(found.touch, expected)
+    assert list(found.is_plainly_foreign) == [True] * 7 + [False]  # the last one has false colours
+    any_colours = ForeignPictures(8, has_false_colours=False)
+    found = GelCheckFeatures.of(matcher, settings, grasps, touch_features(matcher, images), any_colours, seed=0)
+    assert found.is_plainly_foreign.all()
