@@ -43,10 +43,10 @@ class InvariantTrainer(Trainer):
         """Return the loss of a batch: cross-entropies of touches and of photos, and distances from the references."""
         encoded = self.matcher.touch_encoding(touch).partial, self.matcher.photo_encoding(photo).partial
         keys: tuple[Iterable[str | Path], ...] = [grasp.grasp_id for grasp in batch.grasps], batch.photos
-        expected = tuple(torch.stack([self.references[key] for key in part]) for part in keys)
+        expected = tuple(torch.stack([self.references[key] for key in part]).to(touch.device) for part in keys)
         logits, known = (self.matcher.head.all_logits(*part) for part in (encoded, expected))
         touched, shown = map(torch.from_numpy, (batch.touch_objects, batch.photo_objects))
-        labels = (touched[:, None] == shown).to(logits)
+        labels = (touched[:, None] == shown).to(logits)  # its type and device
         loss = _cross_entropy(logits, known, labels) + _cross_entropy(logits.T, known.T, labels.T)
         width = self.matcher.config.pooled_width
         for ours, reference in zip(encoded, expected, strict=True):
