@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 import retrieval
 from models.recognition import interval, top1
-from models.shipped import retrieve
+from models.shipped import grasps_by_object, retrieve
 from retrieval.data.dataset import Grasp, data_digest, load_grasps
 from retrieval.data.opening import RANGE_MM
 from retrieval.evaluation.reject import statistic
@@ -106,7 +106,7 @@ def sessions(folder: Path, checkpoint: Checkpoint, jobs: int) -> Iterator[str]:
         for session, objects in (("monday", ENROLLED), ("tuesday", ENROLLED + SPARE + OTHERS)):
             size = ("--objects", objects + SPARE, "--grasps", REFERENCES, "--seed", seed, "--jobs", jobs)
             retrieve("collect", "--rig", "sim", *size, "--session", session, "--out", out)
-        touched = by_object(load_grasps(out))
+        touched = grasps_by_object(load_grasps(out))
         monday, tuesday = (
             {name: [grasp for grasp in part if grasp.session == session] for name, part in touched.items()}
             for session in ("monday", "tuesday")
@@ -135,7 +135,7 @@ def one_grasp(folder: Path, checkpoint: Checkpoint, jobs: int) -> Iterator[str]:
     rig.write_text(f'rig = "sim"\ngels = {GELS}\n')
     size = ("--objects", OBJECTS + SPARE, "--grasps", 1 + QUERIES, "--seed", SEED, "--jobs", jobs)
     retrieve("collect", "--rig", rig, *size, "--out", folder / "unseen")
-    touched = by_object(load_grasps(folder / "unseen"))
+    touched = grasps_by_object(load_grasps(folder / "unseen"))
     complete = [(name, part) for name, part in touched.items() if len(part) > QUERIES][:OBJECTS]
     contents = [Content(True, 0), Content(False, 1), Content(False, 1, 0.0)]
     contents += [Content(True, 1, error) for error in (None, 0.0, 0.1, 1.0, 3.0)]
@@ -151,14 +151,6 @@ def one_grasp(folder: Path, checkpoint: Checkpoint, jobs: int) -> Iterator[str]:
         found[content] = drawn_measures(np.concatenate(values), np.concatenate(owners))
     bases = {"photo": lambda one: Content(True, 0), "no opening": lambda one: replace(one, error_mm=None)}
     yield from tables(found, bases)
-
-
-def by_object(grasps: Sequence[Grasp]) -> dict[str, list[Grasp]]:
-    """Return the grasps of each object."""
-    found: dict[str, list[Grasp]] = {}
-    for grasp in grasps:
-        found.setdefault(grasp.object_id, []).append(grasp)
-    return found
 
 
 class Queries(NamedTuple):

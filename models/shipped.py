@@ -94,7 +94,7 @@ CALIBRATED = {
     ),
     "varied_gels": (Part("varied", False, 141_000, 200, 1, gels=200),),
 }
-"""Recordings that choose the step and calibrate the model; that fit the bounds of verifications; that fit, besides, the
+"""Recordings that calibrate the model; that fit the bounds of verifications; that fit, besides, the
 check of gel images, and choose its thresholds by gels that it was not fitted to; and that only fit this check, with
 varied photos of their objects as pictures that are no gels."""
 CALIBRATION_MESHES = 5
@@ -215,20 +215,16 @@ def training_images(folder: Path) -> TrainingImages:
     images = TrainingImages([], {}, {})
     for part in PARTS:
         recording = recording_of(folder, part)
-        touches, photos = touches_by_object(load_grasps(recording)), photos_by_object(recording)
-        known = {grasp.grasp_id: grasp for own in touches.values() for grasp in own}
-        for name, own in touches.items():
-            files = [grasp.photo for grasp in own]
-            images.rig_photos.update({file: file for file in files} | dict.fromkeys(photos.get(name, []), files[0]))
-            photos[name] = files + photos.get(name, [])
-        for other in OTHER_SENSORS:
-            if other.seed == part.seed:
-                for grasp in load_grasps(recording_of(folder, other)):
-                    if grasp.grasp_id in known:
-                        touches[grasp.object_id].append(grasp)
-        for name, own in touches.items():
-            for turn in range(max(len(own), len(photos[name]))):
-                grasp, file = own[turn % len(own)], photos[name][turn % len(photos[name])]
+        rig, varied = load_grasps(recording), photos_by_object(recording)
+        known, of_rig = {grasp.grasp_id: grasp for grasp in rig}, grasps_by_object(rig)
+        sensors = [recording_of(folder, other) for other in OTHER_SENSORS if other.seed == part.seed]
+        others = [grasp for sensor in sensors for grasp in load_grasps(sensor) if grasp.grasp_id in known]
+        for name, touches in grasps_by_object([*rig, *others]).items():
+            own = [grasp.photo for grasp in of_rig[name]]
+            photos = own + varied.get(name, [])
+            images.rig_photos.update(dict.fromkeys(photos, own[0]) | dict(zip(own, own, strict=True)))
+            for turn in range(max(len(touches), len(photos))):
+                grasp, file = touches[turn % len(touches)], photos[turn % len(photos)]
                 named = dataclasses.replace(grasp, grasp_id=f"{grasp.grasp_id}-{turn}", photo_file=file)
                 images.grasps.append(named)
                 images.rig_grasps[named.grasp_id] = known[grasp.grasp_id]
@@ -254,7 +250,7 @@ def calibration_grasps(folder: Path, name: str) -> list[Grasp]:
     return [grasp for recording in recordings for grasp in load_grasps(recording)]
 
 
-def touches_by_object(grasps: Iterable[Grasp]) -> dict[str, list[Grasp]]:
+def grasps_by_object(grasps: Iterable[Grasp]) -> dict[str, list[Grasp]]:
     """Return the grasps of each object."""
     found: dict[str, list[Grasp]] = {}
     for grasp in grasps:
@@ -400,10 +396,10 @@ def calibrated(made: Checkpoint, folder: Path, fingers: int) -> Checkpoint:
     assert trials is not None
     assert made.posterior is not None
     refused = [refused_touches(made, touches)]
-    verification = fit_verification([trials], made.posterior, refused=refused)
+    bounds = fit_verification([trials], made.posterior, refused=refused)
     assert made.split is not None
     split = dataclasses.replace(made.split, validation=split_of([], validation).validation)
-    return dataclasses.replace(made, verification=verification, queries=queries, split=split)
+    return dataclasses.replace(made, verification=bounds, queries=queries, split=split)
 
 
 def with_varied_photos(folder: Path, grasps: Sequence[Grasp]) -> list[Grasp]:

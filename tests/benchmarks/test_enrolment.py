@@ -6,6 +6,7 @@ import pytest
 import retrieval
 from benchmarks import enrolment
 from benchmarks.enrolment import Content
+from models.shipped import grasps_by_object
 from retrieval.data.dataset import load_grasps
 from retrieval.metrics.intervals import summarise
 from tests.reference_model import write_reference_model
@@ -41,7 +42,7 @@ def test_an_area_under_the_curve_has_the_variance_of_delong():
 
 def test_queries_are_answered_with_photos_and_reference_grasps(recording, tmp_path):
     checkpoint = write_reference_model(tmp_path / "model.safetensors")
-    grasps = enrolment.by_object(load_grasps(recording))
+    grasps = grasps_by_object(load_grasps(recording))
     references = {name: part[:1] for name, part in grasps.items()}
     queries = enrolment.encode(checkpoint, {name: part[1:2] for name, part in grasps.items()})
     contents = Content(True, 0), Content(True, 1)
