@@ -4,7 +4,8 @@
     python -m models.conditions grasps/ --rig models/shipped_rig.toml --seed 918273 --photos photos/ --model shipped
 
 Each object of the recording is photographed three times in each condition; all photos of a catalogue are in the same
-one, and the touches are unchanged. The field of photos is unknown to the model, or stated. It prints top-1 of one touch
+one, and the touches are unchanged. The camera of the photos is unknown to the model, which assumes one as `build-index`
+does, or its field is stated. It prints top-1 of one touch
 among one photo of each of 10 and of 100 objects, with 95 % intervals over objects, for each model. A touch that the gel
 check refuses gives no evidence.
 """
@@ -20,6 +21,7 @@ import torch
 from models.photography import CONDITIONS
 from models.pictures import LabelledPicture, collect_pictures
 from models.recognition import all_scores, interval, photo_partials, top1
+from retrieval.data.camera import assumed_camera
 from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.data.views import FIELD_MM
 from retrieval.metrics.intervals import summarise
@@ -70,11 +72,12 @@ def measures(
     for condition, how in CONDITIONS.items():
         shown = [photo for photo in photos if photo.name.rpartition("-")[0] == condition and photo.object_id in names]
         owner = np.array([names.index(photo.object_id) for photo in shown])
-        fields = {condition: FIELD_MM}
+        assumed = assumed_camera([photo.file for photo in shown])
+        cameras = {condition: assumed}
         if abs(math.log(how.camera.field_mm / FIELD_MM)) > OTHER_FIELD:
-            fields[f"{condition}, its field stated"] = how.camera.field_mm
-        for name, field_mm in fields.items():
-            partials = photo_partials(checkpoint, [photo.file for photo in shown], field_mm)
+            cameras[f"{condition}, its field stated"] = assumed._replace(field_mm=how.camera.field_mm)
+        for name, camera in cameras.items():
+            partials = photo_partials(checkpoint, [photo.file for photo in shown], camera)
             scores = all_scores(checkpoint, touches, partials)
             scores[refused] = np.median(scores)
             scored = ScoreTable(scores, features.owner, owner, np.zeros(scores.shape, np.bool_))

@@ -46,12 +46,12 @@ class MaskNetwork(nn.Module):
     def __init__(self) -> None:
         """Create random weights."""
         super().__init__()
-        self.enter = nn.Sequential(_convolution(3, WIDTHS[0], stride=2), _convolution(WIDTHS[0], WIDTHS[0]))
+        self.enter = nn.Sequential(convolution(3, WIDTHS[0], stride=2), convolution(WIDTHS[0], WIDTHS[0]))
         pairs = list(itertools.pairwise(WIDTHS))
         self.down = nn.ModuleList(
-            nn.Sequential(_convolution(fine, coarse, stride=2), _convolution(coarse, coarse)) for fine, coarse in pairs
+            nn.Sequential(convolution(fine, coarse, stride=2), convolution(coarse, coarse)) for fine, coarse in pairs
         )
-        self.up = nn.ModuleList(_convolution(fine + coarse, fine) for fine, coarse in pairs[::-1])
+        self.up = nn.ModuleList(convolution(fine + coarse, fine) for fine, coarse in pairs[::-1])
         self.leave = nn.Conv2d(WIDTHS[0], 1, 1)
 
     def forward(self, photos: Tensor) -> Tensor:
@@ -67,7 +67,8 @@ class MaskNetwork(nn.Module):
         return logits
 
 
-def _convolution(channels: int, out: int, stride: int = 1) -> nn.Sequential:
+def convolution(channels: int, out: int, stride: int = 1) -> nn.Sequential:
+    """Return a convolution with batch normalisation and ReLU."""
     layer = nn.Conv2d(channels, out, 3, stride=stride, padding=1, bias=False)
     return nn.Sequential(layer, nn.BatchNorm2d(out), nn.ReLU())
 
@@ -82,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parser.parse_args(argv)
     pictures = [each for folder in options.photos for each in load_pictures(folder)]
     if options.out:
-        options.out.write_bytes(to_onnx(train(pictures)))
+        options.out.write_bytes(to_onnx(train(pictures), torch.zeros(1, 3, INPUT_PX, INPUT_PX)))
     else:
         print(score(ObjectFinder(options.score), pictures))
     return 0
@@ -131,9 +132,9 @@ def draw_crop(
     return crop(photo, INPUT_PX), crop(mask, INPUT_PX // 2)
 
 
-def to_onnx(network: MaskNetwork) -> bytes:
-    """Return the file of a network."""
-    file, example = io.BytesIO(), torch.zeros(1, 3, INPUT_PX, INPUT_PX)
+def to_onnx(network: nn.Module, example: Tensor) -> bytes:
+    """Return the file of a network that takes photos like `example`."""
+    file = io.BytesIO()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the tracing exporter is deprecated; the new one needs one more package
         torch.onnx.export(network.eval(), (example,), file, opset_version=11, dynamo=False, input_names=["photo"])

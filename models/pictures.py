@@ -93,6 +93,7 @@ class LabelledPicture:
         object_id: The object.
         labels: Its labels.
         field_mm: What a varied photo shows along a side, in millimetres.
+        roll_rad: The roll of the camera of a varied photo.
     """
 
     name: str
@@ -102,6 +103,7 @@ class LabelledPicture:
     object_id: str
     labels: ObjectLabels
     field_mm: float | None
+    roll_rad: float | None
 
 
 def collect_pictures(
@@ -155,8 +157,10 @@ def load_pictures(folder: Path) -> list[LabelledPicture]:
         for name, file in files.items():
             if not name.endswith(_PARTNERS):
                 partners = (files.get(name + end) for end in _PARTNERS)
-                about = row["object_id"], ObjectLabels.from_dict(row), row.get("field_mm", {}).get(name)
-                pictures.append(LabelledPicture(name, file, *partners, *about))
+                camera = (row.get(what, {}).get(name) for what in ("field_mm", "roll_rad"))
+                pictures.append(
+                    LabelledPicture(name, file, *partners, row["object_id"], ObjectLabels.from_dict(row), *camera)
+                )
     return pictures
 
 
@@ -178,7 +182,7 @@ def _worker(kind: str, rig: str, seed: int) -> Work[tuple[Pictures, Mapping[str,
         return next((pictures for pictures in tries if pictures), {}), sim_rig.labels(object_id)
 
     def several(object_id: str, number: int) -> tuple[Pictures, Mapping[str, Any]]:
-        pictures, fields = {}, {}
+        pictures, fields, rolls = {}, {}, {}
         for number in range(PHOTOS[kind]):
             sim_rig.prepare(object_id, FIRST_PHOTO + number)
             scene = sim_rig.sim_state.current_scene()
@@ -187,8 +191,8 @@ def _worker(kind: str, rig: str, seed: int) -> Work[tuple[Pictures, Mapping[str,
             else:
                 how = draw(np.random.default_rng([95, scene.seed]))
                 pictures |= _varied_photo(scene, how, number)
-                fields[f"varied-{number}"] = how.camera.field_mm
-        return pictures, {**sim_rig.labels(object_id), "field_mm": fields}
+                fields[f"varied-{number}"], rolls[f"varied-{number}"] = how.camera.field_mm, how.camera.roll_rad
+        return pictures, {**sim_rig.labels(object_id), "field_mm": fields, "roll_rad": rolls}
 
     return {"photo": photograph, "touch": press, "varied": several, "conditions": several}[kind]
 

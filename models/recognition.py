@@ -26,9 +26,9 @@ from scipy.special import gammaln, softmax
 
 from models.pictures import collect_pictures
 from retrieval.console.progress import Bar
+from retrieval.data.camera import USUAL_CAMERA, PhotoCamera
 from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.data.loading import map_in_order, worker_pool
-from retrieval.data.views import FIELD_MM
 from retrieval.evaluation.reject import reject
 from retrieval.metrics.intervals import compare, summarise
 from retrieval.metrics.measure import Measure
@@ -212,9 +212,9 @@ def grasp_sets(owner: NDArray[np.int64], count: int, photos: int) -> NDArray[np.
 
 
 @torch.inference_mode()
-def photo_partials(checkpoint: Checkpoint, files: Sequence[Path], field_mm: float = FIELD_MM) -> torch.Tensor:
-    """Return partial activations (N, partial) of photos with this field."""
-    encoded, load_photo = [], partial(checkpoint.config.preprocessing.load_photo, field_mm=field_mm)
+def photo_partials(checkpoint: Checkpoint, files: Sequence[Path], camera: PhotoCamera = USUAL_CAMERA) -> torch.Tensor:
+    """Return partial activations (N, partial) of photos by this camera."""
+    encoded, load_photo = [], partial(checkpoint.config.preprocessing.load_photo, camera=camera)
     with Bar("encode photos", len(files), "photos") as bar, worker_pool() as pool:
         for images in batches(map_in_order(pool, load_photo, files), 32):
             features = photo_features(checkpoint.matcher, images)

@@ -32,10 +32,10 @@ from models.meshes import vary_meshes
 from models.pictures import collect_pictures, load_pictures
 from retrieval.commands.main import main as run_command
 from retrieval.console.memory import keep_freed_memory
+from retrieval.data.camera import USUAL_CAMERA, PhotoCamera
 from retrieval.data.dataset import LICENCES, Grasp, Split, data_digest, load_grasps
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import RgbImage
-from retrieval.data.views import FIELD_MM
 from retrieval.model.card import SHIPPED_DATA
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
 from retrieval.model.config import load_config
@@ -154,9 +154,9 @@ class StatedFields(Preprocessing):
         pictures = [picture for recording in recordings for picture in load_pictures(varied_photos(recording))]
         self.fields = {each.file: each.field_mm for each in pictures if zlib.crc32(each.file.name.encode()) % 2}
 
-    def load_photo(self, path: str | Path, field_mm: float = FIELD_MM) -> RgbImage:
+    def load_photo(self, path: str | Path, camera: PhotoCamera = USUAL_CAMERA) -> RgbImage:
         """Read a photo with its stated field."""
-        return super().load_photo(path, self.fields.get(Path(path)) or field_mm)
+        return super().load_photo(path, PhotoCamera(self.fields.get(Path(path)) or camera.field_mm))
 
     def digest(self) -> str:
         """Return the SHA-256 of settings and fields."""

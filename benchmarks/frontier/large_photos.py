@@ -11,8 +11,7 @@ from PIL import Image
 
 from retrieval.data.images import decode, picture_size
 from retrieval.data.preprocessing import Preprocessing
-from retrieval.data.resize import RgbImage
-from retrieval.data.views import tile_views
+from retrieval.data.resize import RgbImage, to_float
 from retrieval.frontier.clock import time_points
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, miss_rate_point
 from retrieval.frontier.sample import Array, Sample
@@ -56,7 +55,7 @@ def decoders(settings: Preprocessing) -> Iterator[tuple[Tradeoff, Decoder]]:
 
     def at(fraction: int, data: bytes) -> RgbImage:
         image = decode(data, _NAME, min(picture_size(data, _NAME)) // fraction)
-        return tile_views(image, settings.views, settings.photo_px)
+        return settings.photo(to_float(image))
 
     fixed = "a fixed fraction"
     yield (

@@ -8,8 +8,9 @@
                                     catalogue) or `object_id` (all its photos) and any other keys; a photo's
                                     value of a key takes precedence over its object's; `opening_mm` in the line
                                     of a touch's gel image, or of the object, is the opening of the jaws; `field_mm`
-                                    is what a photo shows along its shorter side, at the object's distance, and a
-                                    line with this key alone is for all photos
+                                    is what a photo shows along its shorter side, at the object's distance, `roll_deg`
+                                    by how much it is turned anticlockwise, and a line with these keys alone is for
+                                    all photos
 
 A picture is recognised by its extension, or by its content if it has no extension of a picture. Hidden files and those
 of systems and network drives are left out (`_touch_retrieval.names`). A photo's path in the catalogue, with forward
@@ -34,6 +35,7 @@ from _touch_retrieval.files import open_regular, parse_json, read_regular
 from _touch_retrieval.names import is_system_name, lookup_key
 from _touch_retrieval.text import decode_text
 from retrieval.console.output import abbreviate_list
+from retrieval.data.camera import PhotoCamera
 from retrieval.data.dataset import load_grasps
 from retrieval.data.images import EXTENSIONS, is_picture
 from retrieval.data.naming import MAX_EXAMPLES, STEM, Naming
@@ -42,8 +44,11 @@ from retrieval.data.text import is_utf8
 from retrieval.errors import BadInput, DatasetError
 
 METADATA_FILE = "metadata.jsonl"
-FIELD_RANGE_MM = (10.0, 10_000.0)
-"""Fields of photos that are accepted."""
+CAMERA_KEYS = {
+    "field_mm": ("the millimetres that the photo shows along its shorter side", 10.0, 10_000.0),
+    "roll_deg": ("the degrees by which the photo is turned anticlockwise", -180.0, 180.0),
+}
+"""Keys of a photo's camera: what they are, least and largest value."""
 _ALL_PHOTOS = ""
 """Name of the object whose metadata are those of all photos."""
 ENROLLED = "enrolled"
@@ -76,13 +81,20 @@ class CataloguePhoto:
         path: Its path relative to the catalogue.
         object_id: Its object.
         metadata: The user's own keys and values.
-        field_mm: Its field, from these metadata.
+        field_mm: The field of its camera, from these metadata.
+        roll_deg: The roll of its camera, from these metadata.
     """
 
     path: str
     object_id: str
     metadata: dict[str, Any] = field(default_factory=dict, hash=False)
     field_mm: float | None = None
+    roll_deg: float | None = None
+
+    def camera(self, assumed: PhotoCamera) -> PhotoCamera:
+        """Return the camera, as assumed where it is not stated."""
+        stated = self.field_mm, self.roll_deg
+        return PhotoCamera(*(other if value is None else value for value, other in zip(stated, assumed, strict=True)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +202,8 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
         # A picture outside every folder is a photo, and so is every picture if the file stem names the object.
         elif "/" not in path or naming.text == STEM or not _NEARLY_TOUCH.fullmatch(PurePosixPath(path).stem):
             metadata = metadata_of(name, path)
-            photos.append(CataloguePhoto(path, name, metadata, _field_mm(metadata, path)))
+            camera = (_camera_value(metadata, key, path) for key in CAMERA_KEYS)
+            photos.append(CataloguePhoto(path, name, metadata, *camera))
         elif (touch := _touch_name(path)) is None:
             skipped.append(SkippedPhoto(path, f"neither a photo nor a touch: {_TOUCH_NAMES}"))
         else:
@@ -360,15 +373,14 @@ def _read_metadata(file: Path, naming: Naming) -> tuple[dict[str, dict[str, Any]
     return by_object, by_photo
 
 
-def _field_mm(metadata: dict[str, Any], path: str) -> float | None:
-    """Return the field of a photo; None if it is unknown. Raises DatasetError."""
-    if (value := metadata.get("field_mm")) is None:
+def _camera_value(metadata: dict[str, Any], key: str, path: str) -> float | None:
+    """Return a value of a photo's camera; None if it is unknown. Raises DatasetError."""
+    if (value := metadata.get(key)) is None:
         return None
-    low, high = FIELD_RANGE_MM
+    what, low, high = CAMERA_KEYS[key]
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
         raise DatasetError(
-            f"{METADATA_FILE}: field_mm of {path} must be the millimetres that the photo shows along its shorter side, "
-            f"from {low:g} to {high:g}; got {value!r:.40}"
+            f"{METADATA_FILE}: {key} of {path} must be {what}, from {low:g} to {high:g}; got {value!r:.40}"
         )
     return float(value)
 
@@ -378,7 +390,7 @@ def _parse_line(line: str, naming: Naming) -> tuple[str, bool, dict[str, Any]]:
     row = parse_json(line)
     if not isinstance(row, dict):
         raise ValueError("must be one JSON object a line, in braces")
-    if row.keys() == {"field_mm"}:
+    if row and row.keys() <= CAMERA_KEYS.keys():
         return _ALL_PHOTOS, False, row
     keys = [key for key in ("file_name", "object_id") if key in row]
     if not keys:

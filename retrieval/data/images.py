@@ -24,6 +24,8 @@ from retrieval.errors import ImageError
 _AVIF_BRANDS = frozenset({b"avif", b"avis"})
 _HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 EXTENSIONS = frozenset({".avif", ".bmp", ".heic", ".heif", ".hif", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
+LOSSLESS = b"\x89PNG\r\n\x1a\n", b"BM", b"II*\0", b"MM\0*"
+"""First bytes of PNG, BMP and TIFF files, which have no compression artefacts."""
 MAX_PIXELS = 20_000_000
 """Maximum pixels of a decoded picture: 240 MB in float32. Larger JPEG files are decoded at 1/2, 1/4 or 1/8 size."""
 MAX_DRAFT_PIXELS = 160_000_000

@@ -96,6 +96,17 @@ def whole_photo(photo: Samples) -> FoundObject:
     return FoundObject(0.0, 0.0, width, height, width * height)
 
 
+def crop_square(image: Samples, found: FoundObject, side: float) -> Samples:
+    """Return the square of `side` pixels around an object's middle; pixels beyond the photo's edge repeat the edge."""
+    size = max(round(side), 1)
+    left, top = (round(middle - size / 2) for middle in found.middle)
+    inside = image[max(top, 0) : top + size, max(left, 0) : left + size]
+    above, before = max(-top, 0), max(-left, 0)
+    beyond = above, size - above - inside.shape[0], before, size - before - inside.shape[1]
+    whole: Samples = cv2.copyMakeBorder(inside, *beyond, cv2.BORDER_REPLICATE) if any(beyond) else inside
+    return whole
+
+
 _FINDER = ObjectFinder()
 
 

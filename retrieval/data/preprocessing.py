@@ -1,6 +1,7 @@
 """Prepare pictures for the towers: decode, resize, subtract the gel's background.
 
-bytes --decode_rgb--> (H, W, 3) --resize--> (px, px, 3) --subtract_background--> input of a tower
+gel image --decode_rgb--> (H, W, 3) --resize--> (px, px, 3) --subtract_background--> input of the touch tower
+photo     --decode--> (H, W, 3) --find the object, sharpen, turn--> --tile_views--> input of the photo tower
 """
 
 import hashlib
@@ -14,11 +15,14 @@ import numpy as np
 from msgspec import Meta
 
 from _touch_retrieval.documents import check_fields
-from retrieval.data.images import decode, picture_size, read_bytes, read_rgb
+from retrieval.data.camera import USUAL_CAMERA, PhotoCamera
+from retrieval.data.images import LOSSLESS, decode, picture_size, read_bytes, read_rgb
 from retrieval.data.object_finder import FoundObject, find_object, network_digest, whole_photo
 from retrieval.data.photo_faults import photo_faults
 from retrieval.data.resize import RgbImage, Samples, resize
-from retrieval.data.views import FIELD_MM, VIEWS, min_photo_side, min_photo_side_for_crop, tile_views
+from retrieval.data.sharpening import blur_px, sharpen
+from retrieval.data.upright import turn
+from retrieval.data.views import VIEWS, min_photo_side, min_photo_side_for_crop, tile_views
 from retrieval.errors import BadInput, ConfigError, NumericalError
 
 PREPROCESSING_VERSION = 2
@@ -89,7 +93,7 @@ class Preprocessing:
         if self.views == ("whole",):  # keeps the digest of checkpoints without this setting
             del content["views"]
         else:
-            content["object_finder"] = network_digest()
+            content |= {"object_finder": network_digest(), "sharpens": True}
         if not self.reduced:  # as above
             del content["reduced"]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
@@ -103,25 +107,31 @@ class Preprocessing:
         """
         _require_rgb(image, "photo")
         _require_finite(image, "photo")
-        return tile_views(image, self.views, self.photo_px)
+        return self._prepare(image, self._find(image), USUAL_CAMERA, is_lossy=False).views
 
-    def photo_from_bytes(self, data: bytes, name: str | Path, field_mm: float = FIELD_MM) -> PreparedPhoto:
-        """Prepare the photo in the bytes of a file, called `name`, and examine it. Raises ImageError.
+    def photo_from_bytes(self, data: bytes, name: str | Path, camera: PhotoCamera = USUAL_CAMERA) -> PreparedPhoto:
+        """Prepare the photo in the bytes of a file, called `name`, and examine it. Raises ImageError."""
+        image, found = self._decode_photo(data, name, camera.field_mm)
+        return self._prepare(image, found, camera, is_lossy=not data.startswith(LOSSLESS))
 
-        `field_mm`: what the photo shows along its shorter side, at the object's distance.
-        """
-        image, found = self._decode_photo(data, name, field_mm)
-        return PreparedPhoto(
-            tile_views(image, self.views, self.photo_px, found, field_mm),
-            () if self.views == ("whole",) else photo_faults(image, found),
-        )
+    def _prepare(self, image: Samples, found: FoundObject, camera: PhotoCamera, is_lossy: bool) -> PreparedPhoto:
+        if self.views == ("whole",):
+            return PreparedPhoto(tile_views(image, self.views, self.photo_px, found), ())
+        measured_px = blur_px(image, found)
+        faults = photo_faults(image, found, measured_px)
+        image, found = sharpen(image, found, measured_px, is_lossy)
+        if camera.roll_deg:
+            image = turn(image, camera.roll_deg)
+            found = find_object(image)
+        return PreparedPhoto(tile_views(image, self.views, self.photo_px, found, camera.field_mm), faults)
+
+    def _find(self, image: Samples) -> FoundObject:
+        return whole_photo(image) if self.views == ("whole",) else find_object(image)
 
     def _decode_photo(self, data: bytes, name: str | Path, field_mm: float) -> tuple[Samples, FoundObject]:
         """Return a photo in the size that its views need, and its object."""
         image = decode(data, name, min_photo_side(self.views, self.photo_px, field_mm) if self.reduced else None)
-        if self.views == ("whole",):
-            return image, whole_photo(image)
-        found, short = find_object(image), min(image.shape[:2])
+        found, short = self._find(image), min(image.shape[:2])
         more = min_photo_side_for_crop(found, short, self.photo_px)
         if self.reduced and "crop" in self.views and short < min(more, *picture_size(data, name)):
             image = decode(data, name, more)
@@ -157,10 +167,9 @@ class Preprocessing:
         _require_finite(touch, "touch")
         return touch
 
-    def load_photo(self, path: str | Path, field_mm: float = FIELD_MM) -> RgbImage:
+    def load_photo(self, path: str | Path, camera: PhotoCamera = USUAL_CAMERA) -> RgbImage:
         """Read a photo as (photo_px, views * photo_px, 3) float32. Raises ImageError."""
-        image, found = self._decode_photo(read_bytes(path), path, field_mm)
-        return tile_views(image, self.views, self.photo_px, found, field_mm)
+        return self.photo_from_bytes(read_bytes(path), path, camera).views
 
     def load_touch(self, path: str | Path, reference: str | Path | None = None) -> RgbImage:
         """Read one finger's gel image as (touch_px, touch_px, 3) float32.

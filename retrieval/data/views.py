@@ -13,27 +13,15 @@ taken to be that of the simulated rig. `grey` drops the colour, which carries no
 import math
 from collections.abc import Callable, Sequence
 
-import cv2
 import numpy as np
 
-from retrieval.data.object_finder import INPUT_PX, FoundObject, find_object, whole_photo
+from retrieval.data.object_finder import INPUT_PX, FoundObject, crop_square, find_object, whole_photo
 from retrieval.data.resize import RgbImage, Samples, resize, to_float
 
 _CROP_MARGIN = 1.12
 _ZOOM_MM = 83.125
 FIELD_MM = 190.0
 """Field of a photo, in millimetres along its shorter side at the object's distance, where it is unknown."""
-
-
-def crop_square(image: Samples, found: FoundObject, side: float) -> Samples:
-    """Return the square of `side` pixels around an object's middle; pixels beyond the photo's edge repeat the edge."""
-    size = max(round(side), 1)
-    left, top = (round(middle - size / 2) for middle in found.middle)
-    inside = image[max(top, 0) : top + size, max(left, 0) : left + size]
-    above, before = max(-top, 0), max(-left, 0)
-    beyond = above, size - above - inside.shape[0], before, size - before - inside.shape[1]
-    whole: Samples = cv2.copyMakeBorder(inside, *beyond, cv2.BORDER_REPLICATE) if any(beyond) else inside
-    return whole
 
 
 def _crop(image: Samples, found: FoundObject, field_mm: float) -> Samples:

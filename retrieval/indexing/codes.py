@@ -25,10 +25,10 @@ from numpy.typing import NDArray
 from _touch_retrieval.cache import Cache, cache_key
 from indexes.errors import WriteFailed
 from retrieval.console.progress import Bar
+from retrieval.data.camera import USUAL_CAMERA, PhotoCamera
 from retrieval.data.catalogue import Catalogue, SkippedPhoto
 from retrieval.data.images import decode_rgb, read_bytes
 from retrieval.data.loading import map_in_order
-from retrieval.data.views import FIELD_MM
 from retrieval.errors import ImageError, NumericalError, RetrievalError
 from retrieval.indexing.enrolled import EnrolledTable, EnrolledTouch, codes_of, model_key, to_code
 from retrieval.model.checkpoint import Checkpoint
@@ -137,8 +137,8 @@ class Encoder(NamedTuple):
         return f"{self.model}/{'-'.join(digests)}{self.variant(paths)}"
 
 
-def photo_encoder(checkpoint: Checkpoint, fields_mm: Mapping[str, float] = MappingProxyType({})) -> Encoder:
-    """Return the encoder of photos; `fields_mm` are the known fields, by path."""
+def photo_encoder(checkpoint: Checkpoint, cameras: Mapping[str, PhotoCamera] = MappingProxyType({})) -> Encoder:
+    """Return the encoder of photos; `cameras` are those that are not usual, by path."""
     settings, photo_from_bytes = checkpoint.config.matcher, checkpoint.config.preprocessing.photo_from_bytes
     stored = stored_layout(settings.pooled_width, settings.partial_width)
     layout = np.dtype(
@@ -169,9 +169,9 @@ def photo_encoder(checkpoint: Checkpoint, fields_mm: Mapping[str, float] = Mappi
         "photos",
         layout,
         _model(checkpoint, layout),
-        lambda data, paths: photo_from_bytes(data[0], paths[0], fields_mm.get(paths[0], FIELD_MM)),
+        lambda data, paths: photo_from_bytes(data[0], paths[0], cameras.get(paths[0], USUAL_CAMERA)),
         start,
-        lambda paths: f"-{fields_mm[paths[0]]:g}" if paths[0] in fields_mm else "",
+        lambda paths: "-{:g}-{:g}".format(*cameras[paths[0]]) if paths[0] in cameras else "",
     )
 
 

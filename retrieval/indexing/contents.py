@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from _touch_retrieval.cache import Cache
 from indexes.store.rows import Row
+from retrieval.data.camera import USUAL_CAMERA, PhotoCamera, assumed_camera
 from retrieval.data.catalogue import Catalogue, CataloguePhoto, SkippedPhoto
 from retrieval.errors import BadInput, NoReadablePhoto
 from retrieval.indexing.codes import (
@@ -64,6 +65,7 @@ class IndexContents:
         encoded: Number of photos that were encoded now.
         skipped: Photos and touches that could not be used.
         faults: Faults (`retrieval.data.photo_faults`) of the photos that were encoded now and have some, by path.
+        assumed: The camera that was assumed where it is not stated (`retrieval.data.camera`).
     """
 
     rows: list[Row]
@@ -73,6 +75,7 @@ class IndexContents:
     encoded: int
     skipped: list[SkippedPhoto]
     faults: dict[str, Sequence[str]]
+    assumed: PhotoCamera
 
     def blocks(self, cache: Cache) -> Iterator[dict[str, NDArray[Any]]]:
         """Yield the codes of the rows in blocks: arrays by name, such as "embeddings" (n, d)."""
@@ -95,8 +98,10 @@ def read_contents(catalogue: Catalogue, checkpoint: Checkpoint, cache: Cache, qu
     files = CatalogueFiles(catalogue, cache)
     references = _find_references(catalogue, checkpoint, files, cache, quiet)
     photos = sorted([*catalogue.photos, *references.pictures], key=lambda photo: photo.path)
-    fields_mm = {photo.path: photo.field_mm for photo in photos if photo.field_mm is not None}
-    encoder, gel_images = photo_encoder(checkpoint, fields_mm), {picture.path for picture in references.pictures}
+    assumed = _assumed_camera(catalogue, checkpoint)
+    stated = {photo.path: photo.camera(assumed) for photo in catalogue.photos}
+    cameras = {path: camera for path, camera in stated.items() if camera != USUAL_CAMERA}
+    encoder, gel_images = photo_encoder(checkpoint, cameras), {picture.path for picture in references.pictures}
     codes = find_codes([(photo.path,) for photo in photos], encoder, files, cache, quiet)
     files.save()
     if not codes.keys:
@@ -110,6 +115,19 @@ def read_contents(catalogue: Catalogue, checkpoint: Checkpoint, cache: Cache, qu
         codes.encoded,
         [*catalogue.skipped, *codes.skipped, *references.skipped],
         {path: faults for path, faults in codes.faults.items() if path not in gel_images},
+        assumed,
+    )
+
+
+def _assumed_camera(catalogue: Catalogue, checkpoint: Checkpoint) -> PhotoCamera:
+    """Return the camera of photos where it is not stated; only objects that are searched for show an unusual one."""
+    if checkpoint.config.preprocessing.views == ("whole",):
+        return USUAL_CAMERA
+    unknown = [photo for photo in catalogue.photos if None in (photo.field_mm, photo.roll_deg)]
+    assumed = assumed_camera([catalogue.folder / photo.path for photo in unknown])
+    return PhotoCamera(
+        assumed.field_mm if any(photo.field_mm is None for photo in unknown) else USUAL_CAMERA.field_mm,
+        assumed.roll_deg if any(photo.roll_deg is None for photo in unknown) else USUAL_CAMERA.roll_deg,
     )
 
 

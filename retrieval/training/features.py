@@ -24,13 +24,13 @@ from torch.utils.data import DataLoader, Dataset
 from _touch_retrieval.cache import Cache, cache_key
 from _touch_retrieval.files import file_digest
 from retrieval.console.progress import Bar
+from retrieval.data.camera import USUAL_CAMERA, PhotoCamera
 from retrieval.data.dataset import Grasp, ImageCache
 from retrieval.data.images import read_rgb
 from retrieval.data.loading import map_in_order, worker_count, worker_pool
 from retrieval.data.pairs import PairBatch
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import RgbImage, resize
-from retrieval.data.views import FIELD_MM
 from retrieval.errors import DatasetError, NumericalError, RetrievalError
 from retrieval.model.checkpoint import tensors_digest
 from retrieval.model.config import Config
@@ -358,7 +358,7 @@ class _LowPassPreprocessing(Preprocessing):
 
 
 class _MarginPreprocessing(Preprocessing):
-    def load_photo(self, path: str | Path, field_mm: float = FIELD_MM) -> RgbImage:
+    def load_photo(self, path: str | Path, camera: PhotoCamera = USUAL_CAMERA) -> RgbImage:
         return self.photo(photo_margin(read_rgb(path)))
 
 

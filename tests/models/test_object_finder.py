@@ -7,12 +7,14 @@ from models.object_finder import MaskNetwork, overlap, score, to_onnx, train
 from models.pictures import collect_pictures
 from retrieval.data.object_finder import INPUT_PX, FoundObject, ObjectFinder
 
+PHOTO = torch.zeros(1, 3, INPUT_PX, INPUT_PX)
+
 
 def test_the_stored_network_gives_the_same_mask(tmp_path):
     torch.manual_seed(0)
     network, photo = MaskNetwork().eval(), np.random.default_rng(0).random((INPUT_PX, INPUT_PX, 3), dtype=np.float32)
     file = tmp_path / "network.onnx"
-    file.write_bytes(to_onnx(network))
+    file.write_bytes(to_onnx(network, PHOTO))
     with torch.inference_mode():
         expected = network(torch.from_numpy(photo).permute(2, 0, 1)[None])[0, 0].numpy()
     np.testing.assert_allclose(ObjectFinder(file).logits(photo), expected, atol=1e-5)
@@ -30,5 +32,5 @@ def test_varied_photos_have_masks_and_train_a_network(tmp_path):
     assert [photo.mask is None for photo in photos] == [False] * 6
     assert all(120 < photo.field_mm < 400 for photo in photos)
     file = tmp_path / "network.onnx"
-    file.write_bytes(to_onnx(train(photos, steps=2)))
+    file.write_bytes(to_onnx(train(photos, steps=2), PHOTO))
     assert "of 6 photos" in score(ObjectFinder(file), photos)

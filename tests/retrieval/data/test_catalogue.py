@@ -7,6 +7,7 @@ import os
 import pytest
 from PIL import Image
 
+from retrieval.data.camera import PhotoCamera
 from retrieval.data.catalogue import SkippedPhoto, list_catalogue
 from retrieval.data.images import EXTENSIONS
 from retrieval.data.naming import Naming
@@ -215,24 +216,36 @@ def test_objects_may_have_only_touches_and_these_have_metadata(tmp_path):
     assert found.touches[0].metadata == {"shelf": 3}
 
 
-def test_the_field_of_a_photo_is_its_own_its_objects_or_that_of_all_photos(tmp_path):
+def test_the_camera_of_a_photo_is_its_own_its_objects_or_that_of_all_photos(tmp_path):
     fill(tmp_path, "mug/0.jpg", "mug/1.jpg", "cup/0.jpg", "tin/0.jpg")
     write_metadata(
         tmp_path,
-        {"field_mm": 320},
+        {"field_mm": 320, "roll_deg": 90},
         {"object_id": "mug", "field_mm": 200},
-        {"file_name": "mug/1.jpg", "field_mm": 150.5},
+        {"file_name": "mug/1.jpg", "field_mm": 150.5, "roll_deg": 0},
         {"object_id": "tin", "price": 5},
     )
     catalogue = list_catalogue(tmp_path)
-    fields = {photo.path: photo.field_mm for photo in catalogue.photos}
-    assert fields == {"cup/0.jpg": 320, "mug/0.jpg": 200, "mug/1.jpg": 150.5, "tin/0.jpg": 320}
+    cameras = {photo.path: (photo.field_mm, photo.roll_deg) for photo in catalogue.photos}
+    assert cameras == {"cup/0.jpg": (320, 90), "mug/0.jpg": (200, 90), "mug/1.jpg": (150.5, 0), "tin/0.jpg": (320, 90)}
     assert catalogue.notes == ()
 
 
-@pytest.mark.parametrize("value", ["0.2", "5", '"190"', "true", "1e5"])
-def test_a_field_that_is_no_length_in_millimetres_is_refused(tmp_path, value):
+def test_what_is_not_stated_of_a_camera_is_assumed(tmp_path):
+    write_metadata(fill(tmp_path, "mug/0.jpg", "cup/0.jpg"), {"object_id": "mug", "roll_deg": 0})
+    cup, mug = list_catalogue(tmp_path).photos
+    assert (mug.camera(PhotoCamera(400, 90)), cup.camera(PhotoCamera(400, 90))) == ((400, 0), (400, 90))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "what"),
+    [
+        *(("field_mm", value, "the millimetres") for value in ("0.2", "5", '"190"', "true", "1e5")),
+        ("roll_deg", "270", "the degrees"),
+    ],
+)
+def test_values_of_a_camera_that_are_impossible_are_refused(tmp_path, key, value, what):
     fill(tmp_path, "mug/0.jpg")
-    (tmp_path / "metadata.jsonl").write_text(f'{{"field_mm": {value}}}')
-    with pytest.raises(DatasetError, match=r"field_mm of mug/0\.jpg must be the millimetres"):
+    (tmp_path / "metadata.jsonl").write_text(f'{{"{key}": {value}}}')
+    with pytest.raises(DatasetError, match=rf"{key} of mug/0\.jpg must be {what}"):
         list_catalogue(tmp_path)

@@ -9,10 +9,10 @@ from hypothesis.extra.numpy import arrays
 from PIL import Image
 
 from retrieval.commands.main import main
-from retrieval.data.object_finder import FoundObject, find_object
+from retrieval.data.object_finder import FoundObject, crop_square, find_object
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import resize
-from retrieval.data.views import FIELD_MM, VIEWS, crop_square, tile_views
+from retrieval.data.views import FIELD_MM, VIEWS, tile_views
 from retrieval.model.config import MatcherConfig
 from retrieval.model.fusion import Matcher
 

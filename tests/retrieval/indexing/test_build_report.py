@@ -11,6 +11,7 @@ from PIL import Image, ImageFilter
 from indexes.store.folder import IndexStore
 from retrieval.commands.main import main
 from retrieval.indexing.build import build_index
+from tests.retrieval.data.simulated import photo_of
 
 
 @pytest.fixture
@@ -116,3 +117,37 @@ def test_a_stated_field_changes_the_zoom_and_embeds_the_photo_again(tmp_path, ch
     assert (report.written, report.embedded) == (True, 1)
     after = IndexStore(index).open().arrays["partials"][:]
     assert (before == after).all(axis=1).tolist() == [True, False]  # cup, mug
+
+
+def small_square(number):
+    photo = np.full((256, 256, 3), 140, np.uint8)
+    photo[108:148, 108:148] = [30, 60, 180 + number]
+    return photo
+
+
+def rolled(number):
+    return np.rint(255 * np.rot90(photo_of(number)[0])).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("photo", "warning", "stated"),
+    [
+        (small_square, "2.0 times smaller than usual, so photos are assumed to show 380 mm", '{"field_mm": 190}'),
+        (rolled, "turned by 90 degrees anticlockwise, and are turned back (roll_deg 90)", '{"roll_deg": 0}'),
+    ],
+)
+def test_the_camera_that_all_photos_share_is_assumed_until_it_is_stated(
+    tmp_path, checkpoint, index, photo, warning, stated
+):
+    zooms = dataclasses.replace(checkpoint.config.preprocessing, views=("zoom",))
+    checkpoint = dataclasses.replace(checkpoint, config=dataclasses.replace(checkpoint.config, preprocessing=zooms))
+    own = tmp_path / "own"
+    own.mkdir()
+    for number in range(20):
+        Image.fromarray(photo(number)).save(own / f"{number}.png")
+    assert any(warning in line for line in build_index(own, checkpoint, index, quiet=True).warnings)
+    (own / "metadata.jsonl").write_text(stated)
+    report = build_index(own, checkpoint, index, quiet=True)
+    assert (report.embedded, [line for line in report.warnings if warning in line]) == (20, [])
+    (own / "metadata.jsonl").unlink()
+    assert build_index(own, checkpoint, index, quiet=True).embedded == 0  # their codes are still stored

@@ -1,0 +1,64 @@
+"""The camera that is assumed for the photos of a catalogue."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from retrieval.data.camera import FEWEST, USUAL_CAMERA, PhotoCamera, assumed_camera
+from retrieval.data.preprocessing import Preprocessing
+from retrieval.data.upright import turn
+from retrieval.data.views import FIELD_MM
+from tests.retrieval.data.simulated import photo_of
+
+
+def squares(folder, share, count=FEWEST):
+    """Photos of a square object that takes this share of the side."""
+    folder.mkdir()
+    for number in range(count):
+        photo = np.full((256, 256, 3), 140, np.uint8)
+        half = round(128 * share)
+        photo[128 - half : 128 + half, 128 - half : 128 + half] = [30, 60, 180 + number]
+        Image.fromarray(photo).save(folder / f"{number}.png")
+    return sorted(folder.iterdir())
+
+
+def turned_photos(folder, roll_deg):
+    """Photos of simulated objects by a camera with this roll."""
+    folder.mkdir()
+    for number in range(FEWEST):
+        photo = np.rint(255 * turn(photo_of(number)[0], -roll_deg)).astype(np.uint8)
+        Image.fromarray(photo).save(folder / f"{number:02}.png")
+    return sorted(folder.iterdir())
+
+
+@pytest.mark.parametrize(("share", "factor"), [(0.32, 1), (0.16, 2), (0.64, 0.5)])
+def test_objects_of_half_the_usual_size_are_photographed_with_twice_the_field(tmp_path, share, factor):
+    assumed = assumed_camera(squares(tmp_path / "photos", share))
+    assert assumed.field_mm == pytest.approx(FIELD_MM * factor, rel=0.2)
+
+
+def test_few_photos_or_a_small_difference_do_not_change_the_camera(tmp_path):
+    assert assumed_camera(squares(tmp_path / "photos", 0.38)) == USUAL_CAMERA  # nearly the usual size
+    assert assumed_camera(squares(tmp_path / "few", 0.16, FEWEST - 1)) == USUAL_CAMERA
+    assert assumed_camera([]) == USUAL_CAMERA
+
+
+def test_files_that_are_no_photos_are_left_out(tmp_path):
+    photos = squares(tmp_path / "photos", 0.16)
+    (tmp_path / "photos" / "a.png").write_text("no picture")
+    assert assumed_camera([tmp_path / "photos" / "a.png", *photos]).field_mm == 2 * FIELD_MM
+
+
+@pytest.mark.parametrize("roll_deg", [0, 90, 180, -90, 50])
+def test_the_roll_that_all_photos_share_is_found(tmp_path, roll_deg):
+    photos = turned_photos(tmp_path / "photos", roll_deg)
+    assert abs(assumed_camera(photos).roll_deg) == pytest.approx(abs(roll_deg), abs=8)
+
+
+def test_the_views_of_turned_photos_are_those_of_the_upright_ones(tmp_path):
+    settings = Preprocessing(photo_px=64, views=("crop", "grey"))
+    errors = []
+    for number, path in enumerate(turned_photos(tmp_path / "photos", 90)):
+        views = settings.load_photo(path, PhotoCamera(roll_deg=90))
+        errors.append(np.abs(views - settings.photo(photo_of(number)[0])).mean())
+    assert np.median(errors) < 0.01
