@@ -1,13 +1,14 @@
 """Pictures of pages: thumbnails, data URIs, and contact sheets of photo views."""
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from retrieval.console.files import write_output
+from retrieval.data.camera import PhotoCamera
 from retrieval.data.images import decode_rgb, read_bytes
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import resize
@@ -35,18 +36,18 @@ def data_uri(data: bytes, kind: str) -> str:
     return f"data:image/{kind};base64," + base64.b64encode(data).decode("ascii")
 
 
-def write_views(photos: Sequence[Path], settings: Preprocessing, out: Path) -> None:
+def write_views(photos: Mapping[Path, PhotoCamera], settings: Preprocessing, out: Path) -> None:
     """Write a PNG file with the views of photos, two photos per row.
 
     Args:
-        photos: The photos, at least one.
+        photos: The photos, at least one, with their cameras.
         settings: Preprocessing that makes the views.
         out: File to write.
 
     Raises:
         ImageError: A photo cannot be read.
     """
-    views = [np.rint(255 * settings.load_photo(path)).astype(np.uint8) for path in photos]
+    views = [np.rint(255 * settings.load_photo(*each)).astype(np.uint8) for each in photos.items()]
     blanks = [np.full_like(views[0], 255)] * (-len(views) % COLUMNS)
     sheet = np.concatenate([*views, *blanks]).reshape(-1, COLUMNS, *views[0].shape)
     sheet = np.vstack([np.hstack(list(row)) for row in sheet])

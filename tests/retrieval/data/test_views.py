@@ -9,12 +9,14 @@ from hypothesis.extra.numpy import arrays
 from PIL import Image
 
 from retrieval.commands.main import main
+from retrieval.data.camera import PhotoCamera
 from retrieval.data.object_finder import FoundObject, crop_square, find_object
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import resize
 from retrieval.data.views import FIELD_MM, VIEWS, tile_views
 from retrieval.model.config import MatcherConfig
 from retrieval.model.fusion import Matcher
+from retrieval.report.pages import write_views
 
 GROUND = (0.55, 0.5, 0.45)
 
@@ -158,3 +160,16 @@ def test_a_sheet_shows_the_views_of_a_catalogue(tmp_path, model, catalogue, caps
     with Image.open(sheet) as picture:
         assert picture.width == 2 * 48
         assert picture.height >= 48
+
+
+def test_a_sheet_shows_photos_turned_as_the_model_receives_them(tmp_path):
+    path, settings = tmp_path / "a.png", Preprocessing(photo_px=64, views=("crop",))
+    image = photo()
+    image[60:120, 100:150] = [0.9, 0.2, 0.1]  # the upper part of the box
+    Image.fromarray(np.rint(255 * image).astype(np.uint8)).save(path)
+    sheets = []
+    for roll_deg in (0, 180):
+        write_views({path: PhotoCamera(roll_deg=roll_deg)}, settings, tmp_path / "views.png")
+        sheets.append(np.asarray(Image.open(tmp_path / "views.png"), np.float32)[:, :64])
+    upright, turned = sheets
+    assert np.abs(upright - turned[::-1, ::-1]).mean() < 5 < np.abs(upright - turned).mean()
