@@ -8,7 +8,6 @@ import math
 
 import cv2
 import numpy as np
-from scipy import fft
 
 from retrieval.data.object_finder import FoundObject
 from retrieval.data.resize import RgbImage, Samples, resize, to_float
@@ -72,8 +71,8 @@ def sharpen(photo: Samples, found: FoundObject, measured_px: float, is_lossy: bo
     down, across = np.fft.fftfreq(levels.shape[0])[:, None], np.fft.rfftfreq(levels.shape[1])
     kept = np.exp(-2 * np.square(math.pi * removed_px) * (down**2 + across**2))
     gain = (1 + noise) * kept / (kept**2 + noise)
-    spectrum = fft.rfft2(levels, axes=(0, 1)) * gain.astype(np.float32)[..., None]
-    sharp = fft.irfft2(spectrum, levels.shape[:2], axes=(0, 1))[margin:-margin, margin:-margin]
+    spectrum = np.fft.rfft2(levels, axes=(0, 1)) * gain[..., None]
+    sharp = np.fft.irfft2(spectrum, levels.shape[:2], axes=(0, 1))[margin:-margin, margin:-margin]
     return np.ascontiguousarray(np.clip(sharp, 0, 1), np.float32), found
 
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import softmax
 
 from retrieval.data.object_finder import FoundObject, crop_square
 from retrieval.data.resize import Samples, resize
@@ -58,8 +57,8 @@ class RollEstimator:
         shown, found_rolls = disc(photo, found), []
         for quarters in range(4):
             self._network.setInput(np.ascontiguousarray(np.rot90(shown, quarters).transpose(2, 0, 1)[None]))
-            logits = self._network.forward()[0].astype(np.float64)
-            found_rolls.append(np.roll(softmax(logits), -quarters * ROLLS // 4))
+            likely = np.exp(self._network.forward()[0].astype(np.float64))
+            found_rolls.append(np.roll(likely / likely.sum(), -quarters * ROLLS // 4))
         return np.asarray(np.mean(found_rolls, axis=0))
 
 
