@@ -16,7 +16,7 @@ _TEST_BLUR_PX, _STEEPEST, _MARGIN = 1.5, 99.5, 0.05
 _VIEW_PX = 160
 """Side of the picture of the object in which slopes are measured, about that of a view: finer detail is not used."""
 _LARGEST_SCALE = 2.0
-SHARP_PX, BLURRED_PX = 0.85, 1.25
+SHARP_PX, BLURRED_PX = 0.85, 1.4
 """Blur of an ordinary photo, which stays, and the least one that is removed, as standard deviations in pixels."""
 _MOST_PX = 2.5
 """Largest blur that is removed; of a stronger one, as much."""
