@@ -8,13 +8,9 @@ prints how well the object's box agrees with that of the mask: the mean intersec
 photos where it is below 0.7.
 """
 
-import argparse
-import io
 import itertools
 import math
-import warnings
 from collections.abc import Sequence
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -23,9 +19,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from models.pictures import LabelledPicture, load_pictures
+from models.pictures import LabelledPicture
 from models.recognition import mean_interval
-from retrieval.console.progress import Bar
+from models.small_networks import convolution, fit, run_command, to_onnx
 from retrieval.data.images import read_rgb
 from retrieval.data.object_finder import INPUT_PX, FoundObject, ObjectFinder
 
@@ -35,6 +31,7 @@ WIDTHS = (16, 32, 64, 96)
 SMALLEST_CROP, STRETCH = 0.6, 0.15
 """Smallest side of a training crop relative to the photo; standard deviation of the logarithm of its stretch."""
 GOOD_OVERLAP = 0.7
+EXAMPLE = torch.zeros(1, 3, INPUT_PX, INPUT_PX)
 
 
 class MaskNetwork(nn.Module):
@@ -67,49 +64,32 @@ class MaskNetwork(nn.Module):
         return logits
 
 
-def convolution(channels: int, out: int, stride: int = 1) -> nn.Sequential:
-    """Return a convolution with batch normalisation and ReLU."""
-    layer = nn.Conv2d(channels, out, 3, stride=stride, padding=1, bias=False)
-    return nn.Sequential(layer, nn.BatchNorm2d(out), nn.ReLU())
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Train and write a network, or score one."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("photos", nargs="+", type=Path)
-    chosen = parser.add_mutually_exclusive_group(required=True)
-    chosen.add_argument("--out", type=Path, help="train, and write the network to this file")
-    chosen.add_argument("--score", type=Path, help="score the network of this file")
-    options = parser.parse_args(argv)
-    pictures = [each for folder in options.photos for each in load_pictures(folder)]
-    if options.out:
-        options.out.write_bytes(to_onnx(train(pictures), torch.zeros(1, 3, INPUT_PX, INPUT_PX)))
-    else:
-        print(score(ObjectFinder(options.score), pictures))
-    return 0
+    return run_command(
+        argv,
+        __doc__,
+        lambda pictures: to_onnx(train(pictures), EXAMPLE),
+        lambda file, pictures: score(ObjectFinder(file), pictures),
+    )
 
 
 def train(pictures: Sequence[LabelledPicture], steps: int = STEPS) -> MaskNetwork:
     """Return a network that was trained on photos and their masks."""
     torch.manual_seed(0)
     rng, network = np.random.default_rng(96), MaskNetwork().to(memory_format=torch.channels_last)  # faster on a CPU
-    optimizer = torch.optim.AdamW(network.parameters(), LEARNING_RATE, weight_decay=1e-4)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LEARNING_RATE, total_steps=steps)
     photos = [cv2.imread(str(each.file))[..., ::-1] for each in pictures]
     masks = [cv2.imread(str(each.mask), cv2.IMREAD_GRAYSCALE) for each in pictures]
-    with Bar("train the object finder", steps, "steps") as bar:
-        for _ in range(steps):
-            rows = rng.integers(len(photos), size=PHOTOS_PER_STEP)
-            crops = [draw_crop(photos[row], masks[row], rng) for row in rows]
-            shown, marked = (torch.from_numpy(np.stack(part)) for part in zip(*crops, strict=True))
-            logits = network(shown.permute(0, 3, 1, 2))[:, 0]  # the permuted memory has the channels last
-            loss = functional.binary_cross_entropy_with_logits(logits, marked)
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            schedule.step()
-            bar.advance(note=f"loss {loss.item():.3f}")
-    return network.eval()
+
+    def loss_of_step() -> Tensor:
+        rows = rng.integers(len(photos), size=PHOTOS_PER_STEP)
+        crops = [draw_crop(photos[row], masks[row], rng) for row in rows]
+        shown, marked = (torch.from_numpy(np.stack(part)) for part in zip(*crops, strict=True))
+        logits = network(shown.permute(0, 3, 1, 2))[:, 0]  # the permuted memory has the channels last
+        return functional.binary_cross_entropy_with_logits(logits, marked)
+
+    fit(network, loss_of_step, "object finder", steps, LEARNING_RATE, weight_decay=1e-4)
+    return network
 
 
 def draw_crop(
@@ -130,15 +110,6 @@ def draw_crop(
         return np.ascontiguousarray(resized[:, ::-1] if is_mirrored else resized)
 
     return crop(photo, INPUT_PX), crop(mask, INPUT_PX // 2)
-
-
-def to_onnx(network: nn.Module, example: Tensor) -> bytes:
-    """Return the file of a network that takes photos like `example`."""
-    file = io.BytesIO()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the tracing exporter is deprecated; the new one needs one more package
-        torch.onnx.export(network.eval(), (example,), file, opset_version=11, dynamo=False, input_names=["photo"])
-    return file.getvalue()
 
 
 def score(finder: ObjectFinder, pictures: Sequence[LabelledPicture]) -> str:

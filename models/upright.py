@@ -7,22 +7,19 @@ PHOTOS are folders of varied photos (`models.pictures`), whose rolls are known. 
 whose most probable roll is right within 20 degrees. `build-index` uses the mean over the photos of a catalogue.
 """
 
-import argparse
 import math
 from collections.abc import Sequence
-from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 from torch.nn import functional
 
-from models.object_finder import convolution, to_onnx
-from models.pictures import LabelledPicture, load_pictures
+from models.pictures import LabelledPicture
 from models.recognition import mean_interval
-from retrieval.console.progress import Bar
+from models.small_networks import convolution, fit, run_command, to_onnx
 from retrieval.data.images import read_rgb
 from retrieval.data.object_finder import crop_square, find_object
 from retrieval.data.resize import resize
@@ -31,11 +28,12 @@ from retrieval.data.upright import DISC, INPUT_PX, ROLLS, RollEstimator, masked
 STEPS, PHOTOS_PER_STEP, LEARNING_RATE = 3000, 64, 2e-3
 WIDTHS = (24, 48, 64, 96)
 """Channels at a half to a sixteenth of the input's resolution."""
-STORED_PX = 96
-"""Side of the squares around the objects that are kept in memory."""
+STORED_PX, STORED_SIDE = 96, 1.3
+"""Side in pixels of the squares around the objects that are kept in memory, and relative to the disc."""
 SPREAD = 0.75
 """Standard deviation of the target over rolls, in steps."""
 GOOD_ROLL = math.radians(20)
+EXAMPLE = torch.zeros(1, 3, INPUT_PX, INPUT_PX)
 
 
 class RollNetwork(nn.Sequential):
@@ -52,57 +50,44 @@ class RollNetwork(nn.Sequential):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Train and write a network, or score one."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("photos", nargs="+", type=Path)
-    chosen = parser.add_mutually_exclusive_group(required=True)
-    chosen.add_argument("--out", type=Path, help="train, and write the network to this file")
-    chosen.add_argument("--score", type=Path, help="score the network of this file")
-    options = parser.parse_args(argv)
-    pictures = [each for folder in options.photos for each in load_pictures(folder)]
-    if options.out:
-        example = torch.zeros(1, 3, INPUT_PX, INPUT_PX)
-        options.out.write_bytes(to_onnx(train(pictures), example))
-    else:
-        print(score(RollEstimator(options.score), pictures))
-    return 0
+    return run_command(
+        argv,
+        __doc__,
+        lambda pictures: to_onnx(train(pictures), EXAMPLE),
+        lambda file, pictures: score(RollEstimator(file), pictures),
+    )
 
 
 def train(pictures: Sequence[LabelledPicture], steps: int = STEPS) -> RollNetwork:
     """Return a network that was trained on photos, each turned by another random angle in every step."""
     torch.manual_seed(0)
-    rng, network = np.random.default_rng(97), RollNetwork()
-    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # faster on a CPU; torch's stub lacks it
-    optimizer = torch.optim.AdamW(network.parameters(), LEARNING_RATE, weight_decay=1e-2)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LEARNING_RATE, total_steps=steps)
+    rng, network = np.random.default_rng(97), RollNetwork().to(memory_format=torch.channels_last)  # faster on a CPU
     squares = [stored_square(each) for each in pictures]
     squares += [np.ascontiguousarray(square[:, ::-1]) for square in squares]
     rolls = np.array([each.roll_rad for each in pictures])
     rolls = np.concatenate([rolls, -rolls])  # of the mirrored photos
-    with Bar("train the roll network", steps, "steps") as bar:
-        for _ in range(steps):
-            rows = rng.integers(len(squares), size=PHOTOS_PER_STEP)
-            turns = rng.uniform(0, 2 * math.pi, len(rows))
-            shown = [draw_disc(squares[row], turn, rng) for row, turn in zip(rows, turns, strict=True)]
-            logits = network(torch.from_numpy(np.stack(shown)).permute(0, 3, 1, 2))
-            loss = functional.cross_entropy(logits, torch.from_numpy(target(rolls[rows] + turns)))
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            schedule.step()
-            bar.advance(note=f"loss {loss.item():.3f}")
-    return network.eval()
+
+    def loss_of_step() -> Tensor:
+        rows = rng.integers(len(squares), size=PHOTOS_PER_STEP)
+        turns = rng.uniform(0, 2 * math.pi, len(rows))
+        shown = [draw_disc(squares[row], turn, rng) for row, turn in zip(rows, turns, strict=True)]
+        logits = network(torch.from_numpy(np.stack(shown)).permute(0, 3, 1, 2))
+        return functional.cross_entropy(logits, torch.from_numpy(target(rolls[rows] + turns)))
+
+    fit(network, loss_of_step, "roll network", steps, LEARNING_RATE, weight_decay=1e-2)
+    return network
 
 
 def stored_square(picture: LabelledPicture) -> NDArray[np.float32]:
     """Return the surroundings (STORED_PX, STORED_PX, 3) of the object in a photo, larger than the disc."""
     photo = read_rgb(picture.file)
     found = find_object(photo)
-    return resize(crop_square(photo, found, 1.3 * DISC * found.side), (STORED_PX, STORED_PX))
+    return resize(crop_square(photo, found, STORED_SIDE * DISC * found.side), (STORED_PX, STORED_PX))
 
 
 def draw_disc(square: NDArray[np.float32], turn: float, rng: np.random.Generator) -> NDArray[np.float32]:
     """Return a disc from a stored square, turned anticlockwise by `turn`, at a random place, size and brightness."""
-    scale = 1.3 * INPUT_PX / STORED_PX * math.exp(rng.normal(0, 0.12))
+    scale = STORED_SIDE * INPUT_PX / STORED_PX * math.exp(rng.normal(0, 0.12))
     matrix = cv2.getRotationMatrix2D(((STORED_PX - 1) / 2,) * 2, math.degrees(turn), scale)
     matrix[:, 2] += (INPUT_PX - STORED_PX) / 2 + rng.normal(0, 0.03 * INPUT_PX, 2)
     shown = cv2.warpAffine(square, matrix, (INPUT_PX, INPUT_PX), flags=cv2.INTER_AREA, borderMode=cv2.BORDER_REPLICATE)

@@ -3,18 +3,17 @@
 import numpy as np
 import torch
 
-from models.object_finder import MaskNetwork, overlap, score, to_onnx, train
+from models.object_finder import EXAMPLE, MaskNetwork, overlap, score, train
 from models.pictures import collect_pictures
+from models.small_networks import to_onnx
 from retrieval.data.object_finder import INPUT_PX, FoundObject, ObjectFinder
-
-PHOTO = torch.zeros(1, 3, INPUT_PX, INPUT_PX)
 
 
 def test_the_stored_network_gives_the_same_mask(tmp_path):
     torch.manual_seed(0)
     network, photo = MaskNetwork().eval(), np.random.default_rng(0).random((INPUT_PX, INPUT_PX, 3), dtype=np.float32)
     file = tmp_path / "network.onnx"
-    file.write_bytes(to_onnx(network, PHOTO))
+    file.write_bytes(to_onnx(network, EXAMPLE))
     with torch.inference_mode():
         expected = network(torch.from_numpy(photo).permute(2, 0, 1)[None])[0, 0].numpy()
     np.testing.assert_allclose(ObjectFinder(file).logits(photo), expected, atol=1e-5)
@@ -32,5 +31,5 @@ def test_varied_photos_have_masks_and_train_a_network(tmp_path):
     assert [photo.mask is None for photo in photos] == [False] * 6
     assert all(120 < photo.field_mm < 400 for photo in photos)
     file = tmp_path / "network.onnx"
-    file.write_bytes(to_onnx(train(photos, steps=2), PHOTO))
+    file.write_bytes(to_onnx(train(photos, steps=2), EXAMPLE))
     assert "of 6 photos" in score(ObjectFinder(file), photos)

@@ -3,20 +3,18 @@
 import numpy as np
 import torch
 
-from models.object_finder import to_onnx
 from models.pictures import collect_pictures
-from models.upright import INPUT_PX, RollEstimator, RollNetwork, score, target, train
+from models.small_networks import to_onnx
+from models.upright import EXAMPLE, RollEstimator, RollNetwork, score, target, train
 from retrieval.data.object_finder import whole_photo
 from retrieval.data.upright import disc
-
-PHOTO = torch.zeros(1, 3, INPUT_PX, INPUT_PX)
 
 
 def test_the_probabilities_are_the_mean_over_four_turned_copies(tmp_path):
     torch.manual_seed(0)
     network, photo = RollNetwork().eval(), np.random.default_rng(0).random((80, 80, 3), dtype=np.float32)
     file = tmp_path / "network.onnx"
-    file.write_bytes(to_onnx(network, PHOTO))
+    file.write_bytes(to_onnx(network, EXAMPLE))
     found = whole_photo(photo)
     turned = torch.stack([torch.from_numpy(disc(photo, found)).rot90(quarters) for quarters in range(4)])
     with torch.inference_mode():
@@ -34,5 +32,5 @@ def test_varied_photos_state_their_roll_and_train_a_network(tmp_path):
     photos = collect_pictures("varied", tmp_path, objects=4, seed=3)
     assert len({photo.roll_rad for photo in photos}) > 4
     file = tmp_path / "network.onnx"
-    file.write_bytes(to_onnx(train(photos, steps=2), PHOTO))
+    file.write_bytes(to_onnx(train(photos, steps=2), EXAMPLE))
     assert "of 12 photos" in score(RollEstimator(file), photos)
