@@ -5,9 +5,8 @@
 
 Each object of the recording is photographed three times in each condition; all photos of a catalogue are in the same
 one, and the touches are unchanged. The camera of the photos is unknown to the model, which assumes one as `build-index`
-does, or its field is stated. It prints top-1 of one touch
-among one photo of each of 10 and of 100 objects, with 95 % intervals over objects, for each model. A touch that the gel
-check refuses gives no evidence.
+does, or its field is stated. It prints top-1 of one touch among one photo of each of 10 and of 100 objects, with 95 %
+intervals over objects, for each model. A touch that the gel check refuses gives no evidence.
 """
 
 import argparse

@@ -156,7 +156,7 @@ class StatedFields(Preprocessing):
 
     def load_photo(self, path: str | Path, camera: PhotoCamera = USUAL_CAMERA) -> RgbImage:
         """Read a photo with its stated field."""
-        return super().load_photo(path, PhotoCamera(self.fields.get(Path(path)) or camera.field_mm))
+        return super().load_photo(path, camera._replace(field_mm=self.fields.get(Path(path)) or camera.field_mm))
 
     def digest(self) -> str:
         """Return the SHA-256 of settings and fields."""

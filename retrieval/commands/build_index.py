@@ -110,16 +110,15 @@ def build_index(
 def _write_views(catalogue: Path, index: Path, report: "BuildReport", checkpoint: "Checkpoint") -> None:
     """Write some photos of the index, or of its first shard, as the model receives them."""
     from indexes.store.folder import IndexStore
-    from retrieval.data.camera import assumed_camera
-    from retrieval.data.catalogue import CAMERA_KEYS, CataloguePhoto
+    from retrieval.data.camera import PhotoCamera
+    from retrieval.data.catalogue import CataloguePhoto
+    from retrieval.indexing.build import ASSUMED_CAMERA
     from retrieval.report.pages import write_views
 
-    rows = IndexStore(index / report.shards[0]["folder"] if report.shards else index).open(verify=False).rows
+    generation = IndexStore(index / report.shards[0]["folder"] if report.shards else index).open(verify=False)
+    rows, assumed = generation.rows, PhotoCamera(*generation.manifest.about[ASSUMED_CAMERA])
     chosen = sorted({number * len(rows) // PREVIEW_PHOTOS for number in range(PREVIEW_PHOTOS)})
-    assumed = assumed_camera([catalogue / row.path for row in rows])
-    shown = {}
-    for row in map(rows.__getitem__, chosen):
-        stated = map(row.metadata.get, CAMERA_KEYS)
-        shown[catalogue / row.path] = CataloguePhoto(row.path, row.object_id, row.metadata, *stated).camera(assumed)
+    photos = [CataloguePhoto(row.path, row.object_id, row.metadata) for row in map(rows.__getitem__, chosen)]
+    shown = {catalogue / photo.path: photo.camera(assumed) for photo in photos}
     write_views(shown, checkpoint.config.preprocessing, index / "views.png")
     say(f"views: {len(chosen)} photos in {index / 'views.png'}")

@@ -81,15 +81,21 @@ class CataloguePhoto:
         path: Its path relative to the catalogue.
         object_id: Its object.
         metadata: The user's own keys and values.
-        field_mm: The field of its camera, from these metadata.
-        roll_deg: The roll of its camera, from these metadata.
     """
 
     path: str
     object_id: str
     metadata: dict[str, Any] = field(default_factory=dict, hash=False)
-    field_mm: float | None = None
-    roll_deg: float | None = None
+
+    @property
+    def field_mm(self) -> float | None:
+        """The field of its camera, from the metadata."""
+        return self.metadata.get("field_mm")
+
+    @property
+    def roll_deg(self) -> float | None:
+        """The roll of its camera, from the metadata."""
+        return self.metadata.get("roll_deg")
 
     def camera(self, assumed: PhotoCamera) -> PhotoCamera:
         """Return the camera, as assumed where it is not stated."""
@@ -202,8 +208,8 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
         # A picture outside every folder is a photo, and so is every picture if the file stem names the object.
         elif "/" not in path or naming.text == STEM or not _NEARLY_TOUCH.fullmatch(PurePosixPath(path).stem):
             metadata = metadata_of(name, path)
-            camera = (_camera_value(metadata, key, path) for key in CAMERA_KEYS)
-            photos.append(CataloguePhoto(path, name, metadata, *camera))
+            _require_camera(metadata, path)
+            photos.append(CataloguePhoto(path, name, metadata))
         elif (touch := _touch_name(path)) is None:
             skipped.append(SkippedPhoto(path, f"neither a photo nor a touch: {_TOUCH_NAMES}"))
         else:
@@ -373,16 +379,15 @@ def _read_metadata(file: Path, naming: Naming) -> tuple[dict[str, dict[str, Any]
     return by_object, by_photo
 
 
-def _camera_value(metadata: dict[str, Any], key: str, path: str) -> float | None:
-    """Return a value of a photo's camera; None if it is unknown. Raises DatasetError."""
-    if (value := metadata.get(key)) is None:
-        return None
-    what, low, high = CAMERA_KEYS[key]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-        raise DatasetError(
-            f"{METADATA_FILE}: {key} of {path} must be {what}, from {low:g} to {high:g}; got {value!r:.40}"
-        )
-    return float(value)
+def _require_camera(metadata: dict[str, Any], path: str) -> None:
+    """Raise DatasetError if a value of a photo's camera is impossible."""
+    for key, (what, low, high) in CAMERA_KEYS.items():
+        if (value := metadata.get(key)) is None:
+            continue
+        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+            raise DatasetError(
+                f"{METADATA_FILE}: {key} of {path} must be {what}, from {low:g} to {high:g}; got {value!r:.40}"
+            )
 
 
 def _parse_line(line: str, naming: Naming) -> tuple[str, bool, dict[str, Any]]:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from retrieval.data.object_finder import INPUT_PX, FoundObject, crop_square, find_object, whole_photo
+from retrieval.data.object_finder import INPUT_PX, FoundObject, crop_square
 from retrieval.data.resize import RgbImage, Samples, resize, to_float
 
 _CROP_MARGIN = 1.12
@@ -65,14 +65,9 @@ def min_photo_side_for_crop(found: FoundObject, short: int, px: int) -> int:
 
 
 def tile_views(
-    image: Samples, names: Sequence[str], px: int, found: FoundObject | None = None, field_mm: float = FIELD_MM
+    image: Samples, names: Sequence[str], px: int, found: FoundObject, field_mm: float = FIELD_MM
 ) -> RgbImage:
-    """Return the views of a photo (H, W, 3), side by side: (px, len(names) * px, 3).
-
-    The object is searched for if `found` is None and a view needs it.
-    """
-    if found is None:
-        found = whole_photo(image) if set(names) == {"whole"} else find_object(image)
+    """Return the views of a photo (H, W, 3) with this object, side by side: (px, len(names) * px, 3)."""
     tiles = np.empty((px, len(names) * px, 3), np.float32)
     for number, name in enumerate(names):
         tiles[:, number * px : (number + 1) * px] = resize(VIEWS[name](image, found, field_mm), (px, px))

@@ -36,6 +36,8 @@ from retrieval.version import __version__
 
 PARTS = {"checkpoint": "model", "preprocessing": "preprocessing of photos"}
 """Parts of a fingerprint, by their keys."""
+ASSUMED_CAMERA = "assumed_camera"
+"""Key in the manifest of the camera that was assumed for photos where it is not stated: field_mm and roll_deg."""
 CACHE = Path("codes", "cache.sqlite")
 """Cache of codes in the folder of an index, for all generations."""
 _USED = "files/used"
@@ -182,6 +184,7 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, store: IndexStore
             "catalogue": catalogue.where,
             "objects_from": options.naming.text,
             CELLS: options.cells,
+            ASSUMED_CAMERA: list(contents.assumed),
             **contents.references.about,
         }
         current, why = _current(store, checkpoint)

@@ -99,8 +99,7 @@ def read_contents(catalogue: Catalogue, checkpoint: Checkpoint, cache: Cache, qu
     references = _find_references(catalogue, checkpoint, files, cache, quiet)
     photos = sorted([*catalogue.photos, *references.pictures], key=lambda photo: photo.path)
     assumed = _assumed_camera(catalogue, checkpoint)
-    stated = {photo.path: photo.camera(assumed) for photo in catalogue.photos}
-    cameras = {path: camera for path, camera in stated.items() if camera != USUAL_CAMERA}
+    cameras = {photo.path: camera for photo in catalogue.photos if (camera := photo.camera(assumed)) != USUAL_CAMERA}
     encoder, gel_images = photo_encoder(checkpoint, cameras), {picture.path for picture in references.pictures}
     codes = find_codes([(photo.path,) for photo in photos], encoder, files, cache, quiet)
     files.save()

@@ -6,29 +6,24 @@ from PIL import Image
 
 from retrieval.data.camera import FEWEST, USUAL_CAMERA, PhotoCamera, assumed_camera
 from retrieval.data.preprocessing import Preprocessing
-from retrieval.data.upright import turn
 from retrieval.data.views import FIELD_MM
-from tests.retrieval.data.simulated import photo_of
+from tests.retrieval.data.simulated import photo_of, rolled, square
+
+
+def write(folder, photos):
+    """Write photos into a new folder, and return their files."""
+    folder.mkdir()
+    for number, photo in enumerate(photos):
+        Image.fromarray(photo).save(folder / f"{number:02}.png")
+    return sorted(folder.iterdir())
 
 
 def squares(folder, share, count=FEWEST):
-    """Photos of a square object that takes this share of the side."""
-    folder.mkdir()
-    for number in range(count):
-        photo = np.full((256, 256, 3), 140, np.uint8)
-        half = round(128 * share)
-        photo[128 - half : 128 + half, 128 - half : 128 + half] = [30, 60, 180 + number]
-        Image.fromarray(photo).save(folder / f"{number}.png")
-    return sorted(folder.iterdir())
+    return write(folder, [square(number, share) for number in range(count)])
 
 
 def turned_photos(folder, roll_deg):
-    """Photos of simulated objects by a camera with this roll."""
-    folder.mkdir()
-    for number in range(FEWEST):
-        photo = np.rint(255 * turn(photo_of(number)[0], -roll_deg)).astype(np.uint8)
-        Image.fromarray(photo).save(folder / f"{number:02}.png")
-    return sorted(folder.iterdir())
+    return write(folder, [rolled(number, roll_deg) for number in range(FEWEST)])
 
 
 @pytest.mark.parametrize(("share", "factor"), [(0.32, 1), (0.16, 2), (0.64, 0.5)])

@@ -57,7 +57,6 @@ def test_an_ordinary_photo_stays_as_it_is():
 
 
 def test_artefacts_of_a_compressed_photo_are_not_amplified(tmp_path):
-    """A filter for pictures without artefacts triples those of JPEG."""
     sharp, _ = photo_of(0)
     soft = np.rint(255 * blurred(sharp, 1.5)).astype(np.uint8)
     Image.fromarray(soft).save(tmp_path / "soft.png")

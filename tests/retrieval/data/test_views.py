@@ -80,7 +80,7 @@ def test_any_photo_has_a_box_inside_it(image):
     assert 0 <= found.left < found.right <= image.shape[1]
     assert 0 <= found.top < found.bottom <= image.shape[0]
     assert 0 < found.area <= image[..., 0].size
-    assert np.isfinite(tile_views(image, list(VIEWS), 8)).all()
+    assert np.isfinite(tile_views(image, list(VIEWS), 8, find_object(image))).all()
 
 
 @pytest.mark.parametrize("side", [1, 2, 7, 30])
@@ -105,7 +105,7 @@ def test_the_grey_view_is_the_zoom_without_its_colours_to_the_bit():
 
 def test_views_are_tiled_side_by_side():
     image = photo()
-    tiles = tile_views(image, ("whole", "crop", "zoom", "grey"), 64)
+    tiles = tile_views(image, ("whole", "crop", "zoom", "grey"), 64, find_object(image))
     assert tiles.shape == (64, 256, 3)
     np.testing.assert_array_equal(tiles[:, :64], Preprocessing(photo_px=64).photo(image))
     blue = [float((tiles[:, left : left + 64, 2] > 0.65).mean()) for left in (0, 64, 128)]
@@ -125,7 +125,7 @@ def test_the_zoom_has_one_scale_for_all_object_sizes():
         image = photo(box=box)
         left, top, right, bottom = box
         image[top:bottom, left:right:8] = 1
-        return tile_views(image, ("zoom",), 112)
+        return tile_views(image, ("zoom",), 112, find_object(image))
 
     small, large = stripes((110, 90, 150, 170)), stripes((70, 20, 190, 230))
     middle = slice(40, 72)

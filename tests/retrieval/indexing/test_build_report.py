@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from PIL import Image, ImageFilter
 from indexes.store.folder import IndexStore
 from retrieval.commands.main import main
 from retrieval.indexing.build import build_index
-from tests.retrieval.data.simulated import photo_of
+from tests.retrieval.data.simulated import rolled, square
 
 
 @pytest.fixture
@@ -119,21 +120,19 @@ def test_a_stated_field_changes_the_zoom_and_embeds_the_photo_again(tmp_path, ch
     assert (before == after).all(axis=1).tolist() == [True, False]  # cup, mug
 
 
-def small_square(number):
-    photo = np.full((256, 256, 3), 140, np.uint8)
-    photo[108:148, 108:148] = [30, 60, 180 + number]
-    return photo
-
-
-def rolled(number):
-    return np.rint(255 * np.rot90(photo_of(number)[0])).astype(np.uint8)
-
-
 @pytest.mark.parametrize(
     ("photo", "warning", "stated"),
     [
-        (small_square, "2.0 times smaller than usual, so photos are assumed to show 380 mm", '{"field_mm": 190}'),
-        (rolled, "turned by 90 degrees anticlockwise, and are turned back (roll_deg 90)", '{"roll_deg": 0}'),
+        (
+            partial(square, share=0.16),
+            "2.0 times smaller than usual, so photos are assumed to show 380 mm",
+            '{"field_mm": 190}',
+        ),
+        (
+            partial(rolled, roll_deg=90),
+            "turned by 90 degrees anticlockwise, and are turned back (roll_deg 90)",
+            '{"roll_deg": 0}',
+        ),
     ],
 )
 def test_the_camera_that_all_photos_share_is_assumed_until_it_is_stated(
