@@ -152,7 +152,6 @@ class _Run:
     def is_enough(self, grasps: Sequence["RecordedGrasp"]) -> bool:
         """Answer from all grasps so far, print the answer, and return whether it is final."""
         from retrieval.data.opening import believed
-        from retrieval.model.gel_check import NOT_A_GEL
         from retrieval.model.verification import ACCEPT, REJECT
 
         self.touches, self.openings_mm, seen = [], [], set[bytes]()
@@ -174,7 +173,7 @@ class _Run:
             self.answer = self.searcher.verify(self.touches, self.expect, far=self.far, background=self.background)
             is_final = self.answer.decision in (ACCEPT, REJECT)
         say(f"grasp {len(grasps)} of at most {self.grasps}: {self.sentence}")
-        return is_final or NOT_A_GEL in self.answer.grasps  # no further grasp would change it
+        return is_final
 
     def remember(self, name: str, json: bool) -> None:
         """Enrol the grasps with contact, and print how many."""

@@ -130,8 +130,8 @@ class QueryResult:
         timing_ms: Milliseconds of this query by stage; `Searcher.query_many` divides them equally among its objects.
         verdict: "match": the best object is more likely than its absence from the catalogue. "none of these": the
             absence is at least as likely as the best object; the ranking lists the nearest objects. "no contact": no
-            grasp shows contact. "not a gel image": an image is unlike the gels of the model. These two have no ranking.
-            "uncalibrated": the model has no probabilities.
+            grasp shows contact. "not a gel image": nor does any, and an image is unlike the gels of the model. These
+            two have no ranking. "uncalibrated": the model has no probabilities.
         none_probability: Probability that the object is out of catalogue.
         posterior: Formula of the probabilities and its numbers (`retrieval.model.posterior`).
         results: The ranking.
@@ -241,7 +241,8 @@ def verdict_sentence(result: QueryResult) -> str:
             f"on: {result.index['trained_on']}); give gel images, or use a model trained on this sensor"
         )
     best, none = result.results[0], result.none_probability
-    remark = f"; grasps without contact were left out: {grasps(NO_CONTACT)}" if NO_CONTACT in result.grasps else ""
+    unused = [f"{shown}: {grasps(shown)}" for shown in (NO_CONTACT, NOT_A_GEL) if shown in result.grasps]
+    remark = f"; grasps that were left out ({', '.join(unused)})" if unused else ""
     if result.verdict == MATCH:
         return f"match: {best.object_id}, probability {best.probability:.2f}; none of these: {none:.2f}{remark}"
     if result.verdict == NONE_OF_THESE:

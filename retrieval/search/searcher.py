@@ -153,8 +153,8 @@ class Searcher:
     ) -> QueryResult:
         """Rank the objects of the catalogue by one or more grasps of the object in the hand.
 
-        Grasps without contact are ignored. If any image is not a gel image, nothing is ranked. Match logits of grasps
-        add up; `retrieval.model.posterior` converts them to probabilities of the objects and of "none of these".
+        Grasps without contact, or with an image that is not a gel image, are left out. Match logits of the others add
+        up; `retrieval.model.posterior` converts them to probabilities of the objects and of "none of these".
 
         Args:
             touches: One grasp, a list with an image for each finger in their order; or a list of such grasps. For a
@@ -527,11 +527,11 @@ def enrol(
 
 
 def _fault(classes: Iterable[str]) -> str | None:
-    """Return the verdict on grasps that cannot be used, by the gel check of each; None if they can."""
+    """Return the verdict on grasps of which none can be used, by the gel check of each; None if one can."""
     shown = set(classes)
-    if NOT_A_GEL in shown:
-        return NOT_A_GEL
-    return None if CONTACT in shown else NO_CONTACT
+    if CONTACT in shown:
+        return None
+    return NOT_A_GEL if NOT_A_GEL in shown else NO_CONTACT
 
 
 def _names(grasp: Sequence[InputImage]) -> str:

@@ -87,9 +87,11 @@ def test_without_an_accepted_grasp_the_error_states_why_the_last_attempt_failed(
     assert "but the lowest height of the fingers is 500 mm (all attempts are in " in error
 
 
-def test_an_image_that_is_no_gel_image_ends_the_run_since_no_further_grasp_changes_it(identify, monkeypatch):
-    monkeypatch.setattr(GelCheck, "classify", lambda check, readings, levels: ["not a gel image"] * len(readings))
-    assert identify("--confidence", "1", "--grasps", "3") == 5
+def test_a_first_grasp_with_a_foreign_image_does_not_end_the_run(identify, monkeypatch, capsys):
+    shown = ["not a gel image", "contact"]
+    monkeypatch.setattr(GelCheck, "classify", lambda check, readings, levels: shown[: len(readings)])
+    assert identify("--confidence", "1", "--grasps", "2", "--json") in (0, 3)
+    assert json.loads(capsys.readouterr().out)["query"]["grasps"] == shown
 
 
 def test_an_expected_object_ends_with_a_decision_or_after_all_grasps(identify, index, capsys):

@@ -65,22 +65,20 @@ def test_no_contact_frames_match_no_object(searcher, grasps):
         assert verdict_sentence(result).startswith("no contact: the gels show no contact")
 
 
-def test_one_foreign_image_among_good_grasps_rejects_all_and_is_reported(searcher, grasps):
-    good = grasps[0].touches
-    result = searcher.query([good, (good[0], np.zeros_like(NOISE))])
-    assert (result.verdict, result.grasps) == ("not a gel image", ["contact", "not a gel image"])
-    assert "grasp 2 does not look like the gels" in verdict_sentence(result)
-
-
-def test_a_grasp_without_contact_is_left_out(searcher, grasps):
-    grasp = grasps[0]
-    single, with_air = searcher.query(grasp.touches), searcher.query([grasp.touches, grasp.backgrounds])
-    assert with_air.grasps == ["contact", "no contact"]
-    assert [match.object_id for match in with_air.results] == [match.object_id for match in single.results]
-    assert [match.logit for match in with_air.results] == pytest.approx(
+def test_a_grasp_with_a_foreign_image_and_one_without_contact_are_left_out_and_reported(searcher, grasps):
+    touch, air = grasps[0].touches, grasps[0].backgrounds
+    foreign = touch[0], np.zeros_like(NOISE)
+    single, three = searcher.query(touch), searcher.query([touch, foreign, air])
+    assert three.grasps == ["contact", "not a gel image", "no contact"]
+    assert three.verdict == single.verdict
+    assert [match.object_id for match in three.results] == [match.object_id for match in single.results]
+    assert [match.logit for match in three.results] == pytest.approx(
         [match.logit for match in single.results], abs=1e-4
     )
-    assert "left out: 2" in verdict_sentence(with_air)
+    assert "left out (no contact: 3, not a gel image: 2)" in verdict_sentence(three)
+    without = searcher.query([foreign, air])
+    assert (without.verdict, without.results) == ("not a gel image", [])
+    assert "an image of grasp 1 does not look like the gels" in verdict_sentence(without)
 
 
 def test_contact_is_detected_by_comparison_with_a_no_contact_frame(searcher, grasps):
