@@ -71,7 +71,7 @@ def measures(
     for condition, how in CONDITIONS.items():
         shown = [photo for photo in photos if photo.name.rpartition("-")[0] == condition and photo.object_id in names]
         owner = np.array([names.index(photo.object_id) for photo in shown])
-        assumed = assumed_camera([photo.file for photo in shown])
+        assumed = assumed_camera((photo.object_id, photo.file) for photo in shown)
         cameras = {condition: assumed}
         if abs(math.log(how.camera.field_mm / FIELD_MM)) > OTHER_FIELD:
             cameras[f"{condition}, its field stated"] = assumed._replace(field_mm=how.camera.field_mm)

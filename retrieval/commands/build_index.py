@@ -110,15 +110,13 @@ def build_index(
 def _write_views(catalogue: Path, index: Path, report: "BuildReport", checkpoint: "Checkpoint") -> None:
     """Write some photos of the index, or of its first shard, as the model receives them."""
     from indexes.store.folder import IndexStore
-    from retrieval.data.camera import PhotoCamera
-    from retrieval.data.catalogue import CataloguePhoto
+    from retrieval.data.camera import PhotoCamera, stated_camera
     from retrieval.indexing.build import ASSUMED_CAMERA
     from retrieval.report.pages import write_views
 
     generation = IndexStore(index / report.shards[0]["folder"] if report.shards else index).open(verify=False)
     rows, assumed = generation.rows, PhotoCamera(*generation.manifest.about[ASSUMED_CAMERA])
     chosen = sorted({number * len(rows) // PREVIEW_PHOTOS for number in range(PREVIEW_PHOTOS)})
-    photos = [CataloguePhoto(row.path, row.object_id, row.metadata) for row in map(rows.__getitem__, chosen)]
-    shown = {catalogue / photo.path: photo.camera(assumed) for photo in photos}
+    shown = {catalogue / row.path: stated_camera(row.metadata, assumed) for row in map(rows.__getitem__, chosen)}
     write_views(shown, checkpoint.config.preprocessing, index / "views.png")
     say(f"views: {len(chosen)} photos in {index / 'views.png'}")

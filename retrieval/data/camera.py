@@ -1,14 +1,14 @@
-"""The camera of a catalogue's photos where nobody stated it: its field, from the size of all objects, and its roll.
+"""The camera of photos: as stated, or else as they suggest: its field by the size of all objects, and its roll.
 
 One photo does not tell its scale, and a small network is often wrong about the roll of one photo. But the photos of a
-catalogue mostly come from one camera, and objects that a gripper holds have a usual size: if the objects of the whole
-catalogue appear half as large as usual, the photos probably show twice as much.
+catalogue or recording mostly come from one camera, and objects that a gripper holds have a usual size: if all of them
+together appear half as large as usual, the photos probably show twice as much.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Set
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,12 +16,12 @@ from retrieval.data.images import decode, read_bytes
 from retrieval.data.object_finder import INPUT_PX, find_object
 from retrieval.data.upright import RollEstimator, probable_roll
 from retrieval.data.views import FIELD_MM
-from retrieval.errors import ImageError
+from retrieval.errors import DatasetError, ImageError
 
 USUAL_SIZE = 0.32
 """Median root of the visible area of objects, relative to the shorter side, in photos of the field `FIELD_MM`."""
 FEWEST, SAMPLE = 20, 64
-"""Least number of objects, and largest number of photos, from which a camera is estimated."""
+"""Least and largest number of objects from whose photos a camera is estimated."""
 _STEPS, _LEAST_STEPS = 4, 2
 """Steps in which the field doubles: it stays the same when the catalogue grows. A difference of one is ignored."""
 
@@ -39,12 +39,60 @@ class PhotoCamera(NamedTuple):
 
 
 USUAL_CAMERA = PhotoCamera()
+_STATED = {
+    "field_mm": ("the millimetres that the photo shows along its shorter side", 10.0, 10_000.0),
+    "roll_deg": ("the degrees by which the photo is turned anticlockwise", -180.0, 180.0),
+}
+CAMERA_KEYS = frozenset(_STATED)
+"""Keys that state a camera in the metadata of a catalogue, or in the recording.json of a recording."""
 
 
-def assumed_camera(photos: Sequence[Path]) -> PhotoCamera:
-    """Return the camera to assume for a catalogue's photos; USUAL_CAMERA unless they agree on another one."""
+def require_camera(metadata: Mapping[str, Any], where: str) -> None:
+    """Raise DatasetError if a stated value of a camera is impossible; `where` names the file, and the photo."""
+    for key, (what, low, high) in _STATED.items():
+        if (value := metadata.get(key)) is None:
+            continue
+        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+            raise DatasetError(f"{where}: {key} must be {what}, from {low:g} to {high:g}; got {value!r:.40}")
+
+
+def stated_camera(metadata: Mapping[str, Any], assumed: PhotoCamera) -> PhotoCamera:
+    """Return the camera that metadata state, as assumed where they do not."""
+    return assumed._replace(**{key: metadata[key] for key in CAMERA_KEYS if metadata.get(key) is not None})
+
+
+def unusual(assumed: PhotoCamera) -> list[str]:
+    """Return a sentence on each value of an assumed camera that is not the usual one."""
+    found = []
+    if assumed.field_mm != FIELD_MM:
+        factor = max(assumed.field_mm / FIELD_MM, FIELD_MM / assumed.field_mm)
+        found.append(
+            f"objects appear {factor:.1f} times {'smaller' if assumed.field_mm > FIELD_MM else 'larger'} than usual, "
+            f"so photos are assumed to show {assumed.field_mm:.0f} mm, not {FIELD_MM:.0f} (field_mm)"
+        )
+    if assumed.roll_deg:
+        direction = "anticlockwise" if assumed.roll_deg > 0 else "clockwise"
+        found.append(
+            f"photos appear to be turned by {abs(assumed.roll_deg):.0f} degrees {direction}, and are turned back "
+            f"(roll_deg {assumed.roll_deg:g})"
+        )
+    return found
+
+
+def assumed_camera(photos: Iterable[tuple[str, Path]], stated: Set[str] = frozenset()) -> PhotoCamera:
+    """Return the camera to assume for photos; USUAL_CAMERA unless they agree on another one.
+
+    Args:
+        photos: The object in each photo, and its file. Only the first photo of each object is looked at.
+        stated: Those of CAMERA_KEYS that are stated for all photos; these values stay the usual ones.
+    """
+    firsts: dict[str, Path] = {}
+    for name, path in photos:
+        firsts.setdefault(name, path)
+    if len(firsts) < FEWEST or stated >= CAMERA_KEYS:
+        return USUAL_CAMERA
     estimator, sizes, rolls = RollEstimator(), [], []
-    for path in photos[:: math.ceil(len(photos) / SAMPLE)] if photos else ():
+    for path in list(firsts.values())[:: math.ceil(len(firsts) / SAMPLE)]:
         try:
             photo = decode(read_bytes(path), path, 2 * INPUT_PX)
         except ImageError:  # reported when the photo is encoded
@@ -58,4 +106,5 @@ def assumed_camera(photos: Sequence[Path]) -> PhotoCamera:
         return USUAL_CAMERA
     steps = round(_STEPS * math.log2(USUAL_SIZE / float(np.median(sizes))))
     factor = 2 ** (steps / _STEPS) if abs(steps) >= _LEAST_STEPS else 1
-    return PhotoCamera(FIELD_MM * factor, probable_roll(np.mean(rolls, axis=0)))
+    camera = PhotoCamera(FIELD_MM * factor, probable_roll(np.mean(rolls, axis=0)))
+    return camera._replace(**{key: getattr(USUAL_CAMERA, key) for key in stated})

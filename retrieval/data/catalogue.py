@@ -35,20 +35,16 @@ from _touch_retrieval.files import open_regular, parse_json, read_regular
 from _touch_retrieval.names import is_system_name, lookup_key
 from _touch_retrieval.text import decode_text
 from retrieval.console.output import abbreviate_list
-from retrieval.data.camera import PhotoCamera
+from retrieval.data.camera import CAMERA_KEYS, require_camera
 from retrieval.data.dataset import load_grasps
 from retrieval.data.images import EXTENSIONS, is_picture
 from retrieval.data.naming import MAX_EXAMPLES, STEM, Naming
 from retrieval.data.opening import believed, require_opening
 from retrieval.data.text import is_utf8
 from retrieval.errors import BadInput, DatasetError
+from robot.recording.folder import INFO_FILE, read_info
 
 METADATA_FILE = "metadata.jsonl"
-CAMERA_KEYS = {
-    "field_mm": ("the millimetres that the photo shows along its shorter side", 10.0, 10_000.0),
-    "roll_deg": ("the degrees by which the photo is turned anticlockwise", -180.0, 180.0),
-}
-"""Keys of a photo's camera: what they are, least and largest value."""
 _ALL_PHOTOS = ""
 """Name of the object whose metadata are those of all photos."""
 ENROLLED = "enrolled"
@@ -86,21 +82,6 @@ class CataloguePhoto:
     path: str
     object_id: str
     metadata: dict[str, Any] = field(default_factory=dict, hash=False)
-
-    @property
-    def field_mm(self) -> float | None:
-        """The field of its camera, from the metadata."""
-        return self.metadata.get("field_mm")
-
-    @property
-    def roll_deg(self) -> float | None:
-        """The roll of its camera, from the metadata."""
-        return self.metadata.get("roll_deg")
-
-    def camera(self, assumed: PhotoCamera) -> PhotoCamera:
-        """Return the camera, as assumed where it is not stated."""
-        stated = self.field_mm, self.roll_deg
-        return PhotoCamera(*(other if value is None else value for value, other in zip(stated, assumed, strict=True)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,7 +189,7 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
         # A picture outside every folder is a photo, and so is every picture if the file stem names the object.
         elif "/" not in path or naming.text == STEM or not _NEARLY_TOUCH.fullmatch(PurePosixPath(path).stem):
             metadata = metadata_of(name, path)
-            _require_camera(metadata, path)
+            require_camera(metadata, f"{METADATA_FILE}, {path}")
             photos.append(CataloguePhoto(path, name, metadata))
         elif (touch := _touch_name(path)) is None:
             skipped.append(SkippedPhoto(path, f"neither a photo nor a touch: {_TOUCH_NAMES}"))
@@ -239,12 +220,14 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
 
 
 def _list_recording(root: Path) -> Catalogue:
-    grasps = load_grasps(root)
+    grasps, info = load_grasps(root), read_info(root)
+    require_camera(info, INFO_FILE)
+    camera = {key: info[key] for key in CAMERA_KEYS.intersection(info)}
 
     def paths(files: Iterable[Path]) -> tuple[str, ...]:
         return tuple(file.relative_to(root).as_posix() for file in files)
 
-    photos = {path: CataloguePhoto(path, grasp.object_id) for grasp in grasps for path in paths(grasp.photos)}
+    photos = {path: CataloguePhoto(path, grasp.object_id, camera) for grasp in grasps for path in paths(grasp.photos)}
     touches = {
         CatalogueTouch(grasp.object_id, paths(grasp.touches), opening_mm=believed(grasp.opening_mm)) for grasp in grasps
     }
@@ -379,23 +362,12 @@ def _read_metadata(file: Path, naming: Naming) -> tuple[dict[str, dict[str, Any]
     return by_object, by_photo
 
 
-def _require_camera(metadata: dict[str, Any], path: str) -> None:
-    """Raise DatasetError if a value of a photo's camera is impossible."""
-    for key, (what, low, high) in CAMERA_KEYS.items():
-        if (value := metadata.get(key)) is None:
-            continue
-        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-            raise DatasetError(
-                f"{METADATA_FILE}: {key} of {path} must be {what}, from {low:g} to {high:g}; got {value!r:.40}"
-            )
-
-
 def _parse_line(line: str, naming: Naming) -> tuple[str, bool, dict[str, Any]]:
     """Return (photo path or object_id, whether it is a photo, the other keys)."""
     row = parse_json(line)
     if not isinstance(row, dict):
         raise ValueError("must be one JSON object a line, in braces")
-    if row and row.keys() <= CAMERA_KEYS.keys():
+    if row and row.keys() <= CAMERA_KEYS:
         return _ALL_PHOTOS, False, row
     keys = [key for key in ("file_name", "object_id") if key in row]
     if not keys:

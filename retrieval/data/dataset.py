@@ -13,9 +13,19 @@ from numpy.typing import NDArray
 
 from _touch_retrieval.documents import typed
 from _touch_retrieval.files import file_digest
+from retrieval.data.camera import (
+    CAMERA_KEYS,
+    USUAL_CAMERA,
+    PhotoCamera,
+    assumed_camera,
+    require_camera,
+    stated_camera,
+    unusual,
+)
+from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import BadInput, DatasetError
 from robot.errors import RobotError
-from robot.recording.folder import Recording, read_info, read_recording
+from robot.recording.folder import INFO_FILE, Recording, read_info, read_recording
 
 log = logging.getLogger(__name__)
 
@@ -207,6 +217,25 @@ def object_kinds(folder: Path) -> dict[str, str]:
         for name, about in (objects if isinstance(objects, dict) else {}).items()
         if isinstance(about, dict) and "class" in about
     }
+
+
+def recording_camera(folder: Path, grasps: Sequence[Grasp], settings: Preprocessing) -> PhotoCamera:
+    """Return the camera of a recording's photos: as its recording.json states it, or else as they suggest.
+
+    Args:
+        folder: The recording.
+        grasps: Its grasps.
+        settings: How the photos are prepared. If a model sees them as a whole, their camera does not matter.
+    """
+    if not settings.finds_object:
+        return USUAL_CAMERA
+    info = read_info(folder)
+    require_camera(info, f"{folder / INFO_FILE}")
+    photos = ((grasp.object_id, photo) for grasp in grasps for photo in grasp.photos)
+    assumed = assumed_camera(photos, CAMERA_KEYS & info.keys())
+    for sentence in unusual(assumed):
+        log.warning("%s. If that is wrong, state it in %s", sentence, folder / INFO_FILE)
+    return stated_camera(info, assumed)
 
 
 def finger_count(grasps: Sequence[Grasp]) -> int:

@@ -83,6 +83,11 @@ class Preprocessing:
         if self.background not in BACKGROUNDS:
             raise ConfigError(f"background must be one of {', '.join(BACKGROUNDS)}; got {self.background!r}")
 
+    @property
+    def finds_object(self) -> bool:
+        """Whether a view depends on where the object is."""
+        return self.views != ("whole",)
+
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as JSON types."""
         return asdict(self) | {"views": list(self.views)}
@@ -90,7 +95,7 @@ class Preprocessing:
     def digest(self) -> str:
         """Return the SHA-256 (hex) that is equal exactly when the same file gives the same values."""
         content = {"version": PREPROCESSING_VERSION, **self.to_dict()}
-        if self.views == ("whole",):  # keeps the digest of checkpoints without this setting
+        if not self.finds_object:  # keeps the digest of checkpoints without this setting
             del content["views"]
         else:
             content |= {"object_finder": network_digest(), "sharpens": True}
@@ -115,7 +120,7 @@ class Preprocessing:
         return self._prepare(image, found, camera, is_lossy=not data.startswith(LOSSLESS))
 
     def _prepare(self, image: Samples, found: FoundObject, camera: PhotoCamera, is_lossy: bool) -> PreparedPhoto:
-        if self.views == ("whole",):
+        if not self.finds_object:
             return PreparedPhoto(tile_views(image, self.views, self.photo_px, found), ())
         measured_px = blur_px(image, found)
         faults = photo_faults(image, found, measured_px)
@@ -126,7 +131,7 @@ class Preprocessing:
         return PreparedPhoto(tile_views(image, self.views, self.photo_px, found, camera.field_mm), faults)
 
     def _find(self, image: Samples) -> FoundObject:
-        return whole_photo(image) if self.views == ("whole",) else find_object(image)
+        return find_object(image) if self.finds_object else whole_photo(image)
 
     def _decode_photo(self, data: bytes, name: str | Path, field_mm: float) -> tuple[Samples, FoundObject]:
         """Return a photo in the size that its views need, and its object."""

@@ -9,7 +9,7 @@ from types import MappingProxyType
 
 from _touch_retrieval.cache import Cache
 from retrieval.console.interruption import resumable
-from retrieval.data.dataset import AnyRecording, Split, finger_count, folder_of
+from retrieval.data.dataset import AnyRecording, Split, finger_count, folder_of, recording_camera
 from retrieval.errors import BadInput
 from retrieval.evaluation import PROTOCOLS, UNSEEN_OBJECTS
 from retrieval.evaluation.experiment import ProtocolRun
@@ -133,7 +133,9 @@ def evaluate(
     others = {name: one if isinstance(one, Config) else load_checkpoint(one) for name, one in compared.items()}
 
     def encoder(facts: RecordingFacts, source: Config | Checkpoint) -> TowerEncoder:
-        return TowerEncoder.of(facts.grasps, source, seed, out, quiet)
+        config = source if isinstance(source, Config) else source.config
+        camera = recording_camera(facts.folder, facts.grasps, config.preprocessing)
+        return TowerEncoder.of(facts.grasps, source, camera, seed, out, quiet)
 
     towers_of = {
         name: {row: encoder(facts, source) for row, source in {FROZEN: own, **others}.items()}
@@ -213,4 +215,5 @@ def _trained(facts: RecordingFacts, protocol: Protocol, towers: TowerEncoder, ou
     (split,) = protocol.folds(facts, towers.config.training.seed)
     grasps = [facts.grasps[row] for row in protocol.rows_to_fit(facts.grasps)]
     made = made_from(facts.folder, grasps, training_licences(facts.folder, towers.config.training))
-    return Trainer(towers.config, split, grasps, out / "model.safetensors", made).run_or_reuse(quiet)
+    trainer = Trainer(towers.config, split, grasps, out / "model.safetensors", made, camera=towers.camera)
+    return trainer.run_or_reuse(quiet)

@@ -13,6 +13,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from retrieval.data.camera import PhotoCamera
 from retrieval.data.dataset import Grasp, finger_count
 from retrieval.errors import DatasetError
 from retrieval.methods import METHODS
@@ -62,20 +63,29 @@ CONTROL_CCA = METHODS.name_of(ControlCca)
 class TowerEncoder:
     """Towers that encode the grasps of a recording; each kind of inputs is encoded once.
 
-    Heads are fitted with `config`, from the head of `checkpoint` if there is one. `cache` is the folder of the cache of
-    features.
+    Heads are fitted with `config`, from the head of `checkpoint` if there is one. `camera` is that of the photos,
+    `cache` the folder of the cache of features.
     """
 
     grasps: list[Grasp]
     config: Config
     matcher: Matcher
     checkpoint: Checkpoint | None
+    camera: PhotoCamera
     cache: Path
     quiet: bool
     _encoded: dict[tuple[str, bool, int | None], Features] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, grasps: list[Grasp], source: Config | Checkpoint, seed: int, cache: Path, quiet: bool) -> Self:
+    def of(
+        cls,
+        grasps: list[Grasp],
+        source: Config | Checkpoint,
+        camera: PhotoCamera,
+        seed: int,
+        cache: Path,
+        quiet: bool,
+    ) -> Self:
         """Return the frozen towers of a configuration, or the towers of a checkpoint, whose seed is replaced.
 
         If a checkpoint has two fingers and the recording one, both fingers get the same touch.
@@ -86,14 +96,14 @@ class TowerEncoder:
         recorded = finger_count(grasps)
         if isinstance(source, Config):
             config = replace(source, matcher=replace(source.matcher, fingers=recorded))
-            return cls(grasps, config, frozen_matcher(config), None, cache, quiet)
+            return cls(grasps, config, frozen_matcher(config), None, camera, cache, quiet)
         if recorded not in (1, fingers := source.config.matcher.fingers):
             raise DatasetError(
                 f"{source.path} needs {fingers} finger(s), but the recording has {recorded}. Evaluate a model for "
                 f"{recorded} finger(s)."
             )
         config = replace(source.config, training=source.config.training.with_given_weights(**FURTHER, seed=seed))
-        return cls(with_fingers(grasps, fingers), config, source.matcher, source, cache, quiet)
+        return cls(with_fingers(grasps, fingers), config, source.matcher, source, camera, cache, quiet)
 
     def inputs(self, kind: str, with_cells: bool = True, max_grasps: int | None = None) -> Features:
         """Return the features of one of `INPUTS`, with or without the cells of the towers, of thinned grasps."""
@@ -138,7 +148,14 @@ class TowerEncoder:
 
     def _encode(self, grasps: Sequence[Grasp], touch: str, photo: str = "photo") -> Features:
         return encode_recording(
-            grasps, self.matcher, self.config, self.cache, touch_variant=touch, photo_variant=photo, quiet=self.quiet
+            grasps,
+            self.matcher,
+            self.config,
+            self.cache,
+            touch_variant=touch,
+            photo_variant=photo,
+            camera=self.camera,
+            quiet=self.quiet,
         )
 
 

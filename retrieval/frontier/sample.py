@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from _touch_retrieval.cache import Cache, cache_key
 from retrieval.console.progress import Bar
-from retrieval.data.dataset import AnyRecording, Grasp, data_digest, folder_of, load_grasps
+from retrieval.data.dataset import AnyRecording, Grasp, data_digest, folder_of, load_grasps, recording_camera
 from retrieval.errors import DatasetError
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.fusion import ImageEncoding
@@ -71,16 +71,20 @@ class Sample:
         return load_checkpoint(self.model).without_cells()
 
     @cached_property
+    def _folder(self) -> Path:
+        return folder_of(self.recording())
+
+    @cached_property
     def grasps(self) -> list[Grasp]:
         """Grasps of unseen objects with at least two grasps each, sorted by object; at least two objects."""
-        recording, split = self.recording(), self.checkpoint.split
+        split = self.checkpoint.split
         trained = {*split.train, *split.validation} if split else set()
-        unseen = [grasp for grasp in load_grasps(recording) if grasp.object_id not in trained]
+        unseen = [grasp for grasp in load_grasps(self._folder) if grasp.object_id not in trained]
         names = [grasp.object_id for grasp in unseen]
         usable = [grasp for grasp in unseen if names.count(grasp.object_id) > 1]
         if len({grasp.object_id for grasp in usable}) < 2:
             raise DatasetError(
-                f"{folder_of(recording)} needs at least 2 objects that the model was not trained on, with at least 2 "
+                f"{self._folder} needs at least 2 objects that the model was not trained on, with at least 2 "
                 "grasps each. Give another --recording, or omit it to collect one."
             )
         return sorted(usable, key=lambda grasp: (grasp.object_id, grasp.grasp_id))
@@ -94,7 +98,10 @@ class Sample:
     def features(self) -> Features:
         """Tower features of `grasps`."""
         model = self.checkpoint
-        return encode_recording(self.grasps, model.matcher, model.config, self.folder / "features", quiet=self.quiet)
+        camera = recording_camera(self._folder, self.grasps, model.config.preprocessing)
+        return encode_recording(
+            self.grasps, model.matcher, model.config, self.folder / "features", camera=camera, quiet=self.quiet
+        )
 
     @cached_property
     def photo_rows(self) -> NDArray[np.int64]:

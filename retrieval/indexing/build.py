@@ -19,10 +19,9 @@ from indexes.store.generation import Arrays
 from indexes.store.manifest import Manifest, read_manifest
 from indexes.store.rows import TEXT, Row, encode_rows
 from retrieval.console.output import abbreviate_list
-from retrieval.data.camera import PhotoCamera
+from retrieval.data.camera import PhotoCamera, unusual
 from retrieval.data.catalogue import METADATA_FILE, Catalogue, list_catalogue
 from retrieval.data.naming import FOLDER, MAX_EXAMPLES, Naming, naming_warnings
-from retrieval.data.views import FIELD_MM
 from retrieval.errors import BadInput
 from retrieval.indexing.candidates import candidates_sentence, kept_measurement, measure_candidates, query_codes
 from retrieval.indexing.codes import encode_enrolled
@@ -282,20 +281,8 @@ def _hard_photos(contents: IndexContents) -> list[str]:
 
 def _assumed_cameras(assumed: PhotoCamera) -> list[str]:
     """Return warnings if an unusual camera was assumed."""
-    warnings, advice = [], f"If that is wrong, state it in {METADATA_FILE}: see docs/catalogue.md, a good photo"
-    if assumed.field_mm != FIELD_MM:
-        factor = max(assumed.field_mm / FIELD_MM, FIELD_MM / assumed.field_mm)
-        warnings.append(
-            f"objects appear {factor:.1f} times {'smaller' if assumed.field_mm > FIELD_MM else 'larger'} than usual, "
-            f"so photos are assumed to show {assumed.field_mm:.0f} mm, not {FIELD_MM:.0f} (field_mm). {advice}"
-        )
-    if assumed.roll_deg:
-        direction = "anticlockwise" if assumed.roll_deg > 0 else "clockwise"
-        warnings.append(
-            f"photos appear to be turned by {abs(assumed.roll_deg):.0f} degrees {direction}, and are turned back "
-            f"(roll_deg {assumed.roll_deg:g}). {advice}"
-        )
-    return warnings
+    advice = f"If that is wrong, state it in {METADATA_FILE}: see docs/catalogue.md, a good photo"
+    return [f"{sentence}. {advice}" for sentence in unusual(assumed)]
 
 
 def _report(

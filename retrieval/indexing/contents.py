@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from _touch_retrieval.cache import Cache
 from indexes.store.rows import Row
-from retrieval.data.camera import USUAL_CAMERA, PhotoCamera, assumed_camera
+from retrieval.data.camera import CAMERA_KEYS, USUAL_CAMERA, PhotoCamera, assumed_camera, stated_camera
 from retrieval.data.catalogue import Catalogue, CataloguePhoto, SkippedPhoto
 from retrieval.errors import BadInput, NoReadablePhoto
 from retrieval.indexing.codes import (
@@ -99,7 +99,11 @@ def read_contents(catalogue: Catalogue, checkpoint: Checkpoint, cache: Cache, qu
     references = _find_references(catalogue, checkpoint, files, cache, quiet)
     photos = sorted([*catalogue.photos, *references.pictures], key=lambda photo: photo.path)
     assumed = _assumed_camera(catalogue, checkpoint)
-    cameras = {photo.path: camera for photo in catalogue.photos if (camera := photo.camera(assumed)) != USUAL_CAMERA}
+    cameras = {
+        photo.path: camera
+        for photo in catalogue.photos
+        if (camera := stated_camera(photo.metadata, assumed)) != USUAL_CAMERA
+    }
     encoder, gel_images = photo_encoder(checkpoint, cameras), {picture.path for picture in references.pictures}
     codes = find_codes([(photo.path,) for photo in photos], encoder, files, cache, quiet)
     files.save()
@@ -120,14 +124,11 @@ def read_contents(catalogue: Catalogue, checkpoint: Checkpoint, cache: Cache, qu
 
 def _assumed_camera(catalogue: Catalogue, checkpoint: Checkpoint) -> PhotoCamera:
     """Return the camera of photos where it is not stated; only objects that are searched for show an unusual one."""
-    if checkpoint.config.preprocessing.views == ("whole",):
+    if not checkpoint.config.preprocessing.finds_object:
         return USUAL_CAMERA
-    unknown = [photo for photo in catalogue.photos if None in (photo.field_mm, photo.roll_deg)]
-    assumed = assumed_camera([catalogue.folder / photo.path for photo in unknown])
-    return PhotoCamera(
-        assumed.field_mm if any(photo.field_mm is None for photo in unknown) else USUAL_CAMERA.field_mm,
-        assumed.roll_deg if any(photo.roll_deg is None for photo in unknown) else USUAL_CAMERA.roll_deg,
-    )
+    unknown = [photo for photo in catalogue.photos if not photo.metadata.keys() >= CAMERA_KEYS]
+    photos = ((photo.object_id, catalogue.folder / photo.path) for photo in unknown)
+    return assumed_camera(photos, CAMERA_KEYS.intersection(*(photo.metadata for photo in unknown)))
 
 
 def no_photo(catalogue: Catalogue, skipped: Sequence[SkippedPhoto]) -> NoReadablePhoto:

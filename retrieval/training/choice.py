@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from retrieval.console.interruption import resumable
 from retrieval.console.output import say
 from retrieval.console.progress import Bar
-from retrieval.data.dataset import DataLicence, Grasp, finger_count, linked_objects, object_kinds
+from retrieval.data.dataset import DataLicence, Grasp, finger_count, linked_objects, object_kinds, recording_camera
 from retrieval.errors import BadInput
 from retrieval.metrics.measure import Measure, pooled
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
@@ -133,7 +133,8 @@ def pose(
     fingers = finger_count(grasps)
     start = model if isinstance(model, Checkpoint) else load_checkpoint(model or shipped_model(min(fingers, 2)))
     kinds, linked = object_kinds(recording), linked_objects(grasps)
-    return Problem(grasps, fingers, start, init, kinds, linked, folder, quiet, on_step)
+    camera = recording_camera(recording, grasps, start.config.preprocessing)
+    return Problem(grasps, camera, fingers, start, init, kinds, linked, folder, quiet, on_step)
 
 
 # Touches of held-out objects -------------------------------------------------------------------------------
@@ -170,8 +171,16 @@ class Comparison:
 
     def features(self, recipe: Recipe, variant: str = "touch") -> Features:
         """Return the features of all grasps by the towers of a recipe; a tower of several recipes encodes once."""
-        grasps, folder, quiet = self.problem.grasps, self.problem.folder, self.problem.quiet
-        return encode_recording(grasps, recipe.matcher, recipe.config, folder, touch_variant=variant, quiet=quiet)
+        problem = self.problem
+        return encode_recording(
+            problem.grasps,
+            recipe.matcher,
+            recipe.config,
+            problem.folder,
+            touch_variant=variant,
+            camera=problem.camera,
+            quiet=problem.quiet,
+        )
 
     def held_out(self, name: str, recipe: Recipe, variant: str = "touch") -> list[HeldOut]:
         """Return the scored touches of each fold."""

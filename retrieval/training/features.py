@@ -75,12 +75,12 @@ class LoadedBatch:
 class BatchImages:
     """The preprocessed images of grasps; up to `keep_bytes` of touches, and of photos, are kept in memory.
 
-    `photo` returns the preprocessed photo of a path.
+    `photo` returns the preprocessed photo of a path; all photos are by one camera.
     """
 
-    def __init__(self, settings: Preprocessing, keep_bytes: int = 0) -> None:
-        self.uses_background = settings.background != "none"
-        self._touch, self.photo = (ImageCache(load, keep_bytes) for load in (settings.load_touch, settings.load_photo))
+    def __init__(self, settings: Preprocessing, camera: PhotoCamera = USUAL_CAMERA, keep_bytes: int = 0) -> None:
+        self.uses_background, load_photo = settings.background != "none", partial(settings.load_photo, camera=camera)
+        self._touch, self.photo = (ImageCache(load, keep_bytes) for load in (settings.load_touch, load_photo))
 
     def touch(self, grasp: Grasp) -> list[Image]:
         """Return the preprocessed finger images of a grasp.
@@ -136,12 +136,12 @@ class TrainedFeatures:
 
     step_context = nullcontext  # of a training step: towers use every core
 
-    def __init__(self, config: Config, device: torch.device) -> None:
+    def __init__(self, config: Config, device: torch.device, camera: PhotoCamera = USUAL_CAMERA) -> None:
         workers = config.training.workers
         # On a CPU the towers use every core, so workers would only take time from them.
         self._workers = workers if isinstance(workers, int) else worker_count() if device.type == "cuda" else 0
         self.config, self.device = config, device
-        self.images = BatchImages(config.preprocessing, _KEEP_BYTES // max(1, self._workers))
+        self.images = BatchImages(config.preprocessing, camera, _KEEP_BYTES // max(1, self._workers))
 
     def batches(self, matcher: Matcher, batches: Iterable[tuple[int, PairBatch]]) -> Iterator[LoadedBatch]:
         """Yield this rank's part of each batch, given with its step; the same parts for any number of workers."""
@@ -178,9 +178,9 @@ class FrozenFeatures:
 
     step_context = staticmethod(one_thread)  # of a training step: more do not speed up the head's small products
 
-    def __init__(self, config: Config, known: Mapping[str | Path, Tensor]) -> None:
+    def __init__(self, config: Config, known: Mapping[str | Path, Tensor], camera: PhotoCamera = USUAL_CAMERA) -> None:
         """Start with features by grasp id (of the touch) and by photo file that need no encoding."""
-        self.images = BatchImages(config.preprocessing)  # images are read once
+        self.images = BatchImages(config.preprocessing, camera)  # images are read once
         self._features: dict[str | Path, Tensor] = dict(known)
 
     def batches(self, matcher: Matcher, batches: Iterable[tuple[int, PairBatch]]) -> Iterator[LoadedBatch]:
@@ -370,6 +370,7 @@ def encode_recording(
     *,
     touch_variant: str = "touch",
     photo_variant: str = "photo",
+    camera: PhotoCamera = USUAL_CAMERA,
     quiet: bool = False,
 ) -> Features:
     """Return features of grasps by the frozen towers of `matcher`; each photo file is encoded once.
@@ -384,6 +385,7 @@ def encode_recording(
             frames, which every grasp must then have.
         photo_variant: "photo" for whole photos; "margin" for their margin, which rarely shows the object, only with
             whole touches; "none" if no photo is needed.
+        camera: The camera of the photos (`recording_camera`).
         quiet: No progress on stderr.
 
     Raises:
@@ -397,14 +399,15 @@ def encode_recording(
     ):
         preprocessing = kind(**preprocessing.to_dict())
     matcher = deepcopy(matcher).to(default_device()).eval()
-    images, digest = BatchImages(preprocessing), preprocessing.digest()
+    images, digest = BatchImages(preprocessing, camera), preprocessing.digest()
     made_by = touch_variant, _tower_digest(matcher.touch_tower), digest
     touch = _encoded_once(cache, made_by, touched, images.touch, partial(touch_features, matcher), images.files, quiet)
     if photo_variant == "none":
         photo = np.zeros((len(grasps), 0), np.float32)
     else:
         files = {path: row for row, path in enumerate(dict.fromkeys(grasp.photo for grasp in grasps))}
-        made_by, encode = (photo_variant, _tower_digest(matcher.photo_tower), digest), partial(photo_features, matcher)
+        seen, encode = f"{digest} {tuple(camera)}", partial(photo_features, matcher)
+        made_by = photo_variant, _tower_digest(matcher.photo_tower), seen
         photo = _encoded_once(cache, made_by, list(files), images.photo, encode, lambda file: (file,), quiet)
         photo = photo[[files[grasp.photo] for grasp in grasps]]
     return Features(

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from _touch_retrieval.registry import code_digest
 from retrieval.console.interruption import interruption
 from retrieval.console.progress import Bar
+from retrieval.data.camera import USUAL_CAMERA, PhotoCamera
 from retrieval.data.check.split import require_fit
 from retrieval.data.dataset import (
     AnyRecording,
@@ -24,6 +25,7 @@ from retrieval.data.dataset import (
     folder_of,
     load_grasps,
     make_split,
+    recording_camera,
 )
 from retrieval.data.pairs import PairBatch, PairSampler
 from retrieval.errors import JobInterrupted
@@ -104,7 +106,8 @@ def prepare_run(recording: Path, out: Path, config: Config, split: Split | None 
     else:
         require_fit(split, grasps)
     made = made_from(recording, grasps, training_licences(recording, settings))
-    return Trainer(config, split, grasps, out, made)
+    camera = recording_camera(recording, grasps, config.preprocessing)
+    return Trainer(config, split, grasps, out, made, camera=camera)
 
 
 _MADE_FROM = ("data_digest", "weights_digest", "code")
@@ -130,11 +133,13 @@ class Trainer:
         provenance: Mapping[str, Any],
         known: Features | None = None,
         weights: Mapping[str, Tensor] = MappingProxyType({}),
+        camera: PhotoCamera = USUAL_CAMERA,
     ) -> None:
         """Prepare a run.
 
         `provenance`: origin of the data (`made_from`). `known`: features of all grasps. They replace the images if the
-        towers are frozen. `weights`: weights that replace the initial ones of these names.
+        towers are frozen. `weights`: weights that replace the initial ones of these names. `camera`: camera of the
+        photos.
         """
         settings = config.training
         self.config, self.split, self.out = config, split, out
@@ -160,9 +165,9 @@ class Trainer:
         held_out = split.select(grasps, "validation")
         self.validation = self._sampler(held_out).evaluation_pairs() if split.validation else None
         self.features: FeatureSource = (
-            FrozenFeatures(config, features_by_image(grasps, known, self.device) if known else {})
+            FrozenFeatures(config, features_by_image(grasps, known, self.device) if known else {}, camera)
             if settings.freeze_towers
-            else TrainedFeatures(config, self.device)
+            else TrainedFeatures(config, self.device, camera)
         )
         set_training_mode(self.matcher, settings)
         for tower in (self.matcher.touch_tower, self.matcher.photo_tower):

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+from retrieval.data.camera import PhotoCamera
 from retrieval.data.dataset import DataLicence, Grasp, Split, make_split, recording_licence
 from retrieval.model.card import checkpoint_licences
 from retrieval.model.checkpoint import Checkpoint
@@ -34,6 +35,7 @@ class Problem:
 
     Attributes:
         grasps: The grasps of the recording.
+        camera: The camera of their photos.
         fingers: Gel images of a touch.
         start: The start model.
         init: Weights of the published tower: "imagenet", a file, or "random" for none.
@@ -45,6 +47,7 @@ class Problem:
     """
 
     grasps: Sequence[Grasp]
+    camera: PhotoCamera
     fingers: int
     start: Checkpoint
     init: str

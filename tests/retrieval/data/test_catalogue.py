@@ -7,7 +7,7 @@ import os
 import pytest
 from PIL import Image
 
-from retrieval.data.camera import PhotoCamera
+from retrieval.data.camera import PhotoCamera, stated_camera
 from retrieval.data.catalogue import SkippedPhoto, list_catalogue
 from retrieval.data.images import EXTENSIONS
 from retrieval.data.naming import Naming
@@ -226,7 +226,7 @@ def test_the_camera_of_a_photo_is_its_own_its_objects_or_that_of_all_photos(tmp_
         {"object_id": "tin", "price": 5},
     )
     catalogue = list_catalogue(tmp_path)
-    cameras = {photo.path: (photo.field_mm, photo.roll_deg) for photo in catalogue.photos}
+    cameras = {photo.path: stated_camera(photo.metadata, PhotoCamera(1, 2)) for photo in catalogue.photos}
     assert cameras == {"cup/0.jpg": (320, 90), "mug/0.jpg": (200, 90), "mug/1.jpg": (150.5, 0), "tin/0.jpg": (320, 90)}
     assert catalogue.notes == ()
 
@@ -234,7 +234,7 @@ def test_the_camera_of_a_photo_is_its_own_its_objects_or_that_of_all_photos(tmp_
 def test_what_is_not_stated_of_a_camera_is_assumed(tmp_path):
     write_metadata(fill(tmp_path, "mug/0.jpg", "cup/0.jpg"), {"object_id": "mug", "roll_deg": 0})
     cup, mug = list_catalogue(tmp_path).photos
-    assert (mug.camera(PhotoCamera(400, 90)), cup.camera(PhotoCamera(400, 90))) == ((400, 0), (400, 90))
+    assert [stated_camera(each.metadata, PhotoCamera(400, 90)) for each in (mug, cup)] == [(400, 0), (400, 90)]
 
 
 @pytest.mark.parametrize(
@@ -247,5 +247,5 @@ def test_what_is_not_stated_of_a_camera_is_assumed(tmp_path):
 def test_values_of_a_camera_that_are_impossible_are_refused(tmp_path, key, value, what):
     fill(tmp_path, "mug/0.jpg")
     (tmp_path / "metadata.jsonl").write_text(f'{{"{key}": {value}}}')
-    with pytest.raises(DatasetError, match=rf"{key} of mug/0\.jpg must be {what}"):
+    with pytest.raises(DatasetError, match=rf"mug/0\.jpg: {key} must be {what}"):
         list_catalogue(tmp_path)

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from retrieval.commands.main import main
+from retrieval.data.camera import USUAL_CAMERA
 from retrieval.data.dataset import Split, load_grasps
 from retrieval.errors import BadInput, ConfigError, DatasetError, JobInterrupted
 from retrieval.evaluation import UNSEEN_OBJECTS
@@ -118,7 +119,7 @@ def test_late_interaction_changes_the_features_of_late_fusion_and_of_no_method_w
     cells = dataclasses.replace(matcher, cell_dim=4, touch_cells=2, photo_cells=2)
     grasps = load_grasps(grasped)
     plain, with_cells = (
-        TowerEncoder.of(grasps, dataclasses.replace(CONFIG, matcher=one), 0, tmp_path, quiet=True)
+        TowerEncoder.of(grasps, dataclasses.replace(CONFIG, matcher=one), USUAL_CAMERA, 0, tmp_path, quiet=True)
         for one in (matcher, cells)
     )
     for kind in ("touch", "touch_to_touch"):
@@ -253,7 +254,7 @@ def test_ceilings_compare_touches_with_touches_and_photos_with_photos(tmp_path):
     touch, photo = np.arange(24, dtype=np.float32).reshape(4, 2, 3), np.ones((4, 5), np.float32)
     features = Features(tuple("1234"), tuple("aabb"), touch, photo)
     encoded = {("touch", False, None): features, ("touch", True, None): features}
-    towers = TowerEncoder([], CONFIG, None, None, tmp_path, True, encoded)
+    towers = TowerEncoder([], CONFIG, None, None, USUAL_CAMERA, tmp_path, True, encoded)
     touches, photos = (towers.inputs(kind, with_cells=False) for kind in ("touch_to_touch", "photo_to_photo"))
     np.testing.assert_array_equal(touches.photo, touch.reshape(4, 6))
     np.testing.assert_array_equal(photos.touch, photo[:, None])

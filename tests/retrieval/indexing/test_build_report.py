@@ -11,13 +11,27 @@ from PIL import Image, ImageFilter
 
 from indexes.store.folder import IndexStore
 from retrieval.commands.main import main
+from retrieval.data.camera import PhotoCamera
+from retrieval.data.catalogue import list_catalogue
+from retrieval.data.dataset import load_grasps, recording_camera
+from retrieval.errors import DatasetError
 from retrieval.indexing.build import build_index
+from retrieval.training.distil import feature_partials
+from retrieval.training.features import encode_recording
+from robot.recording.folder import RecordingWriter
 from tests.retrieval.data.simulated import rolled, square
 
 
 @pytest.fixture
 def index(tmp_path):
     return tmp_path / "index"
+
+
+@pytest.fixture
+def zooms(checkpoint):
+    """A model that sees the zoom of a photo."""
+    settings = dataclasses.replace(checkpoint.config.preprocessing, views=("zoom",))
+    return dataclasses.replace(checkpoint, config=dataclasses.replace(checkpoint.config, preprocessing=settings))
 
 
 @pytest.fixture
@@ -104,17 +118,15 @@ def test_new_photos_in_which_objects_are_hard_to_recognise_give_a_warning(tmp_pa
     assert build_index(own, checkpoint, index, quiet=True).warnings == []  # no photo is new
 
 
-def test_a_stated_field_changes_the_zoom_and_embeds_the_photo_again(tmp_path, checkpoint, index):
-    zooms = dataclasses.replace(checkpoint.config.preprocessing, views=("zoom",))
-    checkpoint = dataclasses.replace(checkpoint, config=dataclasses.replace(checkpoint.config, preprocessing=zooms))
+def test_a_stated_field_changes_the_zoom_and_embeds_the_photo_again(tmp_path, zooms, index):
     own, photo = tmp_path / "own", np.random.default_rng(0).integers(0, 255, (256, 256, 3), np.uint8)
     own.mkdir()
     for name in ("mug", "cup"):
         Image.fromarray(photo if name == "mug" else photo[::-1]).save(own / f"{name}.png")
-    assert build_index(own, checkpoint, index, quiet=True).embedded == 2
+    assert build_index(own, zooms, index, quiet=True).embedded == 2
     before = IndexStore(index).open().arrays["partials"][:]
     (own / "metadata.jsonl").write_text('{"file_name": "mug.png", "field_mm": 400}')
-    report = build_index(own, checkpoint, index, quiet=True)
+    report = build_index(own, zooms, index, quiet=True)
     assert (report.written, report.embedded) == (True, 1)
     after = IndexStore(index).open().arrays["partials"][:]
     assert (before == after).all(axis=1).tolist() == [True, False]  # cup, mug
@@ -135,18 +147,46 @@ def test_a_stated_field_changes_the_zoom_and_embeds_the_photo_again(tmp_path, ch
         ),
     ],
 )
-def test_the_camera_that_all_photos_share_is_assumed_until_it_is_stated(
-    tmp_path, checkpoint, index, photo, warning, stated
-):
-    zooms = dataclasses.replace(checkpoint.config.preprocessing, views=("zoom",))
-    checkpoint = dataclasses.replace(checkpoint, config=dataclasses.replace(checkpoint.config, preprocessing=zooms))
+def test_the_camera_that_all_photos_share_is_assumed_until_it_is_stated(tmp_path, zooms, index, photo, warning, stated):
     own = tmp_path / "own"
     own.mkdir()
     for number in range(20):
         Image.fromarray(photo(number)).save(own / f"{number}.png")
-    assert any(warning in line for line in build_index(own, checkpoint, index, quiet=True).warnings)
+    assert any(warning in line for line in build_index(own, zooms, index, quiet=True).warnings)
     (own / "metadata.jsonl").write_text(stated)
-    report = build_index(own, checkpoint, index, quiet=True)
+    report = build_index(own, zooms, index, quiet=True)
     assert (report.embedded, [line for line in report.warnings if warning in line]) == (20, [])
     (own / "metadata.jsonl").unlink()
-    assert build_index(own, checkpoint, index, quiet=True).embedded == 0  # their codes are still stored
+    assert build_index(own, zooms, index, quiet=True).embedded == 0  # their codes are still stored
+
+
+def test_training_sees_the_photos_of_a_recording_as_an_index_of_them_does(tmp_path, zooms, index):
+    with RecordingWriter(tmp_path / "lab", {"source": "lab", "sensor": "gel"}) as writer:
+        for number in range(20):
+            picture = square(number, 0.16)
+            writer.append(f"{number:02}", f"{number:02}", {"photo": picture, "touch_a": picture, "touch_b": picture})
+    grasps = load_grasps(tmp_path / "lab")
+    catalogue = catalogue_of(
+        tmp_path / "own", [each.photo for each in grasps], *(f"{each.object_id}.png" for each in grasps)
+    )
+    assert any(
+        "are assumed to show 380 mm" in line for line in build_index(catalogue, zooms, index, quiet=True).warnings
+    )
+    camera = recording_camera(tmp_path / "lab", grasps, zooms.config.preprocessing)
+    _, photos = feature_partials(
+        zooms.matcher, encode_recording(grasps, zooms.matcher, zooms.config, None, camera=camera, quiet=True)
+    )
+    np.testing.assert_allclose(IndexStore(index).open().arrays["partials"][:], photos, atol=0.01)
+
+
+@pytest.mark.parametrize(("stated", "camera"), [({}, (380, 0)), ({"field_mm": 300, "roll_deg": 90}, (300, 90))])
+def test_recording_json_states_the_camera_of_all_photos(recording, tmp_path, zooms, monkeypatch, stated, camera):
+    own = shutil.copytree(recording, tmp_path / "own")
+    info = json.loads((own / "recording.json").read_text())
+    monkeypatch.setattr("retrieval.data.dataset.assumed_camera", lambda *_: PhotoCamera(380, 0))
+    (own / "recording.json").write_text(json.dumps(info | stated))
+    assert recording_camera(own, load_grasps(own), zooms.config.preprocessing) == camera
+    assert {tuple(photo.metadata.items()) for photo in list_catalogue(own).photos} == {tuple(stated.items())}
+    (own / "recording.json").write_text(json.dumps(info | {"field_mm": "wide"}))
+    with pytest.raises(DatasetError, match=r"recording\.json: field_mm must be"):
+        recording_camera(own, load_grasps(own), zooms.config.preprocessing)

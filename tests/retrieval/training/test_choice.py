@@ -8,6 +8,7 @@ import torch
 
 import retrieval
 from retrieval.commands.main import main
+from retrieval.data.camera import USUAL_CAMERA
 from retrieval.data.dataset import (
     LICENCES,
     DataLicence,
@@ -253,7 +254,7 @@ def test_queries_of_a_recording_with_sessions_are_compared_with_photos_of_anothe
         for number, grasp in enumerate(load_grasps(recording))
     ]
     names = sorted({grasp.object_id for grasp in grasps})
-    problem = Problem(grasps, start.config.matcher.fingers, start, "random", {}, [], tmp_path, quiet=True)
+    problem = Problem(grasps, USUAL_CAMERA, start.config.matcher.fingers, start, "random", {}, [], tmp_path, quiet=True)
     (part,) = choice.Comparison(problem, [names]).held_out("start", Start(problem))
     sessions = np.array([grasp.session for name in names for grasp in grasps if grasp.object_id == name])
     assert np.array_equal(part.touches.own, sessions[:, None] == sessions)
