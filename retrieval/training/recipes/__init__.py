@@ -15,7 +15,6 @@ RECIPES: Registry[Any] = Registry(
         "start": "retrieval.training.recipes.recipe:Start",
         "linear": "retrieval.training.recipes.recipe:Linear",
         "head": "retrieval.training.recipes.recipe:ContinuedHead",
-        "new-head": "retrieval.training.recipes.recipe:NewHead",
     },
     error=ConfigError,
     base="retrieval.training.recipes.recipe:Recipe",

@@ -15,14 +15,12 @@ from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
 from retrieval.training.features import Features
-from retrieval.training.initial_weights import build_matcher, training_licences, weights_of
+from retrieval.training.initial_weights import build_matcher, training_licences
 from retrieval.training.linear import available_config, fit_linear
 from retrieval.training.loop import OnStep
 from retrieval.training.selection import held_out_folds
 from retrieval.training.trainer import Trainer
 
-MIN_OBJECTS_OF_NEW_HEAD = 1000
-"""Objects that late interaction needs, if it is trained from random weights."""
 DISTIL_STEPS = 600
 """Steps of the candidate encoder of a trained head."""
 VALIDATION_FRACTION = 0.15
@@ -150,8 +148,6 @@ class ContinuedHead(Recipe):
     steps: ClassVar[int] = 150
     touches_per_batch: ClassVar[int] = 64
     learning_rate: ClassVar[float] = 1e-4
-    continues: ClassVar[bool] = True
-    """Whether the head starts from that of the start model, and not from random weights."""
 
     def fit(self, features: Features, name: str, *, is_final: bool = False) -> Checkpoint:
         """Return the model of the step that is best on a part of the objects."""
@@ -169,26 +165,7 @@ class ContinuedHead(Recipe):
         grasps = [grasp for grasp in problem.grasps if grasp.grasp_id in known]
         split = make_split(grasps, validation=VALIDATION_FRACTION, test=0, seed=training.seed)
         config = config if is_final else config.without_candidate_encoder()
-        out, weights = problem.folder / f"{name}.safetensors", weights_of(start.matcher, head=self.continues)
-        trainer = Trainer(config, split, grasps, out, {"source": ""}, features, weights)
+        out = problem.folder / f"{name}.safetensors"
+        trainer = Trainer(config, split, grasps, out, {"source": ""}, features, start.matcher.state_dict())
         fitted = trainer.run_or_reuse(problem.quiet, on_step=problem.on_step if is_final else None)
         return dataclasses.replace(fitted, provenance={key: fitted.provenance[key] for key in ("step", "metrics")})
-
-
-class NewHead(ContinuedHead):
-    """A new head with the late interaction of the start model, trained on its frozen towers."""
-
-    label = "new head with late interaction on the start model's towers"
-    steps = 1000
-    touches_per_batch = 128
-    learning_rate = 1e-3
-    continues = False
-
-    @classmethod
-    def obstacle(cls, problem: Problem, objects: int) -> str:
-        """Return why the recipe cannot be fitted, such as too few objects; empty if it can."""
-        if objects < MIN_OBJECTS_OF_NEW_HEAD:
-            return f"it needs {MIN_OBJECTS_OF_NEW_HEAD} objects, and the recording has {objects}"
-        if not problem.start.config.matcher.cell_dim:
-            return "the start model has no late interaction"
-        return super().obstacle(problem, objects)
