@@ -36,13 +36,12 @@ from _touch_retrieval.names import is_system_name, lookup_key
 from _touch_retrieval.text import decode_text
 from retrieval.console.output import abbreviate_list
 from retrieval.data.camera import CAMERA_KEYS, require_camera
-from retrieval.data.dataset import load_grasps
+from retrieval.data.dataset import load_grasps, stated_by_recording
 from retrieval.data.images import EXTENSIONS, is_picture
 from retrieval.data.naming import MAX_EXAMPLES, STEM, Naming
 from retrieval.data.opening import believed, require_opening
 from retrieval.data.text import is_utf8
 from retrieval.errors import BadInput, DatasetError
-from robot.recording.folder import INFO_FILE, read_info
 
 METADATA_FILE = "metadata.jsonl"
 _ALL_PHOTOS = ""
@@ -220,9 +219,7 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None) -> Catalogu
 
 
 def _list_recording(root: Path) -> Catalogue:
-    grasps, info = load_grasps(root), read_info(root)
-    require_camera(info, INFO_FILE)
-    camera = {key: info[key] for key in CAMERA_KEYS.intersection(info)}
+    grasps, camera = load_grasps(root), stated_by_recording(root)
 
     def paths(files: Iterable[Path]) -> tuple[str, ...]:
         return tuple(file.relative_to(root).as_posix() for file in files)

@@ -219,6 +219,13 @@ def object_kinds(folder: Path) -> dict[str, str]:
     }
 
 
+def stated_by_recording(folder: Path) -> dict[str, float]:
+    """Return what a recording.json states of the camera of all photos, by CAMERA_KEYS. Raises DatasetError."""
+    info = read_info(folder)
+    require_camera(info, f"{folder / INFO_FILE}")
+    return {key: info[key] for key in CAMERA_KEYS.intersection(info)}
+
+
 def recording_camera(folder: Path, grasps: Sequence[Grasp], settings: Preprocessing) -> PhotoCamera:
     """Return the camera of a recording's photos: as its recording.json states it, or else as they suggest.
 
@@ -229,13 +236,12 @@ def recording_camera(folder: Path, grasps: Sequence[Grasp], settings: Preprocess
     """
     if not settings.finds_object:
         return USUAL_CAMERA
-    info = read_info(folder)
-    require_camera(info, f"{folder / INFO_FILE}")
+    stated = stated_by_recording(folder)
     photos = ((grasp.object_id, photo) for grasp in grasps for photo in grasp.photos)
-    assumed = assumed_camera(photos, CAMERA_KEYS & info.keys())
+    assumed = assumed_camera(photos, stated.keys())
     for sentence in unusual(assumed):
         log.warning("%s. If that is wrong, state it in %s", sentence, folder / INFO_FILE)
-    return stated_camera(info, assumed)
+    return stated_camera(stated, assumed)
 
 
 def finger_count(grasps: Sequence[Grasp]) -> int:

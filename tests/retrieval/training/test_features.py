@@ -90,7 +90,7 @@ def test_only_images_that_the_cache_lacks_are_encoded(grasps, matcher, plain, en
 def test_an_interrupted_run_keeps_its_finished_batches(matcher, plain, encode, monkeypatch):
     monkeypatch.setattr(features_module, "_BATCH", 4)
     with monkeypatch.context() as during:
-        during.setattr("retrieval.data.preprocessing.Preprocessing.load_photo", lambda *_: 1 / 0)
+        during.setattr("retrieval.data.preprocessing.Preprocessing.load_photo", lambda *_, **__: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             encode(matcher)
     resumed, count = encode(matcher)
