@@ -14,6 +14,8 @@ import numpy as np
 
 from retrieval.data.images import decode, read_bytes
 from retrieval.data.object_finder import INPUT_PX, find_object
+from retrieval.data.object_finder import NETWORK as OBJECT_FINDER
+from retrieval.data.upright import NETWORK as UPRIGHT
 from retrieval.data.upright import RollEstimator, probable_roll
 from retrieval.data.views import FIELD_MM
 from retrieval.errors import DatasetError, ImageError
@@ -22,6 +24,8 @@ USUAL_SIZE = 0.32
 """Median root of the visible area of objects, relative to the shorter side, in photos of the field `FIELD_MM`."""
 FEWEST, SAMPLE = 20, 64
 """Least and largest number of objects from whose photos a camera is estimated."""
+NETWORKS = OBJECT_FINDER, UPRIGHT
+"""Files of the networks that look at the photos."""
 _STEPS, _LEAST_STEPS = 4, 2
 """Steps in which the field doubles: it stays the same when the catalogue grows. A difference of one is ignored."""
 
@@ -79,20 +83,26 @@ def unusual(assumed: PhotoCamera) -> list[str]:
     return found
 
 
+def sampled(photos: Iterable[tuple[str, Path]]) -> list[Path]:
+    """Return the first photo of each object, or of SAMPLE objects; nothing for fewer than FEWEST objects."""
+    firsts: dict[str, Path] = {}
+    for name, path in photos:
+        firsts.setdefault(name, path)
+    return list(firsts.values())[:: math.ceil(len(firsts) / SAMPLE)] if len(firsts) >= FEWEST else []
+
+
 def assumed_camera(photos: Iterable[tuple[str, Path]], stated: Set[str] = frozenset()) -> PhotoCamera:
     """Return the camera to assume for photos; USUAL_CAMERA unless they agree on another one.
 
     Args:
-        photos: The object in each photo, and its file. Only the first photo of each object is looked at.
+        photos: The object in each photo, and its file; those that are `sampled` are read.
         stated: Those of CAMERA_KEYS that are stated for all photos; these values stay the usual ones.
     """
-    firsts: dict[str, Path] = {}
-    for name, path in photos:
-        firsts.setdefault(name, path)
-    if len(firsts) < FEWEST or stated >= CAMERA_KEYS:
+    files = sampled(photos)
+    if not files or stated >= CAMERA_KEYS:
         return USUAL_CAMERA
     estimator, sizes, rolls = RollEstimator(), [], []
-    for path in list(firsts.values())[:: math.ceil(len(firsts) / SAMPLE)]:
+    for path in files:
         try:
             photo = decode(read_bytes(path), path, 2 * INPUT_PX)
         except ImageError:  # reported when the photo is encoded

@@ -6,11 +6,21 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import msgspec
 from numpy.typing import NDArray
 
-from _touch_retrieval.cache import Cache
+from _touch_retrieval.cache import Cache, cache_key
+from _touch_retrieval.files import file_digest
 from indexes.store.rows import Row
-from retrieval.data.camera import CAMERA_KEYS, USUAL_CAMERA, PhotoCamera, assumed_camera, stated_camera
+from retrieval.data.camera import (
+    CAMERA_KEYS,
+    NETWORKS,
+    USUAL_CAMERA,
+    PhotoCamera,
+    assumed_camera,
+    sampled,
+    stated_camera,
+)
 from retrieval.data.catalogue import Catalogue, CataloguePhoto, SkippedPhoto
 from retrieval.errors import BadInput, NoReadablePhoto
 from retrieval.indexing.codes import (
@@ -98,7 +108,7 @@ def read_contents(catalogue: Catalogue, checkpoint: Checkpoint, cache: Cache, qu
     files = CatalogueFiles(catalogue, cache)
     references = _find_references(catalogue, checkpoint, files, cache, quiet)
     photos = sorted([*catalogue.photos, *references.pictures], key=lambda photo: photo.path)
-    assumed = _assumed_camera(catalogue, checkpoint)
+    assumed = _assumed_camera(catalogue, checkpoint, files, cache)
     cameras = {
         photo.path: camera
         for photo in catalogue.photos
@@ -122,13 +132,22 @@ def read_contents(catalogue: Catalogue, checkpoint: Checkpoint, cache: Cache, qu
     )
 
 
-def _assumed_camera(catalogue: Catalogue, checkpoint: Checkpoint) -> PhotoCamera:
-    """Return the camera of photos where it is not stated; only objects that are searched for show an unusual one."""
+def _assumed_camera(catalogue: Catalogue, checkpoint: Checkpoint, files: CatalogueFiles, cache: Cache) -> PhotoCamera:
+    """Return the camera of photos where it is not stated; only objects that are searched for show an unusual one.
+
+    It is stored, and found again while the photos that show it do not change.
+    """
     if not checkpoint.config.preprocessing.finds_object:
         return USUAL_CAMERA
     unknown = [photo for photo in catalogue.photos if not photo.metadata.keys() >= CAMERA_KEYS]
-    photos = ((photo.object_id, catalogue.folder / photo.path) for photo in unknown)
-    return assumed_camera(photos, CAMERA_KEYS.intersection(*(photo.metadata for photo in unknown)))
+    stated = CAMERA_KEYS.intersection(*(photo.metadata for photo in unknown))
+    photos = [(photo.object_id, catalogue.folder / photo.path) for photo in unknown]
+    digests = [files.current_digest(file.relative_to(catalogue.folder).as_posix()) for file in sampled(photos)]
+    key = cache_key("files", "camera", [file_digest(network) for network in NETWORKS], sorted(stated), digests)
+    if (stored := cache.get(key)) is None:
+        stored = msgspec.json.encode(assumed_camera(photos, stated))
+        cache.add({key: stored})
+    return msgspec.json.decode(stored, type=PhotoCamera)
 
 
 def no_photo(catalogue: Catalogue, skipped: Sequence[SkippedPhoto]) -> NoReadablePhoto:
