@@ -144,7 +144,7 @@ def write_codes(catalogue: Path, out: Path, checkpoint: Checkpoint) -> None:
             partials = rng.uniform(-1, 1, (len(some), matcher.partial_width)).astype(np.float32)
             for name, array in to_stored(partials, matcher.pooled_width).items():
                 records[name] = array
-            keys = [encoder.key([hashlib.sha256(path.read_bytes()).hexdigest()]) for path in some]
+            keys = [encoder.key((path.name,), [hashlib.sha256(path.read_bytes()).hexdigest()]) for path in some]
             cache.add(dict(zip(keys, map(bytes, records), strict=True)))
 
 

@@ -6,9 +6,9 @@ together appear half as large as usual, the photos probably show twice as much.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Set
+from collections.abc import Iterable, Mapping, Sequence, Set
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from retrieval.data.upright import RollEstimator, probable_roll
 from retrieval.data.views import FIELD_MM
 from retrieval.errors import DatasetError, ImageError
 
+T = TypeVar("T")
 USUAL_SIZE = 0.32
 """Median root of the visible area of objects, relative to the shorter side, in photos of the field `FIELD_MM`."""
 FEWEST, SAMPLE = 20, 64
@@ -83,22 +84,24 @@ def unusual(assumed: PhotoCamera) -> list[str]:
     return found
 
 
-def sampled(photos: Iterable[tuple[str, Path]]) -> list[Path]:
-    """Return the first photo of each object, or of SAMPLE objects; nothing for fewer than FEWEST objects."""
-    firsts: dict[str, Path] = {}
-    for name, path in photos:
-        firsts.setdefault(name, path)
+def sample(photos: Iterable[tuple[str, T]]) -> list[T]:
+    """Return the photos that show the camera, from pairs (object, photo): one of each object, of SAMPLE at most.
+
+    Fewer than FEWEST objects show no camera.
+    """
+    firsts: dict[str, T] = {}
+    for name, photo in photos:
+        firsts.setdefault(name, photo)
     return list(firsts.values())[:: math.ceil(len(firsts) / SAMPLE)] if len(firsts) >= FEWEST else []
 
 
-def assumed_camera(photos: Iterable[tuple[str, Path]], stated: Set[str] = frozenset()) -> PhotoCamera:
+def assumed_camera(files: Sequence[Path], stated: Set[str] = frozenset()) -> PhotoCamera:
     """Return the camera to assume for photos; USUAL_CAMERA unless they agree on another one.
 
     Args:
-        photos: The object in each photo, and its file; those that are `sampled` are read.
+        files: The photos of a `sample`.
         stated: Those of CAMERA_KEYS that are stated for all photos; these values stay the usual ones.
     """
-    files = sampled(photos)
     if not files or stated >= CAMERA_KEYS:
         return USUAL_CAMERA
     estimator, sizes, rolls = RollEstimator(), [], []

@@ -19,6 +19,7 @@ from retrieval.data.camera import (
     PhotoCamera,
     assumed_camera,
     require_camera,
+    sample,
     stated_camera,
     unusual,
 )
@@ -237,7 +238,7 @@ def recording_camera(folder: Path, grasps: Sequence[Grasp], settings: Preprocess
     if not settings.finds_object:
         return USUAL_CAMERA
     stated = stated_by_recording(folder)
-    photos = ((grasp.object_id, photo) for grasp in grasps for photo in grasp.photos)
+    photos = sample((grasp.object_id, photo) for grasp in grasps for photo in grasp.photos)
     assumed = assumed_camera(photos, stated.keys())
     for sentence in unusual(assumed):
         log.warning("%s. If that is wrong, state it in %s", sentence, folder / INFO_FILE)

@@ -18,7 +18,7 @@ from retrieval.data.camera import (
     USUAL_CAMERA,
     PhotoCamera,
     assumed_camera,
-    sampled,
+    sample,
     stated_camera,
 )
 from retrieval.data.catalogue import Catalogue, CataloguePhoto, SkippedPhoto
@@ -139,13 +139,13 @@ def _assumed_camera(catalogue: Catalogue, checkpoint: Checkpoint, files: Catalog
     """
     if not checkpoint.config.preprocessing.finds_object:
         return USUAL_CAMERA
-    unknown = [photo for photo in catalogue.photos if not photo.metadata.keys() >= CAMERA_KEYS]
+    unknown = [photo for photo in catalogue.photos if not CAMERA_KEYS.issubset(photo.metadata)]
     stated = CAMERA_KEYS.intersection(*(photo.metadata for photo in unknown))
-    photos = [(photo.object_id, catalogue.folder / photo.path) for photo in unknown]
-    digests = [files.current_digest(file.relative_to(catalogue.folder).as_posix()) for file in sampled(photos)]
-    key = cache_key("files", "camera", [file_digest(network) for network in NETWORKS], sorted(stated), digests)
+    photos = sample((photo.object_id, photo.path) for photo in unknown)
+    digests = [[file_digest(network) for network in NETWORKS], [files.current_digest(photo) for photo in photos]]
+    key = cache_key("files", "camera", sorted(stated), digests)
     if (stored := cache.get(key)) is None:
-        stored = msgspec.json.encode(assumed_camera(photos, stated))
+        stored = msgspec.json.encode(assumed_camera([catalogue.folder / photo for photo in photos], stated))
         cache.add({key: stored})
     return msgspec.json.decode(stored, type=PhotoCamera)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import recipes, rerank, scale
+from benchmarks import again, recipes, rerank, scale
 from benchmarks.frontier import APPROXIMATIONS, NEED_NO_MODEL
 from benchmarks.frontier.__main__ import main
 from retrieval import frontier
@@ -84,6 +84,13 @@ def test_time_against_the_number_of_photos(tmp_path):
 def test_reranking_with_cells_is_compared_with_reranking_without():
     text = rerank.measure(read_checkpoint_info(shipped_model()).config.matcher, candidates=3, repetitions=1)
     assert text.startswith("3 candidates with ")
+
+
+@pytest.mark.slow
+def test_builds_again_are_timed():
+    text, seconds = again.measure(photos=60, rounds=1)
+    assert text.startswith("60 photos, CPU time of one thread: one new photo ")
+    assert min(seconds.values()) > 0
 
 
 @pytest.mark.slow
