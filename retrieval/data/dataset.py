@@ -234,6 +234,9 @@ def recording_camera(folder: Path, grasps: Sequence[Grasp], settings: Preprocess
         folder: The recording.
         grasps: Its grasps.
         settings: How the photos are prepared. If a model sees them as a whole, their camera does not matter.
+
+    Raises:
+        DatasetError: A stated value is impossible.
     """
     if not settings.finds_object:
         return USUAL_CAMERA
