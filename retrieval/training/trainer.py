@@ -110,7 +110,7 @@ def prepare_run(recording: Path, out: Path, config: Config, split: Split | None 
     return Trainer(config, split, grasps, out, made, camera=camera)
 
 
-_MADE_FROM = ("data_digest", "weights_digest", "code")
+_MADE_FROM = ("data_digest", "weights_digest", "code", "camera")
 
 
 class Trainer:
@@ -177,6 +177,7 @@ class Trainer:
             **provenance,
             **({"data_digest": known.digest} if known else {}),
             **({"weights_digest": tensors_digest(weights, "")} if weights else {}),
+            **({"camera": list(camera)} if camera != USUAL_CAMERA else {}),
             **code_digest(*map(type, (*self.losses.terms, *towers))),
         }
 

@@ -1,7 +1,9 @@
 """Training: shared images, losses, augmentation, bit-exact resumption, interruption, frozen parts, initial weights."""
 
 import dataclasses
+import json
 import os
+import shutil
 import signal
 import sys
 from copy import deepcopy
@@ -408,6 +410,19 @@ def test_trained_towers_start_from_random_weights_without_a_download_and_the_che
     assert "The training starts from random weights" in line
     with pytest.raises(CheckpointError, match=r"resnet18-f37072fd\.pth"):  # random ones would stay so
         train_matcher(recording, tmp_path / "m.safetensors", with_training(config, freeze_towers=True), quiet=True)
+
+
+def test_a_checkpoint_names_the_unusual_camera_of_its_photos(recording, tmp_path):
+    own = shutil.copytree(recording, tmp_path / "own")
+    info = json.loads((own / "recording.json").read_text())
+    config = with_training(TINY, iterations=1)
+    config = dataclasses.replace(config, preprocessing=dataclasses.replace(config.preprocessing, views=("zoom",)))
+    cameras = []
+    for stated in ({}, {"field_mm": 320, "roll_deg": 90}):
+        (own / "recording.json").write_text(json.dumps(info | stated))
+        made = train_matcher(own, tmp_path / f"{len(stated)}.safetensors", config, quiet=True)
+        cameras.append(made.provenance.get("camera"))
+    assert cameras == [None, [320, 90]]
 
 
 def test_training_continues_from_the_towers_and_the_head_of_a_checkpoint(model):
