@@ -61,9 +61,14 @@ def require_camera(metadata: Mapping[str, Any], where: str) -> None:
             raise DatasetError(f"{where}: {key} must be {what}, from {low:g} to {high:g}; got {value!r:.40}")
 
 
+def stated_keys(metadata: Mapping[str, Any]) -> set[str]:
+    """Return those of CAMERA_KEYS that metadata state; null states nothing."""
+    return {key for key in CAMERA_KEYS if metadata.get(key) is not None}
+
+
 def stated_camera(metadata: Mapping[str, Any], assumed: PhotoCamera) -> PhotoCamera:
     """Return the camera that metadata state, as assumed where they do not."""
-    return assumed._replace(**{key: metadata[key] for key in CAMERA_KEYS if metadata.get(key) is not None})
+    return assumed._replace(**{key: metadata[key] for key in stated_keys(metadata)})
 
 
 def unusual(assumed: PhotoCamera) -> list[str]:

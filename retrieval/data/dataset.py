@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from _touch_retrieval.documents import typed
 from _touch_retrieval.files import file_digest
 from retrieval.data.camera import (
-    CAMERA_KEYS,
     USUAL_CAMERA,
     PhotoCamera,
     assumed_camera,
     require_camera,
     sample,
     stated_camera,
+    stated_keys,
     unusual,
 )
 from retrieval.data.preprocessing import Preprocessing
@@ -224,7 +224,7 @@ def stated_by_recording(folder: Path) -> dict[str, float]:
     """Return what a recording.json states of the camera of all photos, by CAMERA_KEYS. Raises DatasetError."""
     info = read_info(folder)
     require_camera(info, f"{folder / INFO_FILE}")
-    return {key: info[key] for key in CAMERA_KEYS.intersection(info)}
+    return {key: info[key] for key in stated_keys(info)}
 
 
 def recording_camera(folder: Path, grasps: Sequence[Grasp], settings: Preprocessing) -> PhotoCamera:

@@ -20,6 +20,7 @@ from retrieval.data.camera import (
     assumed_camera,
     sample,
     stated_camera,
+    stated_keys,
 )
 from retrieval.data.catalogue import Catalogue, CataloguePhoto, SkippedPhoto
 from retrieval.errors import BadInput, NoReadablePhoto
@@ -139,8 +140,8 @@ def _assumed_camera(catalogue: Catalogue, checkpoint: Checkpoint, files: Catalog
     """
     if not checkpoint.config.preprocessing.finds_object:
         return USUAL_CAMERA
-    unknown = [photo for photo in catalogue.photos if not CAMERA_KEYS.issubset(photo.metadata)]
-    stated = CAMERA_KEYS.intersection(*(photo.metadata for photo in unknown))
+    unknown = [photo for photo in catalogue.photos if stated_keys(photo.metadata) != CAMERA_KEYS]
+    stated = CAMERA_KEYS.intersection(*(stated_keys(photo.metadata) for photo in unknown))
     photos = sample((photo.object_id, photo.path) for photo in unknown)
     digests = [[file_digest(network) for network in NETWORKS], [files.current_digest(photo) for photo in photos]]
     key = cache_key("files", "camera", sorted(stated), digests)

@@ -14,7 +14,7 @@ from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
 from retrieval.training.features import Features
-from retrieval.training.initial_weights import build_matcher, weights_of
+from retrieval.training.initial_weights import build_matcher, tower_weights
 from retrieval.training.trainer import Trainer
 
 SOURCE = {"source": "features of a recording"}
@@ -75,7 +75,7 @@ def trained_checkpoint(settings: MethodSettings, train: Features, validation: Fe
         training=dataclasses.replace(config.training, seed=settings.seed, freeze_towers=True),
     )
     start = settings.start
-    weights = weights_of(start.matcher if start else frozen_matcher(settings.config), head=start is not None)
+    weights = start.matcher.state_dict() if start else tower_weights(frozen_matcher(settings.config))
     with nullcontext(settings.folder) if settings.folder else tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"late_fusion-{settings.seed}.safetensors"
         return Trainer(config, split, grasps, path, SOURCE, known, weights).run_or_reuse(settings.quiet)

@@ -73,9 +73,9 @@ def build_matcher(config: Config) -> Matcher:
     return matcher
 
 
-def weights_of(matcher: Matcher, *, head: bool) -> dict[str, Tensor]:
-    """Return the weights of a matcher, or without `head` those of its towers, by name."""
-    return {name: part for name, part in matcher.state_dict().items() if head or name.startswith(TOWER_WEIGHTS)}
+def tower_weights(matcher: Matcher) -> dict[str, Tensor]:
+    """Return the weights of a matcher's towers, by name."""
+    return {name: part for name, part in matcher.state_dict().items() if name.startswith(TOWER_WEIGHTS)}
 
 
 def _start_from(matcher: Matcher, path: Path) -> None:

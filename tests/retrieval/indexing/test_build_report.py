@@ -155,6 +155,8 @@ def test_the_camera_that_all_photos_share_is_assumed_until_it_is_stated(
     for number in range(20):
         Image.fromarray(photo(number)).save(own / f"{number}.png")
     assert any(warning in line for line in build_index(own, zooms, index, quiet=True).warnings)
+    (own / "metadata.jsonl").write_text('{"field_mm": null, "roll_deg": null}')  # states nothing
+    assert any(warning in line for line in build_index(own, zooms, index, quiet=True).warnings)
     (own / "metadata.jsonl").write_text(stated)
     report = build_index(own, zooms, index, quiet=True)
     assert (report.embedded, [line for line in report.warnings if warning in line]) == (20, [])
