@@ -28,7 +28,7 @@ from retrieval.metrics.measure import Measure
 from retrieval.metrics.table import ScoreTable
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.search.opening import find_model
-from retrieval.training.calibration import refused_touches
+from retrieval.training.calibration.checkpoint import refused_touches
 from retrieval.training.features import encode_recording
 
 CANDIDATES = (10, 100)

@@ -38,12 +38,10 @@ from retrieval.model.encode import batches, photo_features
 from retrieval.model.posterior import Posterior
 from retrieval.report import numbers
 from retrieval.search.opening import find_model
-from retrieval.training.calibration import (
-    IdentificationTrials,
-    refused_touches,
-    score_grasps,
-    verification_sequences,
-)
+from retrieval.training.calibration.checkpoint import refused_touches
+from retrieval.training.calibration.posterior import IdentificationTrials
+from retrieval.training.calibration.scores import score_grasps
+from retrieval.training.calibration.verification import verification_sequences
 from retrieval.training.distil import feature_partials
 from retrieval.training.features import encode_recording
 

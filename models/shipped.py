@@ -42,7 +42,10 @@ from retrieval.model.config import load_config
 from retrieval.model.encode import default_device
 from retrieval.model.shipped import SHIPPED, shipped_model
 from retrieval.training import distil
-from retrieval.training.calibration import calibrate_checkpoint, fit_verification, refused_touches, score_grasps
+from retrieval.training.calibration.checkpoint import calibrate_checkpoint, refused_touches
+from retrieval.training.calibration.gel_check import ForeignPictures
+from retrieval.training.calibration.scores import score_grasps
+from retrieval.training.calibration.verification import fit_verification
 from retrieval.training.features import (
     FrozenFeatures,
     TrainedFeatures,
@@ -50,7 +53,6 @@ from retrieval.training.features import (
     features_by_image,
     recorded_features,
 )
-from retrieval.training.gel_check import ForeignPictures
 
 RIGS = Path(__file__).parent
 RIG = RIGS / "shipped_rig.toml"

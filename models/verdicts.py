@@ -38,9 +38,10 @@ from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import for_inference, photo_features, touch_batch
 from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
 from retrieval.model.shipped import shipped_model
-from retrieval.training.calibration import IdentificationTrials, ScoredTouches
+from retrieval.training.calibration.gel_check import draw_foreign
+from retrieval.training.calibration.posterior import IdentificationTrials
+from retrieval.training.calibration.scores import ScoredTouches
 from retrieval.training.features import encode_recording
-from retrieval.training.gel_check import draw_foreign
 from robot.collection import CollectSettings, collect
 from robot.rig import load_rig
 from robot.sim.objects.draw import draw_object

@@ -21,7 +21,7 @@ from retrieval.metrics.pairs import reliability_bins
 from retrieval.metrics.registry import confusions, k_way
 from retrieval.metrics.table import ScoreTable, object_scores
 from retrieval.model.posterior import Posterior
-from retrieval.training.calibration import MIN_OBJECTS
+from retrieval.training.calibration.scores import MIN_OBJECTS
 from retrieval.training.features import Features
 
 K_WAY_TESTS = {"k5": 5, "k10": 10}

@@ -18,7 +18,8 @@ from retrieval.metrics.registry import PHOTOS_PER_CANDIDATE, SET_SIZES, MethodSc
 from retrieval.metrics.table import ScoreTable
 from retrieval.model.encode import one_thread
 from retrieval.model.posterior import Posterior
-from retrieval.training.calibration import MIN_OBJECTS, IdentificationTrials, ScoredTouches, fit_posterior_to_trials
+from retrieval.training.calibration.posterior import IdentificationTrials, fit_posterior_to_trials
+from retrieval.training.calibration.scores import MIN_OBJECTS, ScoredTouches
 from retrieval.training.features import Features
 
 PARTS = ("train", "validation", "test")

@@ -19,7 +19,9 @@ from retrieval.evaluation.queries import MethodScores, scored_touches
 from retrieval.evaluation.results import Rate, VerificationRates
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.verification import ERRORS_NEEDED, error_rate, objects_needed
-from retrieval.training.calibration import MIN_OBJECTS, fit_posterior, verification_sequences
+from retrieval.training.calibration.posterior import fit_posterior
+from retrieval.training.calibration.scores import MIN_OBJECTS
+from retrieval.training.calibration.verification import verification_sequences
 from retrieval.training.features import Features
 
 GRASPS = (1, 2, 3, 5)

@@ -5,7 +5,7 @@ from dataclasses import asdict
 
 from retrieval.errors import BadInput
 from retrieval.methods.method import Array, Method
-from retrieval.training.calibration import fit_posterior
+from retrieval.training.calibration.posterior import fit_posterior
 from retrieval.training.cca import fit_projections, select_settings, tower_widths, unit_rows
 from retrieval.training.features import Features
 from retrieval.training.selection import held_out_folds

@@ -179,7 +179,7 @@ class Matcher(nn.Module):
         self.log_scale = nn.Parameter(torch.tensor(LOG_SCALE_INIT))
         self.cosine_scale = nn.Parameter(torch.tensor(COSINE_SCALE_INIT)) if config.cosine else None
         self.candidate_encoder = candidate_encoder_of(config) if config.candidate_width else None
-        self.gel_head: GelHead | None = None  # fitted after training (`retrieval.training.gel_check`)
+        self.gel_head: GelHead | None = None  # fitted after training (`retrieval.training.calibration.gel_check`)
 
     def touch_features(self, touches: Tensor) -> Tensor:
         """Return features (B, fingers * output_count) of touches (B, fingers, 3, H, W) in 0..1, fingers in order a, b.

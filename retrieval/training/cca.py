@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from retrieval.errors import BadInput, NumericalError
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
-from retrieval.training.calibration import ScoredTouches
+from retrieval.training.calibration.scores import ScoredTouches
 from retrieval.training.features import Features
 from retrieval.training.selection import ranking_auc, validation_rows
 

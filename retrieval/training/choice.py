@@ -24,13 +24,8 @@ from retrieval.metrics.measure import Measure, pooled
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import one_thread
 from retrieval.model.shipped import shipped_model
-from retrieval.training.calibration import (
-    ScoredTouches,
-    refused_touches,
-    score_touches,
-    with_calibrations,
-    with_sensor_calibrations,
-)
+from retrieval.training.calibration.checkpoint import refused_touches, with_calibrations, with_sensor_calibrations
+from retrieval.training.calibration.scores import ScoredTouches, score_touches
 from retrieval.training.features import Features, encode_recording
 from retrieval.training.loop import OnStep
 from retrieval.training.recipes import RECIPES

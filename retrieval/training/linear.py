@@ -18,7 +18,7 @@ from retrieval.model.config import Config, load_config
 from retrieval.model.encode import one_thread
 from retrieval.model.fusion import Matcher
 from retrieval.model.towers.weights import GEL, SHIPPED
-from retrieval.training.calibration import ScoredTouches
+from retrieval.training.calibration.scores import ScoredTouches
 from retrieval.training.cca import CcaSelection, select_settings, tower_widths
 from retrieval.training.features import Features
 from retrieval.training.initial_weights import downloaded_or

@@ -35,7 +35,9 @@ from retrieval.model.encode import one_thread
 from retrieval.model.fusion import Matcher
 from retrieval.model.references import reference_similarity
 from retrieval.model.towers import NO_TOWER
-from retrieval.training.calibration import ScoredTouches, fit_references, with_sensor_calibrations
+from retrieval.training.calibration.checkpoint import with_sensor_calibrations
+from retrieval.training.calibration.references import fit_references
+from retrieval.training.calibration.scores import ScoredTouches
 from retrieval.training.cca import (
     MAX_CALIBRATION_TOUCHES,
     MAX_CHOICE_TOUCHES,

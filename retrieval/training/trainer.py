@@ -44,7 +44,7 @@ from retrieval.model.losses import LOSSES
 from retrieval.model.losses.loss import EncodedBatch, Loss, match_loss
 from retrieval.model.towers.tower import Tower
 from retrieval.training import distributed
-from retrieval.training.calibration import calibrate_checkpoint
+from retrieval.training.calibration.checkpoint import calibrate_checkpoint
 from retrieval.training.distil import add_candidate_encoder
 from retrieval.training.features import (
     Features,

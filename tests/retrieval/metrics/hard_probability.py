@@ -10,7 +10,8 @@ from scipy.special import expit, log_expit, softmax
 from retrieval.evaluation.reject import galleries, statistic
 from retrieval.metrics.pairs import fit_calibration, negative_log_likelihood, reliability_bins
 from retrieval.model.posterior import Posterior
-from retrieval.training.calibration import ScoredTouches, fit_posterior
+from retrieval.training.calibration.posterior import fit_posterior
+from retrieval.training.calibration.scores import ScoredTouches
 from tests.hard_case import HardCase, error_of
 
 Matrix = NDArray[np.float64]

@@ -17,8 +17,10 @@ from retrieval.indexing.sharded import build_sharded
 from retrieval.model.posterior import Posterior
 from retrieval.model.references import ReferenceCalibration
 from retrieval.search.searcher import Searcher
-from retrieval.training import calibration
-from retrieval.training.calibration import calibrate_checkpoint, fit_posterior, score_grasps
+from retrieval.training.calibration import checkpoint as calibration
+from retrieval.training.calibration.checkpoint import calibrate_checkpoint
+from retrieval.training.calibration.posterior import fit_posterior
+from retrieval.training.calibration.scores import score_grasps
 from tests.conftest import TINY
 from tests.reference_model import POSTERIOR, write_reference_model
 

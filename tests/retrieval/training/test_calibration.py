@@ -19,14 +19,11 @@ from retrieval.model.verification import (
     QUANTILES,
     VerificationCalibration,
 )
-from retrieval.training.calibration import (
-    ScoredTouches,
-    fit_opening,
-    fit_posterior,
-    fit_references,
-    fit_verification,
-    verification_sequences,
-)
+from retrieval.training.calibration.opening import fit_opening
+from retrieval.training.calibration.posterior import fit_posterior
+from retrieval.training.calibration.references import fit_references
+from retrieval.training.calibration.scores import ScoredTouches
+from retrieval.training.calibration.verification import fit_verification, verification_sequences
 
 # Posterior -------------------------------------------------------------------------------------------------
 

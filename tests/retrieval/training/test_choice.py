@@ -25,7 +25,9 @@ from retrieval.model.fusion import GelHead, Matcher
 from retrieval.model.gel_check import GelCheck
 from retrieval.model.towers.tower import build_tower
 from retrieval.training import choice
-from retrieval.training.calibration import ScoredTouches, fit_posterior, fit_verification, verification_sequences
+from retrieval.training.calibration.posterior import fit_posterior
+from retrieval.training.calibration.scores import ScoredTouches
+from retrieval.training.calibration.verification import fit_verification, verification_sequences
 from retrieval.training.cca import GRID, CcaSettings, TowerWidths, fit_projections, select_settings
 from retrieval.training.choice import HeldOut
 from retrieval.training.features import Features

@@ -11,7 +11,7 @@ from retrieval.model.config import MatcherConfig
 from retrieval.model.encode import touch_features
 from retrieval.model.fusion import Matcher
 from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
-from retrieval.training.gel_check import (
+from retrieval.training.calibration.gel_check import (
     SYNTHETIC_KINDS,
     ForeignPictures,
     GelCheckFeatures,

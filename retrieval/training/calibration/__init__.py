@@ -1,0 +1,1 @@
+"""Calibration of a checkpoint on touches of objects that it was not fitted to."""
