@@ -42,17 +42,12 @@ from retrieval.model.config import load_config
 from retrieval.model.encode import default_device
 from retrieval.model.shipped import SHIPPED, shipped_model
 from retrieval.training import distil
+from retrieval.training.batches import FrozenFeatures, TrainedFeatures, recorded_features
 from retrieval.training.calibration.checkpoint import calibrate_checkpoint, refused_touches
 from retrieval.training.calibration.gel_check import ForeignPictures
 from retrieval.training.calibration.scores import score_grasps
 from retrieval.training.calibration.verification import fit_verification
-from retrieval.training.features import (
-    FrozenFeatures,
-    TrainedFeatures,
-    encode_recording,
-    features_by_image,
-    recorded_features,
-)
+from retrieval.training.features import encode_recording, features_by_image
 
 RIGS = Path(__file__).parent
 RIG = RIGS / "shipped_rig.toml"

@@ -14,7 +14,7 @@ from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff
 from retrieval.frontier.sample import Sample
 from retrieval.model.encode import autocast, has_fast_bfloat16, to_batch, touch_batch
 from retrieval.model.fusion import Matcher
-from retrieval.training.features import BatchImages
+from retrieval.training.batches import BatchImages
 from retrieval.training.trainer import WeightedLosses, batch_loss, set_training_mode
 
 TOLERANCE = 0.1

@@ -31,7 +31,8 @@ from retrieval.metrics.registry import MethodScoreTables
 from retrieval.metrics.table import ScoreTable
 from retrieval.model.encode import one_thread, photo_features, touch_features
 from retrieval.model.losses import LOSSES
-from retrieval.training.features import BatchImages, Features
+from retrieval.training.batches import BatchImages
+from retrieval.training.features import Features
 from retrieval.version import __version__
 
 MAX_CONTROL_GRASPS = 12

@@ -21,7 +21,7 @@ from retrieval.model.encode import for_inference, has_fast_bfloat16, touch_batch
 from retrieval.model.export import touch_encoder_to_onnx
 from retrieval.model.fusion import Matcher
 from retrieval.model.onnx_encoder import OnnxEncoder
-from retrieval.training.features import BatchImages
+from retrieval.training.batches import BatchImages
 
 LOGIT_TOLERANCE = 0.05
 """Largest negligible error of a match logit: the probability changes by about one percentage point at most."""

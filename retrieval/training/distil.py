@@ -27,7 +27,8 @@ from retrieval.model.candidate_encoder import CandidateEncoder, PartialStatistic
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher, candidate_encoder_of
-from retrieval.training.features import Features, FeatureSource, recorded_features
+from retrieval.training.batches import FeatureSource, recorded_features
+from retrieval.training.features import Features
 from retrieval.training.loop import Plan, train_loop
 
 ROWS = 2048

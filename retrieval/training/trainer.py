@@ -44,16 +44,10 @@ from retrieval.model.losses import LOSSES
 from retrieval.model.losses.loss import EncodedBatch, Loss, match_loss
 from retrieval.model.towers.tower import Tower
 from retrieval.training import distributed
+from retrieval.training.batches import FeatureSource, FrozenFeatures, LoadedBatch, TrainedFeatures
 from retrieval.training.calibration.checkpoint import calibrate_checkpoint
 from retrieval.training.distil import add_candidate_encoder
-from retrieval.training.features import (
-    Features,
-    FeatureSource,
-    FrozenFeatures,
-    LoadedBatch,
-    TrainedFeatures,
-    features_by_image,
-)
+from retrieval.training.features import Features, features_by_image
 from retrieval.training.initial_weights import (
     TOWER_WEIGHTS,
     build_matcher,

@@ -12,6 +12,7 @@ from retrieval.data.dataset import Grasp
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import default_device
 from retrieval.model.gel_check import CONTACT
+from retrieval.training.batches import FeatureSource, FrozenFeatures, recorded_features
 from retrieval.training.calibration.gel_check import (
     FOREIGN,
     PENALTY,
@@ -26,7 +27,7 @@ from retrieval.training.calibration.posterior import fit_posterior
 from retrieval.training.calibration.references import fit_references
 from retrieval.training.calibration.scores import ScoredTouches, score_grasps
 from retrieval.training.calibration.verification import fit_verification
-from retrieval.training.features import Features, FeatureSource, FrozenFeatures, features_by_image, recorded_features
+from retrieval.training.features import Features, features_by_image
 
 MAX_CALIBRATION_GRASPS = 400
 """Largest number of grasps from each part of the split."""

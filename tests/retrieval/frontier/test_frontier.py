@@ -24,7 +24,7 @@ from retrieval.indexing.candidates import measure_candidates
 from retrieval.model.candidate_encoder import CandidateEncoder
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import encode_touches
-from retrieval.training.features import BatchImages
+from retrieval.training.batches import BatchImages
 from tests import synthetic
 
 TINY = Scale(photos=700, queries=6, repeats=1, quick=True)

@@ -13,7 +13,9 @@ from retrieval.data.pairs import PairSampler
 from retrieval.data.resize import resize
 from retrieval.errors import NumericalError
 from retrieval.training import features as features_module
-from retrieval.training.features import TrainedFeatures, encode_recording, features_by_image, low_pass, photo_margin
+from retrieval.training.batches import TrainedFeatures
+from retrieval.training.controls import low_pass, photo_margin
+from retrieval.training.features import encode_recording, features_by_image
 from retrieval.training.initial_weights import build_matcher
 from tests.conftest import TINY
 

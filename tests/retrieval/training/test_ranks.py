@@ -99,7 +99,7 @@ GRADIENTS = """
 import sys, torch
 from pathlib import Path
 from retrieval.training import distributed
-from retrieval.training.features import TrainedFeatures
+from retrieval.training.batches import TrainedFeatures
 from retrieval.data.dataset import load_grasps
 from retrieval.data.pairs import PairSampler
 from retrieval.training.initial_weights import build_matcher

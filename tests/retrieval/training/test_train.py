@@ -27,7 +27,7 @@ from retrieval.model.losses.listwise import contrastive_loss, listwise_loss
 from retrieval.model.losses.loss import Loss, match_loss
 from retrieval.model.towers.tower import Tower
 from retrieval.training.augmentation import augment_photos
-from retrieval.training.features import BatchImages, TrainedFeatures
+from retrieval.training.batches import BatchImages, TrainedFeatures
 from retrieval.training.initial_weights import build_matcher
 from retrieval.training.loop import state_path
 from retrieval.training.trainer import (
