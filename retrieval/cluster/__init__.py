@@ -1,1 +1,1 @@
-"""Catalogues on several machines with Ray: building, serving and training. Extra `cluster`."""
+"""Catalogues on several machines with Ray: building and serving. Extra `cluster`."""

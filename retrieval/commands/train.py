@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from retrieval.commands.options import (
-    WORKERS,
     CheckpointOut,
     Iterations,
     Recording,
@@ -16,7 +15,6 @@ from retrieval.commands.options import (
     training_config,
 )
 from retrieval.console.output import say
-from retrieval.errors import BadInput
 from retrieval.training.recipes import RECIPES
 
 if TYPE_CHECKING:
@@ -58,22 +56,10 @@ def train(
         str | None,
         typer.Option(help="report each step to a tracker that a package registers, or to module:function of yours"),
     ] = None,
-    cluster: Annotated[
-        bool,
-        typer.Option(
-            "--cluster",
-            help="start the ranks (processes) with Ray Train, on the Ray cluster at RAY_ADDRESS, else on this machine",
-        ),
-    ] = False,
-    workers: Annotated[
-        int | None, typer.Option(parser=WORKERS, help="with --cluster: number of ranks (default: 2)")
-    ] = None,
 ) -> None:
     """Train a matcher by the best of several recipes, or a grasp-success gate for `collect`."""
     from retrieval.model.checkpoint import require_writable
 
-    if (cluster and config is None) or (workers is not None and not cluster):
-        raise BadInput("--cluster needs --config, and --workers needs --cluster")
     require_writable(out)
     if task == "grasp-success":
         others = {"recipe": recipe, "model": model, "config": config, "split": split, "init": init, "tracker": tracker}
@@ -81,9 +67,8 @@ def train(
         _train_gate(recording, out, iterations)
     elif config is not None:
         refuse_options("does not apply with --config", recipe=recipe, model=model, task=task != "match")
-        refuse_options("does not apply with --cluster", tracker=cluster and tracker)
         settings = training_config(config, iterations, init=init)
-        _train_with_config(recording, out, settings, split, cluster, workers or 2, tracker)
+        _train_with_config(recording, out, settings, split, _tracked(tracker, out))
     else:
         refuse_options("needs --config", iterations=iterations)
         from retrieval.data.check.recording import check_gel_layout
@@ -135,28 +120,14 @@ def _train_with_config(
     out: Path,
     settings: "Config",
     split: Path | None,
-    cluster: bool,
-    workers: int,
-    tracker: str | None,
+    on_step: "OnStep | None",
 ) -> None:
-    from retrieval.training import distributed
     from retrieval.training.initial_weights import training_licences
     from retrieval.training.trainer import train_matcher
 
-    try:
-        for licence in training_licences(recording, settings.training):
-            say(f"licence of {licence.source}: {licence}")
-        if cluster:
-            from retrieval.cluster.training import train_on_ray
-
-            checkpoint = train_on_ray(recording, out, settings, workers=workers, split=read_split(split))
-        else:
-            on_step = _tracked(tracker, out)
-            checkpoint = train_matcher(recording, out, settings, split=read_split(split), on_step=on_step)
-        if distributed.rank():
-            return
-    finally:
-        distributed.stop()
+    for licence in training_licences(recording, settings.training):
+        say(f"licence of {licence.source}: {licence}")
+    checkpoint = train_matcher(recording, out, settings, split=read_split(split), on_step=on_step)
     accuracy = checkpoint.provenance["metrics"].get("validation_pair_accuracy")
     reached = "" if accuracy is None else f", pair accuracy of validation objects {accuracy:.3f} (chance 0.5)"
     say(f"{out}: best step {checkpoint.provenance['step']}{reached}")

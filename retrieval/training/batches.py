@@ -31,7 +31,6 @@ from retrieval.model.encode import (
     touch_features,
 )
 from retrieval.model.fusion import Matcher
-from retrieval.training import distributed
 from retrieval.training.augmentation import augment_photos, augment_touches
 
 _CHUNK = 64
@@ -41,7 +40,7 @@ _KEEP_BYTES = 4 << 30
 
 @dataclass(frozen=True)
 class LoadedBatch:
-    """A batch with this rank's images, or with the features themselves."""
+    """A batch with its images, or with their features."""
 
     batch: PairBatch
     touches: Tensor
@@ -82,27 +81,27 @@ class BatchImages:
         return grasp.touches + (grasp.backgrounds if self.uses_background else ())
 
 
-class _RankLoader(Dataset[LoadedBatch | RetrievalError]):
-    """Loads this rank's images of a batch, in the processes of a `DataLoader`."""
+class _BatchLoader(Dataset[LoadedBatch | RetrievalError]):
+    """Loads the images of a batch, in the processes of a `DataLoader`."""
 
     def __init__(self, config: Config, images: BatchImages) -> None:
-        self.config, self.images, self.rank = config, images, distributed.rank()
+        self.config, self.images = config, images
 
-    def __getitem__(self, part: tuple[int, PairBatch, list[int], list[int]]) -> LoadedBatch | RetrievalError:
-        """Return the images of the rank's touches and photos, or the error: a `DataLoader` would add a traceback."""
-        step, batch, touch_rows, photo_rows = part
+    def __getitem__(self, numbered: tuple[int, PairBatch]) -> LoadedBatch | RetrievalError:
+        """Return the images of the batch of a step, or the error: a `DataLoader` would add a traceback."""
+        step, batch = numbered
         try:
-            touches = touch_batch([self.images.touch(batch.grasps[row]) for row in touch_rows])
-            photos = to_batch([self.images.photo(batch.photos[row]) for row in photo_rows])
+            touches = touch_batch([self.images.touch(grasp) for grasp in batch.grasps])
+            photos = to_batch([self.images.photo(photo) for photo in batch.photos])
         except RetrievalError as error:
             return error
         if self.config.training.augment:
             seed, views = self.config.training.seed, len(self.config.preprocessing.views)
             # The touches and photos of an object are mirrored together.
             is_mirrored = np.random.default_rng([seed, 5, step]).random(1 + int(batch.photo_objects.max())) < 0.5
-            rng = np.random.default_rng([seed, 6, step, self.rank])
-            touches = augment_touches(touches, is_mirrored[batch.touch_objects[touch_rows]], rng)
-            photos = augment_photos(photos, views, is_mirrored[batch.photo_objects[photo_rows]], rng)
+            rng = np.random.default_rng([seed, 6, step])
+            touches = augment_touches(touches, is_mirrored[batch.touch_objects], rng)
+            photos = augment_photos(photos, views, is_mirrored[batch.photo_objects], rng)
         return LoadedBatch(batch, touches, photos)
 
 
@@ -112,7 +111,7 @@ def _ignore_interruption(worker: int) -> None:
 
 
 class TrainedFeatures:
-    """Features of towers in training: each rank encodes a part of the images and gathers the other parts."""
+    """Features of towers in training."""
 
     step_context = nullcontext  # of a training step: towers use every core
 
@@ -124,12 +123,11 @@ class TrainedFeatures:
         self.images = BatchImages(config.preprocessing, camera, _KEEP_BYTES // max(1, self._workers))
 
     def batches(self, matcher: Matcher, batches: Iterable[tuple[int, PairBatch]]) -> Iterator[LoadedBatch]:
-        """Yield this rank's part of each batch, given with its step; the same parts for any number of workers."""
-        rows = distributed.rank_rows
+        """Yield each batch, given with its step, with its images; the same ones for any number of workers."""
         loader = DataLoader(
-            _RankLoader(self.config, self.images),
+            _BatchLoader(self.config, self.images),
             batch_size=None,
-            sampler=((step, batch, rows(len(batch.grasps)), rows(len(batch.photos))) for step, batch in batches),
+            sampler=batches,
             num_workers=self._workers,
             pin_memory=self.device.type == "cuda",
             worker_init_fn=_ignore_interruption,
@@ -142,11 +140,8 @@ class TrainedFeatures:
 
     def train_features(self, matcher: Matcher, loaded: LoadedBatch) -> tuple[Tensor, Tensor]:
         """Return features of the batch's touches and photos; each distinct image passes through its tower once."""
-        touches, photos = len(loaded.batch.grasps), len(loaded.batch.photos)
         with autocast(self.device, self.config.training.precision):
-            touch = matcher.touch_features(loaded.touches)
-            photo = matcher.photo_features(loaded.photos)
-        return distributed.gather_rows(touch, touches), distributed.gather_rows(photo, photos)
+            return matcher.touch_features(loaded.touches), matcher.photo_features(loaded.photos)
 
     def eval_features(self, matcher: Matcher, grasps: Sequence[Grasp], photos: Sequence[Path]) -> tuple[Tensor, Tensor]:
         """Return features of touches and photos, encoded without gradients."""

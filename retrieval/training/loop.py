@@ -21,7 +21,6 @@ from retrieval.console.progress import Bar
 from retrieval.errors import CheckpointError, JobInterrupted, NumericalError
 from retrieval.model.checkpoint import load_weights, read_tensors, sibling_file, write_tensors
 from retrieval.model.config import SCHEDULES
-from retrieval.training import distributed
 
 Batch = TypeVar("Batch")
 OnStep = Callable[[int, dict[str, float]], object]
@@ -105,8 +104,7 @@ def train_loop(
 
     The weights before the first step are validated, too: a run that starts from good weights never makes them worse.
 
-    With a state file the run continues from it, and the first Ctrl-C ends the run after the current step. All ranks
-    (`retrieval.training.distributed`) must then call this function together.
+    With a state file the run continues from it, and the first Ctrl-C ends the run after the current step.
 
     Args:
         module: All that is trained.
@@ -119,7 +117,7 @@ def train_loop(
         validate: Returns the metrics of `BestStep`, and leaves the module in training mode.
         state: Where an unfinished run is stored; None for a short run.
         step_context: Context of each step.
-        on_step: Called on the first rank.
+        on_step: Called before the first step and after each one, with its number and values.
 
     Raises:
         NumericalError: The loss is not finite; no parameter has changed in this step.
@@ -131,7 +129,7 @@ def train_loop(
         with suppress(CheckpointError) if state.is_replaceable else nullcontext():
             done, best, best_weights = _load(state, module, optimizer)
     is_stopped = False
-    tell: OnStep = on_step if on_step and not distributed.rank() else lambda *_: None
+    tell: OnStep = on_step or (lambda *_: None)
     with (
         interruption() if state else nullcontext(threading.Event()) as stop,
         Bar(title, plan.steps, "steps", done=done, quiet=quiet) as bar,
@@ -157,8 +155,7 @@ def train_loop(
             done += 1
             scores = [f"  best {name.replace('_', ' ')} {score:.3f}" for name, score in best.metrics.items()]
             bar.advance(note="".join([f"loss {value:.3f}", *scores[:1]]))
-            # All ranks must stop after the same step, or the remaining ranks would wait forever.
-            is_stopped = state is not None and distributed.any_rank(stop.is_set(), current.device)
+            is_stopped = stop.is_set()
             values = {"loss": value, "learning_rate": rate}
             if is_stopped or done % plan.validate_every == 0 or done == plan.steps:
                 reached = BestStep(done, validate() if validate else {})
@@ -168,9 +165,7 @@ def train_loop(
                 elif not best.metrics or next(iter(reached.metrics.values())) > next(iter(best.metrics.values())):
                     best, best_weights = reached, _copied(module)
                 if state:
-                    if not distributed.rank():
-                        _save(state, module, optimizer, done, best, best_weights)
-                    distributed.any_rank(False, current.device)  # all ranks wait here until the file is written
+                    _save(state, module, optimizer, done, best, best_weights)
             tell(done, values)
             if is_stopped:
                 break

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor, nn
 
 from _touch_retrieval.registry import code_digest
-from retrieval.console.interruption import interruption
 from retrieval.console.progress import Bar
 from retrieval.data.camera import USUAL_CAMERA, PhotoCamera
 from retrieval.data.check.split import require_fit
@@ -43,7 +42,6 @@ from retrieval.model.fusion import Matcher
 from retrieval.model.losses import LOSSES
 from retrieval.model.losses.loss import EncodedBatch, Loss, match_loss
 from retrieval.model.towers.tower import Tower
-from retrieval.training import distributed
 from retrieval.training.batches import FeatureSource, FrozenFeatures, LoadedBatch, TrainedFeatures
 from retrieval.training.calibration.checkpoint import calibrate_checkpoint
 from retrieval.training.distil import add_candidate_encoder
@@ -82,7 +80,6 @@ def train_matcher(
     usable checkpoint; a second Ctrl-C stops immediately. Arguments and errors are those of `retrieval.train`, whose
     `config` this function takes.
     """
-    distributed.start()
     return prepare_run(folder_of(recording), out, named_config(config)[0], split).run(quiet, on_step=on_step)
 
 
@@ -164,8 +161,6 @@ class Trainer:
             else TrainedFeatures(config, self.device, camera)
         )
         set_training_mode(self.matcher, settings)
-        for tower in (self.matcher.touch_tower, self.matcher.photo_tower):
-            distributed.synchronise_batch_norm(tower, self.device)
         towers = [module for module in self.matcher.modules() if isinstance(module, Tower)]
         self.provenance = {
             **provenance,
@@ -197,7 +192,6 @@ class Trainer:
             JobInterrupted: After Ctrl-C.
         """
         settings, touches = self.config.training, self.config.training.touches_per_batch
-        quiet = quiet or distributed.rank() > 0
         made_from = {name: self.provenance.get(name) for name in _MADE_FROM}
         identity = {"config": self.config.to_dict(), "split": self.split.to_dict(), **made_from}
         state, interrupted = StateFile(state_path(self.out), identity, is_replaceable=replace), None
@@ -209,7 +203,7 @@ class Trainer:
                 lambda steps: self.features.batches(
                     self.matcher, ((step, self.sampler.batch(step, touches)) for step in steps)
                 ),
-                distributed.averaging_gradients(self.modules, self.loss),
+                self.loss,
                 title="training",
                 quiet=quiet,
                 validate=self.validate,
@@ -219,31 +213,28 @@ class Trainer:
             )
         except TrainingInterrupted as stopped:
             best, interrupted = stopped.best, f"{stopped} {self.out} can already rank photos."
-        if not distributed.rank():
-            made = Checkpoint(
-                self.out,
-                digest="",
-                config=self.config.without_candidate_encoder(),
-                provenance={"step": best.step, **self.provenance, "metrics": best.metrics},
-                matcher=self.matcher.eval(),
-                split=self.split,
+        made = Checkpoint(
+            self.out,
+            digest="",
+            config=self.config.without_candidate_encoder(),
+            provenance={"step": best.step, **self.provenance, "metrics": best.metrics},
+            matcher=self.matcher.eval(),
+            split=self.split,
+        )
+        try:
+            store_checkpoint(made, self.out)
+            if not interrupted:
+                with Bar("calibrating", 1, "model", quiet=quiet) as bar:
+                    store_checkpoint(self._completed(made, quiet), self.out)
+                    bar.advance()
+                state.path.unlink()
+        except KeyboardInterrupt:
+            interrupted = (
+                f"Stopped before the last parts were fitted. {self.out} can already rank photos; run the same "
+                "command to add these parts."
             )
-            try:
-                store_checkpoint(made, self.out)
-                if not interrupted:
-                    with Bar("calibrating", 1, "model", quiet=quiet) as bar:
-                        store_checkpoint(self._completed(made, quiet), self.out)
-                        bar.advance()
-                    state.path.unlink()
-            except KeyboardInterrupt:
-                interrupted = (
-                    f"Stopped before the last parts were fitted. {self.out} can already rank photos; run the same "
-                    "command to add these parts."
-                )
-        with interruption():
-            is_interrupted = distributed.any_rank(bool(interrupted), self.device)  # wait until the files exist
-        if is_interrupted:
-            raise JobInterrupted(interrupted or "Stopped by another rank; run the same command to continue.")
+        if interrupted:
+            raise JobInterrupted(interrupted)
         return load_checkpoint(self.out)
 
     def run_or_reuse(self, quiet: bool, *, on_step: OnStep | None = None) -> Checkpoint:
