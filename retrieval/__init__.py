@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from retrieval.search.answer import QueryResult as QueryResult
     from retrieval.search.answer import Verification as Verification
     from retrieval.search.searcher import Searcher as Searcher
-    from retrieval.search.searcher import enrol as enrol
     from retrieval.serve.client import Client as Client
     from retrieval.training.recipes.recipe import Recipe as Recipe
     from retrieval.training.train import train as train
@@ -76,7 +75,6 @@ _MODULES = {
     "check_recording": "data.check.recording:check_recording",
     "encode_photos": "model.encode:encode_photos",
     "encode_touches": "model.encode:encode_touches",
-    "enrol": "search.searcher:enrol",
     "evaluate": "evaluation.evaluate:evaluate",
     "load_checkpoint": "model.checkpoint:load_checkpoint",
     "load_config": "model.config:load_config",

@@ -24,7 +24,7 @@ from retrieval.errors import RetrievalError
 from retrieval.indexing.build import build_index
 from retrieval.indexing.enrolled import EnrolledTable, remove_enrolled
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.search.searcher import Searcher, enrol
+from retrieval.search.searcher import Searcher
 
 FULL_DISK_BYTES = (100, 600, 3000)
 
@@ -34,6 +34,11 @@ def in_child(work, *arguments):
     if child := os.fork():
         return child
     os._exit(work(*arguments) or 0)
+
+
+def enrol(index, *words, **options):
+    with Searcher.open(index) as searcher:
+        return searcher.enrol(*words, **options)
 
 
 def limit_files(size=resource.RLIM_INFINITY):

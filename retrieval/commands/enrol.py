@@ -59,16 +59,15 @@ def enrol(
         return 0
     if not gelsight:
         raise BadInput("give the gel images of each grasp with --gelsight, or --remove")
-    from retrieval.search.searcher import enrol as enrol_touches
+    from retrieval.search.searcher import Searcher
 
-    enrolled = enrol_touches(
-        path,
-        name,
-        [[Path(image) for image in grasp] for grasp in gelsight],
-        opening_mm=opening or None,
-        background=None if background is None else [Path(image) for image in background],
-        model=model,
-    )
+    with Searcher.open(path, model=model) as searcher:
+        enrolled = searcher.enrol(
+            name,
+            [[Path(image) for image in grasp] for grasp in gelsight],
+            opening_mm=opening or None,
+            background=None if background is None else [Path(image) for image in background],
+        )
     if json:
         print_json(enrolled._asdict())
     else:

@@ -9,12 +9,12 @@ import io
 import struct
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image, UnidentifiedImageError, features
+from PIL import Image, ImageOps, UnidentifiedImageError, features
 
 from _touch_retrieval.files import read_regular
 from retrieval.data.picture_structure import check_structure
@@ -36,7 +36,7 @@ MAX_BYTES = 512 * 2**20
 
 _EIGHT_BIT_MODES = frozenset({"1", "L", "P", "RGB", "RGBX", "CMYK", "YCbCr", "LA", "PA", "RGBA", "RGBa"})
 _STRIP = 1 << 20  # pixels
-_ORIENTATION, _BITS, _PHOTOMETRIC = 274, 258, 262
+_BITS, _PHOTOMETRIC = 258, 262
 
 # Pillow warns of sizes and damaged metadata. Filters belong to the process: a thread must not change them for a while.
 warnings.filterwarnings("ignore", module="PIL|pillow_heif")
@@ -88,9 +88,8 @@ def decode(data: bytes, name: str | Path, min_side: int | None = None) -> Sample
     with _image_errors(name), _open_image(data, name) as image:
         _apply_draft_mode(image, min_side)
         check_pixels(image.size, name)
-        image.load()
-        samples = _deep_grey(image, name) if image.mode.startswith("I;16") else _eight_bit_rgb(image, name)
-        return _apply_orientation(samples, _orientation(image))
+        _load_upright(image)
+        return _deep_grey(image, name) if image.mode.startswith("I;16") else _eight_bit_rgb(image, name)
 
 
 def picture_size(data: bytes, name: str | Path) -> tuple[int, int]:
@@ -110,8 +109,15 @@ def pillow_rgb(image: Image.Image, name: str | Path) -> RgbImage:
     """
     with _image_errors(name):
         check_pixels(image.size, name)
-        image.load()
-        return to_float(_apply_orientation(_eight_bit_rgb(image, name), _orientation(image)))
+        _load_upright(image)
+        return to_float(_eight_bit_rgb(image, name))
+
+
+def _load_upright(image: Image.Image) -> None:
+    """Decode the pixels, and apply the EXIF orientation."""
+    image.load()
+    with suppress(Exception):  # damaged EXIF data: the pixels are still usable
+        ImageOps.exif_transpose(image, in_place=True)
 
 
 @contextmanager
@@ -271,23 +277,3 @@ def _deep_grey(image: Image.Image, name: str | Path) -> RgbImage:
 def _on_white(rgb: RgbImage, alpha: npt.NDArray[np.float32]) -> RgbImage:
     """Composite on white: `rgb` (H, W, 3), `alpha` (H, W, 1), all in 0..1."""
     return rgb * alpha + (1 - alpha)
-
-
-def _orientation(image: Image.Image) -> int:
-    """Return the EXIF orientation 1..8 to apply; 1 for TIFF files, since both decoders apply theirs."""
-    if image.format == "TIFF":
-        return 1
-    try:
-        value = image.getexif().get(_ORIENTATION, 1)
-    except Exception:  # the pixels are still usable
-        return 1
-    return value if isinstance(value, int) and 1 <= value <= 8 else 1
-
-
-def _apply_orientation(image: Samples, orientation: int) -> Samples:
-    """Undo an EXIF orientation: 5..8 swap the axes, then rows (3, 4, 7, 8) and columns (2, 3, 6, 7) are reversed."""
-    if orientation >= 5:
-        image = image.swapaxes(0, 1)
-    rows = -1 if orientation in (3, 4, 7, 8) else 1
-    columns = -1 if orientation in (2, 3, 6, 7) else 1
-    return np.ascontiguousarray(image[::rows, ::columns])  # type: ignore[return-value]

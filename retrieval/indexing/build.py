@@ -29,7 +29,7 @@ from retrieval.indexing.contents import IndexContents, read_contents
 from retrieval.indexing.report import BuildReport
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.checkpoint_info import fingerprint
-from retrieval.model.fusion_scorer import CELLS, PARTIALS, StoredPartials, largest_rounding
+from retrieval.model.fusion_scorer import CELLS, StoredPartials
 from retrieval.model.references import REFERENCE_ROWS
 from retrieval.version import __version__
 
@@ -233,7 +233,7 @@ def _write(
 
     def measure(index: VectorIndex, arrays: Arrays) -> dict[str, Any]:
         candidates = kept or measure_candidates(checkpoint, index, StoredPartials(arrays), quiet=options.quiet)
-        return {"candidates": candidates, "partial_error": largest_rounding(arrays[PARTIALS])}
+        return {"candidates": candidates}
 
     touches = query_codes(checkpoint, RECALL_QUERIES)
     manifest = store.write(
@@ -317,7 +317,6 @@ def _report(
         reason=" ".join(filter(None, (why, candidates_sentence(candidates, len(rows))))),
         recall=manifest.recall,
         candidates=candidates,
-        partial_error=manifest.about["partial_error"],
         cells=options.cells,
         references=contents.references.report,
     )

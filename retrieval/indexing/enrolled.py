@@ -204,8 +204,9 @@ def remove_enrolled(index: str | Path, object_id: str, *, pictures: Collection[s
         BadInput: No touch of the object is enrolled.
         IndexesError: The table is damaged or cannot be written.
 
-    >>> retrieval.enrol("index", "cup", ["a.png", "b.png"]).touches
-    1
+    >>> with retrieval.open("index") as searcher:
+    ...     searcher.enrol("cup", ["a.png", "b.png"])
+    Enrolment(object_id='cup', touches=1, added=1)
     >>> retrieval.remove_enrolled("index", "cup")
     ('cup', 1)
     """

@@ -32,7 +32,6 @@ class BuildReport:
         reason: What changed since the previous index, and the number of candidates.
         recall: Measured recall and time of the vector index.
         candidates: Measured number of candidates; None if the checkpoint stores no touches to measure with.
-        partial_error: Largest possible rounding error of a stored partial activation.
         cells: Whether the index stores the cells of photos, for late interaction; None for a model without cells.
         shards: Shards of a sharded index, as in its manifest (`indexes.store.sharded`); None for an index folder.
         references: Numbers of reference touches (`touches`), their objects (`objects`), objects without photos
@@ -63,7 +62,6 @@ class BuildReport:
     reason: str
     recall: Any
     candidates: dict[str, Any] | None
-    partial_error: float
     cells: bool | None
     shards: list[dict[str, Any]] | None = None
     references: dict[str, Any] | None = None

@@ -186,7 +186,6 @@ def _report(
         reason=f"{len(reports)} shards; for {same} of them: {reason}",
         recall=min((report.recall for report in reports), key=lambda recall: recall["value"]),
         candidates=None,
-        partial_error=max(report.partial_error for report in reports),
         references=sums if references else None,
     )
 
@@ -205,7 +204,6 @@ def _manifest(
         "checkpoint": str(checkpoint.path.resolve()),
         "catalogue": catalogue.where,
         "objects_from": report.objects_from,
-        "partial_error": report.partial_error,
         CELLS: report.cells,
     }
     if report.references is not None:

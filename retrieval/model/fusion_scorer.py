@@ -63,11 +63,6 @@ def to_stored(partials: NDArray[np.float32], pooled_width: int) -> dict[str, NDA
     return arrays
 
 
-def largest_rounding(partials: NDArray[np.float16]) -> float:
-    """Return the largest possible rounding error of stored partial activations (N, pooled): half a last place."""
-    return max(float(partials.max()), -float(partials.min())) * 2.0**-11
-
-
 Partials = NDArray[np.floating[Any]] | StoredPartials
 
 

@@ -59,18 +59,6 @@ class Enrolment(NamedTuple):
     added: int
 
 
-_MATCH_FIELDS = (
-    "rank",
-    "object_id",
-    "logit",
-    "probability",
-    "probability_if_present",
-    "photo",
-    "photo_digest",
-    "metadata",
-)
-
-
 @dataclass(frozen=True)
 class Match:
     """One object of a ranking, with its best photo.
@@ -114,8 +102,9 @@ class Match:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a plain dictionary for JSON, without the absolute path: the document names the catalogue once."""
-        document = {name: getattr(self, name) for name in _MATCH_FIELDS}
-        return document if self.reference is None else {**document, "reference": asdict(self.reference)}
+        document = asdict(self)
+        left_out = {"photo_path", *(["reference"] if self.reference is None else [])}
+        return {name: value for name, value in document.items() if name not in left_out}
 
 
 @dataclass(frozen=True)

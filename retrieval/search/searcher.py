@@ -338,6 +338,12 @@ class Searcher:
                 already, or the name or an opening is invalid.
             ImageError: An image cannot be read.
             IndexesError: The table of enrolled touches is damaged or cannot be written.
+
+        >>> with retrieval.open("index") as searcher:
+        ...     searcher.enrol("spoon", ["a.png", "b.png"], opening_mm=12.5)
+        Enrolment(object_id='spoon', touches=1, added=1)
+        >>> retrieval.remove_enrolled("index", "spoon")
+        ('spoon', 1)
         """
         opened, stored = self._snapshot(), self.checkpoint
         name, fingers = opened.enrolled_name(object_id), opened.reader.fingers
@@ -496,34 +502,6 @@ class Searcher:
             more_grasps=more_grasps,
             opening_mm=openings_mm if has_openings else None,
         )
-
-
-def enrol(
-    index: str | Path,
-    object_id: str,
-    touches: AnyTouches,
-    *,
-    opening_mm: Openings = None,
-    background: Sequence[AnyImage] | None = None,
-    model: str | Path | None = None,
-) -> Enrolment:
-    """Remember touches of an object in an index, as `Searcher.enrol` of an opened one.
-
-    Args:
-        index: Folder of the index.
-        object_id: As for `Searcher.enrol`; so are `touches`, `opening_mm`, `background` and the errors.
-        touches: Grasps.
-        opening_mm: Openings of the jaws.
-        background: No-contact frames.
-        model: Path of the checkpoint, if it was moved.
-
-    >>> retrieval.enrol("index", "spoon", ["a.png", "b.png"], opening_mm=12.5)
-    Enrolment(object_id='spoon', touches=1, added=1)
-    >>> retrieval.remove_enrolled("index", "spoon")
-    ('spoon', 1)
-    """
-    with Searcher.open(index, model=model) as searcher:
-        return searcher.enrol(object_id, touches, opening_mm=opening_mm, background=background)
 
 
 def _fault(classes: Iterable[str]) -> str | None:

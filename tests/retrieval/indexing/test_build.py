@@ -385,12 +385,12 @@ def test_a_second_writer_raises(catalogue_copy, checkpoint, index, embedded):
     assert embedded == []
 
 
-def test_the_error_of_float16_partials_is_within_the_reported_bound(catalogue_copy, checkpoint, index):
-    report = build_index(catalogue_copy, checkpoint, index, quiet=True)
+def test_stored_partials_are_those_of_the_model_to_half_a_last_place_of_float16(catalogue_copy, checkpoint, index):
+    build_index(catalogue_copy, checkpoint, index, quiet=True)
     generation = IndexStore(index).open()
     images = [checkpoint.config.preprocessing.load_photo(catalogue_copy / row.path) for row in generation.rows]
     exact = encode_photos(checkpoint.matcher, images).partial.numpy()
     stored = np.asarray(generation.arrays["partials"])
     assert stored.dtype == STORED
-    assert np.abs(stored - exact).max() <= report.partial_error + 1e-5  # in other batches of the tower
-    assert report.partial_error == pytest.approx(2**-11 * np.abs(exact).max(), rel=1e-2)
+    half_a_last_place = 2**-11 * np.abs(exact).max()
+    assert np.abs(stored - exact).max() <= half_a_last_place + 1e-5  # in other batches of the tower

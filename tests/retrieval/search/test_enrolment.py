@@ -27,6 +27,11 @@ OTHER = Posterior(0.8)
 KILLS = os.environ.get("ENROLMENT_KILLS", "20")
 
 
+def enrol(index, *words, **options):
+    with Searcher.open(index) as searcher:
+        return searcher.enrol(*words, **options)
+
+
 @pytest.fixture
 def model(tmp_path):
     return write_reference_model(tmp_path / "model.safetensors", verification=calibration(-1e3, -2e3))
@@ -41,7 +46,7 @@ def index(catalogue, model, tmp_path):
 def test_an_opened_searcher_finds_an_object_that_was_enrolled_in_the_meantime(index, touches):
     with Searcher.open(index) as searcher:
         before = searcher.query(touches[NAMES[0]][0], top=99)
-        assert retrieval.enrol(index, "a cup", touches[NAMES[0]][0], opening_mm=30) == ("a cup", 1, 1)
+        assert enrol(index, "a cup", touches[NAMES[0]][0], opening_mm=30) == ("a cup", 1, 1)
         after = searcher.query(touches[NAMES[0]][0], top=99)
         assert len(after.results) == len(before.results) + 1 == after.index["objects"]
         cup = next(match for match in after.results if match.object_id == "a cup")
@@ -59,7 +64,7 @@ def test_an_opened_searcher_finds_an_object_that_was_enrolled_in_the_meantime(in
 
 def test_an_enrolled_object_is_one_object_with_a_folder_that_macos_names(catalogue_copy, model, tmp_path, touches):
     build_index(catalogue_copy, model, tmp_path / "index", quiet=True)
-    retrieval.enrol(tmp_path / "index", "T\u00fclle", touches[NAMES[0]][0])
+    enrol(tmp_path / "index", "T\u00fclle", touches[NAMES[0]][0])
     (catalogue_copy / NAMES[0]).rename(catalogue_copy / "Tu\u0308lle")
     build_index(catalogue_copy, model, tmp_path / "index", quiet=True)
     with Searcher.open(tmp_path / "index") as searcher:
@@ -69,7 +74,7 @@ def test_an_enrolled_object_is_one_object_with_a_folder_that_macos_names(catalog
 
 def test_a_picture_that_the_table_names_is_not_opened_for_writing_again(index, touches):
     """As the no-contact frame of several touches: a full disk would leave half of it."""
-    retrieval.enrol(index, "cup", touches[NAMES[0]][0])
+    enrol(index, "cup", touches[NAMES[0]][0])
     table = EnrolledTable(index)
     with table.lock() as known:
         picture = index / known[0].path
@@ -103,7 +108,7 @@ def test_enrolled_touches_count_like_the_same_touches_in_the_catalogue(
 
 def test_what_cannot_be_a_reference_touch_is_refused(index, touches, catalogue, tmp_path):
     grasp, other = touches[NAMES[0]][:2]
-    assert retrieval.enrol(index, f" {NAMES[0]}", grasp).object_id == NAMES[0]
+    assert enrol(index, f" {NAMES[0]}", grasp).object_id == NAMES[0]
     for name, images, options, reason in (
         ("tin", grasp, {}, f"is enrolled already, for {NAMES[0]}"),
         ("tin", [grasp, other], {"opening_mm": 5}, "one opening for each grasp"),
@@ -111,11 +116,11 @@ def test_what_cannot_be_a_reference_touch_is_refused(index, touches, catalogue, 
         (" \n", other, {}, "must be printable text"),
     ):
         with pytest.raises(BadInput, match=reason):
-            retrieval.enrol(index, name, images, **options)
+            enrol(index, name, images, **options)
     plain = write_reference_model(tmp_path / "plain.safetensors", references=None)
     build_index(catalogue, plain, tmp_path / "plain", quiet=True)
     with pytest.raises(BadInput, match="no calibration of reference touches"):
-        retrieval.enrol(tmp_path / "plain", "tin", grasp)
+        enrol(tmp_path / "plain", "tin", grasp)
     assert [touch.object_id for touch in EnrolledTable(index).read()] == [NAMES[0]]
 
 

@@ -34,7 +34,8 @@ def test_an_enrolled_object_is_found_and_shown_until_its_touches_are_removed(kno
     with with_history(known, tmp_path, serve=listening) as (url, _), httpx.Client(base_url=url) as client:
         before = client.post("/v1/query", json=body(second)).json()["results"]
         assert client.post(PATH, json=body(first, opening_mm=[30])).json()["touches"] == 1
-        retrieval.enrol(known, NEW, other)  # as another process does
+        with retrieval.open(known) as searcher:
+            searcher.enrol(NEW, other)  # as another process does
         made = client.post(PATH, json=body(second))
         assert (made.status_code, made.json()["object_id"], made.json()["touches"]) == (201, NEW, 3)
         about = client.get("/v1/index").json()
