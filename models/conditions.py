@@ -20,7 +20,7 @@ import torch
 from models.photography import CONDITIONS
 from models.pictures import LabelledPicture, collect_pictures
 from models.recognition import all_scores, interval, photo_partials, top1
-from retrieval.data.camera import assumed_camera, sample
+from retrieval.data.camera import assumed_camera
 from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.data.views import FIELD_MM
 from retrieval.metrics.intervals import summarise
@@ -71,7 +71,7 @@ def measures(
     for condition, how in CONDITIONS.items():
         shown = [photo for photo in photos if photo.name.rpartition("-")[0] == condition and photo.object_id in names]
         owner = np.array([names.index(photo.object_id) for photo in shown])
-        assumed = assumed_camera(sample((photo.object_id, photo.file) for photo in shown))
+        assumed = assumed_camera((photo.object_id, photo.file, ()) for photo in shown)
         cameras = {condition: assumed}
         if abs(math.log(how.camera.field_mm / FIELD_MM)) > OTHER_FIELD:
             cameras[f"{condition}, its field stated"] = assumed._replace(field_mm=how.camera.field_mm)

@@ -6,27 +6,25 @@ together appear half as large as usual, the photos probably show twice as much.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from functools import cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from retrieval.data.images import decode, read_bytes
 from retrieval.data.object_finder import INPUT_PX, find_object
-from retrieval.data.object_finder import NETWORK as OBJECT_FINDER
-from retrieval.data.upright import NETWORK as UPRIGHT
 from retrieval.data.upright import RollEstimator, probable_roll
 from retrieval.data.views import FIELD_MM
 from retrieval.errors import DatasetError, ImageError
 
-T = TypeVar("T")
 USUAL_SIZE = 0.32
 """Median root of the visible area of objects, relative to the shorter side, in photos of the field `FIELD_MM`."""
 FEWEST, SAMPLE = 20, 64
 """Least and largest number of objects from whose photos a camera is estimated."""
-NETWORKS = OBJECT_FINDER, UPRIGHT
-"""Files of the networks that look at the photos."""
 _STEPS, _LEAST_STEPS = 4, 2
 """Steps in which the field doubles: it stays the same when the catalogue grows. A difference of one is ignored."""
 
@@ -89,40 +87,63 @@ def unusual(assumed: PhotoCamera) -> list[str]:
     return found
 
 
-def sample(photos: Iterable[tuple[str, T]]) -> list[T]:
-    """Return the photos that show the camera, from pairs (object, photo): one of each object, of SAMPLE at most.
+class _Look(NamedTuple):
+    """What one photo suggests: the relative size of its object, and the probabilities of its roll."""
 
-    Fewer than FEWEST objects show no camera.
-    """
-    firsts: dict[str, T] = {}
-    for name, photo in photos:
-        firsts.setdefault(name, photo)
-    return list(firsts.values())[:: math.ceil(len(firsts) / SAMPLE)] if len(firsts) >= FEWEST else []
+    size: float
+    rolls: NDArray[np.float64]
 
 
-def assumed_camera(files: Sequence[Path], stated: Set[str] = frozenset()) -> PhotoCamera:
-    """Return the camera to assume for photos; USUAL_CAMERA unless they agree on another one.
+def assumed_camera(
+    photos: Iterable[tuple[str, Path, Collection[str]]], before: PhotoCamera = USUAL_CAMERA
+) -> PhotoCamera:
+    """Return the camera to assume where it is not stated: what the photos that do not state it agree on.
 
     Args:
-        files: The photos of a `sample`.
-        stated: Those of CAMERA_KEYS that are stated for all photos; these values stay the usual ones.
+        photos: Object, file, and keys of CAMERA_KEYS that are stated, of each photo.
+        before: What was assumed until now. It stays if fewer than FEWEST objects show the camera.
     """
-    if not files or stated >= CAMERA_KEYS:
-        return USUAL_CAMERA
-    estimator, sizes, rolls = RollEstimator(), [], []
-    for path in files:
-        try:
-            photo = decode(read_bytes(path), path, 2 * INPUT_PX)
-        except ImageError:  # reported when the photo is encoded
-            continue
-        height, width = photo.shape[:2]
-        found = find_object(photo)
-        if found.area < height * width:
-            sizes.append(math.sqrt(found.area) / min(height, width))
-            rolls.append(estimator.probabilities(photo, found))
-    if len(sizes) < FEWEST:
-        return USUAL_CAMERA
-    steps = round(_STEPS * math.log2(USUAL_SIZE / float(np.median(sizes))))
-    factor = 2 ** (steps / _STEPS) if abs(steps) >= _LEAST_STEPS else 1
-    camera = PhotoCamera(FIELD_MM * factor, probable_roll(np.mean(rolls, axis=0)))
-    return camera._replace(**{key: getattr(USUAL_CAMERA, key) for key in stated})
+    listed, look = list(photos), cache(partial(_look, RollEstimator()))
+    found = {}
+    for key, estimate in (("field_mm", _field_mm), ("roll_deg", _roll_deg)):
+        files = defaultdict[str, list[Path]](list)
+        for name, file, stated in listed:
+            if key not in stated:
+                files[name].append(file)
+        looks = _looks(files, look)
+        if len(looks) >= FEWEST:
+            found[key] = estimate(looks)
+        elif files:
+            found[key] = getattr(before, key)
+    return USUAL_CAMERA._replace(**found)
+
+
+def _looks(files: Mapping[str, Sequence[Path]], look: Callable[[Path], _Look | None]) -> list[_Look]:
+    """Return a look at the first photo with a found object, of SAMPLE objects at most; none of too few objects."""
+    if len(files) < FEWEST:
+        return []
+    chosen = list(files.values())[:: math.ceil(len(files) / SAMPLE)]
+    looks = (next(filter(None, map(look, of_object)), None) for of_object in chosen)
+    return [each for each in looks if each is not None]
+
+
+def _look(estimator: RollEstimator, path: Path) -> _Look | None:
+    """Look at a photo; None if it cannot be read, which is reported when it is encoded, or shows no object."""
+    try:
+        photo = decode(read_bytes(path), path, 2 * INPUT_PX)
+    except ImageError:
+        return None
+    height, width = photo.shape[:2]
+    found = find_object(photo)
+    if found.area >= height * width:
+        return None
+    return _Look(math.sqrt(found.area) / min(height, width), estimator.probabilities(photo, found))
+
+
+def _field_mm(looks: Sequence[_Look]) -> float:
+    steps = round(_STEPS * math.log2(USUAL_SIZE / float(np.median([look.size for look in looks]))))
+    return FIELD_MM * (2 ** (steps / _STEPS) if abs(steps) >= _LEAST_STEPS else 1)
+
+
+def _roll_deg(looks: Sequence[_Look]) -> float:
+    return probable_roll(np.mean([look.rolls for look in looks], axis=0))

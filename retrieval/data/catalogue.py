@@ -46,8 +46,8 @@ from retrieval.errors import BadInput, DatasetError
 METADATA_FILE = "metadata.jsonl"
 _ALL_PHOTOS = ""
 """Name of the object whose metadata are those of all photos."""
-ENROLLED = "enrolled"
-"""Folder in an index with the pictures of enrolled touches; in a catalogue around the index they are no photos."""
+_OWN_FILES = frozenset({"CURRENT", "SHARDS.json", "history.sqlite"})
+"""Files in the folder of an index, of a sharded index, and of the history of a service. Its pictures are no photos."""
 UNSUPPORTED_EXTENSIONS = frozenset(
     {".arw", ".cr2", ".cr3", ".dng", ".gif", ".jp2", ".jxl", ".nef", ".orf", ".raf", ".rw2", ".svg", ".tga"}
 )
@@ -137,11 +137,11 @@ class Catalogue:
 
 
 def require_separate_folders(catalogue: str | Path, index: str | Path) -> None:
-    """Raise BadInput if the index folder is the catalogue folder, or a folder below it that contains photos."""
+    """Raise BadInput if the index folder is the catalogue folder, or a folder of photos below it."""
     root, target = Path(catalogue).resolve(), Path(index).resolve()
-    inside = (path for path in target.rglob("*") if target / ENROLLED not in path.parents)
-    has_photos = root in target.parents and any(path.suffix.lower() in EXTENSIONS for path in inside)
-    if target == root or has_photos:
+    is_new = not any((target / name).exists() for name in _OWN_FILES)
+    has_photos = any(path.suffix.lower() in EXTENSIONS for path in target.rglob("*"))
+    if target == root or (root in target.parents and is_new and has_photos):
         raise BadInput(f"the index would be written among the photos in {index}; name another folder with --out")
 
 
@@ -250,8 +250,7 @@ def _notes_on_files(catalogue: Catalogue, names: Sequence[str], system: Sequence
     if system:
         yield f"{len(system)} file(s) or folder(s) of the system left out: {abbreviate_list(system, MAX_EXAMPLES)}"
     used, folders = _folders(catalogue.paths), _folders(names)
-    indexes = {name.rpartition("/")[0] for name in names if name.endswith(("/CURRENT", "/SHARDS.json"))}
-    if empty := sorted(folder for folder in folders - used - indexes if str(PurePosixPath(folder).parent) in used):
+    if empty := sorted(folder for folder in folders - used if str(PurePosixPath(folder).parent) in used):
         yield f"no picture in {len(empty)} folder(s) that contain files: {abbreviate_list(empty, MAX_EXAMPLES)}"
     if tables := [name for name in catalogue.ignored if PurePosixPath(name).suffix.lower() in _TABLES]:
         yield (
@@ -282,11 +281,10 @@ def _list_files(folder: Path) -> tuple[list[str], list[SkippedPhoto], list[str]]
             entries = sorted(os.scandir(place), key=attrgetter("name"))
         except OSError as error:
             raise DatasetError(f"cannot list the catalogue folder {place}: {error.strerror}") from error
-        is_index = any(entry.name in ("CURRENT", "SHARDS.json") for entry in entries)
+        if prefix and any(entry.name in _OWN_FILES for entry in entries):
+            return
         for entry in entries:
             path = prefix + entry.name
-            if is_index and entry.name == ENROLLED:
-                continue
             if is_system_name(entry.name):
                 if not entry.name.startswith("."):
                     system.append(path)
@@ -350,7 +348,7 @@ def _read_metadata(file: Path, naming: Naming) -> tuple[dict[str, dict[str, Any]
             name, is_photo, metadata = _parse_line(line, naming)
             name, table = lookup_key(name), by_photo if is_photo else by_object
             if name in table:
-                raise ValueError(f"{name} has two lines; merge them")
+                raise ValueError(f"{f'{name} has' if name else 'all photos have'} two lines; merge them")
         except msgspec.DecodeError as error:
             raise DatasetError(f"{file}, line {number}: must be one JSON object a line, no NaN: {error}") from error
         except ValueError as error:
@@ -369,7 +367,8 @@ def _parse_line(line: str, naming: Naming) -> tuple[str, bool, dict[str, Any]]:
     keys = [key for key in ("file_name", "object_id") if key in row]
     if not keys:
         raise ValueError(
-            f"must name a photo (file_name) or an object (object_id); it has {', '.join(row) or 'nothing'}"
+            "must name a photo (file_name) or an object (object_id), or have no other keys than "
+            f"{' and '.join(sorted(CAMERA_KEYS))}, for all photos; it has {', '.join(row) or 'nothing'}"
         )
     if bad := [key for key in keys if not isinstance(row[key], str) or not row[key]]:
         raise ValueError(f"{bad[0]} must be a non-empty string, got {row[bad[0]]!r}")

@@ -18,7 +18,6 @@ from retrieval.data.camera import (
     PhotoCamera,
     assumed_camera,
     require_camera,
-    sample,
     stated_camera,
     stated_keys,
     unusual,
@@ -241,8 +240,7 @@ def recording_camera(folder: Path, grasps: Sequence[Grasp], settings: Preprocess
     if not settings.finds_object:
         return USUAL_CAMERA
     stated = stated_by_recording(folder)
-    photos = sample((grasp.object_id, photo) for grasp in grasps for photo in grasp.photos)
-    assumed = assumed_camera(photos, stated.keys())
+    assumed = assumed_camera((grasp.object_id, photo, stated) for grasp in grasps for photo in grasp.photos)
     for sentence in unusual(assumed):
         log.warning("%s. If that is wrong, state it in %s", sentence, folder / INFO_FILE)
     return stated_camera(stated, assumed)

@@ -84,6 +84,18 @@ class Naming:
         return re.compile(pattern.replace(again, f"(?P<{OBJECT}>[^/]+)", 1))
 
 
+def same_name_warnings(objects: Iterable[str]) -> list[str]:
+    """Return a warning if names of objects are nearly the same."""
+    names = sorted(set(objects))
+    keys = Counter(map(same_object_key, names))
+    if same := [name for name in names if keys[same_object_key(name)] > 1]:
+        return [
+            f"the names of {len(same)} objects differ only by case, spaces or the form of their characters: "
+            f"{_some(list(map(repr, same)))}; they are searched as different objects: rename those that are one"
+        ]
+    return []
+
+
 def naming_warnings(photos: Iterable[tuple[str, str]], naming: Naming) -> list[str]:
     """Return a warning sentence for each suspicious property of the objects of photos, given as (object, path)."""
     paths: dict[str, list[str]] = defaultdict(list)
@@ -97,12 +109,6 @@ def naming_warnings(photos: Iterable[tuple[str, str]], naming: Naming) -> list[s
         warnings.append(
             f"{_some(generic)} {'is' if len(generic) == 1 else 'are'} used as the name of an object, with "
             f"{sum(len(paths[name]) for name in generic)} photo(s): {remedy}"
-        )
-    keys = Counter(map(same_object_key, names))
-    if same := [name for name in names if keys[same_object_key(name)] > 1]:
-        warnings.append(
-            f"the names of {len(same)} objects differ only by case, spaces or the form of their characters: "
-            f"{_some(list(map(repr, same)))}; they are searched as different objects: rename those that are one"
         )
     if naming.text == FOLDER and (inner := _object_folders(paths)):
         warnings.append(

@@ -19,18 +19,20 @@ from indexes.store.generation import Arrays
 from indexes.store.manifest import Manifest, read_manifest
 from indexes.store.rows import TEXT, Row, encode_rows
 from retrieval.console.output import abbreviate_list
-from retrieval.data.camera import PhotoCamera, unusual
+from retrieval.data.camera import USUAL_CAMERA, PhotoCamera, assumed_camera, stated_keys, unusual
 from retrieval.data.catalogue import METADATA_FILE, Catalogue, list_catalogue
-from retrieval.data.naming import FOLDER, MAX_EXAMPLES, Naming, naming_warnings
+from retrieval.data.naming import FOLDER, MAX_EXAMPLES, Naming, naming_warnings, same_name_warnings
 from retrieval.errors import BadInput
 from retrieval.indexing.candidates import candidates_sentence, kept_measurement, measure_candidates, query_codes
 from retrieval.indexing.codes import encode_enrolled
 from retrieval.indexing.contents import IndexContents, read_contents
+from retrieval.indexing.enrolled import EnrolledTable
 from retrieval.indexing.report import BuildReport
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.checkpoint_info import fingerprint
 from retrieval.model.fusion_scorer import CELLS, StoredPartials
 from retrieval.model.references import REFERENCE_ROWS
+from retrieval.model.towers import NO_TOWER
 from retrieval.version import __version__
 
 PARTS = {"checkpoint": "model", "preprocessing": "preprocessing of photos"}
@@ -90,12 +92,13 @@ def build_index(
         before, previous = {}, None
     options, note = build_options(checkpoint, before, objects_from=objects_from, kind=kind, cells=cells, quiet=quiet)
     catalogue = list_catalogue(folder, options.naming)
+    options = replace(options, camera=catalogue_camera(catalogue, checkpoint, before))
     with store.lock():
         enrolled = encode_enrolled(store.path, checkpoint, options.cells)
         report = build_listed(catalogue, checkpoint, store, options)
         encode_enrolled(store.path, checkpoint, options.cells, previous)
     store.discard_before(report.generation)
-    warnings = [*catalogue_warnings(before, catalogue, options.naming), *report.warnings]
+    warnings = [*catalogue_warnings(before, catalogue, options, store.path), *report.warnings]
     return replace(
         report,
         warnings=warnings,
@@ -105,9 +108,31 @@ def build_index(
     )
 
 
-def catalogue_warnings(before: Mapping[str, Any], catalogue: Catalogue, naming: Naming) -> list[str]:
-    """Return warnings on the names of objects, and if the existing index is of another catalogue that still exists."""
-    warnings = naming_warnings(((photo.object_id, photo.path) for photo in catalogue.photos), naming)
+def catalogue_camera(catalogue: Catalogue, checkpoint: Checkpoint, before: Mapping[str, Any]) -> PhotoCamera:
+    """Return the camera to assume for photos that do not state it; of too few objects, that of the existing index."""
+    if checkpoint.config.matcher.photo_tower == NO_TOWER or not checkpoint.config.preprocessing.finds_object:
+        return USUAL_CAMERA
+    is_same = before.get("catalogue") == catalogue.where
+    known = PhotoCamera(*before[ASSUMED_CAMERA]) if is_same and ASSUMED_CAMERA in before else USUAL_CAMERA
+    photos = catalogue.photos
+    looked_at = ((each.object_id, catalogue.folder / each.path, stated_keys(each.metadata)) for each in photos)
+    return assumed_camera(looked_at, known)
+
+
+def catalogue_warnings(
+    before: Mapping[str, Any], catalogue: Catalogue, options: "BuildOptions", index: Path
+) -> list[str]:
+    """Return warnings on the names of objects, on an unusual camera, and if the existing index is of another catalogue.
+
+    The other catalogue must still exist. `index`: folder with the table of enrolled touches.
+    """
+    enrolled = (touch.object_id for touch in EnrolledTable(index).read())
+    advice = f"If that is wrong, state it in {METADATA_FILE}: see docs/catalogue.md, a good photo"
+    warnings = [
+        *naming_warnings(((photo.object_id, photo.path) for photo in catalogue.photos), options.naming),
+        *same_name_warnings([*catalogue.object_ids, *enrolled]),
+        *(f"{sentence}. {advice}" for sentence in unusual(options.camera)),
+    ]
     old = str(before.get("catalogue", catalogue.where))
     if old == catalogue.where or not Path(old).is_dir():
         return warnings
@@ -127,12 +152,14 @@ class BuildOptions:
         kind: Name of the kind of index.
         cells: Store the cells of photos; None for a model without cells.
         quiet: Show no progress.
+        camera: The camera that is assumed for photos that do not state it.
     """
 
     naming: Naming
     kind: str
     cells: bool | None
     quiet: bool
+    camera: PhotoCamera = USUAL_CAMERA
 
 
 def build_options(
@@ -177,13 +204,13 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, store: IndexStore
         checkpoint = checkpoint.without_cells()
     load_kind(options.kind).require(options.kind, len(catalogue.photos), checkpoint.config.matcher.embedding_dim)
     with store.lock(), Cache(store.path / CACHE) as cache:
-        contents = read_contents(catalogue, checkpoint, cache, options.quiet)
+        contents = read_contents(catalogue, checkpoint, options.camera, cache, options.quiet)
         about = {
             "checkpoint": str(checkpoint.path.resolve()),
             "catalogue": catalogue.where,
             "objects_from": options.naming.text,
             CELLS: options.cells,
-            ASSUMED_CAMERA: list(contents.assumed),
+            ASSUMED_CAMERA: list(options.camera),
             **contents.references.about,
         }
         current, why = _current(store, checkpoint)
@@ -279,12 +306,6 @@ def _hard_photos(contents: IndexContents) -> list[str]:
     ]
 
 
-def _assumed_cameras(assumed: PhotoCamera) -> list[str]:
-    """Return warnings if an unusual camera was assumed."""
-    advice = f"If that is wrong, state it in {METADATA_FILE}: see docs/catalogue.md, a good photo"
-    return [f"{sentence}. {advice}" for sentence in unusual(assumed)]
-
-
 def _report(
     out: Path,
     catalogue: Catalogue,
@@ -307,7 +328,7 @@ def _report(
         objects=len(names),
         objects_from=options.naming.text,
         examples=[(name, first_photo[name]) for name in shown],
-        warnings=[*_shared_photos(rows), *_assumed_cameras(contents.assumed), *_hard_photos(contents)],
+        warnings=[*_shared_photos(rows), *_hard_photos(contents)],
         embedded=contents.encoded,
         skipped=contents.skipped,
         ignored=[name for name in catalogue.ignored if not (catalogue.folder / name).resolve().is_relative_to(inside)],

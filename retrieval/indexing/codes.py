@@ -12,7 +12,6 @@ import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -90,12 +89,6 @@ class CatalogueFiles:
     def digest(self, path: str) -> str:
         """Return the digest of a known file, or an empty string."""
         return self.known[path].digest if path in self.known else ""
-
-    def current_digest(self, path: str) -> str:
-        """Return the digest of a file, which is read if it is not known; an empty string if it cannot be read."""
-        with suppress(ImageError):
-            return self.digest(path) or self.read(path)[0].digest
-        return ""
 
     def read(self, path: str) -> tuple[FileRecord, bytes]:
         """Read a file, which becomes known. Raises ImageError."""

@@ -6,22 +6,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import msgspec
 from numpy.typing import NDArray
 
-from _touch_retrieval.cache import Cache, cache_key
-from _touch_retrieval.files import file_digest
+from _touch_retrieval.cache import Cache
 from indexes.store.rows import Row
-from retrieval.data.camera import (
-    CAMERA_KEYS,
-    NETWORKS,
-    USUAL_CAMERA,
-    PhotoCamera,
-    assumed_camera,
-    sample,
-    stated_camera,
-    stated_keys,
-)
+from retrieval.data.camera import USUAL_CAMERA, PhotoCamera, stated_camera
 from retrieval.data.catalogue import Catalogue, CataloguePhoto, SkippedPhoto
 from retrieval.errors import BadInput, NoReadablePhoto
 from retrieval.indexing.codes import (
@@ -76,7 +65,6 @@ class IndexContents:
         encoded: Number of photos that were encoded now.
         skipped: Photos and touches that could not be used.
         faults: Faults (`retrieval.data.photo_faults`) of the photos that were encoded now and have some, by path.
-        assumed: The camera that was assumed where it is not stated (`retrieval.data.camera`).
     """
 
     rows: list[Row]
@@ -86,7 +74,6 @@ class IndexContents:
     encoded: int
     skipped: list[SkippedPhoto]
     faults: dict[str, Sequence[str]]
-    assumed: PhotoCamera
 
     def blocks(self, cache: Cache) -> Iterator[dict[str, NDArray[Any]]]:
         """Yield the codes of the rows in blocks: arrays by name, such as "embeddings" (n, d)."""
@@ -95,8 +82,10 @@ class IndexContents:
             yield {name: records[name] for name in self.encoder.layout.names or ()}
 
 
-def read_contents(catalogue: Catalogue, checkpoint: Checkpoint, cache: Cache, quiet: bool) -> IndexContents:
-    """Find or make the codes of a catalogue's photos and touches.
+def read_contents(
+    catalogue: Catalogue, checkpoint: Checkpoint, assumed: PhotoCamera, cache: Cache, quiet: bool
+) -> IndexContents:
+    """Find or make the codes of a catalogue's photos, by the camera that they state or the assumed one, and touches.
 
     Raises:
         NoReadablePhoto: No photo can be read.
@@ -109,7 +98,6 @@ def read_contents(catalogue: Catalogue, checkpoint: Checkpoint, cache: Cache, qu
     files = CatalogueFiles(catalogue, cache)
     references = _find_references(catalogue, checkpoint, files, cache, quiet)
     photos = sorted([*catalogue.photos, *references.pictures], key=lambda photo: photo.path)
-    assumed = _assumed_camera(catalogue, checkpoint, files, cache)
     cameras = {
         photo.path: camera
         for photo in catalogue.photos
@@ -129,26 +117,7 @@ def read_contents(catalogue: Catalogue, checkpoint: Checkpoint, cache: Cache, qu
         codes.encoded,
         [*catalogue.skipped, *codes.skipped, *references.skipped],
         {path: faults for path, faults in codes.faults.items() if path not in gel_images},
-        assumed,
     )
-
-
-def _assumed_camera(catalogue: Catalogue, checkpoint: Checkpoint, files: CatalogueFiles, cache: Cache) -> PhotoCamera:
-    """Return the camera of photos where it is not stated; only objects that are searched for show an unusual one.
-
-    It is stored, and found again while the photos that show it do not change.
-    """
-    if not checkpoint.config.preprocessing.finds_object:
-        return USUAL_CAMERA
-    unknown = [photo for photo in catalogue.photos if stated_keys(photo.metadata) != CAMERA_KEYS]
-    stated = CAMERA_KEYS.intersection(*(stated_keys(photo.metadata) for photo in unknown))
-    photos = sample((photo.object_id, photo.path) for photo in unknown)
-    digests = [[file_digest(network) for network in NETWORKS], [files.current_digest(photo) for photo in photos]]
-    key = cache_key("files", "camera", sorted(stated), digests)
-    if (stored := cache.get(key)) is None:
-        stored = msgspec.json.encode(assumed_camera([catalogue.folder / photo for photo in photos], stated))
-        cache.add({key: stored})
-    return msgspec.json.decode(stored, type=PhotoCamera)
 
 
 def no_photo(catalogue: Catalogue, skipped: Sequence[SkippedPhoto]) -> NoReadablePhoto:

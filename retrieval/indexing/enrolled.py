@@ -28,12 +28,13 @@ from _touch_retrieval.names import lookup_key
 from indexes.errors import CorruptIndex, WriteFailed
 from indexes.store.locking import writer_lock
 from retrieval.console.output import abbreviate_list
-from retrieval.data.catalogue import ENROLLED
 from retrieval.data.opening import RANGE_MM
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint
 
 FORMAT = 1
+ENROLLED = "enrolled"
+"""Folder in an index with the pictures of enrolled touches."""
 _PICTURE = re.compile(r"[0-9a-f]{20}\.[a-z]+")
 _Path = Annotated[str, Meta(pattern=rf"^{ENROLLED}/[^./][^/\0]*/{_PICTURE.pattern}\Z")]
 _Digest = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z")]

@@ -28,7 +28,14 @@ from indexes.store.sharded import (
 )
 from retrieval.data.catalogue import Catalogue, list_catalogue
 from retrieval.errors import BadInput, NoReadablePhoto
-from retrieval.indexing.build import BuildOptions, build_listed, build_options, catalogue_warnings
+from retrieval.indexing.build import (
+    ASSUMED_CAMERA,
+    BuildOptions,
+    build_listed,
+    build_options,
+    catalogue_camera,
+    catalogue_warnings,
+)
 from retrieval.indexing.codes import encode_enrolled
 from retrieval.indexing.contents import no_photo, require_reference_calibration
 from retrieval.indexing.report import BuildReport
@@ -102,6 +109,7 @@ def build_sharded(
             checkpoint, before.about if before else {}, objects_from=objects_from, kind=kind, cells=cells, quiet=quiet
         )
         catalogue = list_catalogue(folder, options.naming)
+        options = replace(options, camera=catalogue_camera(catalogue, checkpoint, before.about if before else {}))
         if catalogue.touches:  # before any shard is built
             require_reference_calibration(checkpoint.without_cells() if options.cells is False else checkpoint)
         _delete_old_shards(root, before, shards)
@@ -111,7 +119,7 @@ def build_sharded(
         reports = sorted((result for result in built if isinstance(result, BuildReport)), key=lambda part: part.index)
         unreadable = [result for result in built if isinstance(result, NoReadablePhoto)]
         report = _report(root, catalogue, reports, unreadable)
-        manifest = _manifest(root, before, shards, checkpoint, catalogue, report, reports)
+        manifest = _manifest(before, shards, checkpoint, catalogue, options, report, reports)
         if written := before is None or manifest.generation != before.generation:
             write_sharded_manifest(root, manifest)
         encode_enrolled(root, checkpoint, options.cells, before.fingerprint if before else None)
@@ -122,7 +130,7 @@ def build_sharded(
         generation=manifest.generation,
         written=written,
         warnings=[
-            *catalogue_warnings(before.about if before else {}, catalogue, options.naming),
+            *catalogue_warnings(before.about if before else {}, catalogue, options, root),
             *report.warnings,
         ],
         reason=" ".join(filter(None, (note, unusable, report.reason))),
@@ -191,11 +199,11 @@ def _report(
 
 
 def _manifest(
-    root: Path,
     before: ShardedManifest | None,
     shards: int,
     checkpoint: Checkpoint,
     catalogue: Catalogue,
+    options: BuildOptions,
     report: BuildReport,
     reports: Sequence[BuildReport],
 ) -> ShardedManifest:
@@ -204,6 +212,7 @@ def _manifest(
         "checkpoint": str(checkpoint.path.resolve()),
         "catalogue": catalogue.where,
         "objects_from": report.objects_from,
+        ASSUMED_CAMERA: list(options.camera),
         CELLS: report.cells,
     }
     if report.references is not None:

@@ -73,9 +73,9 @@ def model_of(manifest: Manifest | ShardedManifest) -> Path:
     path = Path(str(manifest.about.get("checkpoint")))
     if path.is_file():
         return path
-    shipped = shipped_model()
-    if shipped.is_file() and file_digest(shipped) == manifest.fingerprint.get("checkpoint"):
-        return shipped
+    for shipped in map(shipped_model, SHIPPED_NAMES.values()):
+        if shipped.is_file() and file_digest(shipped) == manifest.fingerprint.get("checkpoint"):
+            return shipped
     raise CheckpointError(
         f"the model of this index is no longer at {path}; name it with --model, or build the index again with another"
     )

@@ -11,10 +11,10 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
 
-from retrieval.data.catalogue import ENROLLED
 from retrieval.data.images import read_bytes
 from retrieval.data.text import replace_surrogates
 from retrieval.errors import ImageError
+from retrieval.indexing.enrolled import ENROLLED
 from retrieval.report.pages import thumbnail
 from retrieval.search.shard import resolve_object
 from retrieval.serve.errors import HttpProblem

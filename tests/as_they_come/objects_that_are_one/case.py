@@ -5,7 +5,7 @@ import shutil
 import unicodedata
 
 from retrieval.data.catalogue import list_catalogue
-from retrieval.data.naming import Naming, naming_warnings
+from retrieval.data.naming import same_name_warnings
 from retrieval.indexing.build import build_index
 from retrieval.indexing.sharded import build_sharded
 from retrieval.model.checkpoint import load_checkpoint
@@ -41,6 +41,6 @@ def check(folder, get):
             assert resolve_object(searcher.shard, name) == meant  # with a space two objects could be meant
 
     same = {"Mug": 1, "mug": 1, "blue  cup": 1, "blue cup": 1, NFC: 1, NFD: 1, "tin": 1}
-    (warning,) = naming_warnings([(name, f"{name}/1.jpg") for name in same], Naming())
+    (warning,) = same_name_warnings(same)
     assert "the names of 6 objects differ only by case, spaces" in warning
     assert list_catalogue(write_pictures(folder / "other", "tin/1.jpg")).notes == ()

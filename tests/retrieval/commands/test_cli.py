@@ -198,6 +198,9 @@ def test_an_index_is_not_written_among_the_photos(workplace, model, capsys):
         assert main(["build-index", "catalog", "--model", str(model), "--out", out]) == 2
         assert f"the index would be written among the photos in {Path(out)}" in capsys.readouterr().err
     assert sorted(workplace.rglob("*")) == before
+    for _ in range(2):  # but into a new folder among them, and again
+        assert main(["build-index", "catalog", "--model", str(model), "--out", "catalog/index", "--preview"]) == 0
+        assert "views.png" in capsys.readouterr().err
 
 
 WRONG_WORDS = {

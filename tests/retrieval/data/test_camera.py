@@ -1,12 +1,11 @@
 """The camera that is assumed for the photos of a catalogue."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from PIL import Image
 
-from retrieval.data.camera import FEWEST, USUAL_CAMERA, PhotoCamera, assumed_camera, sample
+from retrieval.data.camera import FEWEST, USUAL_CAMERA, PhotoCamera
+from retrieval.data.camera import assumed_camera as camera_of
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.views import FIELD_MM
 from tests.retrieval.data.simulated import photo_of, rolled, square
@@ -28,6 +27,11 @@ def turned_photos(folder, roll_deg):
     return write(folder, [rolled(number, roll_deg) for number in range(FEWEST)])
 
 
+def assumed_camera(photos):
+    """Return the camera of photos of an object each, nothing stated."""
+    return camera_of((path.stem, path, ()) for path in photos)
+
+
 @pytest.mark.parametrize(("share", "factor"), [(0.32, 1), (0.16, 2), (0.64, 0.5)])
 def test_objects_of_half_the_usual_size_are_photographed_with_twice_the_field(tmp_path, share, factor):
     assumed = assumed_camera(squares(tmp_path / "photos", share))
@@ -35,16 +39,31 @@ def test_objects_of_half_the_usual_size_are_photographed_with_twice_the_field(tm
 
 
 def test_few_objects_or_a_small_difference_do_not_change_the_camera(tmp_path):
-    assert assumed_camera(squares(tmp_path / "photos", 0.38)) == USUAL_CAMERA  # nearly the usual size
-    few = [(str(number), Path("x")) for number in range(FEWEST - 1)]
-    assert sample([*few, *few, *few]) == []
+    assert assumed_camera(squares(tmp_path / "nearly", 0.38)) == USUAL_CAMERA
+    few = squares(tmp_path / "few", 0.16, FEWEST - 1)
+    assert camera_of((path.stem, path, ()) for path in [*few, *few]) == USUAL_CAMERA
     assert assumed_camera([]) == USUAL_CAMERA
 
 
-def test_files_that_are_no_photos_are_left_out(tmp_path):
+def test_what_was_assumed_stays_when_an_object_is_removed_but_not_when_all_photos_state_it(tmp_path):
+    few, before = squares(tmp_path / "few", 0.16, FEWEST - 1), PhotoCamera(380, 90)
+    assert camera_of(((path.stem, path, ()) for path in few), before) == before
+    assert camera_of(((path.stem, path, {"roll_deg"}) for path in few), before) == (380, 0)
+
+
+def test_the_next_photo_of_an_object_stands_in_for_one_that_cannot_be_read(tmp_path):
     photos = squares(tmp_path / "photos", 0.16)
-    (tmp_path / "photos" / "a.png").write_text("no picture")
-    assert assumed_camera([tmp_path / "photos" / "a.png", *photos]).field_mm == 2 * FIELD_MM
+    damaged = tmp_path / "damaged.png"
+    damaged.write_text("no picture")
+    listed = [(photos[0].stem, damaged, ()), *((path.stem, path, ()) for path in photos)]
+    assert camera_of(listed).field_mm == 2 * FIELD_MM
+    assert camera_of(listed[:-1]) == USUAL_CAMERA
+
+
+def test_photos_whose_field_is_stated_do_not_tell_that_of_the_others(tmp_path):
+    far, usual = squares(tmp_path / "far", 0.16), squares(tmp_path / "usual", 0.32, 5)
+    listed = [(path.stem, path, {"field_mm"}) for path in far] + [(f"usual {path.stem}", path, ()) for path in usual]
+    assert camera_of(listed).field_mm == FIELD_MM
 
 
 @pytest.mark.parametrize("roll_deg", [0, 90, 180, -90, 50])

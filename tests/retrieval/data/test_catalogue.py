@@ -70,6 +70,13 @@ def test_other_files_are_ignored_or_skipped_with_a_reason_and_dotfiles_not_liste
     assert catalogue.skipped == (SkippedPhoto("cup/2.DNG", ".dng pictures are not read: save it as PNG or JPEG"),)
 
 
+def test_what_an_index_and_the_history_of_its_service_contain_is_no_part_of_the_catalogue(tmp_path):
+    own = "index/CURRENT", "index/views.png", "index/gen-1/rows.jsonl", "shards/SHARDS.json", "shards/enrolled/x/1.png"
+    fill(tmp_path, "mug/1.png", *own, "index-history/history.sqlite", "index-history/recording/images/a.png")
+    catalogue = list_catalogue(tmp_path)
+    assert ([item.path for item in catalogue.photos], catalogue.ignored, catalogue.notes) == (["mug/1.png"], (), ())
+
+
 def test_a_missing_folder_a_file_and_an_empty_folder_give_different_errors(tmp_path):
     fill(tmp_path, "file.png")
     (tmp_path / "empty" / "mug").mkdir(parents=True)

@@ -15,7 +15,8 @@ from retrieval.data.camera import PhotoCamera
 from retrieval.data.catalogue import list_catalogue
 from retrieval.data.dataset import load_grasps, recording_camera
 from retrieval.errors import DatasetError
-from retrieval.indexing.build import build_index
+from retrieval.indexing.build import ASSUMED_CAMERA, build_index
+from retrieval.indexing.sharded import build_sharded
 from retrieval.training.distil import feature_partials
 from retrieval.training.features import encode_recording
 from robot.recording.folder import RecordingWriter
@@ -147,9 +148,7 @@ def test_a_stated_field_changes_the_zoom_and_embeds_the_photo_again(tmp_path, zo
         ),
     ],
 )
-def test_the_camera_that_all_photos_share_is_assumed_until_it_is_stated(
-    tmp_path, zooms, index, monkeypatch, photo, warning, stated
-):
+def test_the_camera_that_all_photos_share_is_assumed_until_it_is_stated(tmp_path, zooms, index, photo, warning, stated):
     own = tmp_path / "own"
     own.mkdir()
     for number in range(20):
@@ -161,9 +160,24 @@ def test_the_camera_that_all_photos_share_is_assumed_until_it_is_stated(
     report = build_index(own, zooms, index, quiet=True)
     assert (report.embedded, [line for line in report.warnings if warning in line]) == (20, [])
     (own / "metadata.jsonl").unlink()
-    monkeypatch.setattr("retrieval.indexing.contents.assumed_camera", lambda *_: 1 / 0)  # no photo is looked at again
-    report = build_index(own, zooms, index, quiet=True)
-    assert (report.embedded, any(warning in line for line in report.warnings)) == (0, True)  # codes are still stored
+    for _ in range(2):
+        report = build_index(own, zooms, index, quiet=True)
+        assert (report.embedded, any(warning in line for line in report.warnings)) == (0, True)  # codes are stored
+        (own / "0.png").unlink(missing_ok=True)  # too few objects are left to tell: it stays
+
+
+def test_all_shards_assume_the_camera_that_the_whole_catalogue_shows(tmp_path, zooms):
+    own = tmp_path / "own"
+    own.mkdir()
+    for number in range(20):
+        Image.fromarray(square(number, 0.16)).save(own / f"{number}.png")
+    report = build_sharded(own, zooms, tmp_path / "shards", 3, quiet=True)
+    assert ["are assumed to show 380 mm" in line for line in report.warnings].count(True) == 1
+    assumed = {
+        tuple(IndexStore(tmp_path / "shards" / each["folder"]).open().manifest.about[ASSUMED_CAMERA])
+        for each in report.shards
+    }
+    assert assumed == {(380, 0)}
 
 
 def test_training_sees_the_photos_of_a_recording_as_an_index_of_them_does(tmp_path, zooms, index):

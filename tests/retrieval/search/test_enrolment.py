@@ -72,6 +72,14 @@ def test_an_enrolled_object_is_one_object_with_a_folder_that_macos_names(catalog
     assert [(one.object_id, one.reference.is_enrolled) for one in found if one.reference] == [("Tu\u0308lle", True)]
 
 
+def test_a_build_warns_of_an_enrolled_name_that_differs_from_that_of_an_object_only_by_case(
+    index, catalogue, model, touches
+):
+    enrol(index, NAMES[0].upper(), touches[NAMES[0]][0])
+    (warning,) = [line for line in build_index(catalogue, model, index, quiet=True).warnings if "only by case" in line]
+    assert NAMES[0].upper() in warning
+
+
 def test_a_picture_that_the_table_names_is_not_opened_for_writing_again(index, touches):
     """As the no-contact frame of several touches: a full disk would leave half of it."""
     enrol(index, "cup", touches[NAMES[0]][0])

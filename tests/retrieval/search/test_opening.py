@@ -33,7 +33,7 @@ def test_shipped_models_are_selected_by_their_number_of_fingers():
 def shipped_in(folder, monkeypatch):
     shipped = folder / "shipped.safetensors"
     shipped.write_bytes(b"shipped")
-    monkeypatch.setattr(opening, "shipped_model", lambda: shipped)
+    monkeypatch.setattr(opening, "shipped_model", lambda fingers=2: shipped)
     return shipped
 
 
