@@ -1,70 +1,15 @@
-"""Probabilities from match logits, and the accuracy of match decisions on pairs, on held-out objects.
-
-Ranking uses logits and never these probabilities, which are for people to read.
-"""
+"""The accuracy of match decisions on pairs, and of probabilities, on held-out objects."""
 
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import brentq
-from scipy.special import expit
 
 from retrieval.errors import BadInput, NumericalError
 from retrieval.metrics.measure import weight_below
 
-SLOPE_BOUNDS = (0.01, 100.0)
 BINS = 15
 _LARGEST = float(np.finfo(np.float32).max)
-
-
-def fit_calibration(logits: ArrayLike, labels: ArrayLike) -> tuple[float, float]:
-    """Fit log-odds `slope * logit + intercept` at even odds, with Platt's smoothed targets (Platt 1999, section 2.2).
-
-    Smoothing gives separable data a finite optimum. The slope is kept within `SLOPE_BOUNDS`; it is at the lower bound
-    if the logits carry no information, or wrong information.
-
-    Two nested root searches find the maximum of the likelihood, whose derivatives are monotonous: they work at any
-    scale and offset of the logits. A quasi-Newton search for slope and intercept together stops too early if, for
-    example, the logits are 1000 +- 1.
-
-    Args:
-        logits: (P,) match logits.
-        labels: (P,) of 0 and 1.
-
-    Returns:
-        Slope and intercept.
-
-    Raises:
-        BadInput: A class is missing.
-        NumericalError: A logit is not a finite float32.
-    """
-    z, y = _checked(logits, labels)
-    positives, negatives = y.sum(), (1 - y).sum()
-    targets = np.where(y == 1, (positives + 1) / (positives + 2), 1 / (negatives + 2))
-    # Both classes have the same weight, whatever their counts: the odds are even by definition.
-    weights = np.where(y == 1, 0.5 / positives, 0.5 / negatives)
-    centre = float(np.median(z))
-    z = z - centre
-
-    def slack(slope: float, intercept: float) -> NDArray[np.float64]:
-        return np.asarray(weights * (expit(slope * z + intercept) - targets))
-
-    def best_intercept(slope: float) -> float:
-        # Every probability is almost 0 at -reach, almost 1 at +reach; every target is between these values.
-        reach = slope * float(np.abs(z).max()) + 50
-        return float(brentq(lambda intercept: slack(slope, intercept).sum(), -reach, reach, maxiter=1000))
-
-    def derivative(log_slope: float) -> float:
-        slope = float(np.exp(log_slope))
-        return float(np.sum(slack(slope, best_intercept(slope)) * z))
-
-    low, high = np.log(SLOPE_BOUNDS)
-    if derivative(low) >= 0:
-        slope = SLOPE_BOUNDS[0]
-    else:
-        slope = SLOPE_BOUNDS[1] if derivative(high) <= 0 else float(np.exp(brentq(derivative, low, high)))
-    return slope, best_intercept(slope) - slope * centre
 
 
 def pair_accuracy(logits: ArrayLike, labels: ArrayLike) -> float:

@@ -13,10 +13,10 @@ import torch
 from torch import nn
 
 from retrieval.errors import BadInput
-from retrieval.metrics.pairs import fit_calibration
 from retrieval.model.config import Config, load_config
 from retrieval.model.encode import one_thread
 from retrieval.model.fusion import Matcher
+from retrieval.model.posterior import SLOPE_BOUNDS
 from retrieval.model.towers.weights import GEL, SHIPPED
 from retrieval.training.calibration.scores import ScoredTouches
 from retrieval.training.cca import CcaSelection, select_settings, tower_widths
@@ -97,7 +97,15 @@ def install_projections(matcher: Matcher, choice: CcaSelection) -> None:
 
 
 def _log_odds(parts: Iterable[ScoredTouches]) -> tuple[float, float]:
-    """Return scale and offset from cosine to log-odds of a match, with equally many true and false pairs."""
+    """Return scale and offset from cosine to log-odds of a match, with equally many true and false pairs.
+
+    A weak penalty on the scale keeps both finite if cosines separate the pairs.
+
+    Raises:
+        BadInput: No object has two grasps.
+    """
+    from sklearn.linear_model import LogisticRegression  # slow to import
+
     cosines, labels = [], []
     for part in parts:
         same = part.touch_owner[:, None] == part.photo_owner
@@ -106,4 +114,10 @@ def _log_odds(parts: Iterable[ScoredTouches]) -> tuple[float, float]:
         count = min(len(pairs[0]), len(pairs[1]), 20_000)
         cosines += [part.logits.ravel()[drawn[:count]] for drawn in pairs]
         labels += [np.ones(count), np.zeros(count)]
-    return fit_calibration(np.concatenate(cosines), np.concatenate(labels))
+    x, y = np.concatenate(cosines, dtype=np.float64)[:, None], np.concatenate(labels)
+    if not len(x):
+        raise BadInput("no touch has another photo of its object; record at least two grasps of each object")
+    centre = x.mean()
+    found = LogisticRegression(C=1e3, tol=1e-8).fit(x - centre, y)
+    scale = max(found.coef_.item(), SLOPE_BOUNDS[0])  # the head cannot rank by a negative one
+    return scale, found.intercept_.item() - scale * centre

@@ -4,18 +4,17 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
-from scipy.special import expit, log_expit, softmax
+from scipy.special import expit, softmax
 
 from retrieval.evaluation.reject import galleries, statistic
-from retrieval.metrics.pairs import fit_calibration, negative_log_likelihood, reliability_bins
+from retrieval.metrics.pairs import negative_log_likelihood, reliability_bins
 from retrieval.model.posterior import Posterior
 from retrieval.training.calibration.posterior import fit_posterior
 from retrieval.training.calibration.scores import ScoredTouches
-from tests.hard_case import HardCase, error_of
+from tests.hard_case import HardCase
 
 Matrix = NDArray[np.float64]
-_LOGITS, _CALIBRATION = "logits", "calibration"
+_LOGITS = "logits"
 _ADDING = Posterior(slope=1.0, offset=0.0, dependence=0.0)
 """Uses logits unchanged, and assumes independent grasps."""
 
@@ -25,10 +24,6 @@ def hard_cases() -> Iterator[HardCase]:
     yield _probabilities_tie()
     yield _sure_and_wrong()
     yield _many_grasps()
-    yield _separable()
-    yield _far_from_zero()
-    yield _one_class()
-    yield _nan_logit()
     yield _choices_without_errors()
     yield _odds_of_a_gallery()
     yield _last_bin()
@@ -68,60 +63,6 @@ def _many_grasps() -> HardCase:
     must = float(expit(0.8))
     holds = [abs(float(pair[1] / pair.sum()) - must) < 1e-9 for pair in (ours, naive)]
     return HardCase(_LOGITS, "8 grasps at logit -100", f"the second object with {must:.3f}", products, text, *holds)
-
-
-def naive_fit(logits: Matrix, labels: NDArray[np.int64]) -> tuple[float, float]:
-    """Return slope and intercept of the plain likelihood, by a quasi-Newton search from 1 and 0."""
-
-    def loss(x: Matrix) -> float:
-        odds = x[0] * logits + x[1]
-        return float(-np.mean(np.where(labels == 1, log_expit(odds), log_expit(-odds))))
-
-    slope, intercept = minimize(loss, np.array([1.0, 0.0]), method="BFGS", options={"gtol": 1e-12}).x
-    return float(slope), float(intercept)
-
-
-def _separable() -> HardCase:
-    """Twenty true pairs above twenty false ones: too few for odds above 21 to 1.
-
-    The likelihood has no maximum: the search stops where its own arithmetic ends.
-    """
-    logits, labels = np.append(np.linspace(1, 2, 20), np.linspace(-2, -1, 20)), np.repeat([1, 0], 20)
-    slope, intercept = naive_fit(logits, labels)
-    fitted_slope, fitted_intercept = fit_calibration(logits, labels)
-    odds = [slope * 1.5 + intercept, fitted_slope * 1.5 + fitted_intercept]
-    correct = [value < np.log(40) for value in odds]
-    naive, ours = (f"odds of {np.exp(value):.3g} to 1" for value in odds)
-    expected = "a usual true pair at no more than 40 to 1"
-    return HardCase(_CALIBRATION, "separable pairs, 20 of each kind", expected, naive, ours, correct[1], correct[0])
-
-
-def _far_from_zero() -> HardCase:
-    """The same pairs with logits a thousand higher: the same slope."""
-    rng = np.random.default_rng([8])
-    logits, labels = np.append(rng.normal(1, 1, 200), rng.normal(-1, 1, 200)), np.repeat([1, 0], 200)
-    must, _ = fit_calibration(logits, labels)
-    slopes = [naive_fit(logits + 1000, labels)[0], fit_calibration(logits + 1000, labels)[0]]
-    correct = [abs(slope - must) < 1e-6 * must for slope in slopes]
-    naive, ours = (f"{slope:.6g}" for slope in slopes)
-    expected = f"slope {must:.6g}, as without the 1000"
-    return HardCase(_CALIBRATION, "logits of 1000 +- 1", expected, naive, ours, correct[1], correct[0])
-
-
-def _one_class() -> HardCase:
-    logits, labels = np.linspace(-1, 1, 20), np.ones(20, np.int64)
-    intercept = naive_fit(logits, labels)[1]
-    ours, holds = error_of(lambda: fit_calibration(logits, labels), "both classes")
-    naive = f"every pair a match, intercept {intercept:.3g}"
-    return HardCase(_CALIBRATION, "true pairs only", "refused", naive, ours, holds, False)
-
-
-def _nan_logit() -> HardCase:
-    logits, labels = np.array([0.2, np.nan, 0.9, -1.0]), np.array([1, 1, 0, 0])
-    naive = naive_fit(logits, labels)[0]
-    ours, holds = error_of(lambda: fit_calibration(logits, labels), "pair 1")
-    expected = "refused, the pair named"
-    return HardCase(_CALIBRATION, "one logit is NaN", expected, f"slope {naive}", ours, holds, False)
 
 
 def naive_slope(scores: Matrix) -> float:

@@ -32,7 +32,7 @@ from retrieval.training.cca import GRID, CcaSettings, TowerWidths, fit_projectio
 from retrieval.training.choice import HeldOut
 from retrieval.training.features import Features
 from retrieval.training.initial_weights import build_matcher
-from retrieval.training.linear import linear_config
+from retrieval.training.linear import _log_odds, linear_config
 from retrieval.training.recipes.recipe import Problem, Start
 from retrieval.training.selection import COMPARED, draw_folds
 from tests.verification import calibration
@@ -168,6 +168,38 @@ def test_thresholds_of_verifications_come_from_objects_outside_the_fit():
     fitted = fit_verification([scored(touch, photo, owner)], posterior)
     assert (ratios >= found.bounds(0.05).accept).mean() == pytest.approx(0.05, abs=0.015)
     assert (ratios >= fitted.bounds(0.05).accept).mean() > 0.065
+
+
+def scored(true, false):
+    """Return two touches with photos of their two objects: `true` cosines with photos of one's own, `false` others."""
+    cosines = np.block([[np.array(true), np.array(false)], [np.array(false), np.array(true)]])
+    return ScoredTouches(cosines, np.arange(2), np.repeat([0, 1], len(true)), np.zeros(cosines.shape, bool))
+
+
+def test_the_log_odds_of_a_cosine_are_those_of_the_pairs_that_have_it():
+    """At 0.6 three of four pairs are true, at -0.4 one of four: log-odds of log 3 and -log 3."""
+    scale, offset = _log_odds([scored([0.6, 0.6, 0.6, -0.4], [0.6, -0.4, -0.4, -0.4])])
+    assert scale * 0.6 + offset == pytest.approx(np.log(3), rel=0.01)
+    assert scale * -0.4 + offset == pytest.approx(-np.log(3), rel=0.01)
+
+
+def test_cosines_that_separate_the_pairs_have_a_finite_scale_and_offset():
+    scale, offset = _log_odds([scored([0.7] * 20, [0.5] * 20)])
+    assert 0 < scale < 200
+    assert scale * 0.6 + offset == pytest.approx(0, abs=1e-3)
+
+
+def test_cosines_without_information_or_with_wrong_information_have_a_small_positive_scale():
+    for part in (scored([0.5] * 4, [0.5] * 4), scored([0.5] * 4, [0.7] * 4)):
+        scale, offset = _log_odds([part])
+        assert 0 < scale < 0.1
+        assert abs(offset) < 0.1
+
+
+def test_log_odds_without_another_photo_of_any_object_are_refused():
+    alone = ScoredTouches(np.eye(3), np.arange(3), np.arange(3), np.eye(3, dtype=bool))
+    with pytest.raises(BadInput, match="at least two grasps of each object"):
+        _log_odds([alone])
 
 
 # The checkpoint ----------------------------------------------------------------------------------------------
