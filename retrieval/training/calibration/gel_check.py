@@ -145,7 +145,7 @@ def fit_gel_head(fitting: GelCheckFeatures, penalty: float = PENALTY) -> GelHead
 
     Without no-contact frames, the head never predicts that class.
     """
-    from scipy.optimize import minimize
+    from sklearn.linear_model import LogisticRegression  # slow to import
 
     parts = fitting.touch.flatten(0, 1), fitting.no_contact.flatten(0, 1), fitting.foreign
     kinds = [part.double().numpy() for part in parts]
@@ -154,24 +154,17 @@ def fit_gel_head(fitting: GelCheckFeatures, penalty: float = PENALTY) -> GelHead
     centre, spread = x.mean(0), x.std(0)
     spread = np.maximum(spread, MIN_RELATIVE_DEVIATION * np.abs(centre))  # the same standardisation as in the matcher
     spread = np.where(spread > 1e-6, spread, 1.0)
-    x = (x - centre) / spread
-    weights = 1 / counts[labels] / np.count_nonzero(counts)
-    targets, absent = np.eye(len(GEL_CLASSES))[labels], np.where(counts > 0, 0.0, -1e4)
-
-    def loss(flat: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        matrix = flat.reshape(-1, len(GEL_CLASSES))
-        logits = x @ matrix[:-1] + matrix[-1] + absent
-        logs = logits - np.logaddexp.reduce(logits, axis=1, keepdims=True)
-        residuals = weights[:, None] * (np.exp(logs) - targets)
-        value = -float(weights @ (logs * targets).sum(1)) + penalty / 2 * float((matrix[:-1] ** 2).sum())
-        return value, np.vstack([x.T @ residuals + penalty * matrix[:-1], residuals.sum(0)]).ravel()
-
-    found = minimize(loss, np.zeros((x.shape[1] + 1) * len(GEL_CLASSES)), jac=True, method="L-BFGS-B")
-    matrix = found.x.reshape(-1, len(GEL_CLASSES))
+    present = np.flatnonzero(counts)
+    two = len(present) == 2  # then scikit-learn fits the difference of two opposite rows: half of their penalty
+    model = LogisticRegression(C=(2 if two else 1) / penalty, tol=1e-6, max_iter=15_000)
+    model.fit((x - centre) / spread, labels, 1 / counts[labels] / len(present))
+    rows = np.array([[-0.5], [0.5]]) if two else np.eye(len(present))
+    matrix, bias = np.zeros((len(GEL_CLASSES), x.shape[1])), np.full(len(GEL_CLASSES), -1e4)
+    matrix[present], bias[present] = rows @ model.coef_ / spread, rows @ model.intercept_
     head = GelHead(x.shape[1])
     with torch.no_grad():
-        head.classifier.weight.copy_(torch.from_numpy((matrix[:-1] / spread[:, None]).T))
-        head.classifier.bias.copy_(torch.from_numpy(matrix[-1] - (centre / spread) @ matrix[:-1] + absent))
+        head.classifier.weight.copy_(torch.from_numpy(matrix))
+        head.classifier.bias.copy_(torch.from_numpy(bias - matrix @ centre))
     return head.eval()
 
 

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from torch.nn.functional import cross_entropy
 
 from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.data.preprocessing import Preprocessing
@@ -81,6 +82,17 @@ def test_distant_kinds_are_separated_on_other_pictures_of_the_same_kinds():
         others = pictures(2)
         assert check.classify(head(others.touch).numpy()).count(CONTACT) >= 78
         assert check.classify(head(others.no_contact).numpy()).count(NO_CONTACT) >= 58
+
+
+@pytest.mark.parametrize("no_contact", [60, 0])
+def test_the_head_minimises_the_mean_loss_of_each_kind_and_the_penalty(no_contact):
+    features = pictures(0, no_contact)
+    head, parts = fit_gel_head(features, penalty=0.1), (features.touch, features.no_contact, features.foreign)
+    parts = {kind: part.reshape(-1, 8) for kind, part in enumerate(parts) if len(part)}
+    losses = [cross_entropy(head.classifier(part), torch.full((len(part),), kind)) for kind, part in parts.items()]
+    scaled = head.classifier.weight * torch.cat(list(parts.values())).std(0, correction=0)
+    (sum(losses) / len(losses) + 0.1 / 2 * (scaled**2).sum()).backward()
+    assert all(part.grad.abs().max() < 1e-5 for part in head.parameters())
 
 
 def test_without_no_contact_frames_every_gel_is_a_contact():
