@@ -1,4 +1,4 @@
-"""Rays of the simulated rig: step length of gel and camera rays, and the maximum number of steps."""
+"""Rays of the simulated rig: step length of gel and camera rays."""
 
 import dataclasses
 import math
@@ -9,53 +9,43 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.frontier.light import light_panel
 from retrieval.frontier.clock import time_points
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff
 from retrieval.frontier.sample import Sample
-from robot.readings import Pose
 from robot.sim.camera import NOISE, PinholeCamera
 from robot.sim.objects.body import GEL_STEP_MM, SdfBody, Vectors, clip_to_box
 from robot.sim.objects.draw import draw_object
-from robot.sim.objects.packets import MAX_STEPS, Rays, first_hits, hits
-from robot.sim.scene import Grip, Scene
+from robot.sim.objects.packets import Rays, first_hits, hits
+from robot.sim.scene import Scene
 
 _FAMILIES = ("knurl", "bumps", "weave")
 _OBJECTS, _PX = 8, 256
 _EXACT = 1 / 20
 """Step of the reference, relative to the detail of a photo's ray."""
-_UNBOUNDED = 100_000
-"""Number of steps that no ray needs."""
 
 
 def rays(sample: Sample) -> ApproximationResult:
-    """Measure the steps of gel and photo rays, the maximum number of steps, and float32 in shading."""
+    """Measure the steps of gel and photo rays."""
     text = (
         "Rays to a solid with relief: no step is shorter than half the requested detail, and where f changes sign two "
         "secants find the place. A gel requests 0.1 mm; its picture shows heights of some thousandths of a mm. The "
         "camera requests one of its pixels on the object, and two on the way to the lamp. Photos are compared with "
         "photos whose rays go in equal steps of a twentieth of that in plain numpy, over the same relief, which is as "
-        "fine as a pixel. Errors below the noise of the camera's sensor are tolerated. A ray without a hit after this "
-        "many steps is a miss. Shading uses float32, in one compiled pass."
+        "fine as a pixel. Errors below the noise of the camera's sensor are tolerated."
     )
     repeats = sample.scale.repeats
     few, objects, px = (12, 2, 64) if sample.scale.quick else (48, _OBJECTS, _PX)
-    panels = (
-        gel_panel(repeats, few),
-        photo_panel(repeats, objects, px),
-        limit_panel(repeats, objects, px),
-        light_panel(repeats, objects, px),
-    )
-    return ApproximationResult("Rays and light of the simulated rig", text, panels)
+    panels = gel_panel(repeats, few), photo_panel(repeats, objects, px)
+    return ApproximationResult("Rays of the simulated rig", text, panels)
 
 
 class RayMarcher(SdfBody):
-    """A body whose rays take steps `stride` times as long, at most `max_steps`; `casts` repeats the casts so far."""
+    """A body whose rays take steps `stride` times as long; `casts` repeats the casts so far."""
 
-    def __init__(self, body: SdfBody, stride: float = 1.0, max_steps: int = MAX_STEPS) -> None:
+    def __init__(self, body: SdfBody, stride: float) -> None:
         super().__init__(body.shape, body.relief)
         self.wall = body.wall
-        self.stride, self.max_steps = stride, max_steps
+        self.stride = stride
         self.casts: list[Callable[[], NDArray[Any]]] = []
 
     def _cast(self, rays: Rays, step_mm: float) -> Vectors:
@@ -69,7 +59,7 @@ class RayMarcher(SdfBody):
         return cast()
 
     def _by(self, intersect: Callable[..., NDArray[Any]], rays: Rays, step_mm: float) -> NDArray[Any]:
-        return intersect(self.displaced_solid(step_mm), rays, self.stride * step_mm, self.max_steps)
+        return intersect(self.displaced_solid(step_mm), rays, self.stride * step_mm)
 
 
 class EqualStepMarcher(RayMarcher):
@@ -173,45 +163,9 @@ def _photos(marcher: type[RayMarcher], stride: float, objects: int, px: int) -> 
 
 
 def _scene(marcher: type[RayMarcher], stride: float, number: int, px: int) -> tuple[Scene, RayMarcher]:
-    """Return a scene and its body: a camera with the rig's field of view, and two bare fingers that can close."""
+    """Return a scene and its body; the camera has the rig's field of view."""
     obj = draw_object(0, number)
     assert isinstance(obj.body, SdfBody)
     body = marcher(obj.body, stride)
     camera = PinholeCamera(px=px, focal_px=PinholeCamera.focal_px * px / PinholeCamera.px)
-    grip = Grip(Pose(0.0, 0.0, 0.5 * float(obj.body.upper[2]), 0.0), 10.0)
-    return Scene(dataclasses.replace(obj, body=body), camera=camera, grip=grip, seed=number, outputs={"photo"}), body
-
-
-# Steps -----------------------------------------------------------------------------------------------------
-
-
-def limit_panel(
-    repeats: int,
-    objects: int = _OBJECTS,
-    px: int = _PX,
-    limits: Sequence[int] = (25, 50, 100, 200, 300, MAX_STEPS, 2 * MAX_STEPS),
-) -> Panel:
-    """Return a point for each limit: the rays that miss because of it, of photos and of closing fingers."""
-    bodies = []
-    for number in range(objects):
-        scene, body = _scene(RayMarcher, 1.0, number, px)
-        scene.run()
-        assert scene.pinch.final_placement  # its rays graze the object's sides
-        bodies.append(body)
-    exact = _met(bodies, _UNBOUNDED)
-    points, works = list[Tradeoff](), [partial(_met, bodies, limit) for limit in limits]
-    for limit, work in zip(limits, works, strict=True):
-        lost = 100.0 * float(np.mean(work() != exact))
-        points.append(Tradeoff("", f"{limit:,} steps", lost, is_default=limit == MAX_STEPS))
-    timed = time_points(points, works, repeats)
-    time = f"{len(exact):,} rays of photos and fingers"
-    return Panel("maximum steps of a ray", time, "% of rays lost", "no limit", 0.01, timed)
-
-
-def _met(bodies: Sequence[RayMarcher], max_steps: int) -> NDArray[np.bool_]:
-    """Return which of all recorded rays hit within this many steps."""
-    met = []
-    for body in bodies:
-        body.max_steps = max_steps
-        met += [again() for again in body.casts]
-    return np.concatenate([found if found.dtype == bool else np.isfinite(found) for found in met])
+    return Scene(dataclasses.replace(obj, body=body), camera=camera, seed=number, outputs={"photo"}), body

@@ -17,6 +17,8 @@ LANES = 256
 """Points in a packet."""
 
 MAX_STEPS = 600
+"""A ray without a hit after this many steps is a miss."""
+
 OPERATIONS = (
     *("add", "subtract", "multiply", "divide", "maximum", "minimum", "absolute", "sqrt", "rint"),
     *("copysign", "greater", "sin", "cos", "exp", "log", "log1p", "where"),
@@ -172,22 +174,22 @@ class Rays(NamedTuple):
     far_mm: Vectors
 
 
-def first_hits(solid: DisplacedSolid, rays: Rays, step_mm: float, max_steps: int = MAX_STEPS) -> Vectors:
-    """Return the distance (n,) along each ray to the first zero of f; inf if there is none after `max_steps`."""
-    found, out = _find_crossings(solid, rays, step_mm, max_steps), np.full(len(rays.near_mm), np.inf)
+def first_hits(solid: DisplacedSolid, rays: Rays, step_mm: float) -> Vectors:
+    """Return the distance (n,) along each ray to the first zero of f; inf if there is none."""
+    found, out = _find_crossings(solid, rays, step_mm), np.full(len(rays.near_mm), np.inf)
     _refine(solid, _rows_of(solid), rays.origins, rays.directions, rays.near_mm, found, out)
     return out
 
 
-def hits(solid: DisplacedSolid, rays: Rays, step_mm: float, max_steps: int = MAX_STEPS) -> NDArray[np.bool_]:
+def hits(solid: DisplacedSolid, rays: Rays, step_mm: float) -> NDArray[np.bool_]:
     """Return which rays have a first hit, (n,)."""
-    return np.asarray(np.isfinite(_find_crossings(solid, rays, step_mm, max_steps)[0]))
+    return np.asarray(np.isfinite(_find_crossings(solid, rays, step_mm)[0]))
 
 
-def _find_crossings(solid: DisplacedSolid, rays: Rays, step_mm: float, max_steps: int) -> Floats:
+def _find_crossings(solid: DisplacedSolid, rays: Rays, step_mm: float) -> Floats:
     """Return the brackets of the zeros that `_march` finds, (4, n)."""
     found = np.full((4, len(rays.origins)), np.inf, np.float32)
-    _march(solid, _rows_of(solid), *rays, np.float32(0.5 * step_mm), max_steps, found)
+    _march(solid, _rows_of(solid), *rays, np.float32(0.5 * step_mm), found)
     return found
 
 
@@ -264,7 +266,7 @@ _ORIGIN, _DIRECTION, _T, _BEFORE, _F_BEFORE, _ROOM, _STEPS, _LANE_ROWS = 0, 3, 6
 
 
 @jit
-def _march(solid, rows, origins, directions, near, far, finest, max_steps, found):  # type: ignore[no-untyped-def]
+def _march(solid, rows, origins, directions, near, far, finest, found):  # type: ignore[no-untyped-def]
     """Trace spheres until f changes sign; fill `found` with t and f just inside (inf: a miss), t and f just outside.
 
     Outside the shell that relief can reach, the step is the distance to it. Within, f / L is safe (L bounds the slope
@@ -334,7 +336,7 @@ def _march(solid, rows, origins, directions, near, far, finest, max_steps, found
         end = count
         count = 0
         for i in range(end):
-            if base[0, i] > 0 and lanes[_BEFORE, i] <= lanes[_ROOM, i] and lanes[_STEPS, i] < max_steps:
+            if base[0, i] > 0 and lanes[_BEFORE, i] <= lanes[_ROOM, i] and lanes[_STEPS, i] < MAX_STEPS:
                 if count < i:
                     ray[count] = ray[i]
                     for row in range(_LANE_ROWS):
