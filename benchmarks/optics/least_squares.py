@@ -1,8 +1,8 @@
 """Least squares for the fitted optics: features of a press, weights by ridge regression, and the pose of a press.
 
-A press has a pose: x, y of its middle (pixels) and the contact radius (mm). It comes from the label, or from alignment:
-the three numbers that best explain the picture with fixed colours. Alignment uses the picture that it explains, like
-the manual alignment of Taxim's authors; colours are never fitted to a picture of the test set.
+A press has a pose: x, y of its middle (pixels) and the contact radius (mm). It comes from alignment: the three numbers
+that best explain the picture with fixed colours. Alignment uses the picture that it explains, like the manual alignment
+of Taxim's authors; colours are never fitted to a picture of the test set.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ _ALIGN_STRIDE = 8  # three numbers need even fewer
 _PROBE = np.array([0.5, 0.5, 0.02])  # px, px, mm: steps of the difference quotients
 _LONGEST = np.array([6.0, 6.0, 0.1])  # maximum change of a pose per step
 _DEEPEST = 0.985  # contact radius over the ball's; at the equator the slope is infinite
-_FIRST_CONTACT_MM = {"gelsight": 1.8, "gelsight_mini": 0.7}  # start of the alignment; labels of the Mini are not radii
+_FIRST_CONTACT_MM = {"gelsight": 1.8, "gelsight_mini": 0.7}  # start of the alignment
 _FIRST_FRACTION = 0.9  # maximum, relative to the ball's radius
 
 
@@ -37,19 +37,10 @@ class OpticsSetting:
     thickness_mm: float = 4.0
     poisson: float = 0.48
     ball_mm: float = 2.0
-    contact_share: float = (
-        1.0  # factor of labelled radii: people draw the visible edge, which includes the gel around the contact
-    )
 
     def table(self) -> BallTable:
         """Return the profiles of this ball on this layer."""
         return ball_table(self.ball_mm, self.thickness_mm, self.poisson, self.reaches_mm)
-
-
-def labelled_poses(presses: Presses, setting: OpticsSetting) -> Matrix:
-    """Return the labelled poses (count, 3) with scaled radii; no contact reaches the equator."""
-    radii = np.minimum(presses.radii * PIXEL_MM * setting.contact_share, _DEEPEST * setting.ball_mm)
-    return np.column_stack([presses.centres, radii])
 
 
 def first_pose(presses: Presses, index: int, setting: OpticsSetting) -> Matrix:

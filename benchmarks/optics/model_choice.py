@@ -23,7 +23,6 @@ from benchmarks.optics.least_squares import (
     features,
     first_pose,
     gram,
-    labelled_poses,
     solve,
 )
 from benchmarks.optics.real_presses import BALLS_MM, CROP, Presses
@@ -40,7 +39,6 @@ _FLAT_DEGREE = 6
 _WIDE = OpticsSetting(degree=4, places=6)
 _BLURS_PX = (0.0, 1.0, 2.0, 4.0, 8.0)
 _THICKNESSES_MM = (2.0, 4.0, 6.0)
-_CONTACT_SCALES = (1.0, 0.5)
 _RIDGES = (1e-5, 1e-4, 1e-3, 1e-2)
 
 
@@ -60,22 +58,20 @@ class Fit:
         setting: its setting.
         weights: its weights.
         poses: (count, 3) poses of the fitted presses.
-        align: whether poses are aligned instead of labelled.
         blur_px: blur of the unpressed picture.
     """
 
     setting: OpticsSetting
     weights: Matrix
     poses: Matrix
-    align: bool
     blur_px: float = 0.0
 
 
-def fit(presses: Presses, chosen: Sequence[int], setting: OpticsSetting, *, align: bool) -> Fit:
+def fit(presses: Presses, chosen: Sequence[int], setting: OpticsSetting) -> Fit:
     """Return the weights of one setting on the chosen presses, and the best blur for them."""
-    poses = _poses(presses, chosen, setting, align=align)
+    poses = _poses(presses, chosen, setting)
     weights = solve([gram(presses, one, poses[one], setting) for one in chosen], setting.ridge)
-    fitted = Fit(setting, weights, poses, align)
+    fitted = Fit(setting, weights, poses)
     changes = {one: _change(presses, one, poses[one], fitted) for one in chosen[::3]}
     losses = [
         (float(np.mean([picture_error(presses, one, change, blur).mse for one, change in changes.items()])), blur)
@@ -84,20 +80,19 @@ def fit(presses: Presses, chosen: Sequence[int], setting: OpticsSetting, *, alig
     return replace(fitted, blur_px=min(losses)[1])
 
 
-def select(presses: Presses, chosen: Sequence[int], *, align: bool, ship: bool = False) -> OpticsSetting:
+def select(presses: Presses, chosen: Sequence[int]) -> OpticsSetting:
     """Return the setting with the least squared error over inner folds of the chosen presses.
 
-    With `ship`, a fold is a place if presses share places, and the choice is careful if every press was shallow (see
-    SHALLOW): the model must generalise to other places and objects, not only to these presses.
+    A fold is a place if presses share places, and the choice is careful if every press was shallow (see SHALLOW): the
+    model must generalise to other places and objects, not only to these presses.
     """
-    folds = _place_folds(presses, chosen) if ship else [list(range(first, len(chosen), 3)) for first in range(3)]
+    folds = _place_folds(presses, chosen)
     losses: list[tuple[float, OpticsSetting]] = []
-    contact_scales = (1.0,) if align else _CONTACT_SCALES
-    for thickness, ball, contact_scale in itertools.product(_THICKNESSES_MM, BALLS_MM[presses.name], contact_scales):
-        wide = replace(_WIDE, thickness_mm=thickness, ball_mm=ball, contact_share=contact_scale)
-        poses = _poses(presses, chosen, wide, align=align)
+    for thickness, ball in itertools.product(_THICKNESSES_MM, BALLS_MM[presses.name]):
+        wide = replace(_WIDE, thickness_mm=thickness, ball_mm=ball)
+        poses = _poses(presses, chosen, wide)
         grams = [gram(presses, one, poses[one], wide) for one in chosen]
-        for setting in candidates(wide, careful=ship and presses.name in SHALLOW):
+        for setting in candidates(wide, careful=presses.name in SHALLOW):
             losses.append((_inner_loss(grams, folds, columns_of(wide, setting), setting.ridge), setting))
     return min(losses, key=lambda item: item[0])[1]
 
@@ -109,9 +104,7 @@ def _place_folds(presses: Presses, chosen: Sequence[int]) -> list[list[int]]:
     return [fold for fold in folds if fold]
 
 
-def _poses(presses: Presses, chosen: Sequence[int], setting: OpticsSetting, *, align: bool) -> Matrix:
-    if not align:
-        return labelled_poses(presses, setting)
+def _poses(presses: Presses, chosen: Sequence[int], setting: OpticsSetting) -> Matrix:
     return align_all(presses, chosen, replace(ALIGNING, thickness_mm=setting.thickness_mm, ball_mm=setting.ball_mm))
 
 
@@ -177,11 +170,8 @@ def _tuples(values: Matrix) -> tuple[tuple[float, ...], ...]:
 
 def held_out_error(presses: Presses, index: int, model: Fit) -> PictureError:
     """Return the error of a model on a press that it was not fitted to."""
-    if model.align:
-        start = first_pose(presses, index, model.setting)
-        pose = aligned(presses, index, start, model.weights, model.setting, _ALIGN_STEPS)
-    else:
-        pose = labelled_poses(presses, model.setting)[index]
+    start = first_pose(presses, index, model.setting)
+    pose = aligned(presses, index, start, model.weights, model.setting, _ALIGN_STEPS)
     return picture_error(presses, index, _change(presses, index, pose, model), model.blur_px)
 
 

@@ -3,12 +3,8 @@
     python -m benchmarks.optics.photometric --out FOLDER
 
 The fitting presses make all choices (benchmarks.optics.model_choice). A held-out press is predicted as the sensor's own
-unpressed picture plus the model's change, and compared over a crop of 200 x 200 pixels around the ball.
-
-    labels       centre and contact radius of the held-out press are those of its label
-    aligned      these three numbers are fitted to its picture, with fixed colours
-                 (benchmarks.optics.least_squares)
-    as shipped   aligned, and chosen to generalise to other places and objects than the presses
+unpressed picture plus the model's change, and compared over a crop of 200 x 200 pixels around the ball. Centre and
+contact radius of the held-out press are fitted to its picture, with fixed colours (benchmarks.optics.least_squares).
 """
 
 import argparse
@@ -84,16 +80,11 @@ def evaluate(presses: Presses, *, number: int = SPLITS) -> dict[str, Scores]:
 
 
 def _models(presses: Presses, chosen: Sequence[int]) -> dict[str, Fit]:
-    """Return the best models by labels and by alignment, and those of the shipped kind of every degree."""
-    by_label = fit(presses, chosen, select(presses, chosen, align=False), align=False)
-    by_picture = fit(presses, chosen, select(presses, chosen, align=True), align=True)
-    setting = select(presses, chosen, align=True, ship=True)
-    shipped = {degree: replace(setting, degree=degree) for degree in DEGREES}
+    """Return the model of the shipped kind, and the same of every degree."""
+    setting = select(presses, chosen)
     return {
-        "labels": by_label,
-        "aligned": by_picture,
-        "as shipped (aligned)": fit(presses, chosen, setting, align=True),
-        **{by_degree(degree): fit(presses, chosen, one, align=True) for degree, one in shipped.items()},
+        "as shipped (aligned)": fit(presses, chosen, setting),
+        **{by_degree(degree): fit(presses, chosen, replace(setting, degree=degree)) for degree in DEGREES},
     }
 
 
@@ -108,8 +99,8 @@ def by_degree(degree: int) -> str:
 def document(presses: Presses, scores: dict[str, Scores]) -> dict[str, Any]:
     """Return the content of a shipped file: source, the model fitted to every press, and its held-out results."""
     everything = range(len(presses))
-    setting = select(presses, everything, align=True, ship=True)
-    fitted = fit(presses, everything, setting, align=True)
+    setting = select(presses, everything)
+    fitted = fit(presses, everything, setting)
     figures = {name: one.summary() for name, one in scores.items()}
     model = json.dumps(asdict(to_optics(presses, fitted)))
     return {

@@ -1,7 +1,7 @@
 """Real presses of a ball into a GelSight, and the surface of each.
 
 The data are the `dataPack.npz` of the package `taxim` (MIT): `f0` the unpressed gel, `imgs` the pressed ones,
-`touch_center` (x, y) and `touch_radius` in pixels, labelled by hand. The arrays are plain; nothing is unpickled.
+`touch_center` (x, y) in pixels, labelled by hand. The arrays are plain; nothing is unpickled.
 
 Channels keep their order, and the first is called red. The files do not state the order. In this order, the presses on
 the Mini have the colours of other Mini recordings, and the lamps of the older sensor are red below on the left, green
@@ -44,14 +44,12 @@ class Presses:
         no_contact: (rows, cols, 3) uint8, the unpressed gel.
         pictures: (count, rows, cols, 3) uint8, the pressed gels.
         centres: (count, 2) labelled centres x, y in pixels.
-        radii: (count,) labelled radii in pixels.
     """
 
     name: str
     no_contact: NDArray[np.uint8]
     pictures: NDArray[np.uint8]
     centres: Matrix
-    radii: Matrix
 
     def __len__(self) -> int:
         return len(self.pictures)
@@ -93,30 +91,20 @@ def read_presses(folder: str | Path, name: str) -> Presses:
     path = Path(folder) / name / "dataPack.npz"
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as pack:
-            found = [pack[key] for key in ("f0", "imgs", "touch_center", "touch_radius")]
+            found = [pack[key] for key in ("f0", "imgs", "touch_center")]
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise BadRobotInput(
-            f"{path} must hold f0, imgs, touch_center and touch_radius as plain arrays: {error}"
-        ) from error
-    no_contact, pictures, centres, radii = found
+        raise BadRobotInput(f"{path} must hold f0, imgs and touch_center as plain arrays: {error}") from error
+    no_contact, pictures, centres = found
     good = (
         no_contact.dtype == pictures.dtype == np.uint8 and pictures.ndim == 4 and pictures.shape[1:] == no_contact.shape
     )
-    if (
-        not good
-        or min(no_contact.shape[:2]) < CROP
-        or centres.shape != (len(pictures), 2)
-        or radii.shape != (len(pictures),)
-    ):
+    if not good or min(no_contact.shape[:2]) < CROP or centres.shape != (len(pictures), 2):
         shapes = [array.shape for array in found]
         raise BadRobotInput(f"{path} must hold uint8 pictures of one size, {CROP} pixels or more, got {shapes}")
-    labels = np.c_[centres, radii].astype(np.float64)
-    bad = np.flatnonzero(~(np.isfinite(labels).all(axis=1) & (labels[:, 2] > 0)))
-    if len(bad):  # a NaN would make every fitted weight NaN
-        raise BadRobotInput(
-            f"{path} must hold labels that are finite, with radii above 0; press {bad[0]} has {labels[bad[0]]}"
-        )
-    return Presses(name, no_contact, pictures, labels[:, :2], labels[:, 2])
+    bad = np.flatnonzero(~np.isfinite(centres).all(axis=1))
+    if len(bad):
+        raise BadRobotInput(f"{path} must hold finite centres; press {bad[0]} has {centres[bad[0]]}")
+    return Presses(name, no_contact, pictures, centres.astype(np.float64))
 
 
 @lru_cache(maxsize=256)

@@ -7,8 +7,8 @@ from functools import partial
 import numpy as np
 
 from benchmarks.optics.image_error import compare
-from benchmarks.optics.least_squares import Gram, OpticsSetting, aligned, change, features, labelled_poses, solve
-from benchmarks.optics.real_presses import BallTable, Presses
+from benchmarks.optics.least_squares import Gram, OpticsSetting, aligned, change, features, solve
+from benchmarks.optics.real_presses import PIXEL_MM, BallTable, Presses
 from robot.sim.contact.kernels import Floats
 from robot.sim.contact.layer import Layer
 from robot.sim.gel.sensor import GelSensor, Noise
@@ -99,9 +99,9 @@ def naive_step(presses: Presses, pose: Floats, weights: Floats, setting: OpticsS
 def _press_without_information() -> HardCase:
     """Colours that do not depend on the pose make Gauss-Newton's equations singular."""
     gel = np.full((200, 200, 3), 100, np.uint8)
-    presses = Presses("gelsight", gel, gel[None].copy(), np.array([[100.0, 100.0]]), np.array([40.0]))
+    presses = Presses("gelsight", gel, gel[None].copy(), np.array([[100.0, 100.0]]))
     setting = OpticsSetting(degree=1, places=1, reaches_mm=())
-    start = labelled_poses(presses, setting)[0]
+    start = np.array([100.0, 100.0, 40 * PIXEL_MM])
     weights = np.zeros((features(presses, 0, start, setting).shape[1], 3))
     try:
         step = float(np.abs(naive_step(presses, start, weights, setting)).max())
