@@ -21,7 +21,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -29,208 +29,90 @@ from tests.hostile_pictures import jpeg_of_scans, png_chunk, png_of_zeros
 
 MAX_HEALTH_S, MAX_MEMORY_MB, MAX_EXIT_S = 0.5, 300, 10
 BODY_BYTES = 19_500_000
+JSON = "application/json"
 ATTACKERS, HONEST = "127.0.0.1", "127.0.0.2"
 """The attack and the honest clients use two addresses."""
+TIMEOUT_S = {ATTACKERS: 60, HONEST: 30}
+
+Attack = Callable[[int, bytes], str]
+"""An attack on the service at a port; it gets an honest gel image, and returns the answers of the service as text."""
 
 
 @dataclass(frozen=True)
-class Target:
-    """A running service.
+class Posts:
+    """An attack of several equal requests in parallel; `body` is made from the honest gel image."""
 
-    Attributes:
-        port: its port.
-        gels: file contents of the gel images of one honest grasp.
-    """
+    path: str
+    times: int
+    body: Callable[[bytes], bytes]
+    kind: str = JSON
 
-    port: int
-    gels: tuple[bytes, ...]
+    def __call__(self, port: int, gel: bytes) -> str:
+        """Send the requests; return the counts of the statuses."""
+        body, statuses = self.body(gel), list[int]()
 
-    def post(self, path: str, body: bytes, kind: str = "application/json", timeout: float = 60) -> int:
-        """Send one request from the attackers' address; return the status, or 0 if the connection was cut."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout, source_address=(ATTACKERS, 0))
-        try:
-            connection.request("POST", path, body, {"content-type": kind, "origin": f"http://127.0.0.1:{self.port}"})
-            return connection.getresponse().status
-        except (OSError, http.client.HTTPException):
-            return 0
-        finally:
-            connection.close()
+        def post() -> None:
+            statuses.append(_request(port, "POST", self.path, body, self.kind, source=ATTACKERS))
 
-    def connect(self) -> socket.socket:
-        """Open a plain connection from the attackers' address."""
-        return socket.create_connection(("127.0.0.1", self.port), 10, (ATTACKERS, 0))
+        threads = [threading.Thread(target=post) for _ in range(self.times)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        counts = {status: statuses.count(status) for status in sorted(set(statuses))}
+        return ", ".join(f"{count} x {status or 'cut off'}" for status, count in counts.items())
 
 
-Attack = Callable[[Target], str]
-"""An attack returns the answers of the service as text."""
-
-
-def many_keys(target: Target) -> str:
-    """20 MB of small JSON keys to the path that needs no token."""
-    keys = ",".join(f'"k{number}":0' for number in range(1_400_000))
-    return _post_in_parallel(target, "/v1/session", f"{{{keys}}}".encode(), 3)
-
-
-def empty_grasps(target: Target) -> str:
-    """A query of millions of empty grasps."""
-    body = b'{"touches": [' + b"[]," * (BODY_BYTES // 3 - 10) + b"[]]}"
-    return _post_in_parallel(target, "/v1/query", body, 3)
-
-
-def nested(target: Target) -> str:
-    """JSON arrays within arrays, a million deep."""
-    return _post_in_parallel(
-        target, "/v1/query", b'{"touches": ' + b"[" * (BODY_BYTES // 2) + b"]" * (BODY_BYTES // 2), 3
-    )
-
-
-def empty_verification(target: Target) -> str:
-    """A verification of millions of empty grasps."""
-    body = b'{"expect": "mug", "touches": [' + b"[]," * (BODY_BYTES // 3 - 20) + b"[]]}"
-    return _post_in_parallel(target, "/v1/verify", body, 3)
-
-
-def many_parts(target: Target) -> str:
-    """A form of hundreds of thousands of empty parts."""
-    part = b"--b\r\ncontent-disposition: form-data; name=gelsight; filename=a\r\n\r\n\r\n"
-    body = part * (BODY_BYTES // len(part)) + b"--b--\r\n"
-    return _post_in_parallel(target, "/v1/query", body, 3, "multipart/form-data; boundary=b")
-
-
-def jpeg_scans(target: Target) -> str:
-    """A small JPEG file whose 40,000 scans take a minute to decode."""
-    return _pictures(target, jpeg_of_scans(4472, 40_000), 4)
-
-
-def png_column(target: Target) -> str:
-    """A PNG picture 1 pixel wide and 20,000,000 high."""
-    return _pictures(target, png_of_zeros(1, 20_000_000), 4)
-
-
-def png_pixels(target: Target) -> str:
-    """PNG pictures of the largest accepted size, 17 kB each."""
-    return _pictures(target, png_of_zeros(4472, 4472), 4)
-
-
-def jpeg_markers(target: Target) -> str:
-    """14 MB of empty JPEG segments before the picture begins."""
-    return _pictures(target, b"\xff\xd8" + b"\xff\xe0\x00\x02" * 3_500_000, 3)
-
-
-def png_chunks(target: Target) -> str:
-    """14 MB of empty PNG chunks before the picture begins."""
-    return _pictures(target, png_of_zeros(64, 64)[:33] + png_chunk(b"tEXt", b"") * 1_160_000, 3)
-
-
-def many_pictures(target: Target) -> str:
-    """Queries of 32 grasps of two tiny pictures."""
-    return _post_in_parallel(target, "/v1/query", _query([png_of_zeros(8, 8)] * 64), 8)
-
-
-def many_enrolments(target: Target) -> str:
-    """Enrolments of 32 grasps of tiny pictures."""
-    return _post_in_parallel(target, "/v1/objects/x/touches", _query([png_of_zeros(8, 8)] * 64), 8)
-
-
-def half_headers(target: Target) -> str:
+def half_headers(port: int, _gel: bytes) -> str:
     """600 connections that each send half of a request's headers and then wait."""
     connections = []
     for _ in range(600):
-        try:
-            connection = target.connect()
-            connection.sendall(b"GET /healthz HTTP/1.1\r\nhost: localhost\r\nx-half: ")
-            connections.append(connection)
-        except OSError:
-            continue
+        with suppress(OSError):
+            connections.append(_connect(port))
+            connections[-1].sendall(b"GET /healthz HTTP/1.1\r\nhost: localhost\r\nx-half: ")
     time.sleep(15)
-    still_open = sum(_is_open(connection) for connection in connections)
-    for connection in connections:
-        connection.close()
-    return f"{still_open} of 600 open after 15 s"
+    return f"{_close(connections)} of 600 open after 15 s"
 
 
-def slow_bodies(target: Target) -> str:
+def slow_bodies(port: int, _gel: bytes) -> str:
     """100 requests whose bodies arrive at one byte per second."""
-    connections = []
-    for _ in range(100):
-        connection = target.connect()
+    connections = [_connect(port) for _ in range(100)]
+    for connection in connections:
         connection.sendall(
             b"POST /v1/session HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\n"
             b"content-length: 1000\r\n\r\n"
         )
-        connections.append(connection)
     for _ in range(18):
         time.sleep(1)
         for connection in connections:
-            try:
+            with suppress(OSError):
                 connection.sendall(b" ")
-            except OSError:
-                continue
-    still_open = sum(_is_open(connection) for connection in connections)
-    for connection in connections:
-        connection.close()
-    return f"{still_open} of 100 open after 18 s"
+    return f"{_close(connections)} of 100 open after 18 s"
 
 
-def header_flood(target: Target) -> str:
+def header_flood(port: int, _gel: bytes) -> str:
     """One connection that sends headers without end, up to 400 MB."""
     lines = b"".join(b"x-%d: %s\r\n" % (number, b"a" * 1000) for number in range(1000))
-    with target.connect() as connection:
+    with _connect(port) as connection:
         connection.sendall(b"GET /healthz HTTP/1.1\r\nhost: localhost\r\n")
         sent = 0
-        try:
+        with suppress(OSError):
             for _ in range(400):
                 connection.sendall(lines)
                 sent += len(lines)
-        except OSError:
-            pass
         return f"{sent / 1e6:.0f} MB accepted"
 
 
-def many_grasps(target: Target) -> str:
-    """60 simultaneous grasps of the simulated rig."""
-    return _post_in_parallel(target, "/v1/grasp", b"", 60)
+def _connect(port: int) -> socket.socket:
+    return socket.create_connection(("127.0.0.1", port), 10, (ATTACKERS, 0))
 
 
-ATTACKS: tuple[Attack, ...] = (
-    many_keys,
-    empty_grasps,
-    nested,
-    empty_verification,
-    many_parts,
-    jpeg_scans,
-    png_column,
-    png_pixels,
-    jpeg_markers,
-    png_chunks,
-    many_pictures,
-    many_enrolments,
-    half_headers,
-    slow_bodies,
-    header_flood,
-    many_grasps,
-)
-
-
-def _post_in_parallel(target: Target, path: str, body: bytes, times: int, kind: str = "application/json") -> str:
-    """Send the same body several times in parallel; return the counts of the statuses."""
-    statuses: list[int] = []
-    threads = [threading.Thread(target=lambda: statuses.append(target.post(path, body, kind))) for _ in range(times)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    counts = {status: statuses.count(status) for status in sorted(set(statuses))}
-    return ", ".join(f"{count} x {status or 'cut off'}" for status, count in counts.items())
-
-
-def _pictures(target: Target, picture: bytes, times: int) -> str:
-    return _post_in_parallel(target, "/v1/query", _query([picture, target.gels[-1]]), times)
-
-
-def _query(pictures: list[bytes]) -> bytes:
-    grasps = [pictures[start : start + 2] for start in range(0, len(pictures), 2)]
-    return json.dumps({"touches": [[base64.b64encode(one).decode() for one in grasp] for grasp in grasps]}).encode()
+def _close(connections: list[socket.socket]) -> int:
+    """Close connections; return how many the service had left open."""
+    still_open = sum(_is_open(connection) for connection in connections)
+    for connection in connections:
+        connection.close()
+    return still_open
 
 
 def _is_open(connection: socket.socket) -> bool:
@@ -243,6 +125,71 @@ def _is_open(connection: socket.socket) -> bool:
         return True
     except OSError:
         return False
+
+
+def _query(pictures: list[bytes]) -> bytes:
+    grasps = [pictures[start : start + 2] for start in range(0, len(pictures), 2)]
+    return json.dumps({"touches": [[base64.b64encode(one).decode() for one in grasp] for grasp in grasps]}).encode()
+
+
+def _paired(picture: Callable[[], bytes]) -> Callable[[bytes], bytes]:
+    """Return the body of a query of this picture and the honest gel image."""
+    return lambda gel: _query([picture(), gel])
+
+
+_PART = b"--b\r\ncontent-disposition: form-data; name=gelsight; filename=a\r\n\r\n\r\n"
+ATTACKS: dict[str, Attack] = {
+    # 20 MB of small keys, to the path that needs no token
+    "many_keys": Posts(
+        "/v1/session", 3, lambda _: b"{" + b",".join(b'"k%d":0' % number for number in range(1_400_000)) + b"}"
+    ),
+    # millions of empty grasps
+    "empty_grasps": Posts("/v1/query", 3, lambda _: b'{"touches": [' + b"[]," * (BODY_BYTES // 3 - 10) + b"[]]}"),
+    # arrays within arrays, millions deep
+    "nested": Posts("/v1/query", 3, lambda _: b'{"touches": ' + b"[" * (BODY_BYTES // 2) + b"]" * (BODY_BYTES // 2)),
+    "empty_verification": Posts(
+        "/v1/verify", 3, lambda _: b'{"expect": "mug", "touches": [' + b"[]," * (BODY_BYTES // 3 - 20) + b"[]]}"
+    ),
+    # a form of hundreds of thousands of empty parts
+    "many_parts": Posts(
+        "/v1/query", 3, lambda _: _PART * (BODY_BYTES // len(_PART)) + b"--b--\r\n", "multipart/form-data; boundary=b"
+    ),
+    # a small file whose 40,000 scans take a minute to decode
+    "jpeg_scans": Posts("/v1/query", 4, _paired(lambda: jpeg_of_scans(4472, 40_000))),
+    # 1 pixel wide, 20,000,000 high
+    "png_column": Posts("/v1/query", 4, _paired(lambda: png_of_zeros(1, 20_000_000))),
+    # the largest accepted size, 17 kB each
+    "png_pixels": Posts("/v1/query", 4, _paired(lambda: png_of_zeros(4472, 4472))),
+    # 14 MB of empty segments or chunks before the picture begins
+    "jpeg_markers": Posts("/v1/query", 3, _paired(lambda: b"\xff\xd8" + b"\xff\xe0\x00\x02" * 3_500_000)),
+    "png_chunks": Posts(
+        "/v1/query", 3, _paired(lambda: png_of_zeros(64, 64)[:33] + png_chunk(b"tEXt", b"") * 1_160_000)
+    ),
+    # 32 grasps of two tiny pictures
+    "many_pictures": Posts("/v1/query", 8, lambda _: _query([png_of_zeros(8, 8)] * 64)),
+    "many_enrolments": Posts("/v1/objects/x/touches", 8, lambda _: _query([png_of_zeros(8, 8)] * 64)),
+    "half_headers": half_headers,
+    "slow_bodies": slow_bodies,
+    "header_flood": header_flood,
+    # simultaneous grasps of the simulated rig
+    "many_grasps": Posts("/v1/grasp", 60, lambda _: b""),
+}
+
+
+def _request(
+    port: int, method: str, path: str, body: bytes | None = None, kind: str = JSON, *, source: str = HONEST
+) -> int:
+    """Send one request from the address `source`; return the status, or 0 if the connection was cut."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, TIMEOUT_S[source], source_address=(source, 0))
+    try:
+        connection.request(method, path, body, {} if body is None else {"content-type": kind})
+        response = connection.getresponse()
+        response.read()
+        return response.status
+    except (OSError, http.client.HTTPException):
+        return 0
+    finally:
+        connection.close()
 
 
 @dataclass
@@ -285,14 +232,13 @@ HEAD = (
 )
 
 
-def measure(attack: Attack, index: Path, gels: tuple[bytes, ...]) -> AttackResult:
-    """Run one attack against a new service."""
-    measured = AttackResult(attack.__name__.replace("_", " "))
+def measure(attack: str, index: Path, gels: tuple[bytes, ...]) -> AttackResult:
+    """Run one attack against a new service; `gels` are the gel images of an honest grasp."""
+    measured = AttackResult(attack.replace("_", " "))
     with tempfile.TemporaryDirectory() as folder, _service(index, Path(folder)) as (process, port):
-        target = Target(port, gels)
         honest = _query(list(gels))
         for _ in range(3):
-            target.post("/v1/query", honest)
+            _request(port, "POST", "/v1/query", honest)
         idle, over = _memory_mb(process.pid), threading.Event()
         clients = [
             threading.Thread(target=_poll_health, args=(port, measured, over)),
@@ -302,7 +248,7 @@ def measure(attack: Attack, index: Path, gels: tuple[bytes, ...]) -> AttackResul
         for client in clients:
             client.start()
         time.sleep(0.5)
-        measured.answered = attack(target)
+        measured.answered = ATTACKS[attack](port, gels[-1])
         time.sleep(2)
         over.set()
         for client in clients:
@@ -347,7 +293,7 @@ def _port(text: str) -> int | None:
 def _poll_health(port: int, measured: AttackResult, over: threading.Event) -> None:
     while not over.is_set():
         begun = time.monotonic()
-        status = _honest(port, "GET", "/healthz", None)
+        status = _request(port, "GET", "/healthz")
         if status == 200:
             measured.health_s.append(time.monotonic() - begun)
         else:
@@ -359,26 +305,13 @@ def _send_queries(port: int, body: bytes, measured: AttackResult, over: threadin
     """Send honest queries; after 429, wait and retry for at most 10 s."""
     while not over.is_set():
         begun = time.monotonic()
-        while (status := _honest(port, "POST", "/v1/query", body)) == 429 and time.monotonic() < begun + 10:
+        while (status := _request(port, "POST", "/v1/query", body)) == 429 and time.monotonic() < begun + 10:
             time.sleep(0.2)
         if status == 200:
             measured.query_s.append(time.monotonic() - begun)
         else:
             measured.query_failed += 1
         time.sleep(0.25)
-
-
-def _honest(port: int, method: str, path: str, body: bytes | None) -> int:
-    connection = http.client.HTTPConnection("127.0.0.1", port, 30, source_address=(HONEST, 0))
-    try:
-        connection.request(method, path, body, {"content-type": "application/json"} if body else {})
-        response = connection.getresponse()
-        response.read()
-        return response.status
-    except (OSError, http.client.HTTPException):
-        return 0
-    finally:
-        connection.close()
 
 
 def _watch_memory(pid: int, idle: float, measured: AttackResult, over: threading.Event) -> None:
@@ -407,13 +340,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("index", type=Path)
     parser.add_argument("--gelsight", type=Path, nargs="+", required=True)
-    parser.add_argument("--only", nargs="+", choices=[attack.__name__ for attack in ATTACKS])
+    parser.add_argument("--only", nargs="+", choices=ATTACKS, default=ATTACKS)
     arguments = parser.parse_args()
     gels = tuple(path.read_bytes() for path in arguments.gelsight)
     print(HEAD, flush=True)
     all_hold = True
     for attack in ATTACKS:
-        if not arguments.only or attack.__name__ in arguments.only:
+        if attack in arguments.only:
             measured = measure(attack, arguments.index, gels)
             print(measured.row(), flush=True)
             all_hold = all_hold and measured.holds
