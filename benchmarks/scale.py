@@ -335,19 +335,6 @@ def lines(size: Size) -> Iterator[str]:
         )
 
 
-def slopes(sizes: Sequence[Size]) -> Iterator[tuple[str, float]]:
-    """Yield name and d log t / d log N, fitted over all measured sizes from 1e4 photos on."""
-    tables: dict[str, list[tuple[int, float]]] = {}
-    for size in sizes:
-        flat = size.figures | {f"{kind} {name}": value for kind, p in size.kinds.items() for name, value in p.items()}
-        for name, value in flat.items():
-            if name.endswith(("_s", "_mb", " k", " needed")) and size.photos >= 10_000 and value > 0:
-                tables.setdefault(name, []).append((size.photos, value))
-    for name, table in tables.items():
-        if len(table) > 1:
-            yield name, float(np.polyfit(*np.log(np.array(table, dtype=float)).T, 1)[0])
-
-
 def collected(folder: Path) -> Path:
     """Collect a small recording on the simulated rig."""
     words = ["collect", "--rig", "sim", "--objects", "60", "--grasps", "2", "--seed", "20000", "--jobs", "2"]
@@ -357,7 +344,7 @@ def collected(folder: Path) -> Path:
 
 
 def main() -> None:
-    """Print each size as soon as it is measured, then the slopes."""
+    """Print each size as soon as it is measured."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scale", description=__doc__.split("\n\n")[0])
     parser.add_argument("--sizes", nargs="+", type=float, default=[1e3, 1e4, 1e5])
     parser.add_argument("--kinds", nargs="+", default=list(KINDS))
@@ -370,13 +357,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
         crowd = blended_photos(arguments.model, arguments.recording or collected(folder), arguments.features)
-        sizes = []
         for number in arguments.sizes:
-            sizes.append(measure(crowd, int(number), arguments.kinds, folder / "index"))
+            size = measure(crowd, int(number), arguments.kinds, folder / "index")
             shutil.rmtree(folder / "index")
-            print("\n".join(lines(sizes[-1])), flush=True)
-        for name, slope in slopes(sizes):
-            print(f"N^{slope:.2f}  {name}")
+            print("\n".join(lines(size)), flush=True)
 
 
 if __name__ == "__main__":
