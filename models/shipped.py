@@ -7,8 +7,8 @@
     python -m models.shipped calibrate FOLDER --meshes MESHES
         calibrate the shipped checkpoints again; keep their weights
     python -m models.shipped score FOLDER
-        collect other objects into FOLDER/recording, and evaluate the shipped checkpoint on them: FOLDER/report; with
-        --fingers 1 that for one finger, in FOLDER/report-one-finger
+        collect other objects into FOLDER/recording, and evaluate the shipped checkpoint for two fingers on them:
+        FOLDER/report
 
 An interrupted job continues. Accuracy on simulated touches does not predict accuracy on real sensors.
 """
@@ -119,7 +119,6 @@ def main(argv: list[str] | None = None) -> int:
     score.add_argument("--objects", type=int, default=120)
     score.add_argument("--grasps", type=int, default=8)
     score.add_argument("--model", type=Path, help="another checkpoint than the shipped one")
-    score.add_argument("--fingers", type=int, choices=tuple(SHIPPED), default=2, help="gel images of a touch")
     for job in (make, calibrate_job):
         job.add_argument("--meshes", type=Path, required=True, help="folder of closed meshes (STL)")
     for job in (make, calibrate_job, score):
@@ -425,24 +424,8 @@ def score_shipped(arguments: argparse.Namespace) -> int:
         return code
     split = recording.with_name("split.json")
     split.write_text(json.dumps(draw_split(load_grasps(recording), FITTED, FITTED).to_dict(), indent=1) + "\n")
-    model = arguments.model or shipped_model(arguments.fingers)
-    out = arguments.folder / "report"
-    if arguments.fingers == 1:
-        recording, out = first_finger(recording), arguments.folder / "report-one-finger"
+    model, out = arguments.model or shipped_model(), arguments.folder / "report"
     return retrieve("evaluate", recording, "--model", model, "--methods", "chance", "--split", split, "--out", out)
-
-
-def first_finger(recording: Path) -> Path:
-    """Write a recording of the same grasps with only one finger, next to `recording`; images are linked."""
-    out = recording.with_name(recording.name + "-one-finger")
-    out.mkdir(exist_ok=True)
-    if not (out / "images").exists():
-        (out / "images").symlink_to((recording / "images").resolve(), target_is_directory=True)
-    (out / "recording.json").write_bytes((recording / "recording.json").read_bytes())
-    lines = [json.loads(line) for line in (recording / "metadata.jsonl").read_text().splitlines()]
-    one_finger = [{name: value for name, value in line.items() if not name.startswith("touch_b_")} for line in lines]
-    (out / "metadata.jsonl").write_text("".join(json.dumps(line) + "\n" for line in one_finger))
-    return out
 
 
 def draw_split(grasps: list[Grasp], train: int, validation: int) -> Split:
