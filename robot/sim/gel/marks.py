@@ -127,7 +127,6 @@ def marker_positions(markers: Markers, surface: Surface) -> Array:
     return out
 
 
-@lru_cache(maxsize=8)
 def _rest_positions(markers: Markers, field: Field) -> Array:
     height, width = field.size_mm
     axes = [(np.arange(int(size / markers.pitch_mm)) + 0.5) * markers.pitch_mm for size in (width, height)]

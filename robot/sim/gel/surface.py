@@ -6,7 +6,7 @@ sqrt(1 + |grad u|^2).
 """
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -38,20 +38,15 @@ class Field:
 
     def positions(self) -> tuple[Array, Array]:
         """Return x (1, cols) and y (rows, 1) of the pixel centres from the middle of the field, in mm."""
-        return _positions(self)
+        x = (np.arange(self.cols) - (self.cols - 1) / 2) * self.pixel_mm
+        y = (np.arange(self.rows) - (self.rows - 1) / 2) * self.pixel_mm
+        return x.astype(np.float32)[None, :], y.astype(np.float32)[:, None]
 
     def unit_positions(self) -> tuple[Array, Array]:
         """Return the positions scaled so that the field spans -1 to 1 in width and height."""
         x, y = self.positions()
         height, width = self.size_mm
         return x * np.float32(2 / width), y * np.float32(2 / height)
-
-
-@lru_cache(maxsize=16)
-def _positions(field: Field) -> tuple[Array, Array]:
-    x = (np.arange(field.cols) - (field.cols - 1) / 2) * field.pixel_mm
-    y = (np.arange(field.rows) - (field.rows - 1) / 2) * field.pixel_mm
-    return x.astype(np.float32)[None, :], y.astype(np.float32)[:, None]
 
 
 class Surface:
