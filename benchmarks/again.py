@@ -84,7 +84,7 @@ def build(catalogue: Path, index: Path, new: int) -> float:
         encode()  # the first time takes longer
         encoding_s = _cpu_s(on_a_thread)
     start = time.process_time()
-    report = build_index(catalogue, checkpoint, index, quiet=True)
+    report = build_index(catalogue, checkpoint, index)
     assert report.embedded == new, report
     return time.process_time() - start - encoding_s
 

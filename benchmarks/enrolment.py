@@ -183,7 +183,7 @@ def answer(recording: Path, checkpoint: Checkpoint, content: Content, references
         return np.asarray(np.load(file))
     catalogue, index = (recording.with_name(f"{recording.name}-{what}") for what in ("catalog", "index"))
     write_catalogue(catalogue, content, references)
-    retrieval.build_index(catalogue, checkpoint, index, quiet=True)
+    retrieval.build_index(catalogue, checkpoint, index)
     values = np.full((len(queries.grasps), len(references)), REFUSED)
     with retrieval.open(index) as searcher:
         shard, posterior = searcher.folder_shard, searcher.posterior

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from retrieval.console.progress import show_progress
 from retrieval.data.dataset import Split, load_grasps
 from retrieval.metrics.intervals import compare, summarise
 from retrieval.metrics.measure import Measure
@@ -74,6 +75,7 @@ def main() -> None:
     parser.add_argument("--init", default="imagenet", help="weights of MobileNetV2: imagenet, a file, or random")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
+    show_progress()
     begin = time.monotonic()
     found, taken, seconds = measure(
         options.recording, options.objects, options.held_out, options.folds, options.init, options.seed

@@ -47,6 +47,7 @@ from indexes.store.generation import Arrays, Generation
 from indexes.store.manifest import FileChecksum
 from indexes.store.rows import Row
 from retrieval.commands.main import main as retrieve
+from retrieval.console.progress import show_progress
 from retrieval.data.dataset import load_grasps
 from retrieval.frontier.candidates import STRUCTURES
 from retrieval.frontier.points import format_duration
@@ -354,6 +355,7 @@ def main() -> None:
     )
     parser.add_argument("--features", type=Path, help="file to store encoded features")
     arguments = parser.parse_args()
+    show_progress()
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
         crowd = blended_photos(arguments.model, arguments.recording or collected(folder), arguments.features)

@@ -20,6 +20,7 @@ import torch
 from models.photography import CONDITIONS
 from models.pictures import LabelledPicture, collect_pictures
 from models.recognition import all_scores, interval, photo_partials, top1
+from retrieval.console.progress import show_progress
 from retrieval.data.camera import assumed_camera
 from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.data.views import FIELD_MM
@@ -48,6 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--model", action="append", required=True, help="a checkpoint, or `shipped`")
     parser.add_argument("--jobs", type=int, default=2)
     options = parser.parse_args(argv)
+    show_progress()
     grasps = load_grasps(options.recording)
     objects = len({grasp.object_id for grasp in grasps})
     photos = collect_pictures(

@@ -30,7 +30,7 @@ from models.pictures import LabelledPicture, collect_pictures
 from models.random_surfaces import RandomSurface, presses
 from retrieval.console.memory import keep_freed_memory
 from retrieval.console.output import say
-from retrieval.console.progress import Bar
+from retrieval.console.progress import Bar, show_progress
 from retrieval.data.card import LIBRARY, card_header
 from retrieval.data.images import read_rgb
 from retrieval.data.resize import resize, to_float
@@ -76,6 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--labelled", type=int, default=LABELLED, help="number of labelled objects")
     parser.add_argument("--jobs", type=int, default=2)
     arguments = parser.parse_args(argv)
+    show_progress()
     keep_freed_memory()
     folder = arguments.folder
     files = press_surfaces(folder / "surfaces", arguments.sensors, arguments.jobs)

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaln, softmax
 
 from models.pictures import collect_pictures
-from retrieval.console.progress import Bar
+from retrieval.console.progress import Bar, show_progress
 from retrieval.data.camera import USUAL_CAMERA, PhotoCamera
 from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.data.loading import map_in_order, worker_pool
@@ -70,6 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--first-finger", action="store_true", help="use only finger a")
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args(argv)
+    show_progress()
     arguments.out.mkdir(parents=True, exist_ok=True)
     grasps = load_grasps(arguments.recording)
     if arguments.first_finger:

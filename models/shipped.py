@@ -32,6 +32,7 @@ from models.meshes import vary_meshes
 from models.pictures import collect_pictures, load_pictures
 from retrieval.commands.main import main as run_command
 from retrieval.console.memory import keep_freed_memory
+from retrieval.console.progress import show_progress
 from retrieval.data.camera import USUAL_CAMERA, PhotoCamera
 from retrieval.data.dataset import LICENCES, Grasp, Split, data_digest, load_grasps
 from retrieval.data.preprocessing import Preprocessing
@@ -125,6 +126,7 @@ def main(argv: list[str] | None = None) -> int:
         job.add_argument("folder", type=Path)
         job.add_argument("--jobs", type=int, default=2)
     arguments = parser.parse_args(argv)
+    show_progress()
     keep_freed_memory()
     return {"make": make_shipped, "calibrate": calibrate_shipped, "score": score_shipped}[arguments.job](arguments)
 
@@ -189,7 +191,7 @@ def train_towers(folder: Path, **settings: Any) -> Checkpoint:
     )
     stated = StatedFields(config.preprocessing, parts)
     trainer.features = TrainedFeatures(dataclasses.replace(config, preprocessing=stated), trainer.device)
-    return averaged(start, trainer.run_or_reuse(quiet=False))
+    return averaged(start, trainer.run_or_reuse())
 
 
 def averaged(start: Checkpoint, trained: Checkpoint) -> Checkpoint:

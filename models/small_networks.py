@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from models.pictures import LabelledPicture, load_pictures
-from retrieval.console.progress import Bar
+from retrieval.console.progress import Bar, show_progress
 
 
 def convolution(channels: int, out: int, stride: int = 1) -> nn.Sequential:
@@ -39,6 +39,7 @@ def run_command(
     chosen.add_argument("--out", type=Path, help="train, and write the network to this file")
     chosen.add_argument("--score", type=Path, help="score the network of this file")
     options = parser.parse_args(argv)
+    show_progress()
     pictures = [each for folder in options.photos for each in load_pictures(folder)]
     if options.out:
         options.out.write_bytes(make(pictures))

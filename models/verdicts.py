@@ -28,7 +28,7 @@ from scipy.special import softmax
 
 from models import shipped
 from models.recognition import interval
-from retrieval.console.progress import Bar
+from retrieval.console.progress import Bar, show_progress
 from retrieval.data.dataset import load_grasps
 from retrieval.data.images import read_rgb
 from retrieval.data.resize import RgbImage
@@ -59,6 +59,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--model", type=Path, default=shipped_model(), help="another checkpoint than the shipped one")
     parser.add_argument("--jobs", type=int, default=2)
     arguments = parser.parse_args(argv)
+    show_progress()
     folder, checkpoint = arguments.folder, load_checkpoint(arguments.model)
     if checkpoint.posterior is None or checkpoint.gel_check is None:
         parser.error(f"{arguments.model} has no posterior or no check of touches; train it again")

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 from _touch_retrieval.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from retrieval.console.progress import show_progress as show_progress
     from retrieval.data.check.recording import check_recording as check_recording
     from retrieval.data.dataset import load_grasps as load_grasps
     from retrieval.data.dataset import make_split as make_split
@@ -84,6 +85,7 @@ _MODULES = {
     "open": "search.searcher:Searcher.open",
     "remove_enrolled": "indexing.enrolled:remove_enrolled",
     "shipped_model": "model.shipped:shipped_model",
+    "show_progress": "console.progress:show_progress",
     "train": "training.train:train",
     "write_report": "report.evaluation:write_report",
 }

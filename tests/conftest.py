@@ -13,6 +13,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, settings
 
+from retrieval.console.progress import Bar
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from tests import synthetic
@@ -52,13 +53,14 @@ def _cache_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def _own_cache(_cache_folder: Path) -> Iterator[None]:
-    """Separate the cache of each test from those of the user and of other tests.
+def _own_state(_cache_folder: Path) -> Iterator[None]:
+    """Separate the cache of each test from those of the user and of other tests, and its switch of progress.
 
     All tests use one folder, which is emptied after each: creating one per test takes half a minute in total.
     """
     with pytest.MonkeyPatch.context() as patch:  # not the test's own, which may replace functions of the clean-up
         patch.setenv("XDG_CACHE_HOME", str(_cache_folder))
+        patch.setattr(Bar, "is_on", False)
         yield
     shutil.rmtree(_cache_folder)
     _cache_folder.mkdir()
@@ -127,7 +129,7 @@ def model(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     from retrieval.training.trainer import train_matcher
 
     out = tmp_path_factory.mktemp("model") / "tiny.safetensors"
-    train_matcher(recording, out, TINY, quiet=True)
+    train_matcher(recording, out, TINY)
     return out
 
 
@@ -146,7 +148,7 @@ def index(catalogue: Path, model: Path, tmp_path_factory: pytest.TempPathFactory
     from retrieval.model.checkpoint import load_checkpoint
 
     out = tmp_path_factory.mktemp("search") / "index"
-    build_index(catalogue, load_checkpoint(model), out, quiet=True)
+    build_index(catalogue, load_checkpoint(model), out)
     return out
 
 
@@ -164,7 +166,7 @@ def cluster(catalogue: Path, model: Path, tmp_path_factory: pytest.TempPathFacto
     from retrieval.model.checkpoint import load_checkpoint
 
     out = tmp_path_factory.mktemp("cluster") / "cluster"
-    build_sharded(catalogue, load_checkpoint(model), out, 4, quiet=True)
+    build_sharded(catalogue, load_checkpoint(model), out, 4)
     return out
 
 

@@ -59,7 +59,7 @@ def write(catalogue, index, models, writer, seed, log):
                 remove_enrolled(index, name)
             else:
                 limit_files()
-                build_index(catalogue, load_checkpoint(draw.choice(models)), index, quiet=True)
+                build_index(catalogue, load_checkpoint(draw.choice(models)), index)
             outcome = "done"
         except (RetrievalError, IndexesError):  # the disk is full, another build runs, or nothing is enrolled
             outcome = "failed"
@@ -69,7 +69,7 @@ def write(catalogue, index, models, writer, seed, log):
 
 def check(catalogue, index, model):
     """Check that the next build and writer use every touch and delete what killed writers left."""
-    report = build_index(catalogue, load_checkpoint(model), index, quiet=True)
+    report = build_index(catalogue, load_checkpoint(model), index)
     enrol(index, "check", [np.full((8, 8, 3), grey, np.uint8) for grey in (50, 200)])
     remove_enrolled(index, "check")
     touches = EnrolledTable(index).read()

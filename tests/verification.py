@@ -25,5 +25,5 @@ def verified_index(folder, model, catalogue, fitted):
     """Return the index, in `folder`, of a model with this calibration that takes every picture for a gel image."""
     made = dataclasses.replace(load_checkpoint(model), posterior=POSTERIOR, verification=fitted, gel_check=None)
     store_checkpoint(made, folder / "m.safetensors")
-    build_index(catalogue, load_checkpoint(folder / "m.safetensors"), folder / "index", quiet=True)
+    build_index(catalogue, load_checkpoint(folder / "m.safetensors"), folder / "index")
     return folder / "index"

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from benchmarks.frontier import APPROXIMATIONS, NEED_NO_MODEL
 from retrieval.commands.frontier import recording_of
+from retrieval.console.progress import show_progress
 from retrieval.frontier.measure import measure_frontier
 
 
@@ -18,6 +19,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--model", help="a checkpoint (default: the shipped one)")
     parser.add_argument("--quick", action="store_true", help="smallest sizes, as a quick test")
     arguments = parser.parse_args(argv)
+    show_progress()
     measure_frontier(
         arguments.out,
         arguments.model,

@@ -20,7 +20,7 @@ from retrieval.commands.options import Command
 from retrieval.console.interruption import record_interrupts
 from retrieval.console.memory import keep_freed_memory
 from retrieval.console.output import checked_stdout, discard_stdout, prepare_streams, printable, say, show
-from retrieval.console.progress import Bar
+from retrieval.console.progress import Bar, show_progress
 from retrieval.version import __version__
 
 MAX_MESSAGE, MESSAGE_TAIL = 500, 150
@@ -99,6 +99,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     prepare_streams()
     program = typer.main.get_command(application(names))
     context: Any = None
+    before = Bar.is_on, Bar.is_verbose
+    show_progress()
     with record_interrupts() as interrupts:
         # Not program.main(): it handles Ctrl-C and closed pipes in its own way.
         try:
@@ -119,6 +121,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             if isinstance(error, Exception) and context is not None and context.params["debug"]:
                 raise
             return _explain(context, error, interrupts)
+        finally:
+            Bar.is_on, Bar.is_verbose = before
 
 
 def _explain(context: Any, error: BaseException, interrupts: list[int]) -> int:

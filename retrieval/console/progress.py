@@ -1,6 +1,7 @@
 """Progress on stderr: one line for each stage of a command, and the time left of a long one.
 
-A stage within another one, and the figures of a stage, are shown with `--verbose` (`Bar.is_verbose`) only.
+The command line shows progress; Python code does so after `show_progress` (`Bar.is_on`). A stage within another one,
+and the figures of a stage, are shown with `--verbose` (`Bar.is_verbose`) only.
 """
 
 import sys
@@ -22,21 +23,22 @@ class Bar:
         total: Number of units of work; 0 if the first `show` states it.
         unit: Name of the units.
         done: Number of finished units; above 0 if work resumes.
-        quiet: Whether to print nothing.
     """
 
+    is_on: ClassVar[bool] = False
+    """Whether this process shows progress."""
     is_verbose: ClassVar[bool] = False
     """Whether every stage prints its lines and figures; there is then no bar."""
     _running: ClassVar["Bar | None"] = None
     """The innermost stage that is shown."""
 
-    def __init__(self, title: str, total: int, unit: str, *, done: int = 0, quiet: bool = False) -> None:
+    def __init__(self, title: str, total: int, unit: str, *, done: int = 0) -> None:
         self.title, self.total, self.unit, self.done, self.note = title, total, unit, done, ""
         self._first, self._start = done, time.monotonic()
         self._last_line = self._last_advance = self._start
         self._rich: Any = None
         self._outer = Bar._running
-        self._is_shown = not quiet and (self.is_verbose or not self._outer)
+        self._is_shown = self.is_on and (self.is_verbose or not self._outer)
 
     def __enter__(self) -> Self:
         Bar._running = self if self._is_shown else self._outer
@@ -101,6 +103,19 @@ class Bar:
 
     def _say(self, text: str) -> None:
         say(f"{self.title}: {text}" + f" ({self.note})" * bool(self.note and self.is_verbose))
+
+
+def show_progress(is_shown: bool = True) -> None:
+    """Show the progress of long work, such as a training, on stderr from now on; the command line always shows it.
+
+    Args:
+        is_shown: False to show no progress from now on.
+
+    >>> retrieval.show_progress()
+    >>> report = retrieval.build_index("catalog", retrieval.load_checkpoint("model.safetensors"), "index")
+    >>> retrieval.show_progress(False)
+    """
+    Bar.is_on = is_shown
 
 
 def _duration(seconds: float) -> str:

@@ -46,7 +46,6 @@ def evaluate(
     seeds: int | None = None,
     split: Split | None = None,
     skipped: Mapping[str, str] = MappingProxyType({}),
-    quiet: bool = False,
 ) -> Results:
     """Compare methods and models on unseen objects, with controls; write results.json and timings.json.
 
@@ -73,7 +72,6 @@ def evaluate(
             each also draws the folds and queries again. Default: 1, with `protocols` 3.
         split: Objects of each part of "unseen-objects". Default: the split of `model`; without a model, a random one.
         skipped: Why a protocol is left out, by its name. The report states these reasons.
-        quiet: No progress on stderr.
 
     Returns:
         The content of results.json.
@@ -89,7 +87,7 @@ def evaluate(
     >>> from pathlib import Path
     >>> config = retrieval.load_config("tiny")
     >>> config = dataclasses.replace(config, training=config.training.with_iterations(2))
-    >>> results = retrieval.evaluate("lab", Path("report"), config=config, methods=["cca", "chance"], quiet=True)
+    >>> results = retrieval.evaluate("lab", Path("report"), config=config, methods=["cca", "chance"])
     >>> rows = results.protocols["unseen-objects"].rows
     >>> list(rows)
     ['cca', 'chance']
@@ -101,7 +99,7 @@ def evaluate(
     ...     return folds(facts.names, [facts.names[::2], facts.names[1::2]], seed)
     >>> protocol = retrieval.Protocol("mine", "Halves", "Objects are halved by name.", halves, topn_accuracy(5))
     >>> options = {"protocols": [protocol], "methods": ["cca", "chance"], "config": "tiny", "seeds": 1}
-    >>> results = retrieval.evaluate("lab", Path("halves"), **options, quiet=True)
+    >>> results = retrieval.evaluate("lab", Path("halves"), **options)
     >>> list(results.protocols["halves"].rows)
     ['cca', 'chance']
     """
@@ -135,7 +133,7 @@ def evaluate(
     def encoder(facts: RecordingFacts, source: Config | Checkpoint) -> TowerEncoder:
         config = source if isinstance(source, Config) else source.config
         camera = recording_camera(facts.folder, facts.grasps, config.preprocessing)
-        return TowerEncoder.of(facts.grasps, source, camera, seed, out, quiet)
+        return TowerEncoder.of(facts.grasps, source, camera, seed, out)
 
     towers_of = {
         name: {row: encoder(facts, source) for row, source in {FROZEN: own, **others}.items()}
@@ -151,9 +149,9 @@ def evaluate(
             if name == UNSEEN_OBJECTS:
                 protocol = with_split(facts, first.config.training, first.checkpoint, split)
                 if are_trained := not first.config.training.freeze_towers:
-                    first = encoder(facts, _trained(facts, protocol, first, out, quiet))
+                    first = encoder(facts, _trained(facts, protocol, first, out))
             if isinstance(protocol, TouchToTouch):
-                found[name] = run_touch_to_touch(protocol, facts, towers, training_seeds, out / "common-frame", quiet)
+                found[name] = run_touch_to_touch(protocol, facts, towers, training_seeds, out / "common-frame")
                 continue
             rows = []
             if model:
@@ -163,7 +161,7 @@ def evaluate(
                 for method in dict.fromkeys(names)
             ]
             rows += [Row(row, "late_fusion", towers[row], True) for row in others if towers[row].checkpoint]
-            run = ProtocolRun(name, protocol, facts, rows, training_seeds, out, quiet)
+            run = ProtocolRun(name, protocol, facts, rows, training_seeds, out)
             found[name], times[name] = run.measure(cache)
     setting = Setting(
         preset=config_name,
@@ -210,10 +208,10 @@ def _require_use(
         )
 
 
-def _trained(facts: RecordingFacts, protocol: Protocol, towers: TowerEncoder, out: Path, quiet: bool) -> Checkpoint:
+def _trained(facts: RecordingFacts, protocol: Protocol, towers: TowerEncoder, out: Path) -> Checkpoint:
     """Train the towers on the split of the protocol, unless `out` has this model; return the checkpoint."""
     (split,) = protocol.folds(facts, towers.config.training.seed)
     grasps = [facts.grasps[row] for row in protocol.rows_to_fit(facts.grasps)]
     made = made_from(facts.folder, grasps, training_licences(facts.folder, towers.config.training))
     trainer = Trainer(towers.config, split, grasps, out / "model.safetensors", made, camera=towers.camera)
-    return trainer.run_or_reuse(quiet)
+    return trainer.run_or_reuse()

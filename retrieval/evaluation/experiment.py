@@ -166,7 +166,7 @@ class Experiment:
         return dict(self.of.protocol.gallery_of(self.of.facts, self.split))
 
     def _fit(self) -> tuple[Method, float]:
-        if Bar.is_verbose and not self.of.quiet:
+        if Bar.is_on and Bar.is_verbose:
             name = f"{self.row.method} ({self.kind})" if self.is_control else self.row.name
             say(f"evaluate: {name}, seed {self.seed}")
         model = self.row.towers.checkpoint
@@ -174,7 +174,6 @@ class Experiment:
             self.row.towers.config,
             self.seed,
             self._folder,
-            self.of.quiet,
             fit_on_validation=not self.of.protocol.in_depth,
             kind_of=self.of.facts.kind_of,
             **{"model" if self.row.is_unfitted else "start": model},
@@ -252,7 +251,6 @@ class ProtocolRun:
         rows: The rows of the table; controls use the towers of the first one.
         seeds: Seeds of folds and fits.
         out: Folder of fits.
-        quiet: No progress on stderr.
     """
 
     name: str
@@ -261,7 +259,6 @@ class ProtocolRun:
     rows: list[Row]
     seeds: list[int]
     out: Path
-    quiet: bool
 
     def measure(self, cache: Cache) -> tuple[ProtocolResult, ProtocolTimes]:
         """Run all experiments; return measures with intervals, and times."""
@@ -278,7 +275,7 @@ class ProtocolRun:
                 jobs["", kind] = self._experiments(Row(kind, method, towers), kind, is_control=True)
         outcomes: dict[Job, list[list[Outcome]]] = {}
         count = sum(len(by_fold) for by_seed in jobs.values() for by_fold in by_seed)
-        with Bar(f"evaluating {self.name}", count, "fits", quiet=self.quiet) as bar:
+        with Bar(f"evaluating {self.name}", count, "fits") as bar:
             for job, by_seed in jobs.items():
                 outcomes[job] = [[] for _ in by_seed]
                 for found, experiments in zip(outcomes[job], by_seed, strict=True):

@@ -73,19 +73,10 @@ class TowerEncoder:
     checkpoint: Checkpoint | None
     camera: PhotoCamera
     cache: Path
-    quiet: bool
     _encoded: dict[tuple[str, bool, int | None], Features] = field(default_factory=dict)
 
     @classmethod
-    def of(
-        cls,
-        grasps: list[Grasp],
-        source: Config | Checkpoint,
-        camera: PhotoCamera,
-        seed: int,
-        cache: Path,
-        quiet: bool,
-    ) -> Self:
+    def of(cls, grasps: list[Grasp], source: Config | Checkpoint, camera: PhotoCamera, seed: int, cache: Path) -> Self:
         """Return the frozen towers of a configuration, or the towers of a checkpoint, whose seed is replaced.
 
         If a checkpoint has two fingers and the recording one, both fingers get the same touch.
@@ -96,14 +87,14 @@ class TowerEncoder:
         recorded = finger_count(grasps)
         if isinstance(source, Config):
             config = replace(source, matcher=replace(source.matcher, fingers=recorded))
-            return cls(grasps, config, frozen_matcher(config), None, camera, cache, quiet)
+            return cls(grasps, config, frozen_matcher(config), None, camera, cache)
         if recorded not in (1, fingers := source.config.matcher.fingers):
             raise DatasetError(
                 f"{source.path} needs {fingers} finger(s), but the recording has {recorded}. Evaluate a model for "
                 f"{recorded} finger(s)."
             )
         config = replace(source.config, training=source.config.training.with_given_weights(**FURTHER, seed=seed))
-        return cls(with_fingers(grasps, fingers), config, source.matcher, source, camera, cache, quiet)
+        return cls(with_fingers(grasps, fingers), config, source.matcher, source, camera, cache)
 
     def inputs(self, kind: str, with_cells: bool = True, max_grasps: int | None = None) -> Features:
         """Return the features of one of `INPUTS`, with or without the cells of the towers, of thinned grasps."""
@@ -148,14 +139,7 @@ class TowerEncoder:
 
     def _encode(self, grasps: Sequence[Grasp], touch: str, photo: str = "photo") -> Features:
         return encode_recording(
-            grasps,
-            self.matcher,
-            self.config,
-            self.cache,
-            touch_variant=touch,
-            photo_variant=photo,
-            camera=self.camera,
-            quiet=self.quiet,
+            grasps, self.matcher, self.config, self.cache, touch_variant=touch, photo_variant=photo, camera=self.camera
         )
 
 

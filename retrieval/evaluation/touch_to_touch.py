@@ -96,7 +96,7 @@ VT60 = TouchToTouch(
 )
 
 
-def with_common_frame(grasps: Sequence[Grasp], folder: Path, *, quiet: bool = True) -> list[Grasp]:
+def with_common_frame(grasps: Sequence[Grasp], folder: Path) -> list[Grasp]:
     """Return the grasps with images of their contact differences on one common no-contact frame, that of the first.
 
     An image is common + touch - no-contact frame, clipped to 8 bits. It is written to `folder`, unless it exists.
@@ -107,7 +107,7 @@ def with_common_frame(grasps: Sequence[Grasp], folder: Path, *, quiet: bool = Tr
     common = [read_rgb(path) for path in grasps[0].backgrounds]
     folder.mkdir(parents=True, exist_ok=True)
     found = []
-    with Bar("taking differences to one no-contact frame", len(grasps), "grasps", quiet=quiet) as bar:
+    with Bar("taking differences to one no-contact frame", len(grasps), "grasps") as bar:
         for grasp in grasps:
             files = []
             for finger, (touch, before) in enumerate(zip(grasp.touches, grasp.backgrounds, strict=True)):
@@ -154,7 +154,6 @@ def run_touch_to_touch(
     towers_of: Mapping[str, TowerEncoder],
     seeds: Sequence[int],
     folder: Path,
-    quiet: bool,
 ) -> ProtocolResult:
     """Return the results of the protocol.
 
@@ -170,7 +169,7 @@ def run_touch_to_touch(
     sequences = Sequences.of(grasps, protocol.sessions)
     reason = missing_no_contact_reason(sequences.grasps)
     folder = folder / facts.digest[:32] / sequences.grasps[0].grasp_id
-    common = [] if reason else with_common_frame(sequences.grasps, folder, quiet=quiet)
+    common = [] if reason else with_common_frame(sequences.grasps, folder)
     measured = partial(sequences.measures, protocol.measures)
     measures = {("", "order"): measured(clock_features(len(sequences.names)).astype(np.float64))}
     rows: dict[str, RowResult] = {}

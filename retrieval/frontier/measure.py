@@ -14,6 +14,7 @@ from _touch_retrieval.cache import cache_key
 from _touch_retrieval.files import file_digest, write_atomically
 from _touch_retrieval.registry import Registry
 from retrieval.console.output import say
+from retrieval.console.progress import Bar
 from retrieval.data.dataset import AnyRecording
 from retrieval.frontier import APPROXIMATIONS
 from retrieval.frontier.clock import machine
@@ -42,12 +43,11 @@ def measure_frontier(
     quick: bool = False,
     table: Registry[Any] = APPROXIMATIONS,
     model_free: Collection[str] = (),
-    quiet: bool = False,
 ) -> dict[str, Any]:
     """Measure the error and the run time of each approximation; write frontier.json, frontier.html and figures/.
 
     Stored rows are reused if software, model, recording, scale and machine are the same. Each row, measured or stored,
-    is printed on stderr: one line for each plot of error against time.
+    is printed on stderr where progress is shown: one line for each plot of error against time.
 
     Args:
         out: Folder of the results.
@@ -61,7 +61,6 @@ def measure_frontier(
         quick: Use the smallest grids and sizes, as a smoke test.
         table: The approximations.
         model_free: Names of rows that depend on neither the model nor the grasps.
-        quiet: No output on stderr.
 
     Returns:
         The content of frontier.json.
@@ -70,7 +69,7 @@ def measure_frontier(
         ConfigError: A name is unknown. Errors of the measurements pass through.
 
     >>> from pathlib import Path
-    >>> options = {"only": ["partials"], "quick": True, "quiet": True}
+    >>> options = {"only": ["partials"], "quick": True}
     >>> document = retrieval.measure_frontier(Path("frontier"), "model.safetensors", "lab", **options)
     >>> document["rows"]["partials"]["title"]
     'Number format of stored partial activations'
@@ -78,14 +77,14 @@ def measure_frontier(
     works = {name: table.resolve(name) for name in only or table}
     scale = Scale(min(photos, 2000), min(queries, 12), 2, quick) if quick else Scale(photos, queries, repeats)
     grasps = recording if callable(recording) else lambda: recording
-    sample = Sample(Path(model or shipped_model()), grasps, out, scale, quiet)
+    sample = Sample(Path(model or shipped_model()), grasps, out, scale)
     rows, model_digest, here = {}, file_digest(sample.model), machine()
     for name, work in works.items():
         digests = [] if name in model_free else [model_digest, sample.digest]
         key = cache_key("frontier", name, FORMAT, __version__, here, msgspec.to_builtins(scale), *digests)
         stored = sample.stored(key, partial(_measured, work, sample))
         rows[name] = msgspec.convert(stored, ApproximationResult)
-        if not quiet:
+        if Bar.is_on:
             for line in rows[name].lines():
                 say(f"{name}: {line}")
     content = {"software": __version__, "machine": here, "model": model_digest, "scale": scale, "rows": rows}

@@ -56,14 +56,12 @@ class Sample:
         recording: Function that returns the recording, and may collect it first.
         folder: Folder of the cache.
         scale: Scale of the measurements.
-        quiet: No output on stderr.
     """
 
     model: Path
     recording: Callable[[], AnyRecording]
     folder: Path
     scale: Scale
-    quiet: bool = False
 
     @cached_property
     def checkpoint(self) -> Checkpoint:
@@ -99,9 +97,7 @@ class Sample:
         """Tower features of `grasps`."""
         model = self.checkpoint
         camera = recording_camera(self._folder, self.grasps, model.config.preprocessing)
-        return encode_recording(
-            self.grasps, model.matcher, model.config, self.folder / "features", camera=camera, quiet=self.quiet
-        )
+        return encode_recording(self.grasps, model.matcher, model.config, self.folder / "features", camera=camera)
 
     @cached_property
     def photo_rows(self) -> NDArray[np.int64]:
@@ -169,7 +165,7 @@ class Sample:
 
     def _find_exhaustive_top1(self) -> list[int]:
         partials, found = self.queries["partial"], list[int]()
-        with Bar("ranking all photos exactly", len(partials), "queries", quiet=self.quiet) as bar:
+        with Bar("ranking all photos exactly", len(partials), "queries") as bar:
             for touch_partial in partials:
                 found.append(int(self.logits(touch_partial, self.catalogue["partial"]).argmax()))
                 bar.advance()

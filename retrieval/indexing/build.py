@@ -53,7 +53,6 @@ def build_index(
     objects_from: str | None = None,
     kind: str | type[VectorIndex] = "flat",
     cells: bool | None = None,
-    quiet: bool = False,
 ) -> BuildReport:
     """Write the next generation of an index of a catalogue, or the first one.
 
@@ -69,7 +68,6 @@ def build_index(
         kind: Kind of index: "flat", a factory string of FAISS with search settings after a semicolon, or your class.
         cells: Store the cells of photos, for late interaction; None for the setting of the existing index, else True.
             Requires a model with cells.
-        quiet: Show no progress.
 
     Returns:
         A report of the build.
@@ -80,7 +78,7 @@ def build_index(
         IndexesError: The kind is unknown or needs more photos, or the index could not be written and did not change.
 
     >>> checkpoint = retrieval.load_checkpoint("model.safetensors")
-    >>> report = retrieval.build_index("catalog", checkpoint, "index", quiet=True)
+    >>> report = retrieval.build_index("catalog", checkpoint, "index")
     >>> report.photos, report.embedded  # the index exists, and no photo changed
     (4, 0)
     """
@@ -90,7 +88,7 @@ def build_index(
         before, previous = current.about, current.fingerprint
     except IndexesError:
         before, previous = {}, None
-    options, note = build_options(checkpoint, before, objects_from=objects_from, kind=kind, cells=cells, quiet=quiet)
+    options, note = build_options(checkpoint, before, objects_from=objects_from, kind=kind, cells=cells)
     catalogue = list_catalogue(folder, options.naming)
     options = replace(options, camera=catalogue_camera(catalogue, checkpoint, before))
     with store.lock():
@@ -151,14 +149,12 @@ class BuildOptions:
         naming: Rule that names the object of a photo.
         kind: Name of the kind of index.
         cells: Store the cells of photos; None for a model without cells.
-        quiet: Show no progress.
         camera: The camera that is assumed for photos that do not state it.
     """
 
     naming: Naming
     kind: str
     cells: bool | None
-    quiet: bool
     camera: PhotoCamera = USUAL_CAMERA
 
 
@@ -169,7 +165,6 @@ def build_options(
     objects_from: str | None,
     kind: str | type[VectorIndex],
     cells: bool | None,
-    quiet: bool,
 ) -> tuple[BuildOptions, str]:
     """Return the options of a build, and a note if the rule that names objects changed.
 
@@ -191,7 +186,7 @@ def build_options(
     if checkpoint.config.matcher.cell_dim and cells is None:
         cells = before.get(CELLS) is not False
     note = f"The rule for object names changed from {known.text} to {naming.text}." if known and known != naming else ""
-    return BuildOptions(naming, kind_name(kind), cells, quiet), note
+    return BuildOptions(naming, kind_name(kind), cells), note
 
 
 def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, store: IndexStore, options: BuildOptions) -> BuildReport:
@@ -204,7 +199,7 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, store: IndexStore
         checkpoint = checkpoint.without_cells()
     load_kind(options.kind).require(options.kind, len(catalogue.photos), checkpoint.config.matcher.embedding_dim)
     with store.lock(), Cache(store.path / CACHE) as cache:
-        contents = read_contents(catalogue, checkpoint, options.camera, cache, options.quiet)
+        contents = read_contents(catalogue, checkpoint, options.camera, cache)
         about = {
             "checkpoint": str(checkpoint.path.resolve()),
             "catalogue": catalogue.where,
@@ -259,7 +254,7 @@ def _write(
         kept = kept_measurement(before.about.get("candidates"), len(contents.rows), contents.encoded)
 
     def measure(index: VectorIndex, arrays: Arrays) -> dict[str, Any]:
-        candidates = kept or measure_candidates(checkpoint, index, StoredPartials(arrays), quiet=options.quiet)
+        candidates = kept or measure_candidates(checkpoint, index, StoredPartials(arrays))
         return {"candidates": candidates}
 
     touches = query_codes(checkpoint, RECALL_QUERIES)

@@ -36,16 +36,13 @@ MAX_CHANGED_FRACTION = 0.10
 """Fraction of a catalogue that may change before the number of candidates is measured again."""
 
 
-def measure_candidates(
-    checkpoint: Checkpoint, index: VectorIndex, partials: Partials, *, quiet: bool = True
-) -> dict[str, Any] | None:
+def measure_candidates(checkpoint: Checkpoint, index: VectorIndex, partials: Partials) -> dict[str, Any] | None:
     """Return the number of candidates and its measurement, the entry "candidates" of a manifest.
 
     Args:
         checkpoint: The model, with the touches that it stores to measure with.
         index: The vector index over the embeddings of N photos.
         partials: Partial activations (N, partial_width) of the photos, perhaps memory-mapped.
-        quiet: Show no progress.
 
     Returns:
         The entry; None if the checkpoint stores no touches to measure with.
@@ -58,7 +55,7 @@ def measure_candidates(
         return None
     scorer, (touches, queries) = checkpoint.matcher.head.scorer, stored
     top1, taken = [], []
-    with Bar("measuring the candidate search", len(queries), "touches", quiet=quiet) as bar:
+    with Bar("measuring the candidate search", len(queries), "touches") as bar:
         for touch in touches:
             start = time.perf_counter()
             top1.append(int(scorer.logits(touch[None], partials).argmax()))

@@ -282,7 +282,7 @@ class Codes:
     faults: dict[str, Sequence[str]] = field(default_factory=dict)
 
 
-def find_codes(items: Sequence[Paths], encoder: Encoder, files: CatalogueFiles, cache: Cache, quiet: bool) -> Codes:
+def find_codes(items: Sequence[Paths], encoder: Encoder, files: CatalogueFiles, cache: Cache) -> Codes:
     """Store the codes of photos or touches in the cache of the index, each content once.
 
     Raises:
@@ -319,7 +319,7 @@ def find_codes(items: Sequence[Paths], encoder: Encoder, files: CatalogueFiles, 
         return {key: code.tobytes() for key, code in zip(new, codes, strict=True)}
 
     with (
-        Bar("embedding", len(unread), encoder.what, quiet=quiet) as bar,
+        Bar("embedding", len(unread), encoder.what) as bar,
         ThreadPoolExecutor(threads := torch.get_num_threads()) as pool,
         one_thread(),
     ):

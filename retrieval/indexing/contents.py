@@ -82,9 +82,7 @@ class IndexContents:
             yield {name: records[name] for name in self.encoder.layout.names or ()}
 
 
-def read_contents(
-    catalogue: Catalogue, checkpoint: Checkpoint, assumed: PhotoCamera, cache: Cache, quiet: bool
-) -> IndexContents:
+def read_contents(catalogue: Catalogue, checkpoint: Checkpoint, assumed: PhotoCamera, cache: Cache) -> IndexContents:
     """Find or make the codes of a catalogue's photos, by the camera that they state or the assumed one, and touches.
 
     Raises:
@@ -96,7 +94,7 @@ def read_contents(
         unused = (SkippedPhoto(photo.path, reason) for photo in catalogue.photos)
         catalogue = replace(catalogue, photos=(), skipped=(*catalogue.skipped, *unused))
     files = CatalogueFiles(catalogue, cache)
-    references = _find_references(catalogue, checkpoint, files, cache, quiet)
+    references = _find_references(catalogue, checkpoint, files, cache)
     photos = sorted([*catalogue.photos, *references.pictures], key=lambda photo: photo.path)
     cameras = {
         photo.path: camera
@@ -104,7 +102,7 @@ def read_contents(
         if (camera := stated_camera(photo.metadata, assumed)) != USUAL_CAMERA
     }
     encoder, gel_images = photo_encoder(checkpoint, cameras), {picture.path for picture in references.pictures}
-    codes = find_codes([(photo.path,) for photo in photos], encoder, files, cache, quiet)
+    codes = find_codes([(photo.path,) for photo in photos], encoder, files, cache)
     files.save()
     if not codes.keys:
         raise no_photo(catalogue, [*catalogue.skipped, *codes.skipped])
@@ -129,14 +127,14 @@ def no_photo(catalogue: Catalogue, skipped: Sequence[SkippedPhoto]) -> NoReadabl
 
 
 def _find_references(
-    catalogue: Catalogue, checkpoint: Checkpoint, files: CatalogueFiles, cache: Cache, quiet: bool
+    catalogue: Catalogue, checkpoint: Checkpoint, files: CatalogueFiles, cache: Cache
 ) -> ReferenceTouches:
     """Find or make the codes of touches; those without contact or with another number of fingers are left out."""
     if not catalogue.touches:
         return ReferenceTouches()
     require_reference_calibration(checkpoint)
     encoder = touch_encoder(checkpoint)
-    codes = find_codes([touch.paths for touch in catalogue.touches], encoder, files, cache, quiet)
+    codes = find_codes([touch.paths for touch in catalogue.touches], encoder, files, cache)
     readable = [touch for touch in catalogue.touches if touch.paths in codes.keys]
     records = read_codes(cache, encoder, [codes.keys[touch.paths] for touch in readable])
     shown, photographed = [SHOWS[shows] for shows in records["shows"]], {photo.object_id for photo in catalogue.photos}

@@ -40,7 +40,7 @@ class BuildReport:
             (`encoded`) and those that queries use (`usable`); None without enrolled touches.
 
     >>> checkpoint = retrieval.load_checkpoint("model.safetensors")
-    >>> report = retrieval.build_index("catalog", checkpoint, "new-index", quiet=True)
+    >>> report = retrieval.build_index("catalog", checkpoint, "new-index")
     >>> report.written, report.objects, report.photos, report.skipped
     (True, 2, 4, [])
     """

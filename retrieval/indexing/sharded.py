@@ -70,7 +70,6 @@ def build_sharded(
     objects_from: str | None = None,
     kind: str | type[VectorIndex] = "flat",
     cells: bool | None = None,
-    quiet: bool = False,
     run: ShardRunner | None = None,
 ) -> BuildReport:
     """Write the next generation of a sharded index of a catalogue.
@@ -83,7 +82,6 @@ def build_sharded(
         objects_from: As for `build_index`.
         kind: As for `build_index`.
         cells: As for `build_index`.
-        quiet: Show no progress.
         run: Builds the shards; None to build them in this process, one after another.
 
     Returns:
@@ -106,7 +104,7 @@ def build_sharded(
         except (CorruptIndex, UnsupportedFormat) as error:
             unusable = f"The existing sharded index is not usable ({error})."
         options, note = build_options(
-            checkpoint, before.about if before else {}, objects_from=objects_from, kind=kind, cells=cells, quiet=quiet
+            checkpoint, before.about if before else {}, objects_from=objects_from, kind=kind, cells=cells
         )
         catalogue = list_catalogue(folder, options.naming)
         options = replace(options, camera=catalogue_camera(catalogue, checkpoint, before.about if before else {}))

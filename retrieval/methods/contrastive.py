@@ -99,7 +99,6 @@ class ContrastiveEmbedding(Method):
                 lambda steps: steps,
                 loss,
                 title=f"fitting contrastive, regularisation {place + 1} of {len(REGULARISATIONS)}",
-                quiet=self.settings.quiet,
                 validate=validate,
             )
         return module.eval(), best

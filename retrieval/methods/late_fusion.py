@@ -78,7 +78,7 @@ def trained_checkpoint(settings: MethodSettings, train: Features, validation: Fe
     weights = start.matcher.state_dict() if start else tower_weights(frozen_matcher(settings.config))
     with nullcontext(settings.folder) if settings.folder else tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"late_fusion-{settings.seed}.safetensors"
-        return Trainer(config, split, grasps, path, SOURCE, known, weights).run_or_reuse(settings.quiet)
+        return Trainer(config, split, grasps, path, SOURCE, known, weights).run_or_reuse()
 
 
 def frozen_matcher(config: Config) -> Matcher:

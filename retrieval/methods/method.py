@@ -25,7 +25,6 @@ class MethodSettings:
         config: Towers, head and training.
         seed: Seed of the fit.
         folder: Folder in which the method may store files, such as a checkpoint; None to store nothing.
-        quiet: Show no progress on stderr.
         fit_on_validation: A method that can (`cca`, `cca_towers`) also fits on validation objects once its
             settings are chosen. A calibration on their scores is then overconfident.
         kind_of: The kind of each object, if the recording names it. Half of each kind is then held out together to
@@ -40,7 +39,6 @@ class MethodSettings:
     config: Config
     seed: int = 0
     folder: Path | None = None
-    quiet: bool = True
     _: KW_ONLY
     fit_on_validation: bool = False
     kind_of: Mapping[str, str] | None = None

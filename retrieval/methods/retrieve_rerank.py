@@ -35,7 +35,7 @@ class RetrieveRerank(LateFusion):
                 checkpoint = dataclasses.replace(checkpoint, config=config)
             elif config.matcher.candidate_width:
                 partials = (feature_partials(checkpoint.matcher, part) for part in (train, validation))
-                checkpoint = with_candidate_encoder(checkpoint, config, *partials, quiet=self.settings.quiet)
+                checkpoint = with_candidate_encoder(checkpoint, config, *partials)
         self._use_checkpoint(checkpoint)
 
     def _use_checkpoint(self, checkpoint: Checkpoint) -> None:

@@ -76,7 +76,7 @@ def write_report(out: Path) -> list[Path]:
     >>> from pathlib import Path
     >>> config = retrieval.load_config("tiny")
     >>> config = dataclasses.replace(config, training=config.training.with_iterations(2))
-    >>> done = retrieval.evaluate("lab", Path("summaries"), config=config, methods=["cca", "chance"], quiet=True)
+    >>> done = retrieval.evaluate("lab", Path("summaries"), config=config, methods=["cca", "chance"])
     >>> [path.name for path in retrieval.write_report(Path("summaries"))][:2]
     ['report.md', 'report.html']
     """

@@ -194,12 +194,12 @@ def _encoded(
 
 @torch.inference_mode()
 def recorded_features(
-    matcher: Matcher, source: FeatureSource, grasps: Sequence[Grasp], *, quiet: bool = False
+    matcher: Matcher, source: FeatureSource, grasps: Sequence[Grasp]
 ) -> tuple[Tensor, dict[Path, Tensor]]:
     """Return features of the touches of grasps (G, fingers * F) and of each of their photo files (F,)."""
     touches: list[Tensor] = []
     photos: dict[Path, Tensor] = {}
-    with Bar("encoding", len(grasps), "grasps", quiet=quiet) as bar:
+    with Bar("encoding", len(grasps), "grasps") as bar:
         for part in batches(grasps, _CHUNK):
             files = list(dict.fromkeys(path for grasp in part for path in grasp.photos))
             touch, photo = source.eval_features(matcher, part, files)

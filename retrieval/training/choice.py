@@ -68,7 +68,7 @@ def fit_best(
         fitted = recipes[best].fit(features, "final", is_final=True)
         parts = [part for part in held_out[best] if part.touches.has_trials]
         pooled_parts = [part.pooled for part in parts if part.pooled is not None]
-        fitted = with_sensor_calibrations(fitted, problem.grasps, features, quiet=problem.quiet)
+        fitted = with_sensor_calibrations(fitted, problem.grasps, features)
         refused = np.array(features.grasp_ids)[refused_touches(fitted, torch.from_numpy(features.touch_rows))]
         is_refused = [np.isin(part.grasp_ids, refused) for part in parts]
         fitted = with_calibrations(fitted, [part.touches for part in parts], pooled_parts, refused=is_refused)
@@ -121,7 +121,6 @@ def pose(
     *,
     model: str | Path | Checkpoint | None = None,
     init: str = "imagenet",
-    quiet: bool = False,
     on_step: OnStep | None = None,
 ) -> Problem:
     """Return the problem of grasps of a recording; unfinished parts are stored in `folder`."""
@@ -129,7 +128,7 @@ def pose(
     start = model if isinstance(model, Checkpoint) else load_checkpoint(model or shipped_model(min(fingers, 2)))
     kinds, linked = object_kinds(recording), linked_objects(grasps)
     camera = recording_camera(recording, grasps, start.config.preprocessing)
-    return Problem(grasps, camera, fingers, start, init, kinds, linked, folder, quiet, on_step)
+    return Problem(grasps, camera, fingers, start, init, kinds, linked, folder, on_step)
 
 
 # Touches of held-out objects -------------------------------------------------------------------------------
@@ -168,19 +167,13 @@ class Comparison:
         """Return the features of all grasps by the towers of a recipe; a tower of several recipes encodes once."""
         problem = self.problem
         return encode_recording(
-            problem.grasps,
-            recipe.matcher,
-            recipe.config,
-            problem.folder,
-            touch_variant=variant,
-            camera=problem.camera,
-            quiet=problem.quiet,
+            problem.grasps, recipe.matcher, recipe.config, problem.folder, touch_variant=variant, camera=problem.camera
         )
 
     def held_out(self, name: str, recipe: Recipe, variant: str = "touch") -> list[HeldOut]:
         """Return the scored touches of each fold."""
         features, parts = self.features(recipe, variant), []
-        with Bar(f"testing: {recipe.label}", len(self.folds), "folds", quiet=self.problem.quiet) as bar:
+        with Bar(f"testing: {recipe.label}", len(self.folds), "folds") as bar:
             for number, fold in enumerate(self.folds):
                 is_held_out = np.isin(features.object_ids, fold)
                 fitted = recipe.fit(features.select(np.flatnonzero(~is_held_out)), f"{name}-{variant}-{number}")

@@ -54,9 +54,7 @@ MAX_QUERIES = 512
 """Largest number of validation touches stored in a checkpoint."""
 
 
-def distil(
-    matcher: Matcher, touch_partials: Tensor, photo_partials: Tensor, settings: Config, *, quiet: bool = False
-) -> None:
+def distil(matcher: Matcher, touch_partials: Tensor, photo_partials: Tensor, settings: Config) -> None:
     """Train a candidate encoder from `matcher.head`, and add it and its sizes (`matcher.config`) to `matcher`.
 
     The partial activations (N, P) and (M, P) are those of touches and photos of training objects; their cells are not
@@ -96,7 +94,6 @@ def distil(
         lambda left: left,
         loss,
         title="fitting the candidate encoder",
-        quiet=quiet,
     )
     candidate_encoder.fold_statistics(touch_statistics, photo_statistics)
     matcher.config, matcher.candidate_encoder = config, candidate_encoder.eval()
@@ -189,8 +186,6 @@ def with_candidate_encoder(
     config: Config,
     train: tuple[Tensor, Tensor],
     validation: tuple[Tensor, Tensor] | None = None,
-    *,
-    quiet: bool = False,
 ) -> Checkpoint:
     """Return `checkpoint` with a distilled candidate encoder, its metric, and validation touches (`queries`).
 
@@ -199,10 +194,9 @@ def with_candidate_encoder(
         config: Sets the size of the candidate encoder, the steps and the seed.
         train: Partial activations of touches (N, P) and of photos (M, P) of training objects.
         validation: The same of validation objects, if any. The metric ranks all photos by these touches.
-        quiet: No progress on stderr.
     """
     matcher, metrics, seed = checkpoint.matcher, checkpoint.provenance["metrics"], config.training.seed
-    distil(matcher, *train, config, quiet=quiet)
+    distil(matcher, *train, config)
     queries = None if validation is None else select_queries(validation[0], seed)
     if validation is not None and queries is not None:
         touches = torch.from_numpy(queries).to(validation[1].device).float()
@@ -214,13 +208,7 @@ def with_candidate_encoder(
 
 
 def add_candidate_encoder(
-    checkpoint: Checkpoint,
-    config: Config,
-    source: FeatureSource,
-    train: Sequence[Grasp],
-    validation: Sequence[Grasp],
-    *,
-    quiet: bool = False,
+    checkpoint: Checkpoint, config: Config, source: FeatureSource, train: Sequence[Grasp], validation: Sequence[Grasp]
 ) -> Checkpoint:
     """Return `checkpoint` with a candidate encoder distilled on recorded grasps, as by `with_candidate_encoder`.
 
@@ -231,9 +219,9 @@ def add_candidate_encoder(
     for grasps in filter(None, (train, validation)):
         order = torch.randperm(len(grasps), generator=torch.Generator().manual_seed(config.training.seed))[:MAX_GRASPS]
         sample = [grasps[row] for row in order.tolist()]
-        touches, photos = recorded_features(matcher, source, sample, quiet=quiet)
+        touches, photos = recorded_features(matcher, source, sample)
         with torch.inference_mode():
             photo_partials = matcher.photo_encoding(torch.stack(list(photos.values()))).partial
             partials.append((matcher.touch_encoding(touches).partial, photo_partials))
     with source.step_context():
-        return with_candidate_encoder(checkpoint, config, *partials, quiet=quiet)
+        return with_candidate_encoder(checkpoint, config, *partials)

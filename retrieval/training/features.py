@@ -135,7 +135,6 @@ def encode_recording(
     touch_variant: str = "touch",
     photo_variant: str = "photo",
     camera: PhotoCamera = USUAL_CAMERA,
-    quiet: bool = False,
 ) -> Features:
     """Return features of grasps by the frozen towers of `matcher`; each photo file is encoded once.
 
@@ -150,7 +149,6 @@ def encode_recording(
         photo_variant: "photo" for whole photos; "margin" for their margin, which rarely shows the object, only with
             whole touches; "none" if no photo is needed.
         camera: The camera of the photos (`recording_camera`).
-        quiet: No progress on stderr.
 
     Raises:
         DatasetError: A no-contact frame that the preprocessing requires is missing, or a file cannot be read.
@@ -165,14 +163,14 @@ def encode_recording(
     matcher = deepcopy(matcher).to(default_device()).eval()
     images, digest = BatchImages(preprocessing, camera), preprocessing.digest()
     made_by = touch_variant, _tower_digest(matcher.touch_tower), digest
-    touch = _encoded_once(cache, made_by, touched, images.touch, partial(touch_features, matcher), images.files, quiet)
+    touch = _encoded_once(cache, made_by, touched, images.touch, partial(touch_features, matcher), images.files)
     if photo_variant == "none":
         photo = np.zeros((len(grasps), 0), np.float32)
     else:
         files = {path: row for row, path in enumerate(dict.fromkeys(grasp.photo for grasp in grasps))}
         seen, encode = f"{digest} {tuple(camera)}", partial(photo_features, matcher)
         made_by = photo_variant, _tower_digest(matcher.photo_tower), seen
-        photo = _encoded_once(cache, made_by, list(files), images.photo, encode, lambda file: (file,), quiet)
+        photo = _encoded_once(cache, made_by, list(files), images.photo, encode, lambda file: (file,))
         photo = photo[[files[grasp.photo] for grasp in grasps]]
     return Features(
         tuple(grasp.grasp_id for grasp in grasps),
@@ -203,7 +201,6 @@ def _encoded_once(
     load: Callable[[T], Any],
     encode: Callable[[list[Any]], Tensor],
     files: Callable[[T], tuple[Path, ...]],
-    quiet: bool,
 ) -> NDArray[np.float32]:
     """Return the features (len(items), F) of items: read from the cache, or encoded and stored.
 
@@ -211,7 +208,7 @@ def _encoded_once(
     features (B, F) of a list of images, `files` the files of an item. Raises DatasetError if one cannot be read.
     """
     with (
-        Bar("encoding", len(items), _UNITS[made_by[0]], quiet=quiet) as bar,
+        Bar("encoding", len(items), _UNITS[made_by[0]]) as bar,
         worker_pool() as pool,
         Cache(cache / "cache.sqlite") if cache else nullcontext() as store,
     ):

@@ -46,13 +46,7 @@ Differences = Callable[[Sequence[Attempt]], list[list[NDArray[np.float32]]]]
 
 
 def train_gate(
-    recording: Path,
-    out: Path,
-    *,
-    iterations: int = 400,
-    seed: int = 0,
-    settings: GateSettings | None = None,
-    quiet: bool = False,
+    recording: Path, out: Path, *, iterations: int = 400, seed: int = 0, settings: GateSettings | None = None
 ) -> dict[str, Any]:
     """Train a gate on the successful and failed grasps of a recording and write it to `out`.
 
@@ -97,8 +91,8 @@ def train_gate(
 
     logits: list[float] = []  # each grasp's highest logit
     with one_thread():
-        gate = GraspSuccessGate(_train_net(train, differences, iterations, seed, quiet), settings)
-        with Bar("validating", len(validation), "grasps", quiet=quiet) as bar:
+        gate = GraspSuccessGate(_train_net(train, differences, iterations, seed), settings)
+        with Bar("validating", len(validation), "grasps") as bar:
             for part in batches(validation, BATCH):
                 logits += map(max, gate.score(differences(part)))
                 bar.advance(len(part))
@@ -147,7 +141,7 @@ def _require_frames(attempts: Sequence[Attempt], frame: str) -> None:
                 )
 
 
-def _train_net(attempts: list[Attempt], differences: Differences, iterations: int, seed: int, quiet: bool) -> GraspNet:
+def _train_net(attempts: list[Attempt], differences: Differences, iterations: int, seed: int) -> GraspNet:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         net = GraspNet()
@@ -160,7 +154,7 @@ def _train_net(attempts: list[Attempt], differences: Differences, iterations: in
         return gate_loss(net(images), torch.tensor([float(attempt.held) for attempt in batch]))
 
     optimizer, plan = torch.optim.Adam(net.parameters()), Plan(iterations, LEARNING_RATE, "halving")
-    train_loop(net, optimizer, plan, lambda steps: steps, loss, title="training", quiet=quiet)
+    train_loop(net, optimizer, plan, lambda steps: steps, loss, title="training")
     return net
 
 

@@ -94,7 +94,6 @@ def train_loop(
     loss: Callable[[int, Batch], Tensor],
     *,
     title: str,
-    quiet: bool = False,
     validate: Callable[[], dict[str, float]] | None = None,
     state: StateFile | None = None,
     step_context: Callable[[], AbstractContextManager[Any]] = nullcontext,
@@ -113,7 +112,6 @@ def train_loop(
         batches: Returns the batches of steps.
         loss: Returns the loss (scalar) of a step, given its number from 0 and its batch.
         title: What the progress bar shows.
-        quiet: No progress on stderr.
         validate: Returns the metrics of `BestStep`, and leaves the module in training mode.
         state: Where an unfinished run is stored; None for a short run.
         step_context: Context of each step.
@@ -132,7 +130,7 @@ def train_loop(
     tell: OnStep = on_step or (lambda *_: None)
     with (
         interruption() if state else nullcontext(threading.Event()) as stop,
-        Bar(title, plan.steps, "steps", done=done, quiet=quiet) as bar,
+        Bar(title, plan.steps, "steps", done=done) as bar,
     ):
         if validate and not done and (metrics := validate()):
             best, best_weights = BestStep(0, metrics), _copied(module)

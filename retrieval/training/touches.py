@@ -231,9 +231,7 @@ def _accuracies(
 # The checkpoint ---------------------------------------------------------------------------------------------
 
 
-def fit_to_touches(
-    recording: Path, grasps: Sequence[Grasp], init: str, *, quiet: bool = False
-) -> tuple[Checkpoint, list[DataLicence]]:
+def fit_to_touches(recording: Path, grasps: Sequence[Grasp], init: str) -> tuple[Checkpoint, list[DataLicence]]:
     """Fit a model to the touches of grasps of a recording; return it, and the licences of its data.
 
     Raises:
@@ -255,9 +253,7 @@ def fit_to_touches(
     parts = divide(grasps)
     measures, encoded = dict[str, Measure](), dict[str, Touches]()
     for variant, suffix in (("touch", ""), ("low_pass", "_low_pass")):
-        features = encode_recording(
-            grasps, matcher, config, None, touch_variant=variant, photo_variant="none", quiet=quiet
-        )
+        features = encode_recording(grasps, matcher, config, None, touch_variant=variant, photo_variant="none")
         features = dataclasses.replace(features, photo=features.touch_rows)
         encoded[variant] = touches = Touches(features, features.owner, parts.group, parts.turn)
         with one_thread():
@@ -282,7 +278,7 @@ def fit_to_touches(
         posterior=references.touch_only,
         references=references,
     )
-    return with_sensor_calibrations(made, grasps, encoded["touch"].features, quiet=quiet), licences
+    return with_sensor_calibrations(made, grasps, encoded["touch"].features), licences
 
 
 def _table(measures: Mapping[str, Measure], has_sessions: bool) -> dict[str, Any]:

@@ -27,7 +27,6 @@ def train(
     init: str = "imagenet",
     touches_only: bool = False,
     split: Split | None = None,
-    quiet: bool = False,
     on_step: OnStep | None = None,
 ) -> Checkpoint:
     """Train a model on a recording and write the checkpoint `out`.
@@ -47,7 +46,6 @@ def train(
             "random" to do without.
         touches_only: Whether the model compares touches with touches, as always for a recording without photos.
         split: A split whose test objects are not used at all; with `config`, also the training and validation objects.
-        quiet: No progress on stderr.
         on_step: Called after each step of a head or tower: with the number of completed steps, and `loss`,
             `learning_rate` and, after a validation, its metrics. Before the first step it gets 0 and the metrics. With
             recipes it is told of the final fit only; the recipes `start` and `linear`, and models of touches only,
@@ -61,7 +59,7 @@ def train(
         JobInterrupted: After Ctrl-C.
 
     >>> from pathlib import Path
-    >>> made = retrieval.train("lab", Path("own.safetensors"), model="model.safetensors", init="random", quiet=True)
+    >>> made = retrieval.train("lab", Path("own.safetensors"), model="model.safetensors", init="random")
     >>> made.provenance["recipe"] in ("start", "linear", "head")
     True
 
@@ -70,14 +68,14 @@ def train(
     >>> import dataclasses
     >>> config = retrieval.load_config("tiny").using(losses={"contrastive": 1.0, "listwise": 0.1})
     >>> config = dataclasses.replace(config, training=config.training.with_iterations(2))  # preset paper: 26,000
-    >>> made = retrieval.train("lab", Path("lab.safetensors"), config, quiet=True)
+    >>> made = retrieval.train("lab", Path("lab.safetensors"), config)
     >>> made.provenance["step"] <= 2, len(made.split.train)
     (True, 7)
     """
     if config is not None:
         if recipe is not None or model is not None or touches_only:
             raise BadInput("A configuration trains without recipe and start model; leave out either.")
-        return train_matcher(recording, out, config, split=split, quiet=quiet, on_step=on_step)
+        return train_matcher(recording, out, config, split=split, on_step=on_step)
     require_writable(out)
     recording, parts = folder_of(recording), sibling_file(out, ".parts")
     grasps = load_grasps(recording)
@@ -85,12 +83,12 @@ def train(
         require_fit(split, grasps)
         grasps = [grasp for grasp in grasps if grasp.object_id not in split.test]
     if not touches_only and any(grasp.photos for grasp in grasps):
-        problem = pose(recording, grasps, parts, model=model, init=init, quiet=quiet, on_step=on_step)
+        problem = pose(recording, grasps, parts, model=model, init=init, on_step=on_step)
         fitted, licences = fit_best(recording, problem, recipe)
     elif recipe is not None or model is not None:
         raise BadInput("A model of touches only has one way to be trained. Leave recipe and start model out.")
     else:
-        fitted, licences = fit_to_touches(recording, grasps, init, quiet=quiet)
+        fitted, licences = fit_to_touches(recording, grasps, init)
     made = made_from(recording, grasps, licences)
     provenance = made | fitted.provenance | {LICENCES: made[LICENCES]}  # a start model has licences of its own
     store_checkpoint(dataclasses.replace(fitted, provenance=provenance), out)

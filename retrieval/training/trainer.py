@@ -71,7 +71,6 @@ def train_matcher(
     config: Config | str,
     *,
     split: Split | None = None,
-    quiet: bool = False,
     on_step: OnStep | None = None,
 ) -> Checkpoint:
     """Train on a recording and write the checkpoint with the best validation score to `out`.
@@ -80,7 +79,7 @@ def train_matcher(
     usable checkpoint; a second Ctrl-C stops immediately. Arguments and errors are those of `retrieval.train`, whose
     `config` this function takes.
     """
-    return prepare_run(folder_of(recording), out, named_config(config)[0], split).run(quiet, on_step=on_step)
+    return prepare_run(folder_of(recording), out, named_config(config)[0], split).run(on_step=on_step)
 
 
 def prepare_run(recording: Path, out: Path, config: Config, split: Split | None = None) -> "Trainer":
@@ -182,7 +181,7 @@ class Trainer:
             share_photos=shared,
         )
 
-    def run(self, quiet: bool = False, *, replace: bool = False, on_step: OnStep | None = None) -> Checkpoint:
+    def run(self, *, replace: bool = False, on_step: OnStep | None = None) -> Checkpoint:
         """Train from the first step, or from that of the state file, to the last; write the checkpoint and return it.
 
         `replace`: replace the state of another run, which is else an error. `on_step`: see `train_loop`.
@@ -205,7 +204,6 @@ class Trainer:
                 ),
                 self.loss,
                 title="training",
-                quiet=quiet,
                 validate=self.validate,
                 state=state,
                 step_context=self.features.step_context,
@@ -224,8 +222,8 @@ class Trainer:
         try:
             store_checkpoint(made, self.out)
             if not interrupted:
-                with Bar("calibrating", 1, "model", quiet=quiet) as bar:
-                    store_checkpoint(self._completed(made, quiet), self.out)
+                with Bar("calibrating", 1, "model") as bar:
+                    store_checkpoint(self._completed(made), self.out)
                     bar.advance()
                 state.path.unlink()
         except KeyboardInterrupt:
@@ -237,7 +235,7 @@ class Trainer:
             raise JobInterrupted(interrupted)
         return load_checkpoint(self.out)
 
-    def run_or_reuse(self, quiet: bool, *, on_step: OnStep | None = None) -> Checkpoint:
+    def run_or_reuse(self, *, on_step: OnStep | None = None) -> Checkpoint:
         """Return the finished checkpoint of this run, or run; files of another run are replaced.
 
         Raises:
@@ -248,7 +246,7 @@ class Trainer:
             same = all(stored.provenance.get(name) == self.provenance.get(name) for name in _MADE_FROM)
             if same and (stored.config, stored.split) == (self.config, self.split):
                 return stored
-        return self.run(quiet, replace=True, on_step=on_step)
+        return self.run(replace=True, on_step=on_step)
 
     def loss(self, step: int, loaded: LoadedBatch) -> Tensor:
         """Return the loss of a step and its prepared batch."""
@@ -281,13 +279,13 @@ class Trainer:
             "validation_nll": negative_log_likelihood(logits, pairs.labels),
         }
 
-    def _completed(self, made: Checkpoint, quiet: bool) -> Checkpoint:
+    def _completed(self, made: Checkpoint) -> Checkpoint:
         """Add the parts that are fitted after training: candidate encoder, calibrations and gel check."""
         train = [grasp for part in self.sampler.grasps for grasp in part]
         held_out = self.validation.grasps if self.validation else []
         if self.config.matcher.candidate_width:
-            made = add_candidate_encoder(made, self.config, self.features, train, held_out, quiet=quiet)
-        return calibrate_checkpoint(made, self.features, train, held_out, quiet=quiet) if self.has_images else made
+            made = add_candidate_encoder(made, self.config, self.features, train, held_out)
+        return calibrate_checkpoint(made, self.features, train, held_out) if self.has_images else made
 
 
 def set_training_mode(matcher: Matcher, settings: TrainingConfig) -> None:

@@ -26,7 +26,7 @@ def rows(model, tmp_path_factory):
     """Every row of the frontier of kernels, measured once, with objects that no model was trained on."""
     folder = tmp_path_factory.mktemp("unseen")
     unseen = synthetic.write_recording(folder / "recording", synthetic.make_objects(4, seed=77), 2)
-    sample = Sample(model, lambda: unseen, folder, Scale(photos=700, queries=4, repeats=1, quick=True), quiet=True)
+    sample = Sample(model, lambda: unseen, folder, Scale(photos=700, queries=4, repeats=1, quick=True))
     return {name: APPROXIMATIONS.load(name)(sample) for name in APPROXIMATIONS}
 
 

@@ -40,7 +40,7 @@ def folder(catalogue, touch, model, tmp_path_factory):
     synthetic.write_recording(root / "lab", synthetic.make_objects(12), 2, before=False)
     calibrated = dataclasses.replace(load_checkpoint(model), references=REFERENCE_CALIBRATION)
     store_checkpoint(calibrated, root / "model.safetensors")
-    build_index(root / "catalog", load_checkpoint(root / "model.safetensors"), root / "index", quiet=True)
+    build_index(root / "catalog", load_checkpoint(root / "model.safetensors"), root / "index")
     return root
 
 

@@ -43,7 +43,6 @@ def calibrate_checkpoint(
     *,
     foreign: ForeignPictures = FOREIGN,
     max_grasps: int = MAX_CALIBRATION_GRASPS,
-    quiet: bool = False,
 ) -> Checkpoint:
     """Return the checkpoint with calibrations and a gel check, if there are enough validation grasps.
 
@@ -55,22 +54,14 @@ def calibrate_checkpoint(
     grasps = _sample_grasps(validation, seed, max_grasps)
     if not train or not grasps:
         return checkpoint
-    touches, photos = recorded_features(matcher, source, grasps, quiet=quiet)
+    touches, photos = recorded_features(matcher, source, grasps)
     scored = [
         each
         for pooled in ((False, True) if matcher.config.cell_dim else (False,))
         if (each := score_grasps(matcher, grasps, touches, photos, pooled=pooled)) is not None
     ]
     checkpoint = dataclasses.replace(checkpoint, opening=fit_opening([*train, *validation]))
-    checkpoint = with_gel_check(
-        checkpoint,
-        source,
-        train,
-        validation,
-        foreign=foreign,
-        max_grasps=max_grasps,
-        quiet=quiet,
-    )
+    checkpoint = with_gel_check(checkpoint, source, train, validation, foreign=foreign, max_grasps=max_grasps)
     if not scored:
         return checkpoint
     refused = [refused_touches(checkpoint, touches)]
@@ -109,7 +100,6 @@ def with_gel_check(
     *,
     foreign: ForeignPictures = FOREIGN,
     max_grasps: int = MAX_CALIBRATION_GRASPS,
-    quiet: bool = False,
 ) -> Checkpoint:
     """Return the checkpoint with a new gel check (`calibrate_checkpoint`).
 
@@ -123,12 +113,7 @@ def with_gel_check(
     half = dataclasses.replace(foreign, count=foreign.count // 2)
     fitting, test = (
         GelCheckFeatures.of(
-            matcher,
-            settings,
-            grasps,
-            recorded_features(matcher, source, grasps, quiet=quiet)[0],
-            pictures,
-            seed + number,
+            matcher, settings, grasps, recorded_features(matcher, source, grasps)[0], pictures, seed + number
         )
         for number, (grasps, pictures) in enumerate(((train, foreign), (validation, half)))
     )
@@ -147,9 +132,7 @@ def refused_touches(checkpoint: Checkpoint, touches: Tensor) -> NDArray[np.bool_
     return np.not_equal(checkpoint.gel_check.classify(readings.cpu().numpy()), CONTACT)
 
 
-def with_sensor_calibrations(
-    checkpoint: Checkpoint, grasps: Sequence[Grasp], features: Features, *, quiet: bool = False
-) -> Checkpoint:
+def with_sensor_calibrations(checkpoint: Checkpoint, grasps: Sequence[Grasp], features: Features) -> Checkpoint:
     """Return the checkpoint with a gel check and the evidence of openings, from all grasps of a recording.
 
     The gel check is fitted on half of the objects, with thresholds from the others. `features` are those of the grasps.
@@ -158,7 +141,7 @@ def with_sensor_calibrations(
     halves = [[grasp for grasp in grasps if grasp.object_id in names[side::2]] for side in (0, 1)]
     checkpoint.matcher.to(device)
     source = FrozenFeatures(checkpoint.config, features_by_image(grasps, features, device))
-    return with_gel_check(dataclasses.replace(checkpoint, opening=fit_opening(grasps)), source, *halves, quiet=quiet)
+    return with_gel_check(dataclasses.replace(checkpoint, opening=fit_opening(grasps)), source, *halves)
 
 
 def _sample_grasps(grasps: Sequence[Grasp], seed: int, count: int) -> list[Grasp]:

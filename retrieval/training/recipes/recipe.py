@@ -40,7 +40,6 @@ class Problem:
         kind_of: Class of each object, if the recording names it.
         linked: Groups of objects that stay together, such as those of one sequence.
         folder: Folder of unfinished trainings, which continue there.
-        quiet: No progress on stderr.
         on_step: Told of the steps of the final fit (`retrieval.train`).
     """
 
@@ -52,7 +51,6 @@ class Problem:
     kind_of: Mapping[str, str]
     linked: Sequence[Sequence[str]]
     folder: Path
-    quiet: bool
     on_step: OnStep | None = None
 
 
@@ -167,5 +165,5 @@ class ContinuedHead(Recipe):
         config = config if is_final else config.without_candidate_encoder()
         out = problem.folder / f"{name}.safetensors"
         trainer = Trainer(config, split, grasps, out, {"source": ""}, features, start.matcher.state_dict())
-        fitted = trainer.run_or_reuse(problem.quiet, on_step=problem.on_step if is_final else None)
+        fitted = trainer.run_or_reuse(on_step=problem.on_step if is_final else None)
         return dataclasses.replace(fitted, provenance={key: fitted.provenance[key] for key in ("step", "metrics")})

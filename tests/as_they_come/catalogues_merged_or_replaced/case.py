@@ -20,9 +20,9 @@ def check(folder, get):
 
     first, model = get("catalogue"), load_checkpoint(get("model"))
     second = shutil.copytree(first, folder / "second", ignore=lambda place, names: sorted(names)[:1])
-    assert build_index(first, model, folder / "index", quiet=True).warnings == []
-    (warning,) = build_index(second, model, folder / "index", quiet=True).warnings
+    assert build_index(first, model, folder / "index").warnings == []
+    (warning,) = build_index(second, model, folder / "index").warnings
     assert str(first) in warning
     assert "--out" in warning
     moved = second.rename(folder / "moved")  # the same catalogue at another place
-    assert build_index(moved, model, folder / "index", quiet=True).warnings == []
+    assert build_index(moved, model, folder / "index").warnings == []

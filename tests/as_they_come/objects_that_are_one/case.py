@@ -24,7 +24,7 @@ def check(folder, get):
         shutil.copy(next((catalogue / names[3]).iterdir()), catalogue / name / "no-image-yet.jpg")
     line = {"object_id": f" {NFC} ", "shelf": "B4"}  # as a person types it
     (catalogue / "metadata.jsonl").write_text(json.dumps(line, ensure_ascii=False), "utf-8")
-    report = build_index(catalogue, load_checkpoint(get("model")), folder / "index", quiet=True)
+    report = build_index(catalogue, load_checkpoint(get("model")), folder / "index")
     assert report.notes == []
     (warning,) = report.warnings
     assert "one picture is the photo of 3 objects" in warning
@@ -35,7 +35,7 @@ def check(folder, get):
             assert photo.metadata == {"shelf": "B4"}
 
     (catalogue / names[4]).rename(catalogue / NFC)
-    build_sharded(catalogue, load_checkpoint(get("model")), folder / "shards", 3, quiet=True)
+    build_sharded(catalogue, load_checkpoint(get("model")), folder / "shards", 3)
     with Searcher.open(folder / "shards") as searcher:
         for name, meant in ((NFC, NFC), (NFD, NFD), (f" {NFC}", f" {NFC}"), (f"{names[5]} ", names[5])):
             assert resolve_object(searcher.shard, name) == meant  # with a space two objects could be meant

@@ -15,7 +15,7 @@ from tests.serving import problem, with_history
 
 def check(folder, get):
     catalogue, index, touch = shutil.copytree(get("catalogue"), folder / "catalog"), folder / "index", get("touch")
-    build_index(catalogue, load_checkpoint(get("model")), index, quiet=True)
+    build_index(catalogue, load_checkpoint(get("model")), index)
     with Searcher.open(index) as searcher:
         result = searcher.query(touch, top=2)
     shown, replaced = (match.photo for match in result.results)

@@ -41,7 +41,7 @@ def fetched(monkeypatch):
 def test_photos_and_touches_are_encoded_on_the_models_device(catalogue_with_touches, tmp_path, fetched):
     model = reference_model.write_reference_model(tmp_path / "model.safetensors")
     model.matcher.to("meta")
-    report = build_index(catalogue_with_touches, model, tmp_path / "index", quiet=True)
+    report = build_index(catalogue_with_touches, model, tmp_path / "index")
     assert (report.embedded, report.references["touches"]) == (22, 8)
     partial = model.config.matcher.partial_width
     assert sum(shape[0] for shape in fetched if shape[1:] == (partial,)) == 22 + 8
@@ -51,7 +51,7 @@ def test_measurements_work_on_any_device_of_the_model(catalogue, tmp_path, fetch
     monkeypatch.setattr(candidates, "EXHAUSTIVE_LIMIT", 5)
     checkpoint = checkpoint_of()
     checkpoint.matcher.to("meta")
-    report = build_index(catalogue, checkpoint, tmp_path / "index", quiet=True)
+    report = build_index(catalogue, checkpoint, tmp_path / "index")
     assert (report.embedded, report.candidates["queries"]) == (24, len(checkpoint.queries))
     assert (len(checkpoint.queries), checkpoint.config.matcher.embedding_dim) in fetched
 

@@ -139,7 +139,7 @@ def test_a_new_generation_is_used_during_running_queries(ray, catalogue, cluster
     try:
         name = min(path.name for path in (tmp_path / "catalog").iterdir())
         shutil.copy(next(catalogue.glob("*/2.jpg")), tmp_path / "catalog" / name / "new.jpg")
-        build_sharded(tmp_path / "catalog", load_checkpoint(model), tmp_path / "cluster", 4, quiet=True)
+        build_sharded(tmp_path / "catalog", load_checkpoint(model), tmp_path / "cluster", 4)
         before = current[0]
         current[0] = Searcher.open(tmp_path / "cluster", shards=served.open)
         del before
@@ -168,7 +168,7 @@ def partials_of(cluster):
 def test_shards_built_by_ray_equal_those_built_in_process(ray, catalogue, cluster, model, tmp_path):
     from retrieval.cluster.building import build_on_ray
 
-    report = build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=build_on_ray)
+    report = build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4, run=build_on_ray)
     assert (report.photos, report.embedded, len(report.shards)) == (24, 24, 4)
     assert ray.is_initialized()  # an existing session stays open
     ours, theirs = partials_of(tmp_path / "c"), partials_of(cluster)
@@ -197,7 +197,7 @@ def test_a_killed_worker_loses_nothing_and_repeats_little(ray, many, model, tmp_
     done = {}
 
     def build():
-        done["report"] = build_sharded(many, load_checkpoint(model), tmp_path / "c", 3, quiet=True, run=build_on_ray)
+        done["report"] = build_sharded(many, load_checkpoint(model), tmp_path / "c", 3, run=build_on_ray)
 
     thread = threading.Thread(target=build)
     thread.start()

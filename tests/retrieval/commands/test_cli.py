@@ -13,6 +13,7 @@ import typer
 
 from retrieval.commands.main import application, main
 from retrieval.commands.options import Command
+from retrieval.console.progress import Bar, show_progress
 from retrieval.model.shipped import shipped_model
 from tests import synthetic
 
@@ -143,6 +144,14 @@ def test_verbose_shows_short_steps_too(workplace, capsys):
     assert re.search(r"^embedding: \d+ photos in ", capsys.readouterr().err, re.MULTILINE)
     assert main(["build-index", "catalog/"]) == 0
     assert "embedding" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("is_shown", [False, True])
+@pytest.mark.parametrize("words", [["build-index", "catalog/"], ["build-index", "absent/"]])
+def test_after_a_command_python_shows_as_much_progress_as_before(words, is_shown, workplace):
+    show_progress(is_shown)
+    main(["--verbose", *words])
+    assert (Bar.is_on, Bar.is_verbose) == (is_shown, False)
 
 
 def numeric_options(command, words=()):

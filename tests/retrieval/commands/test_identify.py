@@ -28,7 +28,7 @@ def index(tmp_path_factory):
         photo = folder / "catalog" / grasp.object_id / grasp.photo.name
         photo.parent.mkdir(parents=True, exist_ok=True)
         photo.symlink_to(grasp.photo)
-    build_index(folder / "catalog", load_checkpoint(shipped_model()), folder / "index", quiet=True)
+    build_index(folder / "catalog", load_checkpoint(shipped_model()), folder / "index")
     return folder / "index"
 
 
@@ -120,7 +120,7 @@ def test_a_wrong_option_is_refused_in_one_line_before_the_rig_moves(
 
 
 def test_a_model_for_one_finger_is_refused_by_a_rig_with_two_sensors(index, tmp_path, capsys):
-    build_index(index.parent / "catalog", load_checkpoint(shipped_model(1)), tmp_path / "one-finger", quiet=True)
+    build_index(index.parent / "catalog", load_checkpoint(shipped_model(1)), tmp_path / "one-finger")
     assert main(["identify", "--index", str(tmp_path / "one-finger"), "--out", str(tmp_path / "run")]) == 2
     assert "takes 1 gel image(s) of a grasp, but the rig sim has 2 sensor(s)" in capsys.readouterr().err
 

@@ -4,8 +4,14 @@ from contextlib import suppress
 
 import pytest
 
+import retrieval
 from retrieval.console import progress
-from retrieval.console.progress import Bar
+from retrieval.console.progress import Bar, show_progress
+
+
+@pytest.fixture(autouse=True)
+def shown():
+    show_progress()
 
 
 @pytest.fixture
@@ -38,6 +44,15 @@ def test_a_long_stage_prints_a_line_every_fifteen_seconds_and_at_its_end(clock, 
         "",
         "training: 16 of 40 steps, 24 s left\ntraining: 32 of 40 steps, 8 s left\ntraining: 40 steps in 45 s\n",
     )
+
+
+def test_python_shows_progress_only_while_its_switch_is_on(clock, capsys):
+    show_progress(False)
+    work(clock)
+    assert capsys.readouterr().err == ""
+    retrieval.show_progress()
+    work(clock)
+    assert "training: 40 steps in 45 s\n" in capsys.readouterr().err
 
 
 def test_a_verbose_command_shows_figures_and_the_stages_within_a_stage(clock, capsys, verbose):

@@ -23,7 +23,7 @@ def test_a_catalogue_in_a_folder_whose_name_is_not_utf8_is_served_and_half_chara
 ):
     folder = tmp_path / NAME
     shutil.copytree(catalogue, folder / "catalog")
-    build_index(folder / "catalog", load_checkpoint(model), folder / "index", quiet=True)
+    build_index(folder / "catalog", load_checkpoint(model), folder / "index")
     with (
         RecordingWriter(tmp_path / "recording", INFO) as writer,
         service(folder / "index", None, writer, history=tmp_path) as client,

@@ -71,7 +71,7 @@ def run(grasped):
 
     def run(out, **changes):
         towers = {} if "model" in changes else {"config": CONFIG, "preset": "test"}
-        options = towers | {"methods": FEW, "quiet": True} | changes
+        options = towers | {"methods": FEW} | changes
         return evaluate(options.pop("recording", grasped), out, **options)
 
     return run
@@ -119,7 +119,7 @@ def test_late_interaction_changes_the_features_of_late_fusion_and_of_no_method_w
     cells = dataclasses.replace(matcher, cell_dim=4, touch_cells=2, photo_cells=2)
     grasps = load_grasps(grasped)
     plain, with_cells = (
-        TowerEncoder.of(grasps, dataclasses.replace(CONFIG, matcher=one), USUAL_CAMERA, 0, tmp_path, quiet=True)
+        TowerEncoder.of(grasps, dataclasses.replace(CONFIG, matcher=one), USUAL_CAMERA, 0, tmp_path)
         for one in (matcher, cells)
     )
     for kind in ("touch", "touch_to_touch"):
@@ -254,7 +254,7 @@ def test_ceilings_compare_touches_with_touches_and_photos_with_photos(tmp_path):
     touch, photo = np.arange(24, dtype=np.float32).reshape(4, 2, 3), np.ones((4, 5), np.float32)
     features = Features(tuple("1234"), tuple("aabb"), touch, photo)
     encoded = {("touch", False, None): features, ("touch", True, None): features}
-    towers = TowerEncoder([], CONFIG, None, None, USUAL_CAMERA, tmp_path, True, encoded)
+    towers = TowerEncoder([], CONFIG, None, None, USUAL_CAMERA, tmp_path, encoded)
     touches, photos = (towers.inputs(kind, with_cells=False) for kind in ("touch_to_touch", "photo_to_photo"))
     np.testing.assert_array_equal(touches.photo, touch.reshape(4, 6))
     np.testing.assert_array_equal(photos.touch, photo[:, None])
@@ -266,7 +266,7 @@ def test_ceilings_compare_touches_with_touches_and_photos_with_photos(tmp_path):
 @pytest.fixture(scope="module")
 def model(grasped, tmp_path_factory):
     """A checkpoint with trained towers."""
-    return train_matcher(grasped, tmp_path_factory.mktemp("m") / "m.safetensors", TRAINED_TOWERS, quiet=True)
+    return train_matcher(grasped, tmp_path_factory.mktemp("m") / "m.safetensors", TRAINED_TOWERS)
 
 
 def test_a_checkpoint_is_evaluated_on_its_unseen_objects(model, run, tmp_path, monkeypatch):
@@ -359,7 +359,7 @@ def test_the_command_refuses_conflicting_options(grasped, tmp_path, capsys):
 
 
 def test_without_a_configuration_the_first_row_is_the_shipped_model(grasped, tmp_path):
-    results = evaluate(grasped, tmp_path, methods=("late_fusion", "retrieve_rerank", "chance"), quiet=True)
+    results = evaluate(grasped, tmp_path, methods=("late_fusion", "retrieve_rerank", "chance"))
     write_report(tmp_path)
     found, text = of(results), (tmp_path / "report.md").read_text()
     assert list(found.rows) == ["shipped model", "late_fusion", "retrieve_rerank", "chance"]

@@ -44,7 +44,7 @@ def unseen(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def sample(unseen, model, tmp_path_factory):
-    return Sample(model, lambda: unseen, tmp_path_factory.mktemp("features"), TINY, quiet=True)
+    return Sample(model, lambda: unseen, tmp_path_factory.mktemp("features"), TINY)
 
 
 def test_the_front_has_the_points_that_no_other_beats_in_both():
@@ -121,11 +121,11 @@ def test_grasps_provide_a_photo_or_a_touch_and_every_object_both(sample):
 
 
 def test_trained_objects_are_left_out_and_too_few_others_refused(model, recording, tmp_path):
-    own = Sample(model, lambda: recording, tmp_path, TINY, quiet=True)
+    own = Sample(model, lambda: recording, tmp_path, TINY)
     assert {grasp.object_id for grasp in own.grasps} == set(load_checkpoint(model).split.test)
     few = synthetic.write_recording(tmp_path / "few", synthetic.make_objects(12)[:1], 3)
     with pytest.raises(DatasetError, match="at least 2 objects that the model was not trained on"):
-        _ = Sample(model, lambda: few, tmp_path, TINY, quiet=True).grasps
+        _ = Sample(model, lambda: few, tmp_path, TINY).grasps
 
 
 def test_exhaustive_top1_is_the_highest_logit_and_is_cached(sample, monkeypatch):
@@ -160,7 +160,7 @@ def other(sample):
 
 def test_finished_rows_are_reused_until_their_inputs_change_or_the_cache_is_damaged(model, tmp_path):
     def measure(*only, **changed):
-        options = {"table": TABLE, "model_free": TABLE, "quick": True, "quiet": True} | changed
+        options = {"table": TABLE, "model_free": TABLE, "quick": True} | changed
         return measure_frontier(tmp_path, model, not_needed, only=only, **options)
 
     with pytest.raises(KeyboardInterrupt):

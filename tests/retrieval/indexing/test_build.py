@@ -92,7 +92,7 @@ def check_same(one, other):
 
 
 def test_a_first_build_embeds_every_photo_once_in_batches(catalogue_copy, checkpoint, index, embedded):
-    report = build_index(catalogue_copy, checkpoint, index, quiet=True)
+    report = build_index(catalogue_copy, checkpoint, index)
     assert sorted(embedded) == [8, 16]
     assert (report.photos, report.objects, report.embedded) == (24, 8, 24)
     assert report.skipped == []
@@ -101,12 +101,12 @@ def test_a_first_build_embeds_every_photo_once_in_batches(catalogue_copy, checkp
 
 
 def test_a_rebuild_without_changes_writes_nothing_and_reports_it(catalogue_copy, checkpoint, index, embedded):
-    assert build_index(catalogue_copy, checkpoint, index, quiet=True).written
+    assert build_index(catalogue_copy, checkpoint, index).written
     embedded.clear()
     (catalogue_copy / "note.txt").write_text("not a photo")
     (catalogue_copy / "broken.png").write_bytes(b"not a photo either")
     before = {path: path.stat().st_mtime_ns for path in index.glob("gen-*/*")}
-    report = build_index(catalogue_copy, checkpoint, index, quiet=True)
+    report = build_index(catalogue_copy, checkpoint, index)
     assert (embedded, report.embedded, report.generation) == ([], 0, "gen-000001")
     assert not report.written
     assert {path: path.stat().st_mtime_ns for path in index.glob("gen-*/*")} == before
@@ -117,17 +117,17 @@ def test_a_rebuild_without_changes_writes_nothing_and_reports_it(catalogue_copy,
 def test_another_kind_a_moved_catalogue_and_metadata_are_written_without_embedding(
     catalogue_copy, checkpoint, index, embedded
 ):
-    build_index(catalogue_copy, checkpoint, index, quiet=True)
+    build_index(catalogue_copy, checkpoint, index)
     embedded.clear()
     kind = "HNSW8;efSearch=32"
-    assert build_index(catalogue_copy, checkpoint, index, kind=kind, quiet=True).written
-    assert not build_index(catalogue_copy, checkpoint, index, kind=kind, quiet=True).written
+    assert build_index(catalogue_copy, checkpoint, index, kind=kind).written
+    assert not build_index(catalogue_copy, checkpoint, index, kind=kind).written
     moved = catalogue_copy.rename(catalogue_copy.with_name("elsewhere"))
-    assert build_index(moved, checkpoint, index, kind=kind, quiet=True).written
+    assert build_index(moved, checkpoint, index, kind=kind).written
     assert Searcher.open(index).catalogue == moved
     name = first_photo(moved).parent.name
     (moved / "metadata.jsonl").write_text(json.dumps({"object_id": name, "price": 3}) + "\n")
-    assert build_index(moved, checkpoint, index, kind=kind, quiet=True).written
+    assert build_index(moved, checkpoint, index, kind=kind).written
     assert {row.object_id for row in rows_of(index).values() if row.metadata == {"price": 3}} == {name}
     assert embedded == []
 
@@ -137,7 +137,7 @@ def test_after_any_changes_only_new_contents_are_embedded_and_the_index_equals_a
     seed, catalogue_copy, checkpoint, index, tmp_path, embedded, old_files
 ):
     draw = random.Random(seed)
-    build_index(catalogue_copy, checkpoint, index, quiet=True)
+    build_index(catalogue_copy, checkpoint, index)
     for round_ in range(2):
         embedded.clear()
         photos = sorted(catalogue_copy.rglob("*.jpg"))
@@ -146,22 +146,22 @@ def test_after_any_changes_only_new_contents_are_embedded_and_the_index_equals_a
         other_picture(changed, seed=100 + round_)
         moved.rename(draw.choice(photos).with_name(f"moved-{round_}.jpg"))
         other_picture(catalogue_copy / draw.choice(["aaa", "mmm", "zzz"]) / f"{round_}.jpg", seed=200 + round_)
-        report = build_index(catalogue_copy, checkpoint, index, quiet=True)
+        report = build_index(catalogue_copy, checkpoint, index)
         assert (sum(embedded), report.embedded) == (2, 2)
         assert "2 embedded, 22 unchanged" in next(report.lines())
-    build_index(catalogue_copy, checkpoint, tmp_path / "fresh", quiet=True)
+    build_index(catalogue_copy, checkpoint, tmp_path / "fresh")
     check_same(index, tmp_path / "fresh")
 
 
 def test_photos_that_were_removed_or_damaged_are_dropped_and_listed(catalogue_copy, checkpoint, index):
-    build_index(catalogue_copy, checkpoint, index, quiet=True)
+    build_index(catalogue_copy, checkpoint, index)
     photos = sorted(catalogue_copy.rglob("*.jpg"))
     photos[0].unlink()
     broken = {photos[1]: photos[1].read_bytes()[:500], photos[7]: b"", photos[8]: b"this is not an image"}
     for path, content in broken.items():
         path.write_bytes(content)
     shutil.rmtree(photos[-1].parent)
-    report = build_index(catalogue_copy, checkpoint, index, quiet=True)
+    report = build_index(catalogue_copy, checkpoint, index)
     assert (report.photos, report.objects, report.embedded) == (17, 7, 0)
     assert [item.path for item in report.skipped] == [named(catalogue_copy, path) for path in broken]
     assert all(item.reason for item in report.skipped)
@@ -176,7 +176,7 @@ def test_the_same_image_of_two_objects_is_embedded_once(catalogue_copy, checkpoi
     folder = catalogue_copy / f"{original_photo.parent.name}-twin"
     folder.mkdir()
     shutil.copy(original_photo, folder / "1.jpg")
-    assert build_index(catalogue_copy, checkpoint, index, quiet=True).photos == 25
+    assert build_index(catalogue_copy, checkpoint, index).photos == 25
     assert sum(embedded) == 24
     generation = IndexStore(index).open()
     twin, original = (generation.rows.find(named(catalogue_copy, path)) for path in (folder / "1.jpg", original_photo))
@@ -187,48 +187,48 @@ def test_the_same_image_of_two_objects_is_embedded_once(catalogue_copy, checkpoi
 def test_a_changed_model_embeds_everything_and_the_codes_of_two_generations_stay(
     catalogue_copy, checkpoint, index, embedded, tmp_path
 ):
-    build_index(catalogue_copy, checkpoint, index, quiet=True)
+    build_index(catalogue_copy, checkpoint, index)
     embedded.clear()
-    report = build_index(catalogue_copy, changed_model(checkpoint, tmp_path / "b.safetensors"), index, quiet=True)
+    report = build_index(catalogue_copy, changed_model(checkpoint, tmp_path / "b.safetensors"), index)
     assert (sum(embedded), report.embedded) == (24, 24)
     assert report.reason.startswith("The model changed")
     first = load_checkpoint(checkpoint.path)
-    assert build_index(catalogue_copy, first, index, quiet=True).embedded == 0
-    build_index(catalogue_copy, changed_model(first, tmp_path / "c.safetensors", by=1.0), index, quiet=True)
-    build_index(catalogue_copy, load_checkpoint(checkpoint.path), index, quiet=True)
+    assert build_index(catalogue_copy, first, index).embedded == 0
+    build_index(catalogue_copy, changed_model(first, tmp_path / "c.safetensors", by=1.0), index)
+    build_index(catalogue_copy, load_checkpoint(checkpoint.path), index)
     # "c" and the first model made the last two generations
-    assert build_index(catalogue_copy, load_checkpoint(tmp_path / "b.safetensors"), index, quiet=True).embedded == 24
+    assert build_index(catalogue_copy, load_checkpoint(tmp_path / "b.safetensors"), index).embedded == 24
 
 
 def test_a_changed_preprocessing_embeds_all_photos_again(catalogue_copy, checkpoint, index, monkeypatch):
-    build_index(catalogue_copy, checkpoint, index, quiet=True)
+    build_index(catalogue_copy, checkpoint, index)
     monkeypatch.setattr(preprocessing, "PREPROCESSING_VERSION", preprocessing.PREPROCESSING_VERSION + 1)
-    report = build_index(catalogue_copy, checkpoint, index, quiet=True)
+    report = build_index(catalogue_copy, checkpoint, index)
     assert report.embedded == 24
     assert report.reason.startswith("The preprocessing of photos changed")
 
 
 def test_a_damaged_index_is_written_anew_from_the_codes(catalogue_copy, checkpoint, index):
-    build_index(catalogue_copy, checkpoint, index, quiet=True)
+    build_index(catalogue_copy, checkpoint, index)
     partials = index / "gen-000001" / "partials.npy"
     partials.write_bytes(partials.read_bytes()[:-1])
-    report = build_index(catalogue_copy, checkpoint, index, quiet=True)
+    report = build_index(catalogue_copy, checkpoint, index)
     assert (report.embedded, report.written) == (0, True)
     assert "is not usable" in report.reason
     assert Searcher.open(index).generation.count == 24
 
 
 def test_only_files_with_another_size_or_time_are_read(catalogue_copy, checkpoint, index, read, old_files):
-    first = build_index(catalogue_copy, checkpoint, index, quiet=True)
+    first = build_index(catalogue_copy, checkpoint, index)
     assert (len(read), first.written) == (24, True)
     read.clear()
-    again = build_index(catalogue_copy, checkpoint, index, quiet=True)
+    again = build_index(catalogue_copy, checkpoint, index)
     assert (read, again.written) == ([], False)
     other_picture(old_files[3])
     old_files[7].touch()
     moved = old_files[11].rename(old_files[11].with_name("moved.jpg"))
     read.clear()
-    report = build_index(catalogue_copy, checkpoint, index, quiet=True)
+    report = build_index(catalogue_copy, checkpoint, index)
     assert sorted(read) == sorted([old_files[3], old_files[7], moved])
     assert report.embedded == 1
 
@@ -244,26 +244,26 @@ def test_a_photo_written_in_the_tick_of_its_reading_is_read_again(
     for number, ending in enumerate((b"ab", b"cd")):
         photo.write_bytes(content + ending)
         os.utime(photo, ns=(tick, tick))
-        report = build_index(catalogue_copy, checkpoint, index, quiet=True)
+        report = build_index(catalogue_copy, checkpoint, index)
         assert report.embedded == (found if number else 24)
 
 
 def test_without_the_cache_everything_is_read_and_embedded_again(catalogue_copy, checkpoint, index, read, old_files):
-    build_index(catalogue_copy, checkpoint, index, quiet=True)
+    build_index(catalogue_copy, checkpoint, index)
     (index / "codes" / "cache.sqlite").write_bytes(b"damaged")
     read.clear()
-    report = build_index(catalogue_copy, checkpoint, index, quiet=True)
+    report = build_index(catalogue_copy, checkpoint, index)
     assert (len(read), report.embedded, report.written) == (24, 24, False)
 
 
 def test_a_damaged_code_fails_the_build_and_the_next_one_makes_it_again(catalogue_copy, checkpoint, index):
-    build_index(catalogue_copy, checkpoint, index, quiet=True)
+    build_index(catalogue_copy, checkpoint, index)
     with sqlite3.connect(index / CACHE) as connection:
         connection.execute("UPDATE entries SET checksum = checksum + 1 WHERE key NOT LIKE 'files/%'")
     with pytest.raises(WriteFailed, match="build again"):
-        build_index(catalogue_copy, checkpoint, index, kind="HNSW8", quiet=True)
+        build_index(catalogue_copy, checkpoint, index, kind="HNSW8")
     assert IndexStore(index).current() == "gen-000001"
-    assert build_index(catalogue_copy, checkpoint, index, kind="HNSW8", quiet=True).embedded == 24
+    assert build_index(catalogue_copy, checkpoint, index, kind="HNSW8").embedded == 24
 
 
 KILLED = """
@@ -287,7 +287,7 @@ def counting(matcher):
     return counted
 
 codes.torch_photo_encoder = counting
-build_index(Path(catalogue), load_checkpoint(Path(model)), Path(index), quiet=True)
+build_index(Path(catalogue), load_checkpoint(Path(model)), Path(index))
 """
 
 
@@ -302,7 +302,7 @@ def test_killed_builds_leave_the_old_index_and_continue_even_if_photos_are_renam
     catalogue_copy, model, tmp_path, embedded
 ):
     index, checkpoint = tmp_path / "index", load_checkpoint(model)
-    build_index(catalogue_copy, checkpoint, index, quiet=True)
+    build_index(catalogue_copy, checkpoint, index)
     embedded.clear()
     for path in catalogue_copy.rglob("*.jpg"):
         path.write_bytes(path.read_bytes() + b"other content, the same image")
@@ -312,11 +312,11 @@ def test_killed_builds_leave_the_old_index_and_continue_even_if_photos_are_renam
     for number, photo in enumerate(sorted(catalogue_copy.rglob("*.jpg"))):
         photo.rename(photo.with_name(f"again{number}.jpg"))
     killed(catalogue_copy, model, index, 3)
-    report = build_index(catalogue_copy, checkpoint, index, quiet=True)
+    report = build_index(catalogue_copy, checkpoint, index)
     assert 24 - 16 <= sum(embedded) <= 24 - 8  # at most the batch that is being stored is lost
     assert report.embedded == sum(embedded)
     assert list(index.glob("*.tmp-*")) == []
-    build_index(catalogue_copy, checkpoint, tmp_path / "whole", quiet=True)
+    build_index(catalogue_copy, checkpoint, tmp_path / "whole")
     check_same(index, tmp_path / "whole")
 
 
@@ -339,11 +339,11 @@ def test_ctrl_c_keeps_the_finished_embeddings_and_reports_it(
 
 
 def test_a_catalogue_of_only_broken_photos_raises_and_the_old_index_stays(catalogue_copy, checkpoint, index):
-    build_index(catalogue_copy, checkpoint, index, quiet=True)
+    build_index(catalogue_copy, checkpoint, index)
     for path in catalogue_copy.rglob("*.jpg"):
         path.write_bytes(b"broken")
     with pytest.raises(DatasetError, match=r"no photo in .*catalog can be read; the first: .*\.jpg: not a PNG"):
-        build_index(catalogue_copy, checkpoint, index, quiet=True)
+        build_index(catalogue_copy, checkpoint, index)
     assert len(rows_of(index)) == 24
 
 
@@ -358,7 +358,7 @@ BAD_NUMBERS = [
 @pytest.mark.parametrize(("part", "value"), BAD_NUMBERS)
 def test_a_nan_or_overflow_never_reaches_an_index(part, value, catalogue_copy, checkpoint, index):
     """A module outputs a bad number for the fourth photo: the error names the photo, and the old index stays."""
-    build_index(catalogue_copy, checkpoint, index, quiet=True)
+    build_index(catalogue_copy, checkpoint, index)
     for path in catalogue_copy.rglob("*.jpg"):
         path.write_bytes(path.read_bytes() + b"other content, the same image")
 
@@ -367,7 +367,7 @@ def test_a_nan_or_overflow_never_reaches_an_index(part, value, catalogue_copy, c
 
     checkpoint.matcher.get_submodule(part).register_forward_hook(corrupt)
     with pytest.raises((NumericalError, VectorError), match=list_catalogue(catalogue_copy).photos[3].path):
-        build_index(catalogue_copy, checkpoint, index, quiet=True)
+        build_index(catalogue_copy, checkpoint, index)
     assert IndexStore(index).current() == "gen-000001"
     assert np.isfinite(IndexStore(index).open().arrays["partials"]).all()
 
@@ -375,18 +375,18 @@ def test_a_nan_or_overflow_never_reaches_an_index(part, value, catalogue_copy, c
 @pytest.mark.parametrize("kind", ["tree", "HNSW1", "IVF4,SQ8;nprobes=2", "IVF4,Flat", "PQ4"])
 def test_an_impossible_kind_raises_before_embedding(catalogue_copy, checkpoint, index, embedded, kind):
     with pytest.raises(ParameterError, match="flat"):
-        build_index(catalogue_copy, checkpoint, index, kind=kind, quiet=True)
+        build_index(catalogue_copy, checkpoint, index, kind=kind)
     assert embedded == []
 
 
 def test_a_second_writer_raises(catalogue_copy, checkpoint, index, embedded):
     with IndexStore(index).lock(), pytest.raises(LockedIndex):
-        build_index(catalogue_copy, checkpoint, index, quiet=True)
+        build_index(catalogue_copy, checkpoint, index)
     assert embedded == []
 
 
 def test_stored_partials_are_those_of_the_model_to_half_a_last_place_of_float16(catalogue_copy, checkpoint, index):
-    build_index(catalogue_copy, checkpoint, index, quiet=True)
+    build_index(catalogue_copy, checkpoint, index)
     generation = IndexStore(index).open()
     images = [checkpoint.config.preprocessing.load_photo(catalogue_copy / row.path) for row in generation.rows]
     exact = encode_photos(checkpoint.matcher, images).partial.numpy()

@@ -69,23 +69,23 @@ def test_suspicious_names_give_a_warning_and_a_rule_corrects_them(
     tmp_path, photos, checkpoint, index, names, warning, rule, corrected
 ):
     own = catalogue_of(tmp_path / "own", photos, *names)
-    report = build_index(own, checkpoint, index, quiet=True)
+    report = build_index(own, checkpoint, index)
     assert any(line.startswith(f"warning: {warning}") for line in report.lines())
-    report = build_index(own, checkpoint, index, objects_from=rule, quiet=True)
+    report = build_index(own, checkpoint, index, objects_from=rule)
     assert set(objects(index).values()) == corrected
     assert (report.written, report.embedded, report.warnings) == (True, 0, [])
 
 
 def test_the_index_stores_the_rule_and_reports_a_change(tmp_path, photos, checkpoint, index):
     own = catalogue_of(tmp_path / "own", photos, "mug_0.jpg", "mug_1.jpg", "cup_0.jpg")
-    build_index(own, checkpoint, index, objects_from="stem", quiet=True)
-    again = build_index(own, checkpoint, index, quiet=True)
+    build_index(own, checkpoint, index, objects_from="stem")
+    again = build_index(own, checkpoint, index)
     assert (again.objects_from, again.objects, again.written) == ("stem", 2, False)
-    changed = build_index(own, checkpoint, index, objects_from="folder", quiet=True)
+    changed = build_index(own, checkpoint, index, objects_from="folder")
     assert (changed.objects, changed.written, changed.embedded) == (3, True, 0)
     assert changed.reason.startswith("The rule for object names changed from stem to folder.")
     assert IndexStore(index).open().manifest.about["objects_from"] == "folder"
-    alike = build_index(own, checkpoint, index, objects_from="{object}.jpg", quiet=True)
+    alike = build_index(own, checkpoint, index, objects_from="{object}.jpg")
     assert (alike.objects, alike.written) == (3, True)
 
 
@@ -114,9 +114,9 @@ def test_new_photos_in_which_objects_are_hard_to_recognise_give_a_warning(tmp_pa
         photo[60:200, 100:180] = rng.integers(120, 220, (140, 80, 1))
         own.mkdir(exist_ok=True)
         Image.fromarray(photo).filter(ImageFilter.GaussianBlur(3 * (name == "mug"))).save(own / f"{name}.png")
-    report = build_index(own, checkpoint, index, quiet=True)
+    report = build_index(own, checkpoint, index)
     assert ["1 of 2" in line and "1 blurred; for example mug.png" in line for line in report.warnings] == [True]
-    assert build_index(own, checkpoint, index, quiet=True).warnings == []  # no photo is new
+    assert build_index(own, checkpoint, index).warnings == []  # no photo is new
 
 
 def test_a_stated_field_changes_the_zoom_and_embeds_the_photo_again(tmp_path, zooms, index):
@@ -124,10 +124,10 @@ def test_a_stated_field_changes_the_zoom_and_embeds_the_photo_again(tmp_path, zo
     own.mkdir()
     for name in ("mug", "cup"):
         Image.fromarray(photo if name == "mug" else photo[::-1]).save(own / f"{name}.png")
-    assert build_index(own, zooms, index, quiet=True).embedded == 2
+    assert build_index(own, zooms, index).embedded == 2
     before = IndexStore(index).open().arrays["partials"][:]
     (own / "metadata.jsonl").write_text('{"file_name": "mug.png", "field_mm": 400}')
-    report = build_index(own, zooms, index, quiet=True)
+    report = build_index(own, zooms, index)
     assert (report.written, report.embedded) == (True, 1)
     after = IndexStore(index).open().arrays["partials"][:]
     assert (before == after).all(axis=1).tolist() == [True, False]  # cup, mug
@@ -153,15 +153,15 @@ def test_the_camera_that_all_photos_share_is_assumed_until_it_is_stated(tmp_path
     own.mkdir()
     for number in range(20):
         Image.fromarray(photo(number)).save(own / f"{number}.png")
-    assert any(warning in line for line in build_index(own, zooms, index, quiet=True).warnings)
+    assert any(warning in line for line in build_index(own, zooms, index).warnings)
     (own / "metadata.jsonl").write_text('{"field_mm": null, "roll_deg": null}')  # states nothing
-    assert any(warning in line for line in build_index(own, zooms, index, quiet=True).warnings)
+    assert any(warning in line for line in build_index(own, zooms, index).warnings)
     (own / "metadata.jsonl").write_text(stated)
-    report = build_index(own, zooms, index, quiet=True)
+    report = build_index(own, zooms, index)
     assert (report.embedded, [line for line in report.warnings if warning in line]) == (20, [])
     (own / "metadata.jsonl").unlink()
     for _ in range(2):
-        report = build_index(own, zooms, index, quiet=True)
+        report = build_index(own, zooms, index)
         assert (report.embedded, any(warning in line for line in report.warnings)) == (0, True)  # codes are stored
         (own / "0.png").unlink(missing_ok=True)  # too few objects are left to tell: it stays
 
@@ -171,7 +171,7 @@ def test_all_shards_assume_the_camera_that_the_whole_catalogue_shows(tmp_path, z
     own.mkdir()
     for number in range(20):
         Image.fromarray(square(number, 0.16)).save(own / f"{number}.png")
-    report = build_sharded(own, zooms, tmp_path / "shards", 3, quiet=True)
+    report = build_sharded(own, zooms, tmp_path / "shards", 3)
     assert ["are assumed to show 380 mm" in line for line in report.warnings].count(True) == 1
     assumed = {
         tuple(IndexStore(tmp_path / "shards" / each["folder"]).open().manifest.about[ASSUMED_CAMERA])
@@ -189,12 +189,10 @@ def test_training_sees_the_photos_of_a_recording_as_an_index_of_them_does(tmp_pa
     catalogue = catalogue_of(
         tmp_path / "own", [each.photo for each in grasps], *(f"{each.object_id}.png" for each in grasps)
     )
-    assert any(
-        "are assumed to show 380 mm" in line for line in build_index(catalogue, zooms, index, quiet=True).warnings
-    )
+    assert any("are assumed to show 380 mm" in line for line in build_index(catalogue, zooms, index).warnings)
     camera = recording_camera(tmp_path / "lab", grasps, zooms.config.preprocessing)
     _, photos = feature_partials(
-        zooms.matcher, encode_recording(grasps, zooms.matcher, zooms.config, None, camera=camera, quiet=True)
+        zooms.matcher, encode_recording(grasps, zooms.matcher, zooms.config, None, camera=camera)
     )
     np.testing.assert_allclose(IndexStore(index).open().arrays["partials"][:], photos, atol=0.01)
 

@@ -119,11 +119,11 @@ def test_the_measurement_is_in_manifest_and_report_and_kept_by_small_changes(
         return measure_candidates(*arguments, **options)
 
     monkeypatch.setattr(building, "measure_candidates", counted)
-    report = build_index(catalogue_copy, queried, index, quiet=True)
+    report = build_index(catalogue_copy, queried, index)
     assert IndexStore(index).open().manifest.about["candidates"] == report.candidates
     assert "validation touches (95 % interval" in "\n".join(report.lines())
     other_picture(catalogue_copy / "newcomer" / "1.jpg", seed=78)
-    assert build_index(catalogue_copy, queried, index, quiet=True).candidates["photos"] == 24
-    recall = build_index(catalogue_copy, queried, index, kind="HNSW8", quiet=True).recall
+    assert build_index(catalogue_copy, queried, index).candidates["photos"] == 24
+    recall = build_index(catalogue_copy, queried, index, kind="HNSW8").recall
     assert (recall["queries"], recall["how"]) == (TOUCHES, "measured on the given queries")
     assert [len(partials) for _, _, partials in measured] == [24, 25]  # another kind is measured again

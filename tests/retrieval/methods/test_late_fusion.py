@@ -32,7 +32,7 @@ def split(recording):
 @pytest.fixture(scope="module")
 def features(recording):
     torch.manual_seed(FROZEN.training.seed)
-    return encode_recording(load_grasps(recording), build_matcher(FROZEN), FROZEN, None, quiet=True)
+    return encode_recording(load_grasps(recording), build_matcher(FROZEN), FROZEN, None)
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def test_scores_are_the_match_logits_of_every_pair(fitted, parts):
 
 def test_the_method_trains_the_same_model_as_the_command_line(recording, split, fitted, tmp_path):
     ours = load_checkpoint(fitted.settings.folder / "late_fusion-0.safetensors")
-    theirs = train_matcher(recording, tmp_path / "m.safetensors", FROZEN, split=split, quiet=True)
+    theirs = train_matcher(recording, tmp_path / "m.safetensors", FROZEN, split=split)
     assert (ours.provenance["step"], ours.config) == (theirs.provenance["step"], theirs.config)
     for name, weight in theirs.matcher.state_dict().items():
         # The same steps, on features from batches of another size.

@@ -42,7 +42,7 @@ def model_copy(model, tmp_path):
 
 @pytest.fixture
 def index(model_copy, catalogue, tmp_path):
-    build_index(catalogue, load_checkpoint(model_copy), tmp_path / "index", quiet=True)
+    build_index(catalogue, load_checkpoint(model_copy), tmp_path / "index")
     return tmp_path / "index"
 
 
@@ -108,7 +108,7 @@ def test_a_stale_export_is_not_used_and_a_warning_is_logged(model_copy, index, t
     export(load_checkpoint(model_copy))
     checkpoint = load_checkpoint(model_copy)
     store_checkpoint(dataclasses.replace(checkpoint, provenance=PROVENANCE), model_copy)
-    build_index(catalogue, load_checkpoint(model_copy), tmp_path / "index", quiet=True)
+    build_index(catalogue, load_checkpoint(model_copy), tmp_path / "index")
     assert Searcher.open(index).query([touch]).index["encoder"] == "torch"
     assert "m.onnx is the export of another checkpoint" in caplog.text
     assert "run `retrieve export` again" in caplog.text
@@ -162,14 +162,14 @@ def test_pytorch_encodes_if_onnx_runtime_is_missing_or_wrong(model, monkeypatch,
 
 def test_a_long_build_gives_the_same_index_with_either_encoder(catalogue, model, tmp_path, monkeypatch):
     checkpoint = load_checkpoint(model)
-    build_index(catalogue, checkpoint, tmp_path / "torch", quiet=True)
+    build_index(catalogue, checkpoint, tmp_path / "torch")
     calls = []
     monkeypatch.setattr("retrieval.indexing.codes.MIN_PHOTOS_FOR_ONNX", 1)
     monkeypatch.setattr(
         "retrieval.indexing.codes.choose_photo_encoder",
         lambda made: calls.append(1) or choose_photo_encoder(made),
     )
-    build_index(catalogue, checkpoint, tmp_path / "onnx", quiet=True)
+    build_index(catalogue, checkpoint, tmp_path / "onnx")
     assert calls == [1]  # once per build
     ours, theirs = (IndexStore(tmp_path / name).open() for name in ("torch", "onnx"))
     assert [row.path for row in ours.rows] == [row.path for row in theirs.rows]

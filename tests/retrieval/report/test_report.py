@@ -73,7 +73,7 @@ def answer(catalogue, model, two_grasps, tmp_path_factory):
     own = shutil.copytree(catalogue, folder / "catalog")
     lines = [json.dumps({"object_id": path.name, "shelf": "B4"}) for path in own.iterdir()]
     (own / "metadata.jsonl").write_text("\n".join(lines))
-    build_index(own, load_checkpoint(model), folder / "index", quiet=True)
+    build_index(own, load_checkpoint(model), folder / "index")
     result = Searcher.open(folder / "index").query(two_grasps, top=5)
     (own / result.results[0].photo).unlink()
     broken = own / result.results[1].photo

@@ -39,7 +39,7 @@ def model(tmp_path):
 
 @pytest.fixture
 def index(catalogue, model, tmp_path):
-    build_index(catalogue, model, tmp_path / "index", quiet=True)
+    build_index(catalogue, model, tmp_path / "index")
     return tmp_path / "index"
 
 
@@ -63,10 +63,10 @@ def test_an_opened_searcher_finds_an_object_that_was_enrolled_in_the_meantime(in
 
 
 def test_an_enrolled_object_is_one_object_with_a_folder_that_macos_names(catalogue_copy, model, tmp_path, touches):
-    build_index(catalogue_copy, model, tmp_path / "index", quiet=True)
+    build_index(catalogue_copy, model, tmp_path / "index")
     enrol(tmp_path / "index", "T\u00fclle", touches[NAMES[0]][0])
     (catalogue_copy / NAMES[0]).rename(catalogue_copy / "Tu\u0308lle")
-    build_index(catalogue_copy, model, tmp_path / "index", quiet=True)
+    build_index(catalogue_copy, model, tmp_path / "index")
     with Searcher.open(tmp_path / "index") as searcher:
         found = searcher.query(touches[NAMES[0]][0], top=99).results
     assert [(one.object_id, one.reference.is_enrolled) for one in found if one.reference] == [("Tu\u0308lle", True)]
@@ -76,7 +76,7 @@ def test_a_build_warns_of_an_enrolled_name_that_differs_from_that_of_an_object_o
     index, catalogue, model, touches
 ):
     enrol(index, NAMES[0].upper(), touches[NAMES[0]][0])
-    (warning,) = [line for line in build_index(catalogue, model, index, quiet=True).warnings if "only by case" in line]
+    (warning,) = [line for line in build_index(catalogue, model, index).warnings if "only by case" in line]
     assert NAMES[0].upper() in warning
 
 
@@ -99,13 +99,13 @@ def test_enrolled_touches_count_like_the_same_touches_in_the_catalogue(
     grasps = {NAMES[0]: touches[NAMES[0]][0], NAMES[5]: touches[NAMES[5]][0]}
     grasps |= {f"new {number}": touches[name][1] for number, name in enumerate(NAMES)}
     build = build_index if shards is None else build_sharded
-    build(catalogue_copy, model, tmp_path / "index", *filter(None, [shards]), quiet=True)
+    build(catalogue_copy, model, tmp_path / "index", *filter(None, [shards]))
     with Searcher.open(tmp_path / "index") as searcher:
         for name, grasp in grasps.items():
             searcher.enrol(name, grasp)
             synthetic.put_touch(catalogue_copy, name, 0, grasp)
         ours = searcher.query(touches[NAMES[0]][2], top=99)
-    build_index(catalogue_copy, model, tmp_path / "expected", quiet=True)
+    build_index(catalogue_copy, model, tmp_path / "expected")
     with Searcher.open(tmp_path / "expected") as searcher:
         theirs = searcher.query(touches[NAMES[0]][2], top=99)
     logits = [{match.object_id: match.logit for match in result.results} for result in (ours, theirs)]
@@ -126,7 +126,7 @@ def test_what_cannot_be_a_reference_touch_is_refused(index, touches, catalogue, 
         with pytest.raises(BadInput, match=reason):
             enrol(index, name, images, **options)
     plain = write_reference_model(tmp_path / "plain.safetensors", references=None)
-    build_index(catalogue, plain, tmp_path / "plain", quiet=True)
+    build_index(catalogue, plain, tmp_path / "plain")
     with pytest.raises(BadInput, match="no calibration of reference touches"):
         enrol(tmp_path / "plain", "tin", grasp)
     assert [touch.object_id for touch in EnrolledTable(index).read()] == [NAMES[0]]
@@ -144,7 +144,7 @@ def test_a_build_with_another_model_encodes_again_and_keeps_a_touch_that_it_cann
     damaged, usable = EnrolledTable(index).read()
     (index / damaged.path).write_bytes(b"damaged")
     other = write_reference_model(tmp_path / "other.safetensors", posterior=OTHER)
-    report = build_index(catalogue_copy, other, index, quiet=True)
+    report = build_index(catalogue_copy, other, index)
     assert (report.photos, report.enrolled) == (24, {"touches": 2, "objects": 2, "encoded": 1, "usable": 1})
     assert f"enrolled for {damaged.object_id}" in report.skipped[0].reason
     assert len(EnrolledTable(index).read()[1].codes) == 2  # readers may still use the model before

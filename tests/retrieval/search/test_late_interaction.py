@@ -37,13 +37,13 @@ def checkpoint(tmp_path):
 
 @pytest.fixture
 def index(catalogue, checkpoint, tmp_path):
-    build_index(catalogue, checkpoint, tmp_path / "index", quiet=True)
+    build_index(catalogue, checkpoint, tmp_path / "index")
     return tmp_path / "index"
 
 
 @pytest.fixture
 def pooled_index(catalogue, checkpoint, tmp_path):
-    build_index(catalogue, checkpoint, tmp_path / "pooled", cells=False, quiet=True)
+    build_index(catalogue, checkpoint, tmp_path / "pooled", cells=False)
     return tmp_path / "pooled"
 
 
@@ -71,16 +71,16 @@ def test_logits_of_an_index_equal_those_of_the_network_but_for_the_rounding(
 
 
 def test_a_later_build_keeps_the_setting(pooled_index, index, catalogue, checkpoint):
-    assert not build_index(catalogue, checkpoint, pooled_index, quiet=True).written
-    report = build_index(catalogue, checkpoint, index, quiet=True)
+    assert not build_index(catalogue, checkpoint, pooled_index).written
+    report = build_index(catalogue, checkpoint, index)
     assert (report.written, report.cells, report.embedded) == (False, True, 0)
 
 
 def test_cells_can_be_dropped_and_added_again(index, pooled_index, catalogue, checkpoint):
-    assert build_index(catalogue, checkpoint, index, cells=False, quiet=True).written
+    assert build_index(catalogue, checkpoint, index, cells=False).written
     assert list(arrays_of(index)) == ["partials"]
     np.testing.assert_allclose(arrays_of(index)["partials"], arrays_of(pooled_index)["partials"], atol=2e-3)
-    report = build_index(catalogue, checkpoint, index, cells=True, quiet=True)
+    report = build_index(catalogue, checkpoint, index, cells=True)
     assert (report.written, report.embedded) == (True, 0)  # the generation before the previous one had cells
     assert set(arrays_of(index)) == {"partials", "cells"}
 
@@ -96,17 +96,17 @@ def test_the_command_takes_the_option(catalogue, checkpoint, tmp_path, capsys):
 def test_a_model_without_cells_refuses_the_option(catalogue, tmp_path, cells):
     model = write_reference_model(tmp_path / "pooled.safetensors")
     with pytest.raises(BadInput, match="need a model with late interaction"):
-        build_index(catalogue, model, tmp_path / "none", cells=cells, quiet=True)
+        build_index(catalogue, model, tmp_path / "none", cells=cells)
     with pytest.raises(BadInput, match="need a model with late interaction"):
-        build_sharded(catalogue, model, tmp_path / "none", 2, cells=cells, quiet=True)
+        build_sharded(catalogue, model, tmp_path / "none", 2, cells=cells)
 
 
 def test_reference_touches_are_reused_with_the_calibration_of_pooled_logits(
     catalogue_with_touches, checkpoint, tmp_path, touches
 ):
-    report = build_index(catalogue_with_touches, checkpoint, tmp_path / "index", cells=False, quiet=True)
+    report = build_index(catalogue_with_touches, checkpoint, tmp_path / "index", cells=False)
     assert (report.references["touches"], report.references["encoded"]) == (8, 8)
-    again = build_index(catalogue_with_touches, checkpoint, tmp_path / "index", quiet=True)
+    again = build_index(catalogue_with_touches, checkpoint, tmp_path / "index")
     assert (again.written, again.references["encoded"]) == (False, 0)
     generation = IndexStore(tmp_path / "index").open()
     assert generation.documents["touches"].shape[1] == CELLS.pooled_width
@@ -147,5 +147,5 @@ def test_a_model_with_a_candidate_encoder_embeds_its_stored_touches(
     queries = np.ones((3, CELLS.touch_partial_width), dtype=np.float16)
     sizes = dataclasses.replace(CELLS, candidate_width=8)
     model = write_reference_model(tmp_path / "encoder.safetensors", matcher=sizes, queries=queries)
-    report = build_index(catalogue, model, tmp_path / "index", cells=cells, quiet=True)
+    report = build_index(catalogue, model, tmp_path / "index", cells=cells)
     assert report.candidates["queries"] == 3

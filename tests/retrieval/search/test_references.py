@@ -37,7 +37,7 @@ def calibrated_model(tmp_path):
 
 
 def query_new_index(catalogue, model, index, files, **options):
-    build_index(catalogue, model, index, quiet=True)
+    build_index(catalogue, model, index)
     with Searcher.open(index) as searcher:
         return searcher.query(files, **{"top": 8, **options})
 
@@ -107,7 +107,7 @@ def test_photos_of_the_nearest_reference_are_always_scored(
     scored = []
     whole = Objects.score
     monkeypatch.setattr(Objects, "score", lambda *arguments: scored.append(arguments[1]) or whole(*arguments))
-    build_index(catalogue_with_touches, calibrated_model, tmp_path / "index", quiet=True)
+    build_index(catalogue_with_touches, calibrated_model, tmp_path / "index")
     with Searcher.open(tmp_path / "index") as searcher:
         for name in NAMES[:4]:
             searcher.query(touches[name][0], top=1, candidates=1)
@@ -146,7 +146,7 @@ def test_the_opening_of_a_reference_adds_its_log_ratio_and_brings_its_object_amo
     lines = [{"file_name": first, "opening_mm": 30}, {"object_id": NAMES[0], "opening_mm": 90}]
     (catalogue_with_touches / "metadata.jsonl").write_text("\n".join(map(json.dumps, lines)))
     model = write_reference_model(tmp_path / "model.safetensors", opening=OPENING)
-    build_index(catalogue_with_touches, model, tmp_path / "index", quiet=True)
+    build_index(catalogue_with_touches, model, tmp_path / "index")
     files = touches[NAMES[1]][:2]
     with Searcher.open(tmp_path / "index") as searcher:
         bare = searcher.query(files, top=8)
@@ -163,22 +163,22 @@ def test_the_opening_of_a_reference_adds_its_log_ratio_and_brings_its_object_amo
     assert QueryResult.from_dict(document).to_dict() == result.to_dict()
     (catalogue_with_touches / "metadata.jsonl").write_text(json.dumps({"file_name": last, "opening_mm": 0.03}))
     with pytest.raises(BadInput, match=rf"opening_mm of {NAMES[3]}/touch_1_a.png must be .*metres"):
-        build_index(catalogue_with_touches, model, tmp_path / "index", quiet=True)
+        build_index(catalogue_with_touches, model, tmp_path / "index")
 
 
 def test_only_new_touches_are_encoded_again(catalogue_with_touches, calibrated_model, tmp_path, touches):
     index = tmp_path / "index"
-    first = build_index(catalogue_with_touches, calibrated_model, index, quiet=True)
+    first = build_index(catalogue_with_touches, calibrated_model, index)
     assert first.references == {"touches": 8, "objects": 4, "touch_only": 1, "encoded": 8}
-    again = build_index(catalogue_with_touches, calibrated_model, index, quiet=True)
+    again = build_index(catalogue_with_touches, calibrated_model, index)
     assert (again.written, again.references["encoded"]) == (False, 0)
     synthetic.put_touch(catalogue_with_touches, NAMES[5], 0, touches[NAMES[5]][0])
-    more = build_index(catalogue_with_touches, calibrated_model, index, quiet=True)
+    more = build_index(catalogue_with_touches, calibrated_model, index)
     assert (more.written, more.embedded, more.references["touches"], more.references["encoded"]) == (True, 0, 9, 1)
 
 
 def test_a_recording_is_a_catalogue_of_the_photos_and_touches_of_its_grasps(recording, calibrated_model, tmp_path):
-    report = build_index(recording, calibrated_model, tmp_path / "index", quiet=True)
+    report = build_index(recording, calibrated_model, tmp_path / "index")
     assert (report.objects, report.photos) == (12, 36)
     assert report.references["touches"] == 36
     grasp = load_grasps(recording)[4]
@@ -192,7 +192,7 @@ def test_unusable_touches_are_left_out_with_a_reason(catalogue_with_touches, cal
     (catalogue_with_touches / NAMES[1] / "touch_0_a.png").write_bytes(b"not an image")
     for path in (catalogue_with_touches / NAMES[2]).glob("touch_*"):
         path.write_bytes(b"")
-    report = build_index(catalogue_with_touches, calibrated_model, tmp_path / "index", quiet=True)
+    report = build_index(catalogue_with_touches, calibrated_model, tmp_path / "index")
     reasons = {item.path: item.reason for item in report.skipped}
     assert "1 gel image(s), the model takes 2: names end in _a and _b" in reasons[f"{NAMES[0]}/touch_0_a.png"]
     assert len(reasons) == 4
@@ -204,16 +204,16 @@ def test_unusable_touches_are_left_out_with_a_reason(catalogue_with_touches, cal
 def test_a_model_without_reference_calibration_builds_nothing(catalogue_with_touches, tmp_path, posterior):
     model = write_reference_model(tmp_path / "other.safetensors", references=None, posterior=posterior)
     with pytest.raises(BadInput, match="no calibration of reference touches"):
-        build_index(catalogue_with_touches, model, tmp_path / "index", quiet=True)
+        build_index(catalogue_with_touches, model, tmp_path / "index")
     with pytest.raises(BadInput, match="no calibration of reference touches"):
-        build_sharded(catalogue_with_touches, model, tmp_path / "sharded", 2, quiet=True)
+        build_sharded(catalogue_with_touches, model, tmp_path / "sharded", 2)
     assert not (tmp_path / "index" / "CURRENT").exists()
 
 
 def test_a_sharded_index_gives_the_results_of_one_folder(catalogue_with_touches, calibrated_model, tmp_path, touches):
     files = touches[NAMES[1]][2]
     whole = query_new_index(catalogue_with_touches, calibrated_model, tmp_path / "index", files)
-    report = build_sharded(catalogue_with_touches, calibrated_model, tmp_path / "sharded", 3, quiet=True)
+    report = build_sharded(catalogue_with_touches, calibrated_model, tmp_path / "sharded", 3)
     assert (report.references["touches"], report.references["touch_only"]) == (8, 1)
     with Searcher.open(tmp_path / "sharded") as searcher:
         divided = searcher.query(files, top=8)
@@ -232,7 +232,7 @@ TOUCH = {"object_id": NAMES[0], "touch": ["a.png"], "digests": ["0"]}
     [[], *({"touches": [TOUCH | change] * 8, "touch_only": []} for change in ({"touch": ["../a"]}, {"digests": []}))],
 )
 def test_forged_references_raise_a_clear_error(catalogue_with_touches, calibrated_model, tmp_path, references):
-    build_index(catalogue_with_touches, calibrated_model, tmp_path / "index", quiet=True)
+    build_index(catalogue_with_touches, calibrated_model, tmp_path / "index")
     folder = IndexStore(tmp_path / "index").open().folder
     (folder / "references.json").write_text(json.dumps(references))
     forge(folder)

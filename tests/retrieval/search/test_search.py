@@ -172,8 +172,8 @@ def test_equal_photos_of_several_objects_are_all_found_in_the_order_of_their_ids
     for name in ("zebra", "ant", "mule"):
         (own / name).mkdir(parents=True)
         shutil.copy(sorted(catalogue.rglob("*.jpg"))[0], own / name / "1.jpg")
-    build_index(own, load_checkpoint(model), tmp_path / "index", quiet=True)
-    build_sharded(own, load_checkpoint(model), tmp_path / "sharded", 4, quiet=True)
+    build_index(own, load_checkpoint(model), tmp_path / "index")
+    build_sharded(own, load_checkpoint(model), tmp_path / "sharded", 4)
     for folder, candidates in (("index", None), ("index", 1), ("sharded", None)):
         results = Searcher.open(tmp_path / folder).query([touch], top=3, candidates=candidates).results
         assert [match.object_id for match in results] == ["ant", "mule", "zebra"]
@@ -183,7 +183,7 @@ def test_equal_photos_of_several_objects_are_all_found_in_the_order_of_their_ids
 
 def test_no_candidate_stage_runs_without_trained_embeddings(catalogue, model, touch, tmp_path, searches):
     checkpoint = variant(model, tmp_path / "paper.safetensors", training__weights={})
-    build_index(catalogue, checkpoint, tmp_path / "index", quiet=True)
+    build_index(catalogue, checkpoint, tmp_path / "index")
     assert Searcher.open(tmp_path / "index").query([touch], candidates=2, top=1).index["scored"] == 24
     assert searches == []
 
@@ -342,7 +342,7 @@ def subtracting(catalogue, model, tmp_path_factory):
     """A searcher whose model subtracts the no-contact frame."""
     folder = tmp_path_factory.mktemp("background")
     checkpoint = variant(model, folder / "difference.safetensors", preprocessing__background="difference")
-    build_index(catalogue, checkpoint, folder / "index", quiet=True)
+    build_index(catalogue, checkpoint, folder / "index")
     return Searcher.open(folder / "index")
 
 
@@ -376,7 +376,7 @@ def moved(catalogue, model, tmp_path):
     """An index whose model was moved: (index, new path of the model)."""
     here, there = tmp_path / "here.safetensors", tmp_path / "there.safetensors"
     shutil.copy(model, here)
-    build_index(catalogue, load_checkpoint(here), tmp_path / "index", quiet=True)
+    build_index(catalogue, load_checkpoint(here), tmp_path / "index")
     here.rename(there)
     return tmp_path / "index", there
 

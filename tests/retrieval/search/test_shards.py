@@ -87,14 +87,14 @@ def catalogue_copy(catalogue, cluster, tmp_path):
 
 def test_a_rebuild_of_the_same_photos_embeds_nothing_and_switches_only_changed_shards(catalogue_copy, model, embedded):
     catalog, cluster = catalogue_copy
-    build_sharded(catalog, load_checkpoint(model), cluster, 4, quiet=True)  # the catalogue has another path now
+    build_sharded(catalog, load_checkpoint(model), cluster, 4)  # the catalogue has another path now
     before = read_sharded_manifest(cluster)
-    again = build_sharded(catalog, load_checkpoint(model), cluster, 4, quiet=True)
+    again = build_sharded(catalog, load_checkpoint(model), cluster, 4)
     assert (again.written, again.embedded) == (False, 0)
     assert read_sharded_manifest(cluster) == before
     name = min(path.name for path in catalog.iterdir())
     shutil.copy(next(catalog.glob("*/2.jpg")), catalog / name / "new.jpg")
-    changed = build_sharded(catalog, load_checkpoint(model), cluster, 4, quiet=True)
+    changed = build_sharded(catalog, load_checkpoint(model), cluster, 4)
     after = read_sharded_manifest(cluster)
     assert (changed.written, changed.photos, changed.embedded) == (True, 25, 1)
     assert number(after) == number(before) + 1
@@ -111,13 +111,13 @@ def test_another_number_of_shards_gives_the_same_results(catalogue_copy, model, 
     catalog, cluster = catalogue_copy
     with Searcher.open(cluster) as searcher:
         expected = searcher.query(touch)
-    report = build_sharded(catalog, load_checkpoint(model), cluster, 3, quiet=True)
+    report = build_sharded(catalog, load_checkpoint(model), cluster, 3)
     assert report.photos == 24
     with Searcher.open(cluster) as searcher:
         found = searcher.query(touch)
     assert names(found) == names(expected)
     assert sorted(path.name for path in cluster.glob("shard-*-of-04"))  # for current readers
-    build_sharded(catalog, load_checkpoint(model), cluster, 3, quiet=True)
+    build_sharded(catalog, load_checkpoint(model), cluster, 3)
     assert not list(cluster.glob("shard-*-of-04"))
 
 
@@ -141,13 +141,13 @@ def test_killed_between_shards_the_index_is_unchanged_and_the_next_build_embeds_
 
     monkeypatch.setattr(module, "build_shard", killed)
     with pytest.raises(Killed):
-        build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True)
+        build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4)
     assert not (tmp_path / "c" / "SHARDS.json").exists()
     (tmp_path / "c" / ".SHARDS.json.1.tmp").touch()  # of a build that was killed in its last step
     monkeypatch.setattr(module, "build_shard", build)
     done = sum(report.photos for report in finished)
     embedded.clear()
-    report = build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True)
+    report = build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4)
     assert (report.photos, sum(embedded)) == (24, 24 - done)
     assert not list((tmp_path / "c").glob(".SHARDS.json.*"))
 
@@ -168,7 +168,7 @@ def test_killed_before_every_switch_the_old_generations_answer(catalogue_copy, m
     for turn in range(4):
         shutil.copy(next(catalog.glob("*/2.jpg")), catalog / name / f"new-{turn}.jpg")
         with pytest.raises(Killed):
-            build_sharded(catalog, load_checkpoint(model), cluster, 4, quiet=True)
+            build_sharded(catalog, load_checkpoint(model), cluster, 4)
         with Searcher.open(cluster) as searcher:
             assert [match.photo for match in searcher.query(touch).results] == expected
             assert searcher.manifest.photos == 24
@@ -182,7 +182,7 @@ def test_bad_photos_and_a_shard_without_a_readable_one_are_left_out_and_listed(c
     bad.append(next((catalog / next(name for name in names if name not in gone)).iterdir()))
     for photo in bad:
         photo.write_bytes(b"not an image")
-    report = build_sharded(catalog, load_checkpoint(model), cluster, 4, quiet=True)
+    report = build_sharded(catalog, load_checkpoint(model), cluster, 4)
     assert {item.path for item in report.skipped} == {photo.relative_to(catalog).as_posix() for photo in bad}
     assert report.without_photo == gone
     assert report.photos == read_sharded_manifest(cluster).photos == 24 - len(bad)
@@ -191,9 +191,9 @@ def test_bad_photos_and_a_shard_without_a_readable_one_are_left_out_and_listed(c
 def test_an_invalid_number_of_shards_or_an_index_folder_raises(catalogue, model, index, tmp_path):
     for shards in (0, -1, 5000):
         with pytest.raises(BadInput, match="shards must be from 1 to 4096"):
-            build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", shards, quiet=True)
+            build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", shards)
     with pytest.raises(BadInput, match="is an index folder; give another folder"):
-        build_sharded(catalogue, load_checkpoint(model), index, 2, quiet=True)
+        build_sharded(catalogue, load_checkpoint(model), index, 2)
 
 
 def test_a_failure_of_ray_ends_the_build_with_a_clear_error(catalogue, model, tmp_path, monkeypatch):
@@ -207,7 +207,7 @@ def test_a_failure_of_ray_ends_the_build_with_a_clear_error(catalogue, model, tm
     monkeypatch.setattr(building, "ray_session", lambda: nullcontext(parts))
     monkeypatch.setattr(building, "ray_worker_pool", lambda ray: (1, {"num_gpus": 0}))
     with pytest.raises(RetrievalError, match=r"KeyError: .*same command again to continue"):
-        build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=building.build_on_ray)
+        build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4, run=building.build_on_ray)
 
 
 def test_a_missing_shard_or_the_generation_of_another_one_is_corrupt(catalogue_copy):

@@ -113,7 +113,7 @@ def grown(catalogue, index, tmp_path, model):
             shutil.rmtree(folder)
         else:
             synthetic.write_catalogue(photos, extra)
-        build_index(photos, checkpoint, own, quiet=True)
+        build_index(photos, checkpoint, own)
 
     return own, build
 

@@ -121,7 +121,7 @@ def test_metadata_of_an_object_are_searched_and_shown(browser, catalogue, model,
     shutil.copytree(next(path for path in catalogue.iterdir() if path.is_dir()), own / name)
     shutil.copytree(next(path for path in catalogue.iterdir() if path.is_dir()), own / "a tin")
     (own / "metadata.jsonl").write_text(json.dumps({"object_id": name, "maker": "Wedgwood", "price": 3}) + "\n")
-    build_index(own, load_checkpoint(model), tmp_path / "index", quiet=True)
+    build_index(own, load_checkpoint(model), tmp_path / "index")
     with address(tmp_path / "index") as url, page(browser, url) as opened:
         opened.get_by_role("navigation").get_by_role("link", name="Catalogue").click()
         opened.get_by_role("searchbox", name="Search").fill("wedgwood 1.jpg")

@@ -32,8 +32,8 @@ def index(recording, tmp_path_factory):
         pixels = np.ascontiguousarray(rig.sim_state.current_scene().image("photo")[..., ::-1])
         assert cv2.imwrite(str(folder / "catalog" / name / "1.jpg"), pixels)
     config = dataclasses.replace(TINY, preprocessing=Preprocessing(touch_px=32, photo_px=48, background="difference"))
-    train_matcher(recording, folder / "tiny.safetensors", config, quiet=True)
-    build_index(folder / "catalog", load_checkpoint(folder / "tiny.safetensors"), folder / "index", quiet=True)
+    train_matcher(recording, folder / "tiny.safetensors", config)
+    build_index(folder / "catalog", load_checkpoint(folder / "tiny.safetensors"), folder / "index")
     return folder / "index"
 
 

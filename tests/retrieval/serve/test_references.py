@@ -14,9 +14,7 @@ from tests.serving import problem, service, with_history
 
 @pytest.fixture
 def index(catalogue_with_touches, tmp_path):
-    build_index(
-        catalogue_with_touches, write_reference_model(tmp_path / "model.safetensors"), tmp_path / "index", quiet=True
-    )
+    build_index(catalogue_with_touches, write_reference_model(tmp_path / "model.safetensors"), tmp_path / "index")
     return tmp_path / "index"
 
 

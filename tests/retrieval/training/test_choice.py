@@ -225,7 +225,7 @@ def made(recording, start, tmp_path_factory):
     names = sorted({grasp.object_id for grasp in load_grasps(recording)})
     split = Split(0, tuple(names[3:]), (), tuple(names[:3]))
     folder = tmp_path_factory.mktemp("made")
-    options = {"model": start, "init": "random", "split": split, "quiet": True}
+    options = {"model": start, "init": "random", "split": split}
     models = {
         recipe: retrieval.train(recording, folder / f"{recipe}.safetensors", recipe=recipe, **options)
         for recipe in ("start", "linear", "head")
@@ -249,7 +249,7 @@ def test_each_recipe_makes_an_ordinary_checkpoint_without_test_objects(
         assert model.posterior not in (None, start.posterior)
         assert (model.verification, model.gel_check) == (None, None)
         assert recipe == "start" or {*model.split.train, *model.split.validation} == known
-        retrieval.build_index(catalogue, model, tmp_path / recipe, quiet=True)
+        retrieval.build_index(catalogue, model, tmp_path / recipe)
         answer = retrieval.open(tmp_path / recipe, model=model.path).query([touch])
         assert 0 <= answer.none_probability <= 1
     assert start.matcher.gel_head is not None  # the caller's model is not changed
@@ -288,7 +288,7 @@ def test_queries_of_a_recording_with_sessions_are_compared_with_photos_of_anothe
         for number, grasp in enumerate(load_grasps(recording))
     ]
     names = sorted({grasp.object_id for grasp in grasps})
-    problem = Problem(grasps, USUAL_CAMERA, start.config.matcher.fingers, start, "random", {}, [], tmp_path, quiet=True)
+    problem = Problem(grasps, USUAL_CAMERA, start.config.matcher.fingers, start, "random", {}, [], tmp_path)
     (part,) = choice.Comparison(problem, [names]).held_out("start", Start(problem))
     sessions = np.array([grasp.session for name in names for grasp in grasps if grasp.object_id == name])
     assert np.array_equal(part.touches.own, sessions[:, None] == sessions)
@@ -298,19 +298,17 @@ def test_a_start_model_that_knows_the_objects_is_not_tested_with_them(recording,
     names = sorted({grasp.object_id for grasp in load_grasps(recording)})
     knowing = dataclasses.replace(start, split=Split(0, tuple(names[:-2]), (), ()))
     out = tmp_path / "own.safetensors"
-    made = retrieval.train(recording, out, model=knowing, init="random", quiet=True)
+    made = retrieval.train(recording, out, model=knowing, init="random")
     assert made.provenance["recipe"] == "linear"
     assert "The start model was trained on these objects" in capsys.readouterr().err
     with pytest.raises(BadInput, match="Recipe head does not apply: the start model was trained on these objects"):
-        retrieval.train(recording, out, model=knowing, recipe="head", init="random", quiet=True)
+        retrieval.train(recording, out, model=knowing, recipe="head", init="random")
 
 
 def test_too_few_objects_or_grasps_are_refused_before_any_work(recording, tmp_path):
     names = sorted({grasp.object_id for grasp in load_grasps(recording)})
     with pytest.raises(BadInput, match=r"at least 8 objects with two grasps each, got 5 objects.*Record more"):
-        retrieval.train(
-            recording, tmp_path / "own.safetensors", split=Split(0, tuple(names[:5]), (), tuple(names[5:])), quiet=True
-        )
+        retrieval.train(recording, tmp_path / "own.safetensors", split=Split(0, tuple(names[:5]), (), tuple(names[5:])))
     assert not list(tmp_path.iterdir())
 
 
@@ -318,4 +316,4 @@ def test_a_recipe_of_another_number_of_fingers_is_refused_by_name(recording, sta
     config = dataclasses.replace(start.config, matcher=dataclasses.replace(start.config.matcher, fingers=1))
     other = dataclasses.replace(start, config=config, matcher=Matcher(config.matcher))
     with pytest.raises(BadInput, match="Recipe head does not apply: the start model takes 1 gel image"):
-        retrieval.train(recording, tmp_path / "own.safetensors", model=other, recipe="head", init="random", quiet=True)
+        retrieval.train(recording, tmp_path / "own.safetensors", model=other, recipe="head", init="random")

@@ -53,7 +53,7 @@ def config_with_encoder(steps=20, seed=0, **sizes):
 
 
 def distilled(matcher, partials, steps=5, seed=0):
-    distil.distil(matcher, *partials, config_with_encoder(steps, seed), quiet=True)
+    distil.distil(matcher, *partials, config_with_encoder(steps, seed))
     return {name: tensor.clone() for name, tensor in matcher.candidate_encoder.state_dict().items()}
 
 
@@ -139,7 +139,7 @@ def checkpoint(matcher, tmp_path):
 def test_a_checkpoint_gets_a_candidate_encoder_and_with_validation_objects_queries_and_a_metric(checkpoint, partials):
     held_out = drawn(30, 8, sign=1), drawn(50, 9, sign=-1)
     assert not checkpoint.config.has_embeddings
-    made = distil.with_candidate_encoder(checkpoint, config_with_encoder(), partials, held_out, quiet=True)
+    made = distil.with_candidate_encoder(checkpoint, config_with_encoder(), partials, held_out)
     store_checkpoint(made, made.path)
     made = load_checkpoint(made.path)
     assert made.config == config_with_encoder()
@@ -151,7 +151,7 @@ def test_a_checkpoint_gets_a_candidate_encoder_and_with_validation_objects_queri
     metrics = made.provenance["metrics"]
     assert metrics == {"validation_auc": 0.75, "candidate_agreement_at_1_percent": (ranks < 4).mean()}
     assert "candidate agreement at 1 percent" in made.path.with_suffix(".md").read_text()
-    without = distil.with_candidate_encoder(checkpoint, config_with_encoder(2), partials, quiet=True)
+    without = distil.with_candidate_encoder(checkpoint, config_with_encoder(2), partials)
     assert (without.queries, without.provenance["metrics"]) == (None, {"validation_auc": 0.75})
 
 

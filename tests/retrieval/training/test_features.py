@@ -33,7 +33,7 @@ def matcher():
 
 @pytest.fixture(scope="module")
 def plain(grasps, matcher):
-    return encode_recording(grasps, matcher, TINY, None, quiet=True)
+    return encode_recording(grasps, matcher, TINY, None)
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def encode(grasps, tmp_path, monkeypatch):
 
     def encoded(matcher, config=TINY, items=grasps, cache=tmp_path, **options):
         counts.clear()
-        return encode_recording(items, matcher, config, cache, quiet=True, **options), sum(counts)
+        return encode_recording(items, matcher, config, cache, **options), sum(counts)
 
     return encoded
 

@@ -74,7 +74,7 @@ def trained(attempts, tmp_path_factory):
     folder, made = tmp_path_factory.mktemp("gate"), {}
     for settings in (DURING, AFTER):
         out = folder / f"{settings.frame}.safetensors"
-        made[settings.frame] = out, train_gate(attempts, out, settings=settings, iterations=ENOUGH, quiet=True)
+        made[settings.frame] = out, train_gate(attempts, out, settings=settings, iterations=ENOUGH)
     return made
 
 
@@ -124,16 +124,16 @@ def test_the_report_and_the_file_state_accuracy_chance_and_accepted_grasps_of_ot
 
 def test_the_frame_after_the_lift_is_used_if_there_is_one(attempts, tmp_path):
     out = tmp_path / "g.safetensors"
-    assert train_gate(attempts, out, iterations=2, quiet=True)["frame"] == "after"
+    assert train_gate(attempts, out, iterations=2)["frame"] == "after"
     without = write(tmp_path / "r", columns=("during", "before"))
-    assert train_gate(without, out, iterations=1, quiet=True)["frame"] == "during"
+    assert train_gate(without, out, iterations=1)["frame"] == "during"
     assert load_gate(out).settings == GateSettings(frame="during")
 
 
 def test_the_same_seed_gives_the_same_file_and_the_global_random_state_is_unchanged(attempts, tmp_path):
     path, state, files = tmp_path / "gate.safetensors", torch.get_rng_state(), []
     for seed in (1, 1, 2):
-        train_gate(attempts, path, iterations=3, seed=seed, quiet=True)
+        train_gate(attempts, path, iterations=3, seed=seed)
         files.append(path.read_bytes())
     assert torch.equal(torch.get_rng_state(), state)
     assert files[0] == files[1] != files[2]
@@ -184,12 +184,12 @@ def test_a_recording_that_cannot_train_a_gate_is_refused(tmp_path, case):
     options, message = REFUSED[case]
     settings = AFTER if "after" in case else DURING
     with pytest.raises(DatasetError, match=message):
-        train_gate(write(tmp_path / "r", **options), tmp_path / "g.safetensors", settings=settings, quiet=True)
+        train_gate(write(tmp_path / "r", **options), tmp_path / "g.safetensors", settings=settings)
 
 
 def test_files_that_are_not_of_a_gate_are_refused(attempts, model, trained, tmp_path):
     with pytest.raises(CheckpointError, match="must be a file"):
-        train_gate(attempts, tmp_path, quiet=True)
+        train_gate(attempts, tmp_path)
     with pytest.raises(CheckpointError, match="retrieve train --task"):
         load_gate(model)
     with pytest.raises(CheckpointError, match="retrieve collect --gate"):

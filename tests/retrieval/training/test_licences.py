@@ -29,7 +29,7 @@ def licensed(recording, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def trained(licensed, tmp_path_factory):
-    return train_matcher(licensed, tmp_path_factory.mktemp("trained") / "m.safetensors", TINY, quiet=True)
+    return train_matcher(licensed, tmp_path_factory.mktemp("trained") / "m.safetensors", TINY)
 
 
 def test_the_licences_of_a_training_are_those_of_all_its_data(recording, licensed, trained):

@@ -21,7 +21,7 @@ def descend(plan, loss=None, module=None, **options):
     optimizer, weights = torch.optim.Adam(module.parameters()), []
     optimizer.register_step_post_hook(lambda *_: weights.append(module[0].item()))
     loss = loss or (lambda step, _: module[0].sum())
-    return weights, train_loop(module, optimizer, plan, lambda steps: steps, loss, title="fit", quiet=True, **options)
+    return weights, train_loop(module, optimizer, plan, lambda steps: steps, loss, title="fit", **options)
 
 
 @pytest.mark.parametrize(
@@ -38,7 +38,7 @@ def test_each_step_has_the_learning_rate_of_its_schedule_and_group(schedule, fac
     optimizer.register_step_post_hook(lambda *_: weights.append(weight.item()))
     module = torch.nn.ParameterList([weight, other])
     loss = lambda step, _: weight.sum() + other.sum()  # noqa: E731
-    best = train_loop(module, optimizer, Plan(4, 0.1, schedule), lambda steps: steps, loss, title="fit", quiet=True)
+    best = train_loop(module, optimizer, Plan(4, 0.1, schedule), lambda steps: steps, loss, title="fit")
     changes = [before - after for before, after in pairwise(weights)]
     assert changes == pytest.approx([0.1 * factor for factor in factors], rel=1e-5)
     assert other.item() == pytest.approx(weight.item() / 2)

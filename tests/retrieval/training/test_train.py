@@ -103,7 +103,7 @@ def stop_after(trainer, steps, stop=lambda: 1 / 0):
     """Run and stop like a power cut in the step after `steps`, when the state of that step is on disk."""
     loss = trainer.loss
     trainer.loss = lambda step, loaded: (stop() if step == steps else None, loss(step, loaded))[1]
-    trainer.run(quiet=True)
+    trainer.run()
 
 
 def interrupt():
@@ -234,14 +234,14 @@ def test_a_resumed_training_gives_the_bits_of_an_uninterrupted_one_with_any_numb
     whole = trainer_for(recording, tmp_path / "a.safetensors", config)
     first = deepcopy(whole.losses.state_dict())
     assert first["terms.1.proxies.weight"].shape == (len(whole.split.train), 16)
-    whole.run(quiet=True)
+    whole.run()
     assert not same_weights(first, whole.losses.state_dict())
     with pytest.raises(ZeroDivisionError):
         stop_after(trainer_for(recording, parts, config), 3)
     with pytest.raises(CheckpointError, match=r"another config; .* delete the file"):
-        trainer_for(recording, parts).run(quiet=True)
+        trainer_for(recording, parts).run()
     resumed = trainer_for(recording, parts, with_training(config, workers=2))
-    resumed.run(quiet=True)
+    resumed.run()
     assert same_weights(whole.losses.state_dict(), resumed.losses.state_dict())
     assert same_weights(whole.matcher.state_dict(), resumed.matcher.state_dict())
     assert whole.out.read_bytes() == parts.read_bytes()
@@ -255,7 +255,7 @@ def test_a_resumed_training_gives_the_bits_of_an_uninterrupted_one_with_any_numb
 @pytest.fixture(scope="module")
 def whole(recording, tmp_path_factory):
     """The checkpoint of an uninterrupted run with a candidate encoder."""
-    return trainer_for(recording, tmp_path_factory.mktemp("whole") / "m.safetensors", WITH_ENCODER).run(quiet=True)
+    return trainer_for(recording, tmp_path_factory.mktemp("whole") / "m.safetensors", WITH_ENCODER).run()
 
 
 @pytest.mark.parametrize(
@@ -281,14 +281,14 @@ def test_a_stop_after_the_last_step_leaves_a_usable_checkpoint_that_resuming_com
     with monkeypatch.context() as cut:
         cut.setattr(where, stopping)
         with pytest.raises((ZeroDivisionError, JobInterrupted)) as stopped:
-            broken.run(quiet=True)
+            broken.run()
     if stop is interrupt:
         assert "can already rank photos; run the same command" in str(stopped.value)
     left = load_checkpoint(broken.out)
     assert (left.matcher.candidate_encoder is not None, left.posterior is not None) == (is_complete, is_complete)
     resumed = trainer_for(recording, broken.out, WITH_ENCODER)
     resumed.loss = lambda *_: pytest.fail("made a step")
-    resumed.run(quiet=True)
+    resumed.run()
     assert whole.path.read_bytes() == broken.out.read_bytes()
     assert not state_path(broken.out).exists()
 
@@ -310,7 +310,7 @@ def test_frozen_towers_encode_each_image_once_and_do_not_change(recording, tmp_p
     tower, counts = trainer.matcher.photo_tower, []
     before = deepcopy(tower.state_dict())
     tower.register_forward_hook(lambda _, images, __: counts.append(len(images[0])))
-    trainer.run(quiet=True)
+    trainer.run()
     assert same_weights(before, tower.state_dict())
     known = {photo for part in trainer.sampler.photos for photo in part} | set(trainer.validation.photos)
     assert sum(counts) <= len(known)
@@ -334,7 +334,7 @@ def test_the_stem_does_not_change_and_the_other_layers_do(recording, tmp_path):
     trainer = trainer_for(recording, tmp_path / "m.safetensors", config)
     tower = trainer.matcher.touch_tower
     before = deepcopy(tower.state_dict())
-    trainer.run(quiet=True)
+    trainer.run()
     changed = {name for name, tensor in tower.state_dict().items() if not torch.equal(before[name], tensor)}
     stem = {f"features.{name}" for name in tower.stem_layers().state_dict()}
     assert stem
@@ -347,7 +347,7 @@ def test_the_towers_learn_at_their_own_rate(recording, tmp_path):
     config = with_training(TINY, iterations=1, tower_rate=0.25)
     trainer = trainer_for(recording, tmp_path / "m.safetensors", config)
     before = deepcopy(trainer.matcher.state_dict())
-    after = trainer.run(quiet=True).matcher.state_dict()
+    after = trainer.run().matcher.state_dict()
     for name, rate in (("touch_tower.stages.0.weight", 0.25), ("head.second.weight", 1.0)):
         moved = float((after[name] - before[name]).abs().max())
         assert moved == pytest.approx(rate * config.training.learning_rate, rel=0.01)
@@ -358,7 +358,7 @@ def test_the_towers_learn_at_their_own_rate(recording, tmp_path):
 
 def test_without_validation_objects_the_checkpoint_is_the_last_step_without_a_posterior(recording, tmp_path):
     config = with_training(TINY, validation_fraction=0.0, iterations=4, validate_every=3)
-    made = train_matcher(recording, tmp_path / "m.safetensors", config, quiet=True)
+    made = train_matcher(recording, tmp_path / "m.safetensors", config)
     assert made.split.validation == ()
     assert len(made.split.train) + len(made.split.test) == 12
     assert (made.provenance["step"], made.posterior) == (4, None)
@@ -373,20 +373,20 @@ def test_a_background_policy_needs_no_contact_frames(recording, tmp_path):
     expected = [preprocessing.load_touch(*files) for files in zip(grasp.touches, grasp.backgrounds, strict=True)]
     np.testing.assert_array_equal(images.touch(grasp), expected)
     config = with_training(dataclasses.replace(TINY, preprocessing=preprocessing), iterations=1)
-    train_matcher(recording, tmp_path / "m.safetensors", config, quiet=True)
+    train_matcher(recording, tmp_path / "m.safetensors", config)
 
 
 def test_bfloat16_is_refused_where_it_would_be_emulated(recording, tmp_path, monkeypatch):
     monkeypatch.setattr("retrieval.model.encode.has_fast_bfloat16", lambda device: False)
     with pytest.raises(ConfigError, match="bfloat16 needs hardware"):
-        train_matcher(recording, tmp_path / "m.safetensors", with_training(TINY, precision="bfloat16"), quiet=True)
+        train_matcher(recording, tmp_path / "m.safetensors", with_training(TINY, precision="bfloat16"))
 
 
 def test_a_split_that_leaks_is_refused(recording, tmp_path):
     names = sorted({grasp.object_id for grasp in load_grasps(recording)})
     leaking = Split(0, tuple(names[:6]), tuple(names[5:9]), ())
     with pytest.raises(DatasetError, match="shares 1 object"):
-        train_matcher(recording, tmp_path / "m.safetensors", TINY, split=leaking, quiet=True)
+        train_matcher(recording, tmp_path / "m.safetensors", TINY, split=leaking)
 
 
 def test_a_checkpoint_that_cannot_be_written_is_an_error_before_the_first_step(recording, tmp_path, monkeypatch):
@@ -394,7 +394,7 @@ def test_a_checkpoint_that_cannot_be_written_is_an_error_before_the_first_step(r
     monkeypatch.setattr(Trainer, "loss", lambda *_: pytest.fail("trained"))
     for name, message in (("", "must be a file"), ("file/model.safetensors", "cannot be written")):
         with pytest.raises(CheckpointError, match=message):
-            train_matcher(recording, tmp_path / name, TINY, quiet=True)
+            train_matcher(recording, tmp_path / name, TINY)
 
 
 def test_trained_towers_start_from_random_weights_without_a_download_and_the_checkpoint_says_so(
@@ -403,13 +403,13 @@ def test_trained_towers_start_from_random_weights_without_a_download_and_the_che
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     monkeypatch.setattr(torch.hub, "download_url_to_file", Mock(side_effect=URLError("no route to host")))
     config = with_training(TINY.using(tower="resnet18"), init="imagenet", iterations=1)
-    made = train_matcher(recording, tmp_path / "m.safetensors", config, quiet=True)
+    made = train_matcher(recording, tmp_path / "m.safetensors", config)
     assert made.config.training.init == "random"
     *_, line = capsys.readouterr().err.splitlines()
     assert "name the file with --init" in line
     assert "The training starts from random weights" in line
     with pytest.raises(CheckpointError, match=r"resnet18-f37072fd\.pth"):  # random ones would stay so
-        train_matcher(recording, tmp_path / "m.safetensors", with_training(config, freeze_towers=True), quiet=True)
+        train_matcher(recording, tmp_path / "m.safetensors", with_training(config, freeze_towers=True))
 
 
 def test_a_checkpoint_names_the_unusual_camera_of_its_photos(recording, tmp_path):
@@ -420,7 +420,7 @@ def test_a_checkpoint_names_the_unusual_camera_of_its_photos(recording, tmp_path
     cameras = []
     for stated in ({}, {"field_mm": 320, "roll_deg": 90}):
         (own / "recording.json").write_text(json.dumps(info | stated))
-        made = train_matcher(own, tmp_path / f"{len(stated)}.safetensors", config, quiet=True)
+        made = train_matcher(own, tmp_path / f"{len(stated)}.safetensors", config)
         cameras.append(made.provenance.get("camera"))
     assert cameras == [None, [320, 90]]
 
