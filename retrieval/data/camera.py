@@ -103,7 +103,7 @@ def assumed_camera(
         photos: Object, file, and keys of CAMERA_KEYS that are stated, of each photo.
         before: What was assumed until now. It stays if fewer than FEWEST objects show the camera.
     """
-    listed, look = list(photos), cache(partial(_look, RollEstimator()))
+    listed, look = list(photos), cache(partial(_look, cache(RollEstimator)))
     found = {}
     for key, estimate in (("field_mm", _field_mm), ("roll_deg", _roll_deg)):
         files = defaultdict[str, list[Path]](list)
@@ -127,7 +127,7 @@ def _looks(files: Mapping[str, Sequence[Path]], look: Callable[[Path], _Look | N
     return [each for each in looks if each is not None]
 
 
-def _look(estimator: RollEstimator, path: Path) -> _Look | None:
+def _look(estimator: Callable[[], RollEstimator], path: Path) -> _Look | None:
     """Look at a photo; None if it cannot be read, which is reported when it is encoded, or shows no object."""
     try:
         photo = decode(read_bytes(path), path, 2 * INPUT_PX)
@@ -137,7 +137,7 @@ def _look(estimator: RollEstimator, path: Path) -> _Look | None:
     found = find_object(photo)
     if found.area >= height * width:
         return None
-    return _Look(math.sqrt(found.area) / min(height, width), estimator.probabilities(photo, found))
+    return _Look(math.sqrt(found.area) / min(height, width), estimator().probabilities(photo, found))
 
 
 def _field_mm(looks: Sequence[_Look]) -> float:
