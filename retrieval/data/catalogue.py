@@ -46,7 +46,9 @@ from retrieval.errors import BadInput, DatasetError
 METADATA_FILE = "metadata.jsonl"
 _ALL_PHOTOS = ""
 """Name of the object whose metadata are those of all photos."""
-_OWN_FILES = frozenset({"CURRENT", "SHARDS.json", "history.sqlite"})
+HISTORY = "history.sqlite"
+"""File with the queries of a service, in the folder of its history."""
+_OWN_FILES = frozenset({"CURRENT", "SHARDS.json", HISTORY})
 """Files in the folder of an index, of a sharded index, and of the history of a service. Its pictures are no photos."""
 UNSUPPORTED_EXTENSIONS = frozenset(
     {".arw", ".cr2", ".cr3", ".dng", ".gif", ".jp2", ".jxl", ".nef", ".orf", ".raf", ".rw2", ".svg", ".tga"}
@@ -139,9 +141,8 @@ class Catalogue:
 def require_separate_folders(catalogue: str | Path, index: str | Path) -> None:
     """Raise BadInput if the index folder is the catalogue folder, or a folder of photos below it."""
     root, target = Path(catalogue).resolve(), Path(index).resolve()
-    is_new = not any((target / name).exists() for name in _OWN_FILES)
-    has_photos = any(path.suffix.lower() in EXTENSIONS for path in target.rglob("*"))
-    if target == root or (root in target.parents and is_new and has_photos):
+    is_new_inside = root in target.parents and not any((target / name).exists() for name in _OWN_FILES)
+    if target == root or (is_new_inside and any(path.suffix.lower() in EXTENSIONS for path in target.rglob("*"))):
         raise BadInput(f"the index would be written among the photos in {index}; name another folder with --out")
 
 

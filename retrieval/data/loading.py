@@ -11,13 +11,12 @@ Result = TypeVar("Result")
 
 
 def worker_count() -> int:
-    """Return the number of cores of this rank."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, cores // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
+    """Return the number of cores of this process."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def worker_pool() -> ThreadPoolExecutor:
-    """Return a pool of threads that decode images, one for each core of this rank."""
+    """Return a pool of threads that decode images, one for each core."""
     return ThreadPoolExecutor(worker_count(), thread_name_prefix="decode")
 
 

@@ -103,11 +103,10 @@ def build_sharded(
             pass
         except (CorruptIndex, UnsupportedFormat) as error:
             unusable = f"The existing sharded index is not usable ({error})."
-        options, note = build_options(
-            checkpoint, before.about if before else {}, objects_from=objects_from, kind=kind, cells=cells
-        )
+        known = before.about if before else {}
+        options, note = build_options(checkpoint, known, objects_from=objects_from, kind=kind, cells=cells)
         catalogue = list_catalogue(folder, options.naming)
-        options = replace(options, camera=catalogue_camera(catalogue, checkpoint, before.about if before else {}))
+        options = replace(options, camera=catalogue_camera(catalogue, checkpoint, known))
         if catalogue.touches:  # before any shard is built
             require_reference_calibration(checkpoint.without_cells() if options.cells is False else checkpoint)
         _delete_old_shards(root, before, shards)
@@ -128,7 +127,7 @@ def build_sharded(
         generation=manifest.generation,
         written=written,
         warnings=[
-            *catalogue_warnings(before.about if before else {}, catalogue, options, root),
+            *catalogue_warnings(known, catalogue, options, root),
             *report.warnings,
         ],
         reason=" ".join(filter(None, (note, unusable, report.reason))),

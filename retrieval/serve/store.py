@@ -22,6 +22,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from retrieval.data.catalogue import HISTORY
 from retrieval.data.images import decode_rgb, encode_image
 from retrieval.data.text import replace_surrogates
 from retrieval.errors import BadInput, RetrievalError
@@ -234,7 +235,7 @@ class HistoryWriter:
     """Writer of the database, and of the recording in the same folder (`recorder`)."""
 
     def __init__(self, folder: Path, recorder: Recorder) -> None:
-        self.store = HistoryStore(folder / "history.sqlite")
+        self.store = HistoryStore(folder / HISTORY)
         self._recorder, self._lock = recorder, Lock()
 
     async def add_query(self, pictures: RequestPictures, result: QueryResult) -> str | None:

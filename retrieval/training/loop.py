@@ -115,7 +115,7 @@ def train_loop(
         validate: Returns the metrics of `BestStep`, and leaves the module in training mode.
         state: Where an unfinished run is stored; None for a short run.
         step_context: Context of each step.
-        on_step: Called before the first step and after each one, with its number and values.
+        on_step: Called with number and values of each step, and before the first one with its validation.
 
     Raises:
         NumericalError: The loss is not finite; no parameter has changed in this step.

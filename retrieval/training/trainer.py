@@ -79,13 +79,9 @@ def train_matcher(
     usable checkpoint; a second Ctrl-C stops immediately. Arguments and errors are those of `retrieval.train`, whose
     `config` this function takes.
     """
-    return prepare_run(folder_of(recording), out, named_config(config)[0], split).run(on_step=on_step)
-
-
-def prepare_run(recording: Path, out: Path, config: Config, split: Split | None = None) -> "Trainer":
-    """Return the run of `train_matcher`, with the weights that are available and the fingers of the recording."""
+    folder, config = folder_of(recording), named_config(config)[0]
     require_writable(out)
-    grasps = load_grasps(recording)
+    grasps = load_grasps(folder)
     config = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, fingers=finger_count(grasps)))
     config = with_available_weights(config)
     settings = config.training
@@ -95,9 +91,9 @@ def prepare_run(recording: Path, out: Path, config: Config, split: Split | None 
         )
     else:
         require_fit(split, grasps)
-    made = made_from(recording, grasps, training_licences(recording, settings))
-    camera = recording_camera(recording, grasps, config.preprocessing)
-    return Trainer(config, split, grasps, out, made, camera=camera)
+    made = made_from(folder, grasps, training_licences(folder, settings))
+    camera = recording_camera(folder, grasps, config.preprocessing)
+    return Trainer(config, split, grasps, out, made, camera=camera).run(on_step=on_step)
 
 
 _MADE_FROM = ("data_digest", "weights_digest", "code", "camera")
@@ -251,7 +247,7 @@ class Trainer:
     def loss(self, step: int, loaded: LoadedBatch) -> Tensor:
         """Return the loss of a step and its prepared batch."""
         settings = self.config.training
-        torch.manual_seed(settings.seed * 1_000_003 + step)  # the dropout mask, the same on every rank
+        torch.manual_seed(settings.seed * 1_000_003 + step)  # the dropout mask
         touch, photo = self.features.train_features(self.matcher, loaded)
         if settings.shuffle_fingers:
             touch = shuffle_fingers(touch, self.matcher.config.fingers)

@@ -19,17 +19,13 @@ from retrieval.report.query import query_page
 from retrieval.search.answer import QueryResult
 from retrieval.search.searcher import Searcher
 from tests import synthetic
+from tests.killed_enrolment import enrol
 from tests.reference_model import NAMES, write_reference_model
 from tests.verification import calibration
 
 OTHER = Posterior(0.8)
 """Posterior of another model."""
 KILLS = os.environ.get("ENROLMENT_KILLS", "20")
-
-
-def enrol(index, *words, **options):
-    with Searcher.open(index) as searcher:
-        return searcher.enrol(*words, **options)
 
 
 @pytest.fixture
