@@ -1,8 +1,9 @@
-"""Training of towers that see the same in the images of any camera and sensor as the start model in those of the rig.
+"""Training of parts of a model that find the same in images of any camera and sensor as the start model in the rig's.
 
-Each object has images of the rig, whose features by the start model are the reference, and images by other cameras and
-sensors. The head of the start model stays as it is: the towers learn to give it what it knows from the rig (knowledge
-distillation, Hinton et al., 2015). Labels alone would let the towers learn the training objects by heart.
+Each object has images of the rig, whose partial activations by the start model are the reference, and images by other
+cameras and sensors. The head of the start model stays as it is: its towers, or the cells of the late interaction, learn
+to give it what it knows from the rig (knowledge distillation, Hinton et al., 2015). Labels alone would let them learn
+the training objects by heart.
 """
 
 from collections.abc import Iterable, Mapping
@@ -17,6 +18,9 @@ from retrieval.data.pairs import PairBatch
 from retrieval.training.initial_weights import TOWER_WEIGHTS
 from retrieval.training.trainer import Trainer
 
+CELLS = ("touch_cells", "photo_cells")
+"""Names of the networks of the late interaction in a matcher."""
+
 LABEL_SHARE = 0.5
 """Share of the true object in the target of a touch; the rest is what the start model finds in the rig's images."""
 ANCHOR_WEIGHT = 0.5
@@ -28,15 +32,20 @@ image of an object that of the rig."""
 
 
 class InvariantTrainer(Trainer):
-    """A trainer of the towers alone, below the head of the start model, towards `references`."""
+    """A trainer of some parts of a matcher, towards `references`."""
 
-    def __init__(self, *arguments: Any, references: References, **options: Any) -> None:
-        """Prepare a run like `Trainer`, with the references of all training images."""
+    def __init__(
+        self, *arguments: Any, parts: tuple[str, ...] = TOWER_WEIGHTS, references: References, **options: Any
+    ) -> None:
+        """Prepare a run like `Trainer`.
+
+        parts: prefixes of the names of the trained weights, TOWER_WEIGHTS or CELLS. references: of all training images.
+        """
         super().__init__(*arguments, **options)
         self.references = references
         self.matcher.eval()  # neither dropout nor batch statistics
         for name, weight in self.matcher.named_parameters():
-            if not name.startswith(TOWER_WEIGHTS):
+            if not name.startswith(parts):
                 weight.requires_grad_(False)
 
     def feature_loss(self, batch: PairBatch, touch: Tensor, photo: Tensor) -> Tensor:

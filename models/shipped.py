@@ -2,8 +2,8 @@
 
     python -m models.shipped make FOLDER --meshes MESHES
         collect grasps of procedural objects and of meshes on simulated rigs, the same grasps by other sensors, and
-        photos of the objects by other cameras, on other grounds and with faults; train the shipped towers further,
-        calibrate the checkpoints for two fingers and for one with them, and store both in FOLDER
+        photos of the objects by other cameras, on other grounds and with faults; train the shipped towers further, and
+        their late interaction; calibrate the checkpoints for two fingers and for one, and store both in FOLDER
     python -m models.shipped calibrate FOLDER --meshes MESHES
         calibrate the shipped checkpoints again; keep their weights
     python -m models.shipped score FOLDER
@@ -26,8 +26,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from models.invariance import InvariantTrainer, References
+from models.invariance import CELLS, InvariantTrainer, References
 from models.meshes import vary_meshes
 from models.pictures import collect_pictures, load_pictures
 from retrieval.commands.main import main as run_command
@@ -74,6 +75,12 @@ PARTS = (
     *(Part("led", False, 113_000 + number, 200) for number in range(8)),
     *(Part("led", True, 126_000 + number, 200) for number in range(2)),
 )
+CELL_PARTS = (
+    *PARTS,
+    *(Part("led", False, 113_000 + number, 200) for number in range(8, 16)),
+    *(Part("led", True, 126_000 + number, 200) for number in range(2, 8)),
+)
+"""Recordings for the training of the towers, and of the late interaction."""
 OTHER_SENSORS = (
     *(Part("varied", False, 113_000 + number, 200, gels=40) for number in (0, 1, 4)),
     *(Part("gelsight", False, 113_005 + number, 200) for number in range(2)),
@@ -101,8 +108,12 @@ SEED_SCORED = 30_000
 """Seed of the scored objects. The demo has its own (retrieval.commands.demo.SEED), the benchmark has 0."""
 TOWERS = RIGS / "shipped_towers.toml"
 """Configuration of the training of the towers."""
+CELL_TRAINING = {"iterations": 500, "learning_rate": 7e-4}
+"""Settings of the training of the late interaction that differ from those of the shipped checkpoint."""
 TRAINED_SHARE = 0.7
 """Share of the trained weights in the towers; the rest are those of the start model."""
+CELL_SHARE = 0.5
+"""The same in the networks of the late interaction."""
 FOREIGN = ForeignPictures(8000, margin=-3.0, has_false_colours=False)
 """Foreign pictures of its check of touches: more than in an ordinary training. The margin is lower than for gels of one
 kind: otherwise too many photos would be taken for gel images."""
@@ -138,7 +149,7 @@ def make_shipped(arguments: argparse.Namespace) -> int:
         return code
     towers = train_towers(folder)
     for fingers, name in SHIPPED.items():
-        made = with_towers(load_checkpoint(shipped_model(fingers)), towers)
+        made = train_cells(with_towers(load_checkpoint(shipped_model(fingers)), towers), folder)
         store(calibrated(made, folder, fingers), folder / name)
     return 0
 
@@ -178,7 +189,7 @@ class TrainingImages(NamedTuple):
 
 def train_towers(folder: Path, **settings: Any) -> Checkpoint:
     """Train both towers further, below the shipped head of two fingers; `settings` change those of TOWERS."""
-    images, parts = training_images(folder), [recording_of(folder, part) for part in PARTS]
+    images, parts = training_images(folder, PARTS), [recording_of(folder, part) for part in PARTS]
     start, config = load_checkpoint(shipped_model(2)), load_config(TOWERS)
     training = dataclasses.replace(config.training, start=str(start.path), **settings)
     trainer = InvariantTrainer(
@@ -191,33 +202,75 @@ def train_towers(folder: Path, **settings: Any) -> Checkpoint:
     )
     stated = StatedFields(config.preprocessing, parts)
     trainer.features = TrainedFeatures(dataclasses.replace(config, preprocessing=stated), trainer.device)
-    return averaged(start, trainer.run_or_reuse())
+    return averaged(start, trainer.run_or_reuse(), TRAINED_SHARE)
 
 
-def averaged(start: Checkpoint, trained: Checkpoint) -> Checkpoint:
+def train_cells(made: Checkpoint, folder: Path, **settings: Any) -> Checkpoint:
+    """Train the late interaction of a checkpoint further; `settings` change those of CELL_TRAINING."""
+    start, grasps = load_checkpoint(shipped_model(made.config.matcher.fingers)), list[Grasp]()
+    known, expected = dict[str | Path, Tensor](), dict[str | Path, Tensor]()
+    for part in CELL_PARTS:
+        images = training_images(folder, [part], made.config.matcher.fingers)
+        stated = StatedFields(made.config.preprocessing, [recording_of(folder, part)])
+        config = dataclasses.replace(made.config, preprocessing=stated)
+        features = encode_recording(images.grasps, made.matcher, config, folder / "features")
+        known |= features_by_image(images.grasps, features, default_device())
+        expected |= references(dataclasses.replace(start, config=config), images, folder / "features")
+        grasps += images.grasps
+    training = made.config.training.with_given_weights(**CELL_TRAINING | settings)
+    config = dataclasses.replace(made.config, training=training)
+    trainer = InvariantTrainer(
+        config,
+        split_of(grasps, []),
+        grasps,
+        folder / f"cells-{made.config.matcher.fingers}.safetensors",
+        {"source": "simulated rigs", "data_digest": data_digest(grasps)},
+        parts=CELLS,
+        references=expected,
+        weights=made.matcher.state_dict(),
+    )
+    trainer.features = FrozenFeatures(config, known)
+    trained = averaged(made, trainer.run_or_reuse(), CELL_SHARE)
+    for name in CELLS:
+        getattr(made.matcher, name).load_state_dict(getattr(trained.matcher, name).state_dict())
+    return with_training_of(trained, made)
+
+
+def with_training_of(trained: Checkpoint, made: Checkpoint) -> Checkpoint:
+    """Return a checkpoint that states the training of another one, of which it has parts."""
+    training = made.config.training.with_iterations(trained.config.training.iterations)
+    return dataclasses.replace(
+        made,
+        config=dataclasses.replace(made.config, training=training),
+        provenance=made.provenance | trained.provenance,
+        split=trained.split,
+    )
+
+
+def averaged(start: Checkpoint, trained: Checkpoint, share: float) -> Checkpoint:
     """Return the trained model with weights averaged with those of the start model (Wortsman et al., CVPR 2022).
 
     It is as good as the trained model with other cameras and sensors, and nearly as good as the start model on the rig.
     """
     before = start.matcher.state_dict()
     weights = {
-        name: before[name].lerp(after, TRAINED_SHARE) if after.is_floating_point() else after
+        name: before[name].lerp(after, share) if after.is_floating_point() else after
         for name, after in trained.matcher.state_dict().items()
     }
     trained.matcher.load_state_dict(weights)
     return trained
 
 
-def training_images(folder: Path) -> TrainingImages:
-    """Return the images of all recordings for training: each object's touches and photos in turn."""
+def training_images(folder: Path, parts: Iterable[Part], fingers: int = 2) -> TrainingImages:
+    """Return the images of recordings for training: each object's touches and photos in turn."""
     images = TrainingImages([], {}, {})
-    for part in PARTS:
+    for part in parts:
         recording = recording_of(folder, part)
-        rig, varied = load_grasps(recording), photos_by_object(recording)
+        rig, varied = of_fingers(load_grasps(recording), fingers), photos_by_object(recording)
         known, of_rig = {grasp.grasp_id: grasp for grasp in rig}, grasps_by_object(rig)
         sensors = [recording_of(folder, other) for other in OTHER_SENSORS if other.seed == part.seed]
         others = [grasp for sensor in sensors for grasp in load_grasps(sensor) if grasp.grasp_id in known]
-        for name, touches in grasps_by_object([*rig, *others]).items():
+        for name, touches in grasps_by_object([*rig, *of_fingers(others, fingers)]).items():
             own = [grasp.photo for grasp in of_rig[name]]
             photos = own + varied.get(name, [])
             images.rig_photos.update(dict.fromkeys(photos, own[0]) | dict(zip(own, own, strict=True)))
@@ -278,13 +331,15 @@ def with_towers(made: Checkpoint, towers: Checkpoint) -> Checkpoint:
     """Return a checkpoint with other towers. Its head stays: training it further made the rig's accuracy worse."""
     for side in ("touch_tower", "photo_tower"):
         getattr(made.matcher, side).load_state_dict(getattr(towers.matcher, side).state_dict())
-    training = made.config.training.with_iterations(towers.config.training.iterations)
-    return dataclasses.replace(
-        made,
-        config=dataclasses.replace(made.config, training=training),
-        provenance=made.provenance | towers.provenance,
-        split=towers.split,
-    )
+    return with_training_of(towers, made)
+
+
+def of_fingers(grasps: Iterable[Grasp], fingers: int) -> list[Grasp]:
+    """Return the grasps with the images of the first fingers only."""
+    return [
+        dataclasses.replace(each, touches=each.touches[:fingers], backgrounds=each.backgrounds[:fingers])
+        for each in grasps
+    ]
 
 
 def split_of(train: list[Grasp], validation: list[Grasp]) -> Split:
@@ -295,9 +350,9 @@ def split_of(train: list[Grasp], validation: list[Grasp]) -> Split:
 def collect_training(arguments: argparse.Namespace) -> int:
     """Collect the training recordings, those by other sensors, and varied photos of the objects."""
     folder = arguments.folder
-    if code := collect_parts(arguments, (*PARTS, *OTHER_SENSORS), folder / RECORDINGS, mesh_files(arguments)[0]):
+    if code := collect_parts(arguments, (*CELL_PARTS, *OTHER_SENSORS), folder / RECORDINGS, mesh_files(arguments)[0]):
         return code
-    for part in PARTS:
+    for part in CELL_PARTS:
         collect_varied_photos(arguments, part, recording_of(folder, part))
     return 0
 
@@ -366,12 +421,7 @@ def calibrated(made: Checkpoint, folder: Path, fingers: int) -> Checkpoint:
     """Return a checkpoint with its gel check, posterior, calibration of reference touches, bounds and queries."""
     parts = [calibration_grasps(folder, name) for name in CALIBRATED]
     parts[-1] = with_varied_photos(folder, parts[-1])
-    if fingers == 1:
-        parts = [
-            [dataclasses.replace(each, touches=each.touches[:1], backgrounds=each.backgrounds[:1]) for each in part]
-            for part in parts
-        ]
-    validation, verification, gels, varied = parts
+    validation, verification, gels, varied = (of_fingers(part, fingers) for part in parts)
     every, device = [*validation, *verification, *gels, *varied], default_device()
     features = encode_recording(every, made.matcher, made.config, folder / "features")
     source = FrozenFeatures(made.config, features_by_image(every, features, device))

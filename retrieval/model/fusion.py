@@ -21,7 +21,7 @@ from retrieval.model.candidate_encoder import CandidateEncoder
 from retrieval.model.config import MatcherConfig
 from retrieval.model.fusion_scorer import FusionScorer
 from retrieval.model.late_interaction import CellEncoder, cell_scores, paired_cell_scores
-from retrieval.model.towers.tower import build_tower
+from retrieval.model.towers.tower import Tower, build_tower
 
 LOG_SCALE_INIT, LOG_SCALE_MAX = math.log(1 / 0.07), math.log(100.0)
 """Initial and largest log of the factor of cosines in the contrastive loss."""
@@ -170,12 +170,10 @@ class Matcher(nn.Module):
         # In evaluation mode a fixed affine map, so the head's first layer remains a sum of two terms.
         norm = Standardise if config.standardise else nn.Identity
         self.touch_norm, self.photo_norm = norm(touch_features), norm(photo_features)
-        self.touch_cells, self.photo_cells = (
-            CellEncoder(tower.cell_channels, config.cell_dim, norm(tower.cell_channels), weighted=weighted)
-            if config.cell_dim
-            else None
-            for tower, weighted in ((self.touch_tower, True), (self.photo_tower, False))
-        )
+        self.touch_cells = self.photo_cells = None
+        if config.cell_dim:
+            self.touch_cells = _cell_encoder(self.touch_tower, self.touch_tower.feature_count, config, weighted=True)
+            self.photo_cells = _cell_encoder(self.photo_tower, photo_features, config, weighted=False)
         self.log_scale = nn.Parameter(torch.tensor(LOG_SCALE_INIT))
         self.cosine_scale = nn.Parameter(torch.tensor(COSINE_SCALE_INIT)) if config.cosine else None
         self.candidate_encoder = candidate_encoder_of(config) if config.candidate_width else None
@@ -216,7 +214,7 @@ class Matcher(nn.Module):
         each = features.reshape(-1, self.config.fingers, self.touch_tower.output_count)
         pooled, cells = each.tensor_split((self.touch_tower.feature_count,), dim=-1)
         layers = self.touch_norm, self.head.touch_partial, self.touch_projection, self.touch_cells
-        return self._encoding(pooled.flatten(1), cells.flatten(1), *layers)
+        return self._encoding(pooled.flatten(1), cells, *layers)
 
     def photo_encoding(self, features: Tensor) -> ImageEncoding:
         """Return partial activations of photo features, and their embeddings by the contrastive projection."""
@@ -233,14 +231,13 @@ class Matcher(nn.Module):
         projection: nn.Module,
         cell_encoder: CellEncoder | None,
     ) -> ImageEncoding:
-        """Return the encoding of features (B, F) and cells (B, cells * channels) by the layers of a modality."""
+        """Return the encoding of features (B, F) and of the cells of these images by the layers of a modality."""
         pooled = norm(pooled)
         parts, embedding = [partial(pooled)], functional.normalize(projection(pooled).float(), dim=-1, eps=1e-6)
         if self.cosine_scale is not None:
             parts.append(embedding * self.cosine_scale.clamp(min=0.0).sqrt())
         if cell_encoder is not None:
-            count = cells.shape[1] // cell_encoder.channels
-            parts.append(cell_encoder(cells.reshape(-1, count, cell_encoder.channels)).flatten(1))
+            parts.append(cell_encoder(cells, pooled).reshape(pooled.shape[0], -1))
         return ImageEncoding(torch.cat(parts, dim=-1), embedding)
 
     def touch_search_encoding(self, features: Tensor) -> ImageEncoding:
@@ -295,6 +292,13 @@ class Matcher(nn.Module):
 def candidate_encoder_of(config: MatcherConfig) -> CandidateEncoder:
     """Return an untrained candidate encoder with the sizes of a matcher."""
     return CandidateEncoder(config.pooled_width, config.candidate_width, config.embedding_dim, config.candidate_linear)
+
+
+def _cell_encoder(tower: Tower, features: int, config: MatcherConfig, *, weighted: bool) -> CellEncoder:
+    """Return the network of the cells of images by a tower, with `features` features of the whole image."""
+    channels = tower.cell_channels
+    norm = Standardise(channels) if config.standardise else nn.Identity()
+    return CellEncoder(tower.cells**2, channels, features, config.cell_dim, norm, weighted=weighted)
 
 
 def _projection(features: int, config: MatcherConfig) -> nn.Module:

@@ -22,9 +22,10 @@ from robot.rig import load_rig
 
 
 @pytest.mark.slow
-def test_towers_learn_varied_photos_meshes_and_other_sensors_for_both_checkpoints(tmp_path, monkeypatch):
+def test_towers_and_cells_learn_varied_photos_meshes_and_other_sensors_for_both_checkpoints(tmp_path, monkeypatch):
     settings = {
         "PARTS": (shipped.Part("led", False, 1, 6), shipped.Part("led", True, 2, 3)),
+        "CELL_PARTS": (shipped.Part("led", False, 1, 6), shipped.Part("led", True, 2, 3)),
         "OTHER_SENSORS": (shipped.Part("varied", False, 1, 6),),
         "CALIBRATED": {
             "validation": (shipped.Part("led", False, 3, 3, 3), shipped.Part("led", True, 4, 1, 3)),
@@ -41,7 +42,7 @@ def test_towers_learn_varied_photos_meshes_and_other_sensors_for_both_checkpoint
     assert (shipped.collect_training(arguments), shipped.collect_calibration(arguments)) == (0, 0)
     steps = {"iterations": 2, "validate_every": 2, "touches_per_batch": 4}
     towers = shipped.train_towers(tmp_path / "made", **steps)
-    images = shipped.training_images(tmp_path / "made")
+    images = shipped.training_images(tmp_path / "made", shipped.PARTS)
     assert any(grasp.object_id.startswith("mesh") for grasp in images.grasps)
     assert {grasp.touches[0].parts[-3] for grasp in images.grasps} == {"1-led", "2-led", "1-varied"}
     assert sum("varied" in name for name in {grasp.photo.name for grasp in images.grasps}) == 27  # three of each object
@@ -60,6 +61,11 @@ def test_towers_learn_varied_photos_meshes_and_other_sensors_for_both_checkpoint
         after, trained = (each.matcher.touch_tower.state_dict()[weights] for each in (made, towers))
         assert torch.equal(after, trained)
         assert not torch.equal(after, before)
+        given = {name: part.clone() for name, part in made.matcher.state_dict().items()}
+        made = shipped.train_cells(made, tmp_path / "made", **steps)
+        changed = {name for name, part in made.matcher.state_dict().items() if not torch.equal(part, given[name])}
+        assert {name.partition(".")[0] for name in changed} == {"touch_cells", "photo_cells"}
+        assert not any("norm" in name for name in changed)
 
 
 def test_a_stopped_collection_of_pictures_continues(tmp_path):

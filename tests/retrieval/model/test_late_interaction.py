@@ -78,6 +78,16 @@ def test_logits_of_every_pair_equal_those_of_single_pairs_and_those_in_numpy(mat
         np.testing.assert_allclose(numpy, table[row], rtol=1e-5, atol=1e-5)
 
 
+def test_the_vector_of_a_cell_depends_on_its_place_and_on_the_whole_image(matcher):
+    cells = torch.rand(1, 1, matcher.photo_tower.cell_channels).expand(2, 9, -1)  # the same in all places
+    features = torch.rand(2, matcher.pooled_counts[1])
+    assert torch.allclose(*(matcher.photo_cells(cells, features)[0, place] for place in (0, 1)))  # places start equal
+    torch.nn.init.normal_(matcher.photo_cells.place)
+    first, second = matcher.photo_cells(cells, features)
+    assert not torch.allclose(first[0], first[1])
+    assert not torch.allclose(first[0], second[0])
+
+
 def test_the_pooled_listwise_loss_is_that_of_the_matcher_without_cells_and_trains_no_cell(matcher, images):
     touch = matcher.touch_encoding(matcher.touch_features(images[0]))
     photo = matcher.photo_encoding(matcher.photo_features(images[1][:3]))
