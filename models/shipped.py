@@ -108,6 +108,8 @@ SEED_SCORED = 30_000
 """Seed of the scored objects. The demo has its own (retrieval.commands.demo.SEED), the benchmark has 0."""
 TOWERS = RIGS / "shipped_towers.toml"
 """Configuration of the training of the towers."""
+TOWER_PARTS = ("touch_tower", "photo_tower")
+"""Names of the towers in a matcher."""
 CELL_TRAINING = {"iterations": 500, "learning_rate": 7e-4}
 """Settings of the training of the late interaction that differ from those of the shipped checkpoint."""
 TRAINED_SHARE = 0.7
@@ -149,8 +151,8 @@ def make_shipped(arguments: argparse.Namespace) -> int:
         return code
     towers = train_towers(folder)
     for fingers, name in SHIPPED.items():
-        made = train_cells(with_towers(load_checkpoint(shipped_model(fingers)), towers), folder)
-        store(calibrated(made, folder, fingers), folder / name)
+        made = with_parts(load_checkpoint(shipped_model(fingers)), towers, TOWER_PARTS)
+        store(calibrated(train_cells(made, folder), folder, fingers), folder / name)
     return 0
 
 
@@ -188,7 +190,10 @@ class TrainingImages(NamedTuple):
 
 
 def train_towers(folder: Path, **settings: Any) -> Checkpoint:
-    """Train both towers further, below the shipped head of two fingers; `settings` change those of TOWERS."""
+    """Train both towers further, below the shipped head of two fingers; `settings` change those of TOWERS.
+
+    The head stays: training it further made the rig's accuracy worse.
+    """
     images, parts = training_images(folder, PARTS), [recording_of(folder, part) for part in PARTS]
     start, config = load_checkpoint(shipped_model(2)), load_config(TOWERS)
     training = dataclasses.replace(config.training, start=str(start.path), **settings)
@@ -230,21 +235,7 @@ def train_cells(made: Checkpoint, folder: Path, **settings: Any) -> Checkpoint:
         weights=made.matcher.state_dict(),
     )
     trainer.features = FrozenFeatures(config, known)
-    trained = averaged(made, trainer.run_or_reuse(), CELL_SHARE)
-    for name in CELLS:
-        getattr(made.matcher, name).load_state_dict(getattr(trained.matcher, name).state_dict())
-    return with_training_of(trained, made)
-
-
-def with_training_of(trained: Checkpoint, made: Checkpoint) -> Checkpoint:
-    """Return a checkpoint that states the training of another one, of which it has parts."""
-    training = made.config.training.with_iterations(trained.config.training.iterations)
-    return dataclasses.replace(
-        made,
-        config=dataclasses.replace(made.config, training=training),
-        provenance=made.provenance | trained.provenance,
-        split=trained.split,
-    )
+    return with_parts(made, averaged(made, trainer.run_or_reuse(), CELL_SHARE), CELLS)
 
 
 def averaged(start: Checkpoint, trained: Checkpoint, share: float) -> Checkpoint:
@@ -327,11 +318,17 @@ def varied_photos(recording: Path) -> Path:
     return recording.with_name(f"{recording.name}-photos")
 
 
-def with_towers(made: Checkpoint, towers: Checkpoint) -> Checkpoint:
-    """Return a checkpoint with other towers. Its head stays: training it further made the rig's accuracy worse."""
-    for side in ("touch_tower", "photo_tower"):
-        getattr(made.matcher, side).load_state_dict(getattr(towers.matcher, side).state_dict())
-    return with_training_of(towers, made)
+def with_parts(made: Checkpoint, trained: Checkpoint, names: Iterable[str]) -> Checkpoint:
+    """Return a checkpoint with these parts of another matcher; it states the training of these."""
+    for name in names:
+        getattr(made.matcher, name).load_state_dict(getattr(trained.matcher, name).state_dict())
+    training = made.config.training.with_iterations(trained.config.training.iterations)
+    return dataclasses.replace(
+        made,
+        config=dataclasses.replace(made.config, training=training),
+        provenance=made.provenance | trained.provenance,
+        split=trained.split,
+    )
 
 
 def of_fingers(grasps: Iterable[Grasp], fingers: int) -> list[Grasp]:

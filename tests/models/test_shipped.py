@@ -55,7 +55,7 @@ def test_towers_and_cells_learn_varied_photos_meshes_and_other_sensors_for_both_
     for fingers in (1, 2):
         shipped_towers = load_checkpoint(shipped_model(fingers))
         before = shipped_towers.matcher.touch_tower.state_dict()[weights].clone()
-        made = shipped.with_towers(shipped_towers, towers)
+        made = shipped.with_parts(shipped_towers, towers, shipped.TOWER_PARTS)
         assert made.config.matcher.fingers == fingers
         assert len(made.split.train) == 9
         after, trained = (each.matcher.touch_tower.state_dict()[weights] for each in (made, towers))
