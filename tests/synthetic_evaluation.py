@@ -1,9 +1,9 @@
-"""A synthetic evaluation: results.json and timings.json in the format of `retrieve evaluate`, with random numbers."""
+"""A synthetic evaluation: results.json in the format of `retrieve evaluate`, with random numbers."""
 
 import msgspec
 import numpy as np
 
-from retrieval.evaluation.results import Results, Timings, write_results
+from retrieval.evaluation.results import Results, write_results
 from retrieval.metrics.registry import METRICS
 
 PROTOCOL = "unseen-objects"
@@ -98,17 +98,10 @@ def synthetic_protocol(methods):
 
 
 def write_synthetic_results(out, methods):
-    """Write results.json and timings.json to `out`; return `out`."""
+    """Write results.json to `out`; return `out`."""
     setting = {"preset": "mobilenet", "config": {"matcher": {}}, "model": None, "compared": {}, "seeds": [0, 1, 2]}
     protocols = {PROTOCOL: synthetic_protocol(methods)}
     results = {"setting": setting, "protocols": protocols, "skipped": {}, "software": "0.1.0"}
-    names = ("fit_s", "encode_touch_ms", "encode_photo_ms", "score_us_per_photo", "query_ms")
-    rows = {name: dict.fromkeys(names, number + 0.5) for number, name in enumerate(methods)}
-    times = {
-        "cpus": 2,
-        "protocols": {PROTOCOL: {"tower_touch_ms": 14, "tower_photo_ms": 21, "rows": rows}},
-    }
     out.mkdir(parents=True, exist_ok=True)
     write_results(out / "results.json", msgspec.convert(results, Results))
-    write_results(out / "timings.json", msgspec.convert(times, Timings))
     return out

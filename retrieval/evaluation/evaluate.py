@@ -1,6 +1,5 @@
 """Evaluate methods and models by protocols: from recordings to results.json. Finished experiments are not repeated."""
 
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -16,7 +15,7 @@ from retrieval.evaluation.experiment import ProtocolRun
 from retrieval.evaluation.inputs import Row, TowerEncoder
 from retrieval.evaluation.protocol import Protocol, RecordingFacts, read_recording_facts
 from retrieval.evaluation.protocols.recording import with_split
-from retrieval.evaluation.results import ProtocolResult, ProtocolTimes, Results, Setting, Timings, write_results
+from retrieval.evaluation.results import ProtocolResult, Results, Setting, write_results
 from retrieval.evaluation.touch_to_touch import FROZEN, TouchToTouch, run_touch_to_touch
 from retrieval.methods import METHODS
 from retrieval.methods.late_fusion import LateFusion
@@ -47,7 +46,7 @@ def evaluate(
     split: Split | None = None,
     skipped: Mapping[str, str] = MappingProxyType({}),
 ) -> Results:
-    """Compare methods and models on unseen objects, with controls; write results.json and timings.json.
+    """Compare methods and models on unseen objects, with controls; write results.json.
 
     A stopped run resumes: experiments under `out` with the same inputs are reused. Equal settings give byte-identical
     results.
@@ -140,7 +139,6 @@ def evaluate(
         for name, facts in facts_of.items()
     }
     found: dict[str, ProtocolResult] = {}
-    times: dict[str, ProtocolTimes] = {}
     out.mkdir(parents=True, exist_ok=True)
     with resumable(out), Cache(out / "cache.sqlite") as cache:
         for name, protocol in selected.items():
@@ -161,8 +159,7 @@ def evaluate(
                 for method in dict.fromkeys(names)
             ]
             rows += [Row(row, "late_fusion", towers[row], True) for row in others if towers[row].checkpoint]
-            run = ProtocolRun(name, protocol, facts, rows, training_seeds, out)
-            found[name], times[name] = run.measure(cache)
+            found[name] = ProtocolRun(name, protocol, facts, rows, training_seeds, out).measure(cache)
     setting = Setting(
         preset=config_name,
         config=(own if isinstance(own, Config) else own.config).without_paths(),
@@ -172,7 +169,6 @@ def evaluate(
     )
     results = Results(setting, found, dict(skipped), __version__)
     write_results(out / "results.json", results)
-    write_results(out / "timings.json", Timings(os.cpu_count() or 1, times))
     return results
 
 

@@ -4,7 +4,7 @@ import shutil
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,24 +20,23 @@ from retrieval.data.dataset import Split
 from retrieval.errors import BadInput
 from retrieval.evaluation.aggregate import Aggregation, MeasuresByName, protocol_result
 from retrieval.evaluation.details import SeedDetails, combine, describe
-from retrieval.evaluation.inputs import Row, TowerEncoder, thin_grasps
+from retrieval.evaluation.inputs import Row, thin_grasps
 from retrieval.evaluation.protocol import Protocol, RecordingFacts
-from retrieval.evaluation.queries import MethodScores, draw_queries, score_queries, timed
-from retrieval.evaluation.results import MethodTimes, ProtocolResult, ProtocolTimes, RowResult
+from retrieval.evaluation.queries import MethodScores, draw_queries, score_queries
+from retrieval.evaluation.results import ProtocolResult, RowResult
 from retrieval.methods import CHANCE, METHODS
 from retrieval.methods.method import Method, MethodSettings
 from retrieval.metrics.measure import Measure, pooled
 from retrieval.metrics.registry import MethodScoreTables
 from retrieval.metrics.table import ScoreTable
-from retrieval.model.encode import one_thread, photo_features, touch_features
+from retrieval.model.encode import one_thread
 from retrieval.model.losses import LOSSES
-from retrieval.training.batches import BatchImages
 from retrieval.training.features import Features
 from retrieval.version import __version__
 
 MAX_CONTROL_GRASPS = 12
 """Maximum number of grasps of one object whose images are encoded again for a control of a protocol in depth."""
-_FORMAT = 3  # raised if the same inputs give other outcomes
+_FORMAT = 4  # raised if the same inputs give other outcomes
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,13 +46,11 @@ class Outcome:
     Attributes:
         measures: Measures by name; owners are the units that intervals resample: objects, or their sequences.
         best_params: Parameters that the method selected on validation objects.
-        seconds: Run times; no result depends on them.
         details: Single objects and decisions; None unless the protocol is in depth and the inputs are touches.
     """
 
     measures: dict[str, Measure]
     best_params: dict[str, Any]
-    seconds: dict[str, float]
     details: SeedDetails | None
 
 
@@ -99,10 +96,10 @@ class Experiment:
             )
         grasps = thin_grasps(self.of.facts.grasps, self._max_grasps)
         queries = draw_queries(grasps, self.split, self.draw_seed, protocol.max_grasps, protocol.across_sessions)
-        method, fit_s = self._fit()
-        scores, seconds = score_queries(method, self.features, queries, self.draw_seed, protocol.allows_own_photos)
+        method = self._fit()
+        scores = score_queries(method, self.features, queries, self.draw_seed, protocol.allows_own_photos)
         details = describe(method, scores, self.features) if protocol.in_depth and not self.is_control else None
-        outcome = Outcome(self._measures(scores), method.best_params, {"fit": fit_s, **seconds}, details)
+        outcome = Outcome(self._measures(scores), method.best_params, details)
         cache.add({self.key: msgspec.msgpack.encode(outcome, enc_hook=_encode_array)})
         if not protocol.in_depth:  # the fits of all folds take gigabytes
             shutil.rmtree(self._folder, ignore_errors=True)
@@ -165,7 +162,7 @@ class Experiment:
     def _gallery_of(self) -> dict[str, str]:
         return dict(self.of.protocol.gallery_of(self.of.facts, self.split))
 
-    def _fit(self) -> tuple[Method, float]:
+    def _fit(self) -> Method:
         if Bar.is_on and Bar.is_verbose:
             name = f"{self.row.method} ({self.kind})" if self.is_control else self.row.name
             say(f"evaluate: {name}, seed {self.seed}")
@@ -183,10 +180,10 @@ class Experiment:
         parts = [features.of_objects(part) for part in (self.split.train, self.split.validation)]
         if self.kind == "permuted":
             parts = [permute_touches(part, self.seed) for part in parts]
-        fitted = METHODS.load(self.row.method)(settings)
-        with one_thread():  # heads are small; times refer to one core
-            seconds = timed(lambda: fitted.fit(*parts))[1]
-        return fitted, 0.0 if self.row.is_unfitted else seconds
+        fitted: Method = METHODS.load(self.row.method)(settings)
+        with one_thread():  # heads are small
+            fitted.fit(*parts)
+        return fitted
 
     def _measures(self, scores: MethodScores) -> dict[str, Measure]:
         """Return the measures of each gallery, pooled."""
@@ -260,8 +257,8 @@ class ProtocolRun:
     seeds: list[int]
     out: Path
 
-    def measure(self, cache: Cache) -> tuple[ProtocolResult, ProtocolTimes]:
-        """Run all experiments; return measures with intervals, and times."""
+    def measure(self, cache: Cache) -> ProtocolResult:
+        """Run all experiments; return measures with intervals."""
         protocol, towers = self.protocol, self.rows[0].towers
         jobs = {(row.name, "touch"): self._experiments(row, "touch") for row in self.rows}
         if not protocol.in_depth:
@@ -292,12 +289,9 @@ class ProtocolRun:
                 best_params=[[one.best_params for one in by_fold] for by_fold in of_row],
                 details=combine(details, self.seeds[0]) if details else None,
             )
-        times = {row.name: _method_times(outcomes[row.name, "touch"]) for row in self.rows}
-        if {"late_fusion", "retrieve_rerank"} <= set(times):  # both use one training run
-            times["retrieve_rerank"] = replace(times["retrieve_rerank"], fit_s=times["late_fusion"].fit_s)
         splits = [split for of_seed in self.folds.values() for split in of_seed]
         ratio = sum(len(one.test) for one in splits) / sum(len(one.train + one.validation) for one in splits)
-        result = protocol_result(
+        return protocol_result(
             protocol,
             self.facts,
             self.folds.values(),
@@ -307,7 +301,6 @@ class ProtocolRun:
             Aggregation(self.seeds[0], ratio if protocol.choices else None),
             reasons,
         )
-        return result, ProtocolTimes(*_tower_times(towers), times)
 
     @cached_property
     def folds(self) -> dict[int, list[Split]]:
@@ -339,25 +332,3 @@ class ProtocolRun:
             for name in every[0]
             if all(name in measures for measures in every)
         }
-
-
-def _method_times(outcomes: Sequence[Sequence[Outcome]]) -> MethodTimes:
-    """Return the median times of a row."""
-    seconds = [one.seconds for by_fold in outcomes for one in by_fold]
-    medians = {key: float(np.median([one[key] for one in seconds])) for key in seconds[0]}
-    return MethodTimes(
-        fit_s=medians["fit"] or None,
-        encode_touch_ms=1e3 * medians["encode_touch"],
-        encode_photo_ms=1e3 * medians["encode_photo"],
-        score_us_per_photo=1e6 * medians["score"],
-        query_ms=1e3 * medians["query"],
-    )
-
-
-@one_thread()
-def _tower_times(towers: TowerEncoder) -> tuple[float, float]:
-    """Return the median times (ms) of the towers for a touch and a photo, on one thread, without reading files."""
-    images, grasps = BatchImages(towers.config.preprocessing), towers.grasps[:3]
-    touches = [timed(partial(touch_features, towers.matcher, [images.touch(grasp)]))[1] for grasp in grasps]
-    photos = [timed(partial(photo_features, towers.matcher, [images.photo(grasp.photo)]))[1] for grasp in grasps]
-    return 1e3 * float(np.median(touches)), 1e3 * float(np.median(photos))

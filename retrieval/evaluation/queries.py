@@ -1,11 +1,9 @@
 """Queries of an evaluation, drawn once for all methods, and the scores of a fitted method for them."""
 
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +24,6 @@ PARTS = ("train", "validation", "test")
 SETS_OF_AN_OBJECT = 20
 
 Rows = NDArray[np.int64]
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +127,6 @@ def draw_queries(
 
 MIN_THRESHOLD_OBJECTS = 10
 """Minimum number of validation objects of a fitted pair threshold."""
-_QUERY_REPEATS = 5
 
 
 def scored_touches(table: ScoreTable) -> ScoredTouches:
@@ -222,34 +218,14 @@ class MethodScores:
 @one_thread()
 def score_queries(
     method: Method, features: Features, queries: Queries, seed: int = 0, allows_own_photos: bool = False
-) -> tuple[MethodScores, dict[str, float]]:
-    """Score all queries with a fitted method, on one thread; return the scores and the run times in seconds.
-
-    `features` are those of all grasps. "query" is the time of one touch against the whole gallery, from its features.
-    """
-    touch, photo = features.touch[queries.touches], features.photo[queries.photos]
-    touch_encodings, touch_s = timed(lambda: method.encode_touch(touch))
-    photo_encodings, photo_s = timed(lambda: method.encode_photo(photo))
-    scores, score_s = timed(lambda: method.score(touch_encodings, photo_encodings))
+) -> MethodScores:
+    """Score all queries with a fitted method, on one thread; `features` are those of all grasps."""
+    touch_encodings = method.encode_touch(features.touch[queries.touches])
+    photo_encodings = method.encode_photo(features.photo[queries.photos])
+    scores = method.score(touch_encodings, photo_encodings)
     if type(method)._score_sets is Method._score_sets:  # the sum of single scores, which are computed
         sets = {size: sum_over_sets(scores, rows) for size, rows in queries.sets.items()}
     else:
         sets = {size: method.score_sets(touch_encodings, photo_encodings, rows) for size, rows in queries.sets.items()}
-    query_s = [
-        timed(lambda: method.score(method.encode_touch(touch[:1]), photo_encodings))[1] for _ in range(_QUERY_REPEATS)
-    ]
-    seconds = {
-        "encode_touch": touch_s / len(touch),
-        "encode_photo": photo_s / len(photo),
-        "score": score_s / scores.size,
-        "query": float(np.median(query_s)),
-    }
     threshold = method.best_params.get("pair_threshold")
-    return MethodScores(queries, scores, sets, threshold, seed, allows_own_photos), seconds
-
-
-def timed(work: Callable[[], T]) -> tuple[T, float]:
-    """Return the result of some work, and the seconds that it took."""
-    start = time.perf_counter()
-    result = work()
-    return result, time.perf_counter() - start
+    return MethodScores(queries, scores, sets, threshold, seed, allows_own_photos)

@@ -1,4 +1,4 @@
-"""Results of an evaluation as data: results.json and timings.json, written by `evaluate` and read by the report."""
+"""Results of an evaluation as data: results.json, written by `evaluate` and read by the report."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +11,6 @@ from retrieval.errors import BadInput
 from retrieval.metrics.intervals import Difference, Summary
 from retrieval.metrics.measure import Measure
 
-T = TypeVar("T")
 M = TypeVar("M", Measure, Summary)
 
 
@@ -223,47 +222,19 @@ class Results:
     schema_version: Literal[5] = 5
 
 
-@dataclass(frozen=True)
-class MethodTimes:
-    """Median run times of a row over seeds and folds; `fit_s` is None for a checkpoint, which is not fitted."""
-
-    fit_s: float | None
-    encode_touch_ms: float
-    encode_photo_ms: float
-    score_us_per_photo: float
-    query_ms: float
-
-
-@dataclass(frozen=True)
-class ProtocolTimes:
-    """Run times of one protocol: the towers for one touch and one photo, and each row."""
-
-    tower_touch_ms: float
-    tower_photo_ms: float
-    rows: dict[str, MethodTimes]
-
-
-@dataclass(frozen=True)
-class Timings:
-    """Content of timings.json: CPUs of the machine, and times by protocol, on one thread."""
-
-    cpus: int
-    protocols: dict[str, ProtocolTimes]
-
-
-def write_results(path: Path, results: Results | Timings) -> None:
-    """Write results.json or timings.json. Equal results give equal bytes."""
+def write_results(path: Path, results: Results) -> None:
+    """Write results.json. Equal results give equal bytes."""
     write_atomically(path, msgspec.json.format(msgspec.json.encode(results), indent=1) + b"\n")
 
 
-def read_results(path: Path, kind: type[T]) -> T:
-    """Read a file that `write_results` wrote, as `Results` or `Timings`.
+def read_results(path: Path) -> Results:
+    """Read a file that `write_results` wrote.
 
     Raises:
         BadInput: The file cannot be read, or another version wrote it.
     """
     try:
-        return msgspec.json.decode(path.read_bytes(), type=kind)
+        return msgspec.json.decode(path.read_bytes(), type=Results)
     except (OSError, msgspec.MsgspecError) as error:
         raise BadInput(
             f"{path} must contain the results of an evaluation by this version ({error}). Run `retrieve evaluate`."

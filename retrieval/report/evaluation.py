@@ -1,6 +1,6 @@
 """The report of an evaluation: Markdown, one HTML page and figures, from results.json.
 
-Every number comes from results.json or timings.json; the report measures nothing. A report of one protocol has a
+Every number comes from results.json; the report measures nothing. A report of one protocol has a
 section for each part; a report of several has a section for each protocol, with folded parts. A part without results is
 left out.
 """
@@ -11,7 +11,7 @@ from pathlib import Path
 
 from retrieval.console.output import show
 from retrieval.evaluation.aggregate import RULE
-from retrieval.evaluation.results import Details, Results, Timings, read_results
+from retrieval.evaluation.results import Details, Results, read_results
 from retrieval.metrics.registry import SET_SIZES, grasps_metric_name
 from retrieval.model.verification import ERRORS_NEEDED
 from retrieval.report import plots, tables
@@ -60,7 +60,7 @@ Blocks = Iterator[Block | None]
 
 
 def write_report(out: Path) -> list[Path]:
-    """Write report.md, report.html and figures/ from results.json, and from timings.json if it exists.
+    """Write report.md, report.html and figures/ from results.json.
 
     Args:
         out: Folder of results.json, to which the report is written.
@@ -80,10 +80,8 @@ def write_report(out: Path) -> list[Path]:
     >>> [path.name for path in retrieval.write_report(Path("summaries"))][:2]
     ['report.md', 'report.html']
     """
-    results, timings = read_results(out / "results.json", Results), None
-    if (out / "timings.json").exists():
-        timings = read_results(out / "timings.json", Timings)
-    found = views(results, timings)
+    results = read_results(out / "results.json")
+    found = views(results)
     blocks: list[Block] = []
     if any(row.verdict for view in found for row in view.result.rows.values()):
         blocks.append(Text(RULE))
@@ -101,7 +99,7 @@ def write_report(out: Path) -> list[Path]:
 
 def print_results(results: Results) -> None:
     """Print a table of each protocol, with its queries, objects and gallery, and the verdicts."""
-    for view in views(results, None):
+    for view in views(results):
         if table := tables.measures(view, {key: view.measure_label(key) for key in view.headlines}):
             print_columns(view.result.title, table.header, table.rows, words=(0,))
             for note in filter(None, (view.note, *table.notes)):
@@ -179,18 +177,6 @@ def _grasps(view: ProtocolView) -> Blocks:
             lambda: plots.grasps(view),
         )
         yield tables.section(view, "grasps")
-
-
-def _time(view: ProtocolView) -> Blocks:
-    if view.timings and view.times:
-        if key := next((key for key in ("topn_k5", view.result.main) if view.summaries(key)), None):
-            yield Picture(
-                view.figure_name("time"),
-                "Accuracy against time on a logarithmic scale; the tables have the numbers.",
-                "Upper left is better. The grey steps join the methods on the Pareto front; dashed: chance.",
-                lambda: plots.accuracy_and_time(view, key),
-            )
-        yield tables.times(view, view.timings, view.times)
 
 
 def _explained(text: str, table: Table | None) -> Blocks:
@@ -292,7 +278,6 @@ PARTS: dict[str, Callable[[ProtocolView], Blocks]] = {
     "Comparison of methods": _methods,
     "Top-N accuracy": _topn,
     "Several grasps": _grasps,
-    "Accuracy and time": _time,
     "Full gallery": lambda view: _explained(GALLERY, tables.section(view, "gallery")),
     "Differences": lambda view: iter([tables.differences(view)]),
     "Controls": lambda view: _explained(CONTROLS, tables.controls(view, view.result.controls)),

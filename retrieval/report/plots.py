@@ -12,7 +12,6 @@ from retrieval.report.canvas import (
     PART_COLOURS,
     Figure,
     canvas,
-    logarithmic,
     percent_axis,
     style_of,
 )
@@ -164,34 +163,4 @@ def reject(view: ProtocolView) -> Figure:
     panel.set(xlim=(-1, 101), ylim=(-1, 101))
     panel.set_aspect("equal", adjustable="box")
     _legend(figure, view, rejections)
-    return figure
-
-
-# Time ------------------------------------------------------------------------------------------------
-
-
-def accuracy_and_time(view: ProtocolView, key: str) -> Figure:
-    """Plot a measure against the time of a query, and against the time of fitting."""
-    figure = canvas(10.5, 4.4)
-    panels = figure.subplots(1, 2, sharey=True)
-    titles = {"query_ms": "one query against the whole gallery, ms", "fit_s": "fitting, s"}
-    for panel, (kind, title) in zip(panels, titles.items(), strict=True):
-        points: list[tuple[float, float]] = []
-        for name, summary in view.summaries(key).items():
-            measured, style = view.times and view.times.rows.get(name), style_of(name)
-            if not (measured and (time := getattr(measured, kind))):
-                continue
-            value, low, high = _first(summary)
-            points.append((time, value))
-            panel.errorbar(time, value, [[value - low], [high - value]], fmt=style.marker, color=style.colour)
-            panel.axhline(100 * summary.chance[0], color=MUTED_COLOUR, ls="--", lw=1.2, zorder=0)
-        if points:  # the Pareto front of time and accuracy
-            times, values = zip(*sorted(points), strict=True)
-            best = np.maximum.accumulate(values)
-            panel.step(times, best, where="post", color="#222222", lw=1, alpha=0.45, zorder=0)
-        panel.set_xscale("log")
-        logarithmic(panel.xaxis)
-        panel.set_xlabel(title)
-    percent_axis(panels[0], f"{view.measure_label(key)}, %")
-    _legend(figure, view, view.result.rows)
     return figure

@@ -3,7 +3,7 @@
 import re
 from dataclasses import dataclass
 
-from retrieval.evaluation.results import Details, ProtocolResult, ProtocolTimes, Results, Timings
+from retrieval.evaluation.results import Details, ProtocolResult, Results
 from retrieval.methods import CHANCE
 from retrieval.metrics.intervals import Summary
 from retrieval.metrics.registry import METRICS, grasps_metric_name
@@ -29,13 +29,11 @@ class ProtocolView:
     Attributes:
         name: Name of the protocol.
         result: Its results.
-        timings: Run times of all protocols, if they were measured.
         is_only: Whether the report has no other protocol.
     """
 
     name: str
     result: ProtocolResult
-    timings: Timings | None
     is_only: bool
 
     @property
@@ -89,17 +87,12 @@ class ProtocolView:
         """Return a measure of all rows that have it."""
         return {row: found for row in self.result.rows if (found := self.summary(row, key))}
 
-    @property
-    def times(self) -> ProtocolTimes | None:
-        """The run times; None if they were not measured."""
-        return self.timings.protocols.get(self.name) if self.timings else None
-
     def figure_name(self, name: str) -> str:
         """Return a name of a figure's file that no other protocol of the report has."""
         return re.sub(r"[^A-Za-z0-9_-]+", "-", name if self.is_only else f"{self.name}-{name}")
 
 
-def views(results: Results, timings: Timings | None) -> list[ProtocolView]:
+def views(results: Results) -> list[ProtocolView]:
     """Return a view of each protocol, in the order of the file."""
     is_only = len(results.protocols) == 1
-    return [ProtocolView(name, result, timings, is_only) for name, result in results.protocols.items()]
+    return [ProtocolView(name, result, is_only) for name, result in results.protocols.items()]

@@ -6,11 +6,9 @@ from retrieval.evaluation.aggregate import CONTROL_NAMES
 from retrieval.evaluation.results import (
     ControlResult,
     Details,
-    ProtocolTimes,
     Rate,
     Rejection,
     Summaries,
-    Timings,
     VerificationRates,
 )
 from retrieval.metrics.intervals import Summary
@@ -22,7 +20,6 @@ from retrieval.report.numbers import (
     FEW_OBJECTS_NOTE,
     MISSING_VALUE,
     difference,
-    format_number,
     interval,
     p_value,
     percent,
@@ -227,28 +224,7 @@ def _supported_rate(rate: Rate) -> str:
     return "refused: " + (f"needs {rate.objects_needed:,} objects" if rate.objects_needed else "no errors")
 
 
-# Times and objects -----------------------------------------------------------------------------------
-
-
-def times(view: ProtocolView, timings: Timings, found: ProtocolTimes) -> Table:
-    """Return the run times of each row."""
-    columns = {
-        "fit_s": "fit, s",
-        "encode_touch_ms": "encode a touch, ms",
-        "encode_photo_ms": "encode a photo, ms",
-        "score_us_per_photo": "score a photo, µs",
-        "query_ms": "a query, ms",
-    }
-    rows = tuple(
-        (view.label(name), *(format_number(getattr(row, key)) for key in columns)) for name, row in found.rows.items()
-    )
-    note = (
-        f"On {timings.cpus} CPU(s) with one thread. Times of the methods without the towers: one "
-        "query is one touch against the whole gallery, with precomputed features. The towers, shared by all methods, "
-        f"take {format_number(found.tower_touch_ms)} ms for a touch and {format_number(found.tower_photo_ms)} ms for a "
-        "photo."
-    )
-    return Table(("method", *columns.values()), rows, (note,))
+# Objects of a split -----------------------------------------------------------------------------------
 
 
 def split(parts: Mapping[str, Sequence[str]]) -> Table:

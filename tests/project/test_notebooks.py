@@ -21,8 +21,6 @@ TINY = {
         "queries": 6,
         "repeats": 1,
         "quick": True,
-        "preset": "tiny",
-        "iterations": 4,
     },
     "one_query": {"demo": "../demo", "out": "../build/one-query", "which": 0, "grasps": 2, "candidates": 4, "top": 2},
     "simulated_data": {

@@ -104,17 +104,17 @@ class Largest(Chance):
 
 def test_scores_are_those_of_the_method_for_touches_and_sets(features):
     method = fitted(Chance, features)
-    found, _ = score_queries(method, features, QUERIES)
+    found = score_queries(method, features, QUERIES)
     codes = method.encode_touch(features.touch[QUERIES.touches]), method.encode_photo(features.photo[QUERIES.photos])
     np.testing.assert_allclose(found.scores, method.score(*codes), atol=1e-6)  # float32 sums
-    largest, _ = score_queries(fitted(Largest, features), features, QUERIES)
+    largest = score_queries(fitted(Largest, features), features, QUERIES)
     for size, sets in QUERIES.sets.items():
         np.testing.assert_allclose(found.set_scores[size], method.score_sets(*codes, sets), rtol=1e-6, atol=1e-6)
         np.testing.assert_array_equal(largest.set_scores[size], [found.scores[list(row)].max(0) for row in sets])
 
 
 def test_tables_have_the_rows_and_photos_of_their_parts_and_mark_photos_of_own_grasps(features):
-    found, _ = score_queries(fitted(Chance, features), features, QUERIES)
+    found = score_queries(fitted(Chance, features), features, QUERIES)
     tables = found.tables(with_threshold=False)
     assert [set(table.photo_owner) for table in (tables.test, tables.all_objects)] == [{4, 5}, set(range(6))]
     for table in (tables.test, tables.all_objects):

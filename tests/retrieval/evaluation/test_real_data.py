@@ -6,7 +6,7 @@ import pytest
 from retrieval.commands.main import main
 from retrieval.evaluation import PROTOCOLS, protocol
 from retrieval.evaluation.protocols import vt60
-from retrieval.evaluation.results import Results, read_results
+from retrieval.evaluation.results import read_results
 from tests import real_data_sets
 from tests.data import touch_data
 
@@ -27,7 +27,7 @@ def evaluate(data, out, *more, methods=TINY):
 
 def read(out):
     """Return the results of each protocol."""
-    return read_results(out / "results.json", Results).protocols
+    return read_results(out / "results.json").protocols
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from retrieval.commands.main import main
 from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.data.images import read_rgb
 from retrieval.errors import DatasetError
-from retrieval.evaluation.results import Results, read_results
+from retrieval.evaluation.results import read_results
 from retrieval.evaluation.sequences import MOST_TOUCHES, Sequences, cosines, leave_one_out_scores
 from retrieval.evaluation.touch_to_touch import with_common_frame
 from robot.importers.estimate_modulus import import_estimate_modulus
@@ -157,7 +157,7 @@ def evaluate(recording, out, *more):
 
 
 def read(out):
-    return read_results(out / "results.json", Results).protocols["physiclear"]
+    return read_results(out / "results.json").protocols["physiclear"]
 
 
 @pytest.fixture(scope="module")
@@ -217,7 +217,7 @@ def two_days(tmp_path_factory):
 def run(recording, out, *more):
     options = ["--config", "tiny", "--seeds", "2", "--out", str(out), *more]
     assert main(["evaluate", str(recording), "--protocol", "touch-to-touch", *options]) == 0
-    return read_results(out / "results.json", Results).protocols["touch-to-touch"]
+    return read_results(out / "results.json").protocols["touch-to-touch"]
 
 
 def test_a_recording_of_two_sessions_is_compared_across_them_with_counts_of_both_directions(two_days, tmp_path):

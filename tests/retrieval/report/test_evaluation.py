@@ -58,7 +58,7 @@ def test_returned_files_exist_and_every_figure_opens(report):
     files, out = report
     assert files[:2] == [out / "report.md", out / "report.html"]
     assert set(files[2:]) == set((out / "figures").iterdir())
-    expected = {f"{name}.png" for name in ("overview", "guess-curves", "grasps", "time", "reject")}
+    expected = {f"{name}.png" for name in ("overview", "guess-curves", "grasps", "reject")}
     for method in ("late_fusion", "cca", "brand-new_method"):
         expected |= {f"objects-test-{method}.png", f"objects-all-{method}.png", f"reliability-{method}.png"}
     assert {path.name for path in files[2:]} == expected
