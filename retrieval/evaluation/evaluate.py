@@ -149,7 +149,7 @@ def evaluate(
                 if are_trained := not first.config.training.freeze_towers:
                     first = encoder(facts, _trained(facts, protocol, first, out))
             if isinstance(protocol, TouchToTouch):
-                found[name] = run_touch_to_touch(protocol, facts, towers, training_seeds, out / "common-frame")
+                found[name] = run_touch_to_touch(protocol, facts, towers, training_seeds)
                 continue
             rows = []
             if model:

@@ -90,7 +90,6 @@ class Sequences:
         names: Name of each sequence.
         owner: (S,) object number of each sequence, in the order of the sorted names.
         rows: Places of the grasps of each.
-        part: (S,) session of each, or "early" and "late"; "" if there is one part.
         rounds: The comparisons; their queries are pooled.
         is_across_sessions: Whether queries and gallery are from different sessions.
         remark: What became of grasps that name no session.
@@ -100,7 +99,6 @@ class Sequences:
     names: tuple[str, ...]
     owner: NDArray[np.int64]
     rows: tuple[Rows, ...]
-    part: NDArray[np.str_]
     rounds: tuple[Round, ...]
     is_across_sessions: bool
     remark: str = ""
@@ -155,7 +153,7 @@ class Sequences:
                     )
         rows = tuple(np.array(each, np.int64) for each in places.values())
         is_across = not (is_late or rounds[0].is_leave_one_out)
-        return cls(grasps, tuple(name for _, _, name in places), owner, rows, part, tuple(rounds), is_across, remark)
+        return cls(grasps, tuple(name for _, _, name in places), owner, rows, tuple(rounds), is_across, remark)
 
     @property
     def rule(self) -> str:
@@ -179,13 +177,6 @@ class Sequences:
     def mean(self, features: NDArray[np.float32]) -> Vectors:
         """Return the mean (S, F) of features (G, F) over the grasps of each sequence."""
         return np.stack([features[rows].mean(0, dtype=np.float64) for rows in self.rows])
-
-    def centred(self, vectors: Vectors) -> Vectors:
-        """Return vectors (S, F) minus the mean of those of the same part."""
-        centred = vectors.copy()
-        for name in np.unique(self.part):
-            centred[self.part == name] -= vectors[self.part == name].mean(0)
-        return centred
 
     def measures(
         self, metrics: Mapping[str, Metric], vectors: Vectors, permutations: Sequence[int | None] = (None,)

@@ -27,8 +27,7 @@ DATA_SET = DataSet(
     caveats=(
         NO_PHOTOS,
         "The videos of a part were made one after the other, and light and gel drift: the no-contact frame alone "
-        "identifies the part far above chance. Print this control, and results with each touch minus its "
-        "no-contact frame, added to one common no-contact frame.",
+        "identifies the part far above chance. Print this control.",
         "Videos were made in two sessions: those of 50 frames have another light than those of 126 frames. Few parts "
         "were pressed in both.",
         "Frames of one video are nearly the same: hold out whole videos, which are the sequences.",

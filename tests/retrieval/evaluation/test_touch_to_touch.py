@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 
 from retrieval.commands.main import main
-from retrieval.data.dataset import Grasp, load_grasps
-from retrieval.data.images import read_rgb
+from retrieval.data.dataset import Grasp
 from retrieval.errors import DatasetError
 from retrieval.evaluation.results import read_results
 from retrieval.evaluation.sequences import MOST_TOUCHES, Sequences, cosines, leave_one_out_scores
-from retrieval.evaluation.touch_to_touch import with_common_frame
 from robot.importers.estimate_modulus import import_estimate_modulus
 from robot.importers.physiclear import import_physiclear
 from tests.miniatures import estimate_modulus, physiclear
@@ -97,8 +95,6 @@ def test_objects_of_both_sessions_are_compared_in_both_directions():
     assert sequences.rule.endswith(" 2 grasps name no session and are left out.")
     one = Sequences.of([*grasps({"a": 2, "b": 2}, "late"), *grasps({"a": 3, "b": 3})], "across")
     assert "not compared: 12 grasps name none, all others the same one." in one.rule
-    vectors = sequences.centred(np.arange(7, dtype=np.float64)[:, None])
-    assert vectors.ravel().tolist() == [-1.5, -0.5, 0.5, 1.5, -1, 0, 1]
     with pytest.raises(
         DatasetError, match=r"no two of late, tuesday have such objects in common.*touch-to-touch-within"
     ):
@@ -125,7 +121,7 @@ def test_late_touches_are_compared_with_early_ones_if_every_object_has_one_seque
     assert (gallery.split()[-1], queries.split()[2]) == ("b-19-1", "b-40-0")
 
 
-# The common no-contact frame -------------------------------------------------------------------------------
+# The protocol ----------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -135,20 +131,6 @@ def recording(tmp_path_factory):
     physiclear.write(folder / "data" / "physiclear")
     import_physiclear(folder / "data" / "physiclear", folder / "recording")
     return folder
-
-
-def test_images_on_the_common_frame_contain_only_the_contact_difference(recording, tmp_path):
-    own = load_grasps(recording / "recording")
-    moved = with_common_frame(own, tmp_path / "common")
-    common = np.rint(255 * read_rgb(own[0].backgrounds[0]))
-    for before, after in zip(own, moved, strict=True):
-        touch, rest = (np.rint(255 * read_rgb(path)) for path in (before.touches[0], before.backgrounds[0]))
-        expected = np.clip(common + touch - rest, 0, 255)
-        np.testing.assert_array_equal(np.rint(255 * read_rgb(after.touches[0])), expected)
-        assert after.backgrounds == own[0].backgrounds
-
-
-# The protocol ----------------------------------------------------------------------------------------------
 
 
 def evaluate(recording, out, *more):
@@ -167,9 +149,9 @@ def out(recording, tmp_path_factory):
     return folder
 
 
-def test_each_representation_is_compared_with_three_controls(out):
+def test_a_tower_is_compared_with_three_controls(out):
     entry = read(out)
-    assert set(entry.rows) == {"frozen-difference", "frozen-common-frame"}
+    assert set(entry.rows) == {"frozen"}
     for row in entry.rows.values():
         summary = row.measures["recall_1"]
         assert (summary.queries, summary.objects) == (6, 2)
@@ -184,7 +166,7 @@ def test_each_representation_is_compared_with_three_controls(out):
     assert entry.controls["no_contact"].measures["recall_1"].value[0] == 1.0
     assert entry.controls["order"].measures["recall_1"].value[0] >= 2 / 3
     text = (out / "report.md").read_text().replace("\\", "")
-    for words in ("one video left out", "| permuted |", "frozen-common-frame", "the no-contact frame as input"):
+    for words in ("one video left out", "| permuted |", "| frozen |", "the no-contact frame as input"):
         assert words in text
 
 
@@ -194,16 +176,12 @@ def test_the_towers_of_other_configurations_are_rows_compared_with_the_first(rec
     larger.write_text(tiny.replace("touch_px = 32", "touch_px = 48"))
     assert evaluate(recording, tmp_path / "report", "--compare", "same=tiny", f"larger={larger}") == 0
     found = read(tmp_path / "report")
-    assert set(found.rows) == {
-        f"{name}-{representation}"
-        for name in ("frozen", "same", "larger")
-        for representation in ("difference", "common-frame")
-    }
-    assert found.rows["same-difference"].measures == found.rows["frozen-difference"].measures
+    assert list(found.rows) == ["frozen", "same", "larger"]
+    assert found.rows["same"].measures == found.rows["frozen"].measures
     differences = {(one.a, one.b): one.difference for one in found.comparisons if one.measure == "map"}
-    same = differences["same-difference", "frozen-difference"]
+    same = differences["same", "frozen"]
     assert (same.low, same.value, same.high) == (0, 0, 0)
-    assert ("larger-difference", "frozen-difference") in differences
+    assert ("larger", "frozen") in differences
 
 
 @pytest.fixture(scope="module")
@@ -222,14 +200,12 @@ def run(recording, out, *more):
 
 def test_a_recording_of_two_sessions_is_compared_across_them_with_counts_of_both_directions(two_days, tmp_path):
     entry = run(two_days, tmp_path / "out")
-    assert set(entry.rows) == {"frozen-difference", "frozen-common-frame", "frozen-difference-centred"}
     directions = [label for name, label in entry.labels if name.startswith("recall_1_")]
     assert directions == ["top-1, 2023-12-16 against 2023-12-06", "top-1, 2023-12-06 against 2023-12-16"]
-    measures = entry.rows["frozen-difference-centred"].measures
+    measures = entry.rows["frozen"].measures
     assert (measures["recall_1"].queries, measures["recall_1_0"].queries, measures["recall_1"].objects) == (8, 4, 2)
     assert measures["recall_1"].value[0] == np.mean([measures[f"recall_1_{number}"].value[0] for number in (0, 1)])
     assert entry.controls["order"].measures["recall_1"].value[0] == 0.5 == measures["recall_1"].chance[0]
-    assert ("frozen-difference-centred", "frozen-difference") in {(one.a, one.b) for one in entry.comparisons}
 
 
 def test_touches_without_no_contact_frames_are_compared_as_they_are(two_days, tmp_path):
@@ -237,6 +213,5 @@ def test_touches_without_no_contact_frames_are_compared_as_they_are(two_days, tm
     lines = (without / "metadata.jsonl").read_text()
     (without / "metadata.jsonl").write_text(lines.replace("touch_a_before_file_name", "other"))
     entry = run(without, tmp_path / "out")
-    assert set(entry.rows) == {"frozen-plain", "frozen-plain-centred"}
     assert entry.controls["no_contact"].reason == "the recording lacks no-contact frames"
     assert "Features of the touches themselves are compared" in entry.rule
