@@ -127,7 +127,7 @@ def combine(by_seed: Sequence[SeedDetails], seed: int) -> Details:
         fractions[one.object_id, one.mistaken_for] += one.share / len(by_seed)
     largest = sorted(fractions.items(), key=lambda item: (-item[1], item[0]))[:_CONFUSIONS]
     rejections = [one.reject for one in by_seed if one.reject]
-    names = ("auroc", "false_accepts_at_95", "balanced_accuracy") if rejections else ()
+    names = ("auroc", "balanced_accuracy") if rejections else ()
     summaries = {name: summarise([getattr(one, name) for one in rejections], seed=seed) for name in names}
     verified = [one.verification for one in by_seed if one.verification]
     return replace(

@@ -15,7 +15,6 @@ from retrieval.metrics.measure import Measure, object_weights, weight_below
 from retrieval.metrics.table import ScoreTable
 from retrieval.model.posterior import Posterior
 
-TRUE_ACCEPTS = 0.95
 _CURVE_POINTS = 200
 
 Floats = NDArray[np.float64]
@@ -45,8 +44,7 @@ def statistic(gallery: Floats) -> Floats:
 def reject(posterior: Posterior, table: ScoreTable, *, seed: int = 0) -> Rejection[Measure]:
     """Measure the rejection performance of a posterior on the scores of objects that it was not fitted on.
 
-    Objects have equal weight. Chance of `auroc` and `balanced_accuracy` is 1/2, of `false_accepts_at_95` 0.95.
-    `seed` draws the galleries. Raises BadInput for fewer than three objects.
+    Objects have equal weight. Chance is 1/2. `seed` draws the galleries. Raises BadInput for fewer than three objects.
     """
     targets = table.with_targets
     true = np.asarray(targets.touch_owner[:, None] == targets.objects)
@@ -54,47 +52,17 @@ def reject(posterior: Posterior, table: ScoreTable, *, seed: int = 0) -> Rejecti
     weights = object_weights(targets.touch_owner)
     words = f"{table.gallery}; each query with its object in the gallery, and with a rival in its place"
 
-    def measure(values: Floats, chance: float) -> Measure:
-        return Measure(values[:, None], targets.touch_owner, np.array([chance]), words)
+    def measure(values: Floats) -> Measure:
+        return Measure(values[:, None], targets.touch_owner, np.array([0.5]), words)
 
     # The object-weighted mean is the area under the curve; the object means give its variance (DeLong 1988; Obuchowski
     # 1997 for clustered data): v = P(present > any absent) + P(any present > absent) - area.
     hits, alarms = weight_below(present, absent, weights), 1 - weight_below(absent, present, weights)
     return Rejection(
-        auroc=measure(hits + alarms - np.sum(weights * hits), 0.5),
-        balanced_accuracy=measure(((present >= 0) + 1.0 - (absent >= 0)) / 2, 0.5),
-        false_accepts_at_95=measure(false_accepts(present, absent, targets.touch_owner), TRUE_ACCEPTS),
+        auroc=measure(hits + alarms - np.sum(weights * hits)),
+        balanced_accuracy=measure(((present >= 0) + 1.0 - (absent >= 0)) / 2),
         roc=_roc(present, absent, weights),
     )
-
-
-def false_accepts(present: Floats, absent: Floats, owner: NDArray[np.int64]) -> Floats:
-    """Return values (T,): their object-weighted mean is the false accept rate; their object means give its variance.
-
-    The threshold depends on the same queries, so the true accepts of an object change the rate too. Each object's value
-    is a jackknife pseudo-value, from the rate without it.
-    """
-    rate = _false_accept_rate(present, absent, owner)
-    objects, place = np.unique(owner, return_inverse=True)
-    if len(objects) == 1:
-        return np.full(len(owner), rate)
-    without = np.array(
-        [_false_accept_rate(*(part[owner != name] for part in (present, absent, owner))) for name in objects]
-    )
-    return np.asarray((rate + (len(objects) - 1) * (without.mean() - without))[place])
-
-
-def _false_accept_rate(present: Floats, absent: Floats, owner: NDArray[np.int64]) -> float:
-    """Return the accept rate of queries without the object when 95 % of those with it are accepted.
-
-    A fraction of the ties at the threshold is accepted, so that the true accept rate is exactly 95 %.
-    """
-    weights, order = object_weights(owner), np.argsort(-present, kind="stable")
-    accepted = np.cumsum(weights[order])
-    threshold = present[order][min(int(np.searchsorted(accepted, TRUE_ACCEPTS * accepted[-1])), len(order) - 1)]
-    tied, above = weights[present == threshold].sum(), weights[present > threshold].sum()
-    part = (TRUE_ACCEPTS * accepted[-1] - above) / tied
-    return float(weights[absent > threshold].sum() + part * weights[absent == threshold].sum())
 
 
 def _roc(present: Floats, absent: Floats, weights: Floats) -> list[list[float]]:

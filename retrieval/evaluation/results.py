@@ -51,14 +51,12 @@ class Rejection(Generic[M]):
     Attributes:
         auroc: Area under the ROC curve: how often the statistic of a row with its object in the gallery exceeds that of
             a row without; ties count 1/2.
-        false_accepts_at_95: False accept rate at the threshold with a true accept rate of 95 %.
         balanced_accuracy: Mean of true accept rate and true reject rate; a row is accepted if "one of these" is at
             least as likely as none, at even prior.
         roc: [false accept rate, true accept rate] of the first seed, from accepting none to accepting all.
     """
 
     auroc: M
-    false_accepts_at_95: M
     balanced_accuracy: M
     roc: list[list[float]]
 
@@ -219,7 +217,7 @@ class Results:
     protocols: dict[str, ProtocolResult]
     skipped: dict[str, str]
     software: str
-    schema_version: Literal[5] = 5
+    schema_version: Literal[6] = 6
 
 
 def write_results(path: Path, results: Results) -> None:

@@ -5,10 +5,8 @@ import pytest
 
 from retrieval.evaluation.queries import fit_posterior as fit
 from retrieval.evaluation.queries import identification_trials
-from retrieval.evaluation.reject import false_accepts, galleries, reject, statistic
+from retrieval.evaluation.reject import galleries, reject, statistic
 from retrieval.metrics.intervals import summarise
-from retrieval.metrics.measure import object_means
-from retrieval.model.posterior import Posterior
 from tests.retrieval.metrics.test_registry import table_of
 
 
@@ -23,12 +21,6 @@ def rejection(gap, **more):
     return reject(fit(planted(gap=gap, seed=1, **more)), planted(gap=gap, seed=2, **more))
 
 
-def statistics(posterior, table):
-    """Return the statistics with the object in the gallery and without it."""
-    ratios = identification_trials(table).log_ratios(posterior)
-    return [statistic(gallery) for gallery in galleries(ratios, table.touch_owner[:, None] == table.objects)]
-
-
 def value(measure):
     return summarise([measure]).value[0]
 
@@ -39,10 +31,8 @@ def test_a_constant_scorer_is_exactly_at_chance():
     found = reject(fit(table), table)
     assert value(found.auroc) == pytest.approx(0.5, abs=1e-12)
     assert value(found.balanced_accuracy) == 0.5
-    assert value(found.false_accepts_at_95) == pytest.approx(0.95, abs=1e-12)
     assert found.roc == [[0, 0], [pytest.approx(1), pytest.approx(1)]]
     assert found.auroc.chance.tolist() == found.balanced_accuracy.chance.tolist() == [0.5]
-    assert found.false_accepts_at_95.chance.tolist() == [0.95]
 
 
 def test_a_larger_gallery_with_the_object_makes_an_uninformative_scorer_seem_better():
@@ -80,15 +70,6 @@ def test_the_decision_is_that_of_a_query_at_even_prior():
             assert log_odds == pytest.approx(np.log((1 - none) / none))
 
 
-def test_false_accepts_use_the_threshold_with_95_percent_true_accepts():
-    """Of 200 sorted queries the 190th is the last accepted one."""
-    posterior, table = Posterior(), planted(objects=100, grasps=2, gap=1.5)
-    found = reject(posterior, table)
-    present, absent = statistics(posterior, table)
-    threshold = sorted(present, reverse=True)[190 - 1]
-    assert value(found.false_accepts_at_95) == pytest.approx(np.mean(absent >= threshold))
-
-
 def test_the_roc_runs_from_corner_to_corner_and_has_the_reported_area():
     found = rejection(gap=1.5, grasps=5)
     alarms, hits = np.array(found.roc).T
@@ -114,20 +95,3 @@ def test_values_vary_over_objects_as_the_area_varies_over_draws_of_objects():
         naive.append(((means + means.mean()) / 2).std(ddof=1) / np.sqrt(14))
     assert np.mean(errors) == pytest.approx(np.std(areas, ddof=1), rel=0.2)  # 40 trials measure a deviation to 12 %
     assert np.mean(naive) < 0.7 * np.std(areas, ddof=1)
-
-
-def test_the_false_accept_rate_varies_over_objects_as_over_draws_of_objects():
-    """Naive: with a fixed threshold the spread is far too small."""
-    rates, errors, naive = [], [], []
-    rng = np.random.default_rng(0)
-    for _ in range(120):
-        owner = np.repeat(np.arange(18), 12)
-        present = (2 + rng.normal(size=18))[owner] + rng.normal(size=len(owner))
-        absent = rng.normal(size=18)[owner] + rng.normal(size=len(owner))
-        means = object_means(false_accepts(present, absent, owner)[:, None], owner)[1]
-        rates.append(means.mean())
-        errors.append(means.std(ddof=1) / np.sqrt(18))
-        accepted = (absent >= np.quantile(present, 0.05))[:, None].astype(float)
-        naive.append(object_means(accepted, owner)[1].std(ddof=1) / np.sqrt(18))
-    assert np.mean(errors) == pytest.approx(np.std(rates, ddof=1), rel=0.25)
-    assert np.mean(naive) < 0.75 * np.std(rates, ddof=1)

@@ -104,7 +104,7 @@ def test_numbers_are_printed_without_recomputation(remake):
         protocol = results["protocols"][PROTOCOL]
         row = protocol["rows"]["cca"]
         row["measures"]["pair_accuracy"] |= {"value": [0.12345], "low": [0.9], "high": [0.1]}
-        row["details"]["reject"]["false_accepts_at_95"] |= {"value": [0.8123], "low": [0.7], "high": [0.9]}
+        row["details"]["reject"]["balanced_accuracy"] |= {"value": [0.8123], "low": [0.7], "high": [0.9]}
         for name, low in (("no_contact", 0.51), ("permuted", 0.49)):
             protocol["controls"][name]["measures"]["pair_accuracy"] |= {"low": [low], "high": [0.6]}
         protocol["recording"]["source"] = "billets"
