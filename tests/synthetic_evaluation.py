@@ -43,7 +43,7 @@ def details(rng, name):
             "all_candidates": {name: rng.uniform() for name in OBJECTS},
         },
         "confusions": [{"object_id": OBJECTS[8], "mistaken_for": OBJECTS[9], "share": 0.4}],
-        "reliability": {kind: {"ece": 0.04, "bins": bins} for kind in ("pairs", "k5", "k10")},
+        "reliability": {kind: {"ece": 0.04, "bins": bins} for kind in ("k5", "k10")},
         "posterior": {"slope": 0.9, "offset": -0.1},
         "reject": {
             **{key: summary(rng) for key in ("auroc", "balanced_accuracy")},

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import expit, softmax
+from scipy.special import softmax
 
 from retrieval.evaluation.queries import MethodScores
 from retrieval.evaluation.reject import reject
@@ -27,7 +27,6 @@ from retrieval.training.features import Features
 K_WAY_TESTS = {"k5": 5, "k10": 10}
 """Tests of calibrated probabilities: number of candidates, of one photo each."""
 _CONFUSIONS = 12
-_PAIRS_OF_A_ROW = 8  # of each kind
 _TESTS_OF_A_ROW = 4
 
 
@@ -64,26 +63,6 @@ def describe(method: Method, scores: MethodScores, features: Features) -> SeedDe
     )
 
 
-def draw_pairs(table: ScoreTable, seed: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return scores (P,) and labels (P,) of up to 8 true photos of each row and as many false ones.
-
-    The photo of the row's own grasp is never drawn. For a false pair first one of at least two objects is drawn
-    uniformly, then its photo, with replacement.
-    """
-    targets = table.with_targets
-    rng = np.random.default_rng([seed, 1])
-    keys = np.where(targets.relevant & ~targets.own, rng.random(targets.own.shape), np.inf)
-    true = np.argsort(keys, axis=1)[:, :_PAIRS_OF_A_ROW]
-    is_drawn = np.isfinite(np.take_along_axis(keys, true, 1))
-    objects, counts = np.unique(targets.photo_owner, return_counts=True)
-    order, start = np.argsort(targets.photo_owner, kind="stable"), np.cumsum(counts) - counts
-    other = rng.integers(len(objects) - 1, size=true.shape)
-    other += other >= np.searchsorted(objects, targets.touch_owner)[:, None]
-    false = order[start[other] + (rng.random(other.shape) * counts[other]).astype(np.int64)]
-    scores = [np.take_along_axis(targets.scores, columns, 1)[is_drawn] for columns in (true, false)]
-    return np.concatenate(scores).astype(np.float64), np.repeat([1, 0], is_drawn.sum())
-
-
 def draw_k_way_tests(table: ScoreTable, k: int, seed: int) -> NDArray[np.float64]:
     """Return scores (Q, k) of K-way tests, the true candidate first: 4 tests for each row with uniformly drawn rivals.
 
@@ -98,15 +77,13 @@ def draw_k_way_tests(table: ScoreTable, k: int, seed: int) -> NDArray[np.float64
 
 
 def reliability(posterior: Posterior, test: ScoreTable, *, seed: int = 0) -> dict[str, Any]:
-    """Return the reliability bins of calibrated probabilities on test objects; `seed` draws pairs and tests.
+    """Return the reliability bins of calibrated probabilities on test objects; `seed` draws the tests.
 
     Returns:
-        "pairs": bins of match probabilities at even prior odds; and by name of `K_WAY_TESTS`: probability of the top-1
-        candidate when one candidate is true (prior of none: 0) against its accuracy, where tied candidates split the
-        credit. Tests without enough test objects are left out.
+        By name of `K_WAY_TESTS`: probability of the top-1 candidate when one candidate is true (prior of none: 0)
+        against its accuracy, where tied candidates split the credit. Tests without enough test objects are left out.
     """
-    scores, labels = draw_pairs(test, seed)
-    found = {"pairs": reliability_bins(expit(posterior.log_ratio(scores, 1)), labels)}
+    found = {}
     for name, k in K_WAY_TESTS.items():
         if len(test.objects) >= k:
             logits = draw_k_way_tests(test, k, seed)

@@ -36,7 +36,7 @@ from retrieval.version import __version__
 
 MAX_CONTROL_GRASPS = 12
 """Maximum number of grasps of one object whose images are encoded again for a control of a protocol in depth."""
-_FORMAT = 5  # raised if the same inputs give other outcomes
+_FORMAT = 6  # raised if the same inputs give other outcomes
 
 
 @dataclass(frozen=True, eq=False)

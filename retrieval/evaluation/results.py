@@ -90,7 +90,7 @@ class Details:
         per_object: Mean top-1 accuracy of 5 of each object: "test_candidates" among test objects, "all_candidates".
         confusions: The most frequent ones.
         posterior: That of single touches, of the first seed; None with too few validation objects.
-        reliability: "pairs", "k5", "k10" -> {"ece", "bins"}; empty without a posterior.
+        reliability: "k5", "k10" -> {"ece", "bins"}; empty without a posterior.
         reject: None with too few objects.
         verification: Impostors ("random", "similar") -> number of grasps -> rates; None with too few objects, and for
             methods other than late fusion.

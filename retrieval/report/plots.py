@@ -124,7 +124,6 @@ def objects(view: ProtocolView, row: str, candidates: str, measure: str) -> Figu
 # Decisions -------------------------------------------------------------------------------------------
 
 RELIABILITIES = {
-    "pairs": "one touch, one photo, even odds",
     "k5": "5 candidates, one grasp",
     "k10": "10 candidates, one grasp",
 }

@@ -1,9 +1,9 @@
-"""Calibrated probabilities of a method: drawn pairs and tests, hard scores, transfer to other objects."""
+"""Calibrated probabilities of a method: drawn tests, hard scores, transfer to other objects."""
 
 import numpy as np
 import pytest
 
-from retrieval.evaluation.details import draw_k_way_tests, draw_pairs, reliability
+from retrieval.evaluation.details import draw_k_way_tests, reliability
 from retrieval.evaluation.queries import fit_posterior
 from tests.retrieval.metrics.test_registry import table_of
 
@@ -14,19 +14,6 @@ def planted(objects=20, grasps=10, seed=0):
     owner = np.repeat(np.arange(objects), grasps)
     noise = rng.normal(size=(len(owner), objects))[:, owner]  # equal for all photos of an object
     return table_of(np.where(owner[:, None] == owner, 1, -1) + np.sqrt(2) * noise, owner)
-
-
-def test_drawn_pairs_are_balanced_in_every_row_and_exclude_the_own_photo():
-    """Each score encodes its row and column, so every pair is identified."""
-    owner = np.repeat([0, 1, 2], [3, 4, 12])
-    scores, labels = draw_pairs(table_of(np.arange(19 * 19).reshape(19, 19), owner), seed=0)
-    rows, columns = np.divmod(scores.astype(int), 19)
-    assert (rows != columns).all()
-    np.testing.assert_array_equal(labels, owner[rows] == owner[columns])
-    assert len(np.unique(scores[labels == 1])) == labels.sum()  # without replacement
-    for row in range(19):
-        expected = min(8, np.sum(owner == owner[row]) - 1)
-        assert [np.sum((rows == row) & (labels == label)) for label in (0, 1)] == [expected, expected]
 
 
 def test_drawn_tests_have_the_true_object_first_and_rivals_without_replacement():
@@ -44,7 +31,7 @@ def test_constant_scores_get_chance_probabilities(value):
     owner = np.repeat(np.arange(6), 4)
     table = table_of(np.full((24, 24), value), owner)
     found = reliability(fit_posterior(table), table)
-    assert list(found) == ["pairs", "k5"]  # there are too few objects for ten candidates
+    assert list(found) == ["k5"]  # there are too few objects for ten candidates
     assert found["k5"]["bins"] == [{"probability": pytest.approx(0.2), "frequency": pytest.approx(0.2), "count": 96}]
 
 
@@ -52,6 +39,6 @@ def test_a_calibration_transfers_to_objects_with_the_same_score_distribution_and
     posterior = fit_posterior(planted())
     assert posterior.slope == pytest.approx(1, rel=0.15)
     found = reliability(posterior, planted(seed=7))
-    assert list(found) == ["pairs", "k5", "k10"]
-    assert all(found[name]["ece"] < 0.05 for name in ("pairs", "k5"))
+    assert list(found) == ["k5", "k10"]
+    assert found["k5"]["ece"] < 0.05
     assert fit_posterior(planted(objects=2)) is None
