@@ -4,13 +4,12 @@ Each finished row is stored, so a stopped run continues with the missing rows.
 """
 
 from collections.abc import Callable, Collection, Iterable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from _touch_retrieval.cache import cache_key
+from _touch_retrieval.cache import Cache, cache_key
 from _touch_retrieval.files import file_digest, write_atomically
 from _touch_retrieval.registry import Registry
 from retrieval.console.output import say
@@ -25,10 +24,6 @@ from retrieval.model.shipped import shipped_model
 from retrieval.version import __version__
 
 FORMAT = 5
-
-
-def _measured(work: Callable[[Sample], ApproximationResult], sample: Sample) -> Any:
-    return msgspec.to_builtins(work(sample))
 
 
 def measure_frontier(
@@ -78,15 +73,18 @@ def measure_frontier(
     scale = Scale(min(photos, 2000), min(queries, 12), 2, quick) if quick else Scale(photos, queries, repeats)
     grasps = recording if callable(recording) else lambda: recording
     sample = Sample(Path(model or shipped_model()), grasps, out, scale)
-    rows, model_digest, here = {}, file_digest(sample.model), machine()
-    for name, work in works.items():
-        digests = [] if name in model_free else [model_digest, sample.digest]
-        key = cache_key("frontier", name, FORMAT, __version__, here, msgspec.to_builtins(scale), *digests)
-        stored = sample.stored(key, partial(_measured, work, sample))
-        rows[name] = msgspec.convert(stored, ApproximationResult)
-        if Bar.is_on:
-            for line in rows[name].lines():
-                say(f"{name}: {line}")
+    rows, model_digest, here = dict[str, ApproximationResult](), file_digest(sample.model), machine()
+    with Cache(out / "cache.sqlite") as cache:
+        for name, work in works.items():
+            digests = [] if name in model_free else [model_digest, sample.digest]
+            key = cache_key("frontier", name, FORMAT, __version__, here, msgspec.to_builtins(scale), *digests)
+            if (stored := cache.get(key)) is None:
+                stored = msgspec.json.encode(work(sample))
+                cache.add({key: stored})
+            rows[name] = msgspec.json.decode(stored, type=ApproximationResult)
+            if Bar.is_on:
+                for line in rows[name].lines():
+                    say(f"{name}: {line}")
     content = {"software": __version__, "machine": here, "model": model_digest, "scale": scale, "rows": rows}
     document = msgspec.json.encode(content)
     write_atomically(out / "frontier.json", msgspec.json.format(document, indent=1))

@@ -3,7 +3,6 @@
 Everything is computed on first use: a row without a recording collects none.
 """
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,7 +13,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from _touch_retrieval.cache import Cache, cache_key
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import AnyRecording, Grasp, data_digest, folder_of, load_grasps, recording_camera
 from retrieval.errors import DatasetError
@@ -159,29 +157,14 @@ class Sample:
 
     @cached_property
     def exhaustive_top1(self) -> NDArray[np.int64]:
-        """The photo of `catalogue` that the fusion head ranks first, for each of `queries`; stored in the cache."""
-        inputs = self.checkpoint.digest, self.digest, self.scale.photos, self.scale.queries
-        return np.array(self.stored(cache_key("exhaustive-top1", *inputs), self._find_exhaustive_top1), dtype=np.int64)
-
-    def _find_exhaustive_top1(self) -> list[int]:
+        """The photo of `catalogue` that the fusion head ranks first, for each of `queries`."""
         partials, found = self.queries["partial"], list[int]()
         with Bar("ranking all photos exactly", len(partials), "queries") as bar:
             for touch_partial in partials:
                 found.append(int(self.logits(touch_partial, self.catalogue["partial"]).argmax()))
                 bar.advance()
-        return found
+        return np.array(found, dtype=np.int64)
 
     def logits(self, touch_partial: Array, photos: NDArray[Any], rows: NDArray[np.int64] | None = None) -> Array:
         """Return match logits of a touch's partial activations (h,) with those of `rows` of photos (N, h)."""
         return self.checkpoint.matcher.head.scorer.logits(touch_partial[None], photos, rows)
-
-    def stored(self, key: str, make: Callable[[], Any]) -> Any:
-        """Return the JSON value `make()`, or the one that an earlier run stored under this key."""
-        path = self.folder / "cache.sqlite"
-        with Cache(path) as cache:
-            content = cache.get(key)
-        if content is None:
-            content = json.dumps(make(), allow_nan=False).encode()
-            with Cache(path) as cache:
-                cache.add({key: content})
-        return json.loads(content)
