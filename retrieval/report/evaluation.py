@@ -154,7 +154,6 @@ def _methods(view: ProtocolView) -> Blocks:
     yield tables.section(view, "main")
     of_choices = view.result.unit == "choice"
     yield Text((INTERVALS_OF_CHOICES if of_choices else INTERVALS_OF_UNITS).format(unit=view.result.unit, ties=TIES))
-    yield tables.choices(view)
 
 
 def _topn(view: ProtocolView) -> Blocks:

@@ -102,22 +102,6 @@ def basis(summary: Summary) -> str:
     return f"{summary.queries:,} queries of {summary.objects} objects. Gallery: {summary.gallery}."
 
 
-def choices(view: ProtocolView) -> Table | None:
-    """Return the spread of the main measure over choices of test objects."""
-    if view.result.unit != "choice":
-        return None
-    main = view.result.main
-    rows = []
-    for name, row in view.result.rows.items():
-        for label, found in ((view.label(name), row.measures), (LOW_PASS_LABEL, row.low_pass)):
-            if found:
-                values = [one[0] for one in found[main].repeats]
-                spread = (percent(value) for value in (found[main].value[0], min(values), max(values)))
-                rows.append((label, *spread, str(len(values))))
-    header = (f"{view.measure_label(main)}, over choices", "mean, %", "minimum, %", "maximum, %", "choices")
-    return _marked(header, rows)
-
-
 # Differences and controls ----------------------------------------------------------------------------
 
 
