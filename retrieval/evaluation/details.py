@@ -1,8 +1,6 @@
 """Single objects and decisions of a method on one split: accuracy by object, confusions, calibration, rejection."""
 
-from collections import defaultdict
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -12,11 +10,10 @@ from scipy.special import softmax
 from retrieval.evaluation.queries import MethodScores
 from retrieval.evaluation.reject import reject
 from retrieval.evaluation.results import Confusion, Details, Rejection
-from retrieval.evaluation.verification import ErrorsByImpostors, verification_errors, verification_rates
+from retrieval.evaluation.verification import verification_rates
 from retrieval.methods.late_fusion import LateFusion
 from retrieval.methods.method import Method
 from retrieval.metrics.intervals import summarise
-from retrieval.metrics.measure import Measure
 from retrieval.metrics.pairs import reliability_bins
 from retrieval.metrics.registry import confusions, k_way
 from retrieval.metrics.table import ScoreTable, object_scores
@@ -30,20 +27,16 @@ _CONFUSIONS = 12
 _TESTS_OF_A_ROW = 4
 
 
-@dataclass(frozen=True, eq=False)
-class SeedDetails:
-    """Details of one training seed; those that have intervals are apart."""
-
-    details: Details
-    reject: Rejection[Measure] | None
-    verification: ErrorsByImpostors | None
-
-
-def describe(method: Method, scores: MethodScores, features: Features) -> SeedDetails:
+def describe(method: Method, scores: MethodScores, features: Features) -> Details:
     """Return the details of a fitted method, from its scores and all features; only late fusion is verified."""
     seed, objects, test, posterior = scores.seed, scores.queries.objects, scores.touches("test"), scores.posterior
     accuracies = {"test_candidates": k_way(test, 5, seed=seed), "all_candidates": k_way(scores.touches(), 5, seed=seed)}
-    details = Details(
+    rejection = None
+    if posterior and len(test.objects) >= MIN_OBJECTS:
+        found = reject(posterior, test, seed=seed)
+        auroc, balanced = (summarise([one], seed=seed) for one in (found.auroc, found.balanced_accuracy))
+        rejection = Rejection(auroc, balanced, found.roc)
+    return Details(
         pair_threshold=scores.pair_threshold,
         per_object={
             key: {objects[number]: float(mean[0]) for number, mean in zip(*measure.by_object(), strict=True)}
@@ -51,15 +44,13 @@ def describe(method: Method, scores: MethodScores, features: Features) -> SeedDe
             if measure
         },
         confusions=[
-            Confusion(objects[true], objects[other], fraction) for true, other, fraction in confusions(test, seed=seed)
+            Confusion(objects[true], objects[other], fraction)
+            for true, other, fraction in confusions(test, seed=seed)[:_CONFUSIONS]
         ],
         posterior=asdict(posterior) if posterior else None,
         reliability=reliability(posterior, test, seed=seed) if posterior else {},
-    )
-    return SeedDetails(
-        details,
-        reject(posterior, test, seed=seed) if posterior and len(test.objects) >= MIN_OBJECTS else None,
-        verification_errors(scores, features, method.checkpoint) if type(method) is LateFusion else None,
+        reject=rejection,
+        verification=verification_rates(scores, features, method.checkpoint) if type(method) is LateFusion else None,
     )
 
 
@@ -91,29 +82,3 @@ def reliability(posterior: Posterior, test: ScoreTable, *, seed: int = 0) -> dic
             confidences = softmax(posterior.slope * logits, axis=1).max(1)
             found[name] = reliability_bins(confidences, tied[:, 0] / tied.sum(1))
     return found
-
-
-def combine(by_seed: Sequence[SeedDetails], seed: int) -> Details:
-    """Return the details of all training seeds: means; threshold, calibration and curves are those of the first seed.
-
-    `seed` is that of the resamples.
-    """
-    first = by_seed[0].details
-    fractions: dict[tuple[str, str], float] = defaultdict(float)
-    for one in (confusion for each in by_seed for confusion in each.details.confusions):
-        fractions[one.object_id, one.mistaken_for] += one.share / len(by_seed)
-    largest = sorted(fractions.items(), key=lambda item: (-item[1], item[0]))[:_CONFUSIONS]
-    rejections = [one.reject for one in by_seed if one.reject]
-    names = ("auroc", "balanced_accuracy") if rejections else ()
-    summaries = {name: summarise([getattr(one, name) for one in rejections], seed=seed) for name in names}
-    verified = [one.verification for one in by_seed if one.verification]
-    return replace(
-        first,
-        per_object={
-            key: {name: float(np.mean([one.details.per_object[key][name] for one in by_seed])) for name in accuracies}
-            for key, accuracies in first.per_object.items()
-        },
-        confusions=[Confusion(*pair, fraction) for pair, fraction in largest],
-        reject=Rejection(**summaries, roc=rejections[0].roc) if rejections else None,
-        verification=verification_rates(verified) if verified else None,
-    )

@@ -19,11 +19,11 @@ from retrieval.console.progress import Bar
 from retrieval.data.dataset import Split
 from retrieval.errors import BadInput
 from retrieval.evaluation.aggregate import Aggregation, MeasuresByName, protocol_result
-from retrieval.evaluation.details import SeedDetails, combine, describe
+from retrieval.evaluation.details import describe
 from retrieval.evaluation.inputs import Row, thin_grasps
 from retrieval.evaluation.protocol import Protocol, RecordingFacts
 from retrieval.evaluation.queries import MethodScores, draw_queries, score_queries
-from retrieval.evaluation.results import ProtocolResult, RowResult
+from retrieval.evaluation.results import Details, ProtocolResult, RowResult
 from retrieval.methods import CHANCE, METHODS
 from retrieval.methods.method import Method, MethodSettings
 from retrieval.metrics.measure import Measure, pooled
@@ -36,7 +36,7 @@ from retrieval.version import __version__
 
 MAX_CONTROL_GRASPS = 12
 """Maximum number of grasps of one object whose images are encoded again for a control of a protocol in depth."""
-_FORMAT = 6  # raised if the same inputs give other outcomes
+_FORMAT = 7  # raised if the same inputs give other outcomes
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,12 +46,12 @@ class Outcome:
     Attributes:
         measures: Measures by name; owners are the units that intervals resample: objects, or their sequences.
         best_params: Parameters that the method selected on validation objects.
-        details: Single objects and decisions; None unless the protocol is in depth and the inputs are touches.
+        details: Single objects and decisions; None without `Experiment.has_details`.
     """
 
     measures: dict[str, Measure]
     best_params: dict[str, Any]
-    details: SeedDetails | None
+    details: Details | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,7 @@ class Experiment:
         queries = draw_queries(grasps, self.split, self.draw_seed, protocol.max_grasps, protocol.across_sessions)
         method = self._fit()
         scores = score_queries(method, self.features, queries, self.draw_seed, protocol.allows_own_photos)
-        details = describe(method, scores, self.features) if protocol.in_depth and not self.is_control else None
+        details = describe(method, scores, self.features) if self.has_details else None
         outcome = Outcome(self._measures(scores), method.best_params, details)
         cache.add({self.key: msgspec.msgpack.encode(outcome, enc_hook=_encode_array)})
         if not protocol.in_depth:  # the fits of all folds take gigabytes
@@ -133,11 +133,16 @@ class Experiment:
                 "split": asdict(self.split),
                 "config": config.without_paths(),
                 "model": model.digest if model else None,
-                "in_depth": protocol.in_depth,
+                "in_depth": [protocol.in_depth, self.has_details],
                 "software": __version__,
                 **code_digest(METHODS.load(self.row.method), *losses),
             },
         )
+
+    @property
+    def has_details(self) -> bool:
+        """Whether single objects and decisions are described: of touches, with the first seed, in depth."""
+        return self.of.protocol.in_depth and not self.is_control and self.seed == self.of.seeds[0]
 
     @property
     def _folder(self) -> Path:
@@ -282,12 +287,11 @@ class ProtocolRun:
         rows = {}
         for row in self.rows:
             of_row = outcomes[row.name, "touch"]
-            details = [one.details for by_fold in of_row for one in by_fold if one.details]
             rows[row.name] = RowResult(
                 row.method,
                 row.towers.checkpoint.digest if row.towers.checkpoint else None,
                 best_params=[[one.best_params for one in by_fold] for by_fold in of_row],
-                details=combine(details, self.seeds[0]) if details else None,
+                details=of_row[0][0].details,
             )
         splits = [split for of_seed in self.folds.values() for split in of_seed]
         ratio = sum(len(one.test) for one in splits) / sum(len(one.train + one.validation) for one in splits)

@@ -46,14 +46,14 @@ class Confusion:
 
 @dataclass(frozen=True)
 class Rejection(Generic[M]):
-    """Decisions that an object is not in the catalogue: measures of one training seed, or summaries of all.
+    """Decisions that an object is not in the catalogue: measures, or their summaries.
 
     Attributes:
         auroc: Area under the ROC curve: how often the statistic of a row with its object in the gallery exceeds that of
             a row without; ties count 1/2.
         balanced_accuracy: Mean of true accept rate and true reject rate; a row is accepted if "one of these" is at
             least as likely as none, at even prior.
-        roc: [false accept rate, true accept rate] of the first seed, from accepting none to accepting all.
+        roc: [false accept rate, true accept rate], from accepting none to accepting all.
     """
 
     auroc: M
@@ -83,13 +83,13 @@ class VerificationRates:
 
 @dataclass(frozen=True)
 class Details:
-    """Single objects and decisions of a method on one split.
+    """Single objects and decisions of a method on one split, fitted with the first seed.
 
     Attributes:
         pair_threshold: The threshold of pair accuracy.
         per_object: Mean top-1 accuracy of 5 of each object: "test_candidates" among test objects, "all_candidates".
         confusions: The most frequent ones.
-        posterior: That of single touches, of the first seed; None with too few validation objects.
+        posterior: That of single touches; None with too few validation objects.
         reliability: "k5", "k10" -> {"ece", "bins"}; empty without a posterior.
         reject: None with too few objects.
         verification: Impostors ("random", "similar") -> number of grasps -> rates; None with too few objects, and for

@@ -8,7 +8,7 @@ to 100 % of cases; a bootstrap over objects did so in 76 to 97 %, least for smal
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -32,17 +32,16 @@ FARS = (0.1, 0.01, 0.001)
 Floats = NDArray[np.float64]
 
 
-Errors = tuple[int, int, tuple[float, ...]]
-"""Numbers of objects and of sequences, equal error rate, then false-reject rates at `FARS`, of one training seed."""
-ErrorsByImpostors = dict[str, dict[str, Errors]]
-"""Kind of impostors ("random", "similar") -> number of grasps -> errors."""
+def verification_rates(
+    scores: MethodScores, features: Features, checkpoint: Checkpoint
+) -> dict[str, dict[str, VerificationRates]] | None:
+    """Return the rates of late fusion on test objects, from its scores and the tower features of all grasps.
 
+    A head that was trained on features has no posterior; one is fitted on validation objects, as in training.
 
-def verification_errors(scores: MethodScores, features: Features, checkpoint: Checkpoint) -> ErrorsByImpostors | None:
-    """Return the errors of late fusion on test objects, from its scores and the tower features of all grasps.
-
-    A head that was trained on features has no posterior; one is fitted on validation objects, as in training. None for
-    fewer than three test objects, or for a model without posterior and fewer than three validation objects.
+    Returns:
+        Kind of impostors ("random", "similar") -> number of grasps -> rates. None for fewer than three test objects, or
+        for a model without posterior and fewer than three validation objects.
     """
     queries, posterior, test = scores.queries, checkpoint.posterior, scored_touches(scores.touches("test"))
     if posterior is None:
@@ -55,40 +54,33 @@ def verification_errors(scores: MethodScores, features: Features, checkpoint: Ch
     with torch.inference_mode():
         embeddings = checkpoint.matcher.photo_encoding(photos).embedding.numpy()
     test = replace(test, photo_embeddings=embeddings)
-    found: ErrorsByImpostors = {"random": {}, "similar": {}}
+    found: dict[str, dict[str, VerificationRates]] = {"random": {}, "similar": {}}
     for grasps in GRASPS:
         sequences = verification_sequences(test, posterior, scores.seed, grasps)
         if sequences is not None and (objects := len(np.unique(sequences.owner))) >= MIN_OBJECTS:
-            genuine = sequences.ratios.max(1)
-            for kind, impostors in (("random", sequences.impostor.ravel()), ("similar", sequences.similar)):
-                frr = [false_rejects(far, genuine, impostors) for far in FARS]
-                found[kind][str(grasps)] = objects, len(genuine), (equal_error_rate(genuine, impostors), *frr)
+            genuine, random = sequences.ratios.max(1), sequences.impostor.ravel()
+            found["random"][str(grasps)] = _rates(objects, genuine, random, objects_needed)
+            found["similar"][str(grasps)] = _rates(objects, genuine, sequences.similar, _similar_needed)
     return found if found["random"] else None
 
 
-def verification_rates(by_seed: Sequence[ErrorsByImpostors]) -> dict[str, dict[str, VerificationRates]]:
-    """Return the rates with intervals, averaged over the training seeds."""
-    return {
-        kind: {grasps: _rates(kind, [one[kind][grasps] for one in by_seed]) for grasps in by_grasps}
-        for kind, by_grasps in by_seed[0].items()
-    }
+def _similar_needed(far: float) -> int:
+    """Return how many objects support a false-accept rate of the most similar objects: an object is one trial."""
+    return math.ceil(ERRORS_NEEDED / far)
 
 
-def _rates(kind: str, by_seed: Sequence[Errors]) -> VerificationRates:
-    objects, sequences, _ = by_seed[0]
-    eer, *frr = np.mean([rates for _, _, rates in by_seed], axis=0).tolist()
-
+def _rates(objects: int, genuine: Floats, impostors: Floats, needed: Callable[[float], int]) -> VerificationRates:
     def rate(value: float, far: float) -> Rate:
-        needed = objects_needed(far) if kind == "random" else math.ceil(ERRORS_NEEDED / far)
-        if objects < needed:
-            return Rate(None, None, None, needed)
-        return Rate(**asdict(error_rate(value, objects)), objects_needed=needed)
+        if objects < needed(far):
+            return Rate(None, None, None, needed(far))
+        return Rate(**asdict(error_rate(value, objects)), objects_needed=needed(far))
 
+    eer = equal_error_rate(genuine, impostors)
     return VerificationRates(
         objects,
-        sequences,
+        len(genuine),
         rate(eer, eer) if eer else Rate(None, None, None, None),
-        {f"{far:g}": rate(value, far) for far, value in zip(FARS, frr, strict=True)},
+        {f"{far:g}": rate(false_rejects(far, genuine, impostors), far) for far in FARS},
     )
 
 

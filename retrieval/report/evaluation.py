@@ -269,7 +269,10 @@ def _settings(results: Results) -> Table:
     ]
     if setting.model:
         rows.insert(1, ("digest of the model", setting.model))
-    note = "results.json has the whole configuration, the calibrations and the parameters that methods selected."
+    note = (
+        "results.json has the whole configuration, the calibrations and the parameters that methods selected. Single "
+        "objects and decisions are those of the first seed."
+    )
     return Table(("setting", "value"), tuple(rows), (note,), frozenset({1}))
 
 

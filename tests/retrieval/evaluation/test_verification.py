@@ -7,7 +7,7 @@ import pytest
 
 from retrieval.evaluation.queries import MethodScores, Queries
 from retrieval.evaluation.results import Rate
-from retrieval.evaluation.verification import equal_error_rate, false_rejects, verification_errors, verification_rates
+from retrieval.evaluation.verification import equal_error_rate, false_rejects, verification_rates
 from retrieval.model.posterior import Posterior
 
 GENUINE = np.array([1.0, 2.0, 3.0, 4.0, 5.0])
@@ -54,8 +54,7 @@ def evaluated(objects, grasps=7, gap=0.0, posterior=POSTERIOR, validation=0):
     matcher = SimpleNamespace(photo_encoding=lambda photo: SimpleNamespace(embedding=photo))
     checkpoint = SimpleNamespace(matcher=matcher, posterior=posterior)
     scores = MethodScores(queries, logits.astype(np.float32), {}, None, 0)
-    errors = verification_errors(scores, features, checkpoint)
-    return errors and verification_rates([errors])
+    return verification_rates(scores, features, checkpoint)
 
 
 def test_each_kind_of_impostor_has_rates_or_the_number_of_objects_that_would_be_enough():
