@@ -63,17 +63,6 @@ class Posts:
         return ", ".join(f"{count} x {status or 'cut off'}" for status, count in counts.items())
 
 
-def half_headers(port: int, _gel: bytes) -> str:
-    """600 connections that each send half of a request's headers and then wait."""
-    connections = []
-    for _ in range(600):
-        with suppress(OSError):
-            connections.append(_connect(port))
-            connections[-1].sendall(b"GET /healthz HTTP/1.1\r\nhost: localhost\r\nx-half: ")
-    time.sleep(15)
-    return f"{_close(connections)} of 600 open after 15 s"
-
-
 def slow_bodies(port: int, _gel: bytes) -> str:
     """100 requests whose bodies arrive at one byte per second."""
     connections = [_connect(port) for _ in range(100)]
@@ -168,7 +157,6 @@ ATTACKS: dict[str, Attack] = {
     # 32 grasps of two tiny pictures
     "many_pictures": Posts("/v1/query", 8, lambda _: _query([png_of_zeros(8, 8)] * 64)),
     "many_enrolments": Posts("/v1/objects/x/touches", 8, lambda _: _query([png_of_zeros(8, 8)] * 64)),
-    "half_headers": half_headers,
     "slow_bodies": slow_bodies,
     "header_flood": header_flood,
     # simultaneous grasps of the simulated rig
