@@ -15,16 +15,14 @@ from retrieval.serve.errors import DocumentResponse, HttpProblem
 from retrieval.serve.service import Parts, Service
 from retrieval.serve.uploads import (
     MAX_GRASPS,
-    QUERY_BODY,
     Base64Image,
     Grasps,
     Openings,
-    Options,
+    QueryBody,
     RequestBody,
     RequestPictures,
     json_body,
     read_json,
-    read_query,
 )
 
 router = APIRouter()
@@ -34,17 +32,17 @@ router = APIRouter()
     "/v1/query",
     tags=["queries"],
     response_model=dict[str, Any],
-    openapi_extra={"requestBody": QUERY_BODY},
+    openapi_extra=json_body(QueryBody),
     summary="Which object is in the hand?",
 )
 async def query(request: Request, parts: Parts) -> DocumentResponse:
     """Return the document of `retrieve query --json` for one or several grasps of one object."""
     parts.queue.require_capacity()
-    pictures, options = await read_query(request, parts.generations.current.reader.fingers)
+    body = await read_json(request, QueryBody)
+    pictures = RequestPictures(body.touches, body.background)
+    options = body.model_dump(exclude={"touches", "background"})
     result = await parts.queue.submit(
-        lambda searcher: searcher.query(
-            pictures.images, background=pictures.frames, **options.model_dump(include=set(Options.model_fields))
-        ),
+        lambda searcher: searcher.query(pictures.images, background=pictures.frames, **options),
         request,
         pictures,
     )

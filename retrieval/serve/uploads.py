@@ -1,8 +1,6 @@
 """Parsing of request bodies, and limits on their size and time. The limits apply before memory is used.
 
-application/json      {"touches": [["<base64>", "<base64>"], ...], "background": [...], "opening_mm": [...], ...}
-multipart/form-data   gelsight, once for each image, fingers in their order, grasp after grasp; background; opening_mm,
-                      once for each grasp; top; ...
+{"touches": [["<base64>", "<base64>"], ...], "background": [...], "opening_mm": [...], ...}
 """
 
 import asyncio
@@ -32,8 +30,6 @@ MAX_JSON_VALUES = 2_000
 """Maximum number of JSON values of a body. A body with `MAX_PICTURES` pictures as data URLs, each in its own lists, and
 with all options is counted with fewer than 1,200."""
 MAX_GRASPS = 32
-MAX_FIELDS, MAX_FIELD_BYTES = 8 + MAX_GRASPS, 1024
-"""Maximum number of the options in a form, and maximum size of each."""
 Body = TypeVar("Body", bound=BaseModel)
 _CLOSE = {"connection": "close"}  # the rest of the body is not read
 
@@ -125,9 +121,12 @@ class RequestBody(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
 
-class Options(RequestBody):
-    """Options of a query, as those of `retrieve query`."""
+class QueryBody(RequestBody):
+    """The touches of one object, and the options of `retrieve query`."""
 
+    touches: Grasps = Field(description="Grasps, each with one image for each finger.")
+    background: list[Base64Image] | None = Field(None, description="No-contact frames, one for each finger.")
+    opening_mm: Openings = None
     top: int = Field(10, ge=1, le=1000, description="Number of objects to return.")
     candidates: int | None = Field(
         None, ge=1, le=10_000_000, description="Photos that the fusion head scores; null for the index's own number."
@@ -135,38 +134,6 @@ class Options(RequestBody):
     none_prior: float = Field(
         NONE_PRIOR, gt=0, lt=1, description="Prior probability that the catalogue lacks the object."
     )
-    opening_mm: Openings = None
-
-
-class QueryBody(Options):
-    """The touches of one object."""
-
-    touches: Grasps = Field(description="Grasps, each with one image for each finger.")
-    background: list[Base64Image] | None = Field(None, description="No-contact frames, one for each finger.")
-
-
-QUERY_BODY = {
-    "required": True,
-    "content": {
-        "application/json": {"schema": QueryBody.model_json_schema()},
-        "multipart/form-data": {
-            "schema": {
-                "type": "object",
-                "required": ["gelsight"],
-                "properties": {
-                    "gelsight": {
-                        "type": "array",
-                        "items": {"type": "string", "format": "binary"},
-                        "description": "Gel images: the fingers of a grasp in their order, grasp after grasp.",
-                    },
-                    "background": {"type": "array", "items": {"type": "string", "format": "binary"}},
-                    **Options.model_json_schema()["properties"],
-                },
-            }
-        },
-    },
-}
-"""OpenAPI description of a query's body; FastAPI cannot describe two content types of one route."""
 
 
 def json_body(model: type[BaseModel]) -> dict[str, Any]:
@@ -208,34 +175,18 @@ class RequestPictures:
         self.frames = None if self.background is None else list(images)
 
 
-async def read_query(request: Request, fingers: int) -> tuple[RequestPictures, Options]:
-    """Return the query in a request's body; `fingers` is the number of gel images of one grasp.
-
-    Raises:
-        HttpProblem: The body is not a valid query.
-    """
-    if _content_type(request) == "multipart/form-data":
-        return await _read_form(request, fingers)
-    body = await read_json(request, QueryBody)
-    return RequestPictures(body.touches, body.background), body
-
-
 async def read_json(request: Request, model: type[Body]) -> Body:
     """Return the JSON body of a request with pictures, parsed in a thread.
 
     Raises:
         HttpProblem: The body is not valid JSON for the model, or exceeds a limit.
     """
-    kind = _content_type(request)
+    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if kind != "application/json":
         raise HttpProblem(
             "unsupported-type", f"The body must be application/json, got {kind[:100] or 'no content-type'}."
         )
     return await run_in_threadpool(_parsed, await request.body(), model)
-
-
-def _content_type(request: Request) -> str:
-    return request.headers.get("content-type", "").partition(";")[0].strip().lower()
 
 
 def _parsed(data: bytes, model: type[Body]) -> Body:
@@ -252,46 +203,9 @@ def _parsed(data: bytes, model: type[Body]) -> Body:
     try:
         return model.model_validate_json(data.translate(None, b"\r\n"))
     except ValidationError as error:
-        raise _invalid(error) from None
-
-
-def _invalid(error: ValidationError) -> HttpProblem:
-    errors = error.errors(include_input=False, include_url=False, include_context=False)
-    is_malformed = any(detail["type"] == "json_invalid" for detail in errors)
-    return HttpProblem("malformed" if is_malformed else "bad-input", validation_message(errors))
-
-
-async def _read_form(request: Request, fingers: int) -> tuple[RequestPictures, Options]:
-    files: dict[str, list[bytes]] = {"gelsight": [], "background": []}
-    fields: dict[str, Any] = {}
-    limits = {"max_files": MAX_PICTURES, "max_fields": MAX_FIELDS, "max_part_size": MAX_FIELD_BYTES}
-    async with request.form(**limits) as form:
-        for name, value in form.multi_items():
-            if isinstance(value, str) == (name in files):
-                raise HttpProblem(
-                    "bad-input", f"{name[:100]!r}: gelsight and background must be files, and all others text."
-                )
-            if name == "opening_mm":
-                fields.setdefault(name, []).append(value or None)
-            elif isinstance(value, str):
-                fields[name] = value
-            else:
-                files[name].append(await value.read())
-    try:
-        options = Options.model_validate(fields)
-    except ValidationError as error:
-        raise _invalid(error) from None
-    images = files["gelsight"]
-    if not images or len(images) % fingers:
-        raise HttpProblem(
-            "bad-input",
-            f"This model takes {fingers} gel image(s) for one grasp, so gelsight must occur {fingers} times for "
-            f"each grasp, got {len(images)}.",
-        )
-    touches = [images[start : start + fingers] for start in range(0, len(images), fingers)]
-    if len(touches) > MAX_GRASPS:
-        raise HttpProblem("bad-input", f"A query may have at most {MAX_GRASPS} grasps, got {len(touches)}.")
-    return RequestPictures(touches, files["background"] or None), options
+        errors = error.errors(include_input=False, include_url=False, include_context=False)
+        is_malformed = any(detail["type"] == "json_invalid" for detail in errors)
+        raise HttpProblem("malformed" if is_malformed else "bad-input", validation_message(errors)) from None
 
 
 def _letter(place: int) -> str:

@@ -1,5 +1,6 @@
 """A service behind a proxy that serves it below a prefix: every address of the page and of answers works, also HEAD."""
 
+import base64
 import re
 from urllib.parse import urljoin
 
@@ -44,8 +45,8 @@ def check(folder, get):
                     if (target := urljoin(address if name.startswith(".") else page, name)) not in found:
                         found.append(target)
             assert len(found) > 15
-            files = [("gelsight", path.read_bytes()) for path in get("touch")]
-            query = client.post(f"{page}v1/query", files=files, headers=same_origin).headers["x-query-id"]
+            body = {"touches": [[base64.b64encode(path.read_bytes()).decode() for path in get("touch")]]}
+            query = client.post(f"{page}v1/query", json=body, headers=same_origin).headers["x-query-id"]
             for path in ("v1/history", f"v1/history/{query}"):
                 document = client.get(page + path)
                 item = document.json().get("items", [document.json()])[0]

@@ -1,4 +1,4 @@
-"""Queries over HTTP: the same answers as in Python, for JSON and forms."""
+"""Queries over HTTP: the same answers as in Python, and refused bodies."""
 
 import base64
 import json
@@ -20,24 +20,17 @@ def encoded(grasps):
     return [[base64.b64encode(image).decode() for image in grasp] for grasp in grasps]
 
 
-def form(grasps, **fields):
-    images = [("gelsight", (f"{number}.png", image)) for grasp in grasps for number, image in enumerate(grasp)]
-    return {"files": images, "data": fields}
-
-
 def without_times(document):
     """Return a document with only the names of the timed stages."""
     return document | {"timing_ms": set(document["timing_ms"])}
 
 
-def test_json_and_multipart_give_the_document_of_the_searcher(client, searcher, grasps):
+def test_a_query_returns_the_document_of_the_searcher(client, searcher, grasps):
     for touches, openings in ((grasps[:1], None), (grasps, [None, 40.5])):
         expected = without_times(searcher.query(touches, opening_mm=openings, top=3, none_prior=0.2).to_dict())
         options = {"opening_mm": openings, "top": 3, "none_prior": 0.2}
-        by_json = client.post("/v1/query", json={"touches": encoded(touches), **options})
-        fields = {"opening_mm": ["", "40.5"]} if openings else {}
-        by_form = client.post("/v1/query", **form(touches, top="3", none_prior="0.2", **fields))
-        assert without_times(by_json.json()) == without_times(by_form.json()) == expected
+        answer = client.post("/v1/query", json={"touches": encoded(touches), **options})
+        assert without_times(answer.json()) == expected
 
 
 def test_verification_returns_the_document_of_the_searcher(grasps, model, catalogue, tmp_path):
@@ -68,7 +61,6 @@ def test_an_invalid_body_is_reported_with_the_place(client, body, message):
     [
         ("text/plain", b"x", 415, "unsupported-type"),
         ("application/json", b"{", 400, "malformed"),
-        ("multipart/form-data", b"x", 400, "malformed"),
     ],
 )
 def test_other_content_types_and_broken_bodies_are_refused(client, kind, content, status, problem_kind):

@@ -1,5 +1,6 @@
 """Reference touches over HTTP and on the page: their gel images by id, and an object without photos."""
 
+import base64
 import io
 
 import pytest
@@ -18,13 +19,13 @@ def index(catalogue_with_touches, tmp_path):
     return tmp_path / "index"
 
 
-def files(grasp):
-    return {"files": [("gelsight", (path.name, path.read_bytes())) for path in grasp]}
+def body(grasp):
+    return {"touches": [[base64.b64encode(path.read_bytes()).decode() for path in grasp]]}
 
 
 def test_the_reference_gel_images_of_an_answer_are_served(index, catalogue_with_touches, touches):
     with service(index) as client:
-        found = client.post("/v1/query", **files(touches[NAMES[1]][1])).json()
+        found = client.post("/v1/query", json=body(touches[NAMES[1]][1])).json()
         best = {match["object_id"]: match for match in found["results"]}[NAMES[1]]
         assert best["reference"]["touch"] == [f"{NAMES[1]}/touch_1_{finger}.png" for finger in "ab"]
         for path in best["reference"]["touch"]:
@@ -40,7 +41,7 @@ def test_the_reference_gel_images_of_an_answer_are_served(index, catalogue_with_
 def test_feedback_on_an_object_without_photos_adds_no_photo(index, touches, tmp_path):
     with with_history(index, tmp_path) as client:
         for name in (NAMES[0], NAMES[2]):
-            response = client.post("/v1/query", **files(touches[name][0]))
+            response = client.post("/v1/query", json=body(touches[name][0]))
             feedback = {"query": response.headers["x-query-id"], "feedback": "object", "object_id": name}
             assert client.post("/v1/feedback", json=feedback).status_code == 201
             entry = client.get(f"/v1/history/{feedback['query']}").json()

@@ -51,17 +51,6 @@ function withParameters(path, parameters) {
   return present.length ? `${path}?${new URLSearchParams(present)}` : path;
 }
 
-/** The form with the pictures and options of a query. */
-function form(touches, background, openings, options) {
-  const body = new FormData();
-  if (openings.some((opening) => opening !== null))
-    openings.forEach((opening) => body.append("opening_mm", opening ?? ""));
-  touches.flat().forEach((blob, place) => body.append("gelsight", blob, blob.name ?? `touch-${place}.png`));
-  background?.forEach((blob, place) => body.append("background", blob, blob.name ?? `background-${place}.png`));
-  Object.entries(options).forEach(([name, value]) => value !== null && body.append(name, String(value)));
-  return { method: "POST", body };
-}
-
 async function base64(blob) {
   const text = await new Promise((done, failed) => {
     const reader = new FileReader();
@@ -88,7 +77,7 @@ export const frame = (name) => blob(`v1/sensors/${encodeURIComponent(name)}/fram
 
 /** The answer to touches, and its id in the history, null if no history is stored. */
 export async function query(touches, background, openings, options) {
-  const response = await reply("v1/query", form(touches, background, openings, options));
+  const response = await reply("v1/query", await touchesPost(touches, background, { opening_mm: openings, ...options }));
   return { answer: await response.json(), id: response.headers.get("x-query-id") };
 }
 
@@ -103,20 +92,20 @@ export async function grasp(objectId = null) {
   };
 }
 
-/** Post gel images and other values as one JSON body. */
-async function postTouches(path, touches, background, values) {
+/** The request with gel images and other values as one JSON body. */
+async function touchesPost(touches, background, values) {
   const all = await Promise.all(touches.map((grasp) => Promise.all(grasp.map(base64))));
   const frames = background ? await Promise.all(background.map(base64)) : null;
-  return json(path, jsonPost({ touches: all, background: frames, ...values }));
+  return jsonPost({ touches: all, background: frames, ...values });
 }
 
-export const verify = (expect, touches, background, far) =>
-  postTouches("v1/verify", touches, background, { expect, far });
+export const verify = async (expect, touches, background, far) =>
+  json("v1/verify", await touchesPost(touches, background, { expect, far }));
 
 const enrolled = (objectId) => `v1/objects/${encodedPath(objectId)}/touches`;
 /** Remember touches of an object. */
-export const enrol = (objectId, touches, background, opening_mm) =>
-  postTouches(enrolled(objectId), touches, background, { opening_mm });
+export const enrol = async (objectId, touches, background, opening_mm) =>
+  json(enrolled(objectId), await touchesPost(touches, background, { opening_mm }));
 /** Forget the touches that `enrol` added. */
 export const forget = (objectId, added) =>
   json(`${enrolled(objectId)}?${new URLSearchParams(added.map((id) => ["touch", id]))}`, { method: "DELETE" });
