@@ -55,9 +55,3 @@ class WriteFailed(IndexesError):
     """A file could not be written. The index is complete: either the old one or the new one."""
 
     exit_code = 1
-
-
-class EngineError(IndexesError):
-    """The vector library failed on input that passed every check."""
-
-    exit_code = 1

@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from indexes.errors import AGAIN, CorruptIndex, EngineError, ParameterError
+from indexes.errors import AGAIN, CorruptIndex, ParameterError, WriteFailed
 from indexes.kinds.vector_index import Floats, RowNumbers, VectorIndex
 
 FLAT = "flat"
@@ -28,16 +28,14 @@ def load_faiss() -> Any:
 
 
 @contextmanager
-def faiss_call(doing: str, threads: int | None) -> Iterator[None]:
-    """Run FAISS with `threads` threads (None: its own setting), and convert its exceptions to `EngineError`."""
+def _one_thread(is_one: bool) -> Iterator[None]:
+    """Run FAISS with one thread if `is_one`, else with its own number."""
     faiss = load_faiss()
     before = faiss.omp_get_max_threads()
-    if threads is not None:
-        faiss.omp_set_num_threads(threads)
+    if is_one:
+        faiss.omp_set_num_threads(1)
     try:
         yield
-    except (RuntimeError, AssertionError, ValueError, TypeError, MemoryError) as error:
-        raise EngineError(f"FAISS failed while {doing}: {_reason(error)}") from error
     finally:
         faiss.omp_set_num_threads(before)
 
@@ -89,7 +87,7 @@ class FaissIndex(VectorIndex):
             return
         self._structure = _empty(self.kind, self.dim)
         # The graph of more threads would depend on their timing.
-        with faiss_call(f"building {self.kind}", 1 if hasattr(self._structure, "hnsw") else None):
+        with _one_thread(hasattr(self._structure, "hnsw")):
             if not self._structure.is_trained:
                 self._structure.train(self.vectors)
             self._structure.add(self.vectors)
@@ -99,7 +97,7 @@ class FaissIndex(VectorIndex):
             scores: Floats = queries @ self.vectors.T
             rows: RowNumbers = np.argsort(-scores, axis=1, kind="stable")[:, :k]
             return np.take_along_axis(scores, rows, axis=1), rows
-        with faiss_call("searching", 1 if len(queries) == 1 else None):
+        with _one_thread(len(queries) == 1):
             if self.exact:
                 faiss = load_faiss()
                 scores, rows = faiss.knn(queries, self.vectors, k, faiss.METRIC_INNER_PRODUCT)
@@ -111,8 +109,10 @@ class FaissIndex(VectorIndex):
         """As `VectorIndex.save`."""
         if self._structure is None:
             return False
-        with faiss_call(f"writing {path}", None):
+        try:
             load_faiss().write_index(self._structure, str(path))
+        except RuntimeError as error:  # the disk is full
+            raise WriteFailed(f"{path}: writing failed ({_reason(error)}); write again") from error
         return True
 
     def _read(self, path: Path) -> None:

@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 import indexes
-from indexes.errors import CorruptIndex, EngineError, ParameterError, VectorError
+from indexes.errors import CorruptIndex, ParameterError, VectorError
 from indexes.kinds import faiss_index
-from indexes.kinds.faiss_index import faiss_call
 from indexes.kinds.vector_index import VectorIndex, score_tolerance
 from tests import plugins
 from tests.oracle import disagreements
@@ -167,8 +166,3 @@ def test_a_users_own_class_is_a_kind(tmp_path, monkeypatch):
     rows = [indexes.Row(f"{number:02}", "mug", str(number)) for number in range(40)]
     assert store.write(rows, [{"embeddings": unit(40)}], kind="backwards").recall["value"] < 1
     assert type(store.open().index) is Backwards
-
-
-def test_exceptions_of_faiss_become_our_error():
-    with pytest.raises(EngineError, match="FAISS failed while reading nothing"), faiss_call("reading nothing", 1):
-        faiss.read_index("/nowhere")
