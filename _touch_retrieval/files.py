@@ -85,10 +85,6 @@ def file_digest(path: Path) -> str:
         return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
-MAX_DEPTH = 64
-"""Largest number of nested lists and objects. Recursive readers and writers of JSON fail at some larger depth."""
-
-
 def open_regular(path: str | Path) -> BufferedReader:
     """Open a regular file for reading. Raises OSError; its `strerror` says that any other file is not one."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # a pipe does not block
@@ -129,17 +125,14 @@ def parse_json(text: str | bytes, *, own: bool = False) -> Any:
         own: Whether `json.dumps` wrote it: it may contain paths that are not UTF-8, which msgspec refuses.
 
     Raises:
-        ValueError: The text is not JSON, has a number that is not finite, or is nested deeper than `MAX_DEPTH`.
+        ValueError: The text is not JSON, has a number that is not finite, or is nested too deep.
     """
     try:
         if own:
-            document = json.loads(text, parse_constant=_finite, parse_float=_finite)
-        else:
-            document = msgspec.json.decode(decode_text(text) if isinstance(text, bytes) else text)
-        _require_depth(document, MAX_DEPTH)
+            return json.loads(text, parse_constant=_finite, parse_float=_finite)
+        return msgspec.json.decode(decode_text(text) if isinstance(text, bytes) else text)
     except RecursionError as error:
-        raise ValueError(f"it is nested deeper than {MAX_DEPTH} levels") from error
-    return document
+        raise ValueError("it is nested too deep") from error
 
 
 def _finite(number: str) -> float:
@@ -147,11 +140,3 @@ def _finite(number: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"{number} is not a finite number")
     return value
-
-
-def _require_depth(document: Any, depth: int) -> None:
-    if isinstance(document, dict | list):
-        if depth == 0:
-            raise RecursionError
-        for inner in document.values() if isinstance(document, dict) else document:
-            _require_depth(inner, depth - 1)

@@ -181,7 +181,7 @@ BAD_LINES = {
     '{"object_id": 5}': "object_id must be a non-empty string, got 5",
     '{"object_id": "mug", "x": NaN}': "malformed",
     '{"object_id": "first"}': "first has two lines; merge them",
-    '{"object_id": ' + "[" * 100_000: "nested deeper than 64 levels",
+    '{"object_id": ' + "[" * 100_000: "nested too deep",
     r'{"object_id": "mug", "deep": [{"\udfff": 1}]}': "surrogate|malformed|truncated",
 }
 
