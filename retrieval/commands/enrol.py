@@ -1,11 +1,11 @@
 """`retrieve enrol`: remember touches of an object."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from retrieval.commands.options import (
+    GELSIGHT,
     Background,
     Index,
     IndexModel,
@@ -27,14 +27,7 @@ def enrol(
         str, typer.Argument(metavar="OBJECT", help="object of the index, or a new one", show_default=False)
     ],
     *,
-    gelsight: Annotated[
-        list[OptionValues] | None,
-        typer.Option(
-            parser=OptionValues.parse,
-            metavar="IMAGE...",
-            help="gel images of one grasp, one per finger; repeat the option for more grasps",
-        ),
-    ] = None,
+    gelsight: Annotated[list[OptionValues] | None, GELSIGHT] = None,
     opening: Opening = None,
     background: Background = None,
     index: Index = None,
@@ -62,12 +55,7 @@ def enrol(
     from retrieval.search.searcher import Searcher
 
     with Searcher.open(path, model=model) as searcher:
-        enrolled = searcher.enrol(
-            name,
-            [[Path(image) for image in grasp] for grasp in gelsight],
-            opening_mm=opening or None,
-            background=None if background is None else [Path(image) for image in background],
-        )
+        enrolled = searcher.enrol(name, gelsight, opening_mm=opening or None, background=background)
     if json:
         print_json(enrolled._asdict())
     else:

@@ -154,16 +154,8 @@ class _Run:
         from retrieval.data.opening import believed
         from retrieval.model.verification import ACCEPT, REJECT
 
-        self.touches, self.openings_mm, seen = [], [], set[bytes]()
-        for grasp in grasps:
-            files = self._files(grasp.touches)
-            pictures = {file.read_bytes() for file in files}
-            if seen & pictures:  # a camera that stands still: a picture counts once
-                say(f"{grasp.grasp_id} repeats a picture of an earlier grasp and does not count; check the gel cameras")
-            else:
-                self.touches.append(files)
-                self.openings_mm.append(believed(grasp.opening_mm))
-            seen |= pictures
+        self.touches = [self._files(grasp.touches) for grasp in grasps]
+        self.openings_mm = [believed(grasp.opening_mm) for grasp in grasps]
         self.background = self._files(grasps[-1].touches_before) if self.searcher.reader.takes_background else None
         if self.expect is None:
             self.answer = self.searcher.query(self.touches, opening_mm=self.openings_mm, background=self.background)

@@ -50,14 +50,12 @@ class OptionValues(tuple[str, ...]):
         return cls(joined.split(_SEPARATOR))
 
 
-GelSight = Annotated[
-    list[OptionValues],
-    typer.Option(
-        parser=OptionValues.parse,
-        metavar="IMAGE...",
-        help="gel images of one grasp, one per finger; repeat the option for more grasps of the same object",
-    ),
-]
+GELSIGHT = typer.Option(
+    parser=OptionValues.parse,
+    metavar="IMAGE...",
+    help="gel images of one grasp, one per finger; repeat the option for more grasps of the same object",
+)
+GelSight = Annotated[list[OptionValues], GELSIGHT]
 Background = Annotated[
     OptionValues | None,
     typer.Option(

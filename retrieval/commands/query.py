@@ -43,13 +43,7 @@ def query(
     if html:
         require_output(html, ".html")
     searcher = Searcher.open(path, model=model)
-    result = searcher.query(
-        [[Path(image) for image in grasp] for grasp in gelsight],
-        background=None if background is None else [Path(image) for image in background],
-        opening_mm=opening or None,
-        top=top,
-        none_prior=none_prior,
-    )
+    result = searcher.query(gelsight, background=background, opening_mm=opening or None, top=top, none_prior=none_prior)
     if html:
         from retrieval.report.query import query_page
 

@@ -43,7 +43,6 @@ def serve(
         Path | None, typer.Option(help="folder that stores queries and feedback (default: INDEX-history)")
     ] = None,
     no_history: Annotated[bool, typer.Option("--no-history", help="store no queries and no feedback")] = False,
-    workers: Annotated[int, typer.Option(parser=WORKERS, help="requests that run in parallel")] = 1,
     deadline: Annotated[
         float, typer.Option(metavar="SECONDS", parser=SECONDS, help="maximum time for one request")
     ] = 30.0,
@@ -84,7 +83,6 @@ def serve(
         host=host,
         port=port,
         token=os.environ.get(TOKEN_VARIABLE),
-        workers=workers,
         deadline_s=deadline,
         history=None if no_history else history or local.with_name(f"{local.name}-history"),
     )

@@ -1,6 +1,5 @@
 """`retrieve verify`: is the object in the hand the expected one?"""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -28,12 +27,7 @@ def verify(
     from retrieval.search.searcher import Searcher
 
     with Searcher.open(path, model=model) as searcher:
-        result = searcher.verify(
-            [[Path(image) for image in grasp] for grasp in gelsight],
-            expect,
-            far=far,
-            background=None if background is None else [Path(image) for image in background],
-        )
+        result = searcher.verify(gelsight, expect, far=far, background=background)
     if json:
         print_json(result.to_dict())
     say(result.sentence)

@@ -22,7 +22,7 @@ Result = TypeVar("Result")
 
 
 class Queue:
-    """Threads that process requests in the order of their arrival.
+    """A thread that processes requests in the order of their arrival.
 
     Attributes:
         in_flight: Number of requests that wait or are being processed.
@@ -30,7 +30,7 @@ class Queue:
 
     def __init__(self, generations: Generations, settings: ServiceSettings, decoders: Decoders) -> None:
         self._generations, self._settings, self._decoders = generations, settings, decoders
-        self._threads = ThreadPoolExecutor(settings.workers)
+        self._threads = ThreadPoolExecutor(1)
         self.in_flight = 0
 
     def close(self) -> None:
@@ -49,7 +49,7 @@ class Queue:
     async def submit(
         self, work: Callable[[Searcher], Result], request: Request, pictures: RequestPictures | None = None
     ) -> Result:
-        """Decode `pictures`, then run `work` in a worker thread with the generation that is served when it starts.
+        """Decode `pictures`, then run `work` in the thread with the generation that is served when it starts.
 
         The body of the request must have been read.
 
@@ -85,16 +85,7 @@ class Queue:
             px = self._generations.current.checkpoint.config.preprocessing.touch_px
             images = await self._decoders.read(pictures.named_files(), px)
             pictures.set_images(iter(images))
-
-        def run() -> Result:
-            try:
-                return work(self._generations.current)
-            except BaseException as error:
-                if isinstance(error, Exception) and not isinstance(error, StopIteration):
-                    raise
-                raise RuntimeError(repr(error)) from error  # asyncio's futures take no StopIteration or SystemExit
-
-        return await asyncio.wrap_future(self._threads.submit(run))
+        return await asyncio.wrap_future(self._threads.submit(lambda: work(self._generations.current)))
 
     def _release(self, answer: asyncio.Future[Any]) -> None:
         self.in_flight -= 1

@@ -68,8 +68,8 @@ class Service:
         self.generations, self.decoders = Generations(settings, shards), Decoders()
         queue = partial(Queue, self.generations, decoders=self.decoders)
         self.queue = queue(settings)
-        self.grasps = queue(replace(settings, workers=1, queue=MAX_RIG_GRASPS))
-        self.frames = {name: queue(replace(settings, workers=1, queue=MAX_FRAMES)) for name in self.rig.sensors}
+        self.grasps = queue(replace(settings, queue=MAX_RIG_GRASPS))
+        self.frames = {name: queue(replace(settings, queue=MAX_FRAMES)) for name in self.rig.sensors}
         self.history_writer = None
         if settings.history and recorder:
             self.history_writer = HistoryWriter(settings.history, recorder)

@@ -36,7 +36,6 @@ class ServiceSettings:
         port: Port to listen on; 0: any free port.
         token: Access token of at least 16 ASCII characters; None for a service without one.
         queue: Maximum number of requests in flight.
-        workers: Threads that answer queries.
         deadline_s: Time limit for an answer.
         body_s: Time limit for the body of a request to arrive.
         poll_s: Interval of the checks for a new generation of the index.
@@ -52,7 +51,6 @@ class ServiceSettings:
     port: Port = 8000
     token: str | None = None
     queue: Count = 8
-    workers: Count = 1
     deadline_s: Wait = 30.0
     body_s: Wait = 10.0
     poll_s: Wait = 1.0
@@ -73,7 +71,7 @@ class ServiceSettings:
     @property
     def threads(self) -> int:
         """Number of threads for the computation of one request; one core stays free for the event loop."""
-        return max(1, ((os.cpu_count() or 1) - 1) // self.workers)
+        return max(1, (os.cpu_count() or 1) - 1)
 
     @property
     def is_local(self) -> bool:

@@ -69,7 +69,7 @@ def test_touches_that_cannot_be_enrolled_are_refused_with_the_reason(client, kno
 def test_clients_of_a_sharded_index_enrol_at_once(catalogue, touches, tmp_path):
     index = tmp_path / "shards"
     build_sharded(catalogue, write_reference_model(tmp_path / "model.safetensors"), index, 2)
-    with listening(index, workers=2) as (url, _), retrieval.Client(url) as client, ThreadPoolExecutor(4) as threads:
+    with listening(index) as (url, _), retrieval.Client(url) as client, ThreadPoolExecutor(4) as threads:
         made = list(threads.map(lambda name: client.enrol(f"new/../{name}", touches[name]), NAMES))
         assert made == [(f"new/../{name}", 3, 3) for name in NAMES]
         found = client.query(touches[NAMES[3]][1], top=99).top
