@@ -18,10 +18,6 @@ try:
 except ImportError as missing:
     raise BadInput("A client needs httpx. Run: pip install 'touch-retrieval[serve]'") from missing
 
-_BAD_INPUT_KINDS = frozenset(
-    {"malformed", "bad-input", "too-large", "unsupported-type", "unknown", "conflict", "no-token"}
-)
-
 
 class QueryOptions(TypedDict, total=False):
     """The other keyword arguments of `Searcher.query`, with the same meanings and defaults."""
@@ -165,7 +161,7 @@ def _error(response: httpx.Response) -> RetrievalError:
     if kind == "bad-image":
         name, _, reason = detail.partition(": ")
         return ImageError(name, reason)
-    return BadInput(detail) if kind in _BAD_INPUT_KINDS else RetrievalError(detail)
+    return BadInput(detail) if response.is_client_error and kind != "busy" else RetrievalError(detail)
 
 
 def _pictures(

@@ -1,6 +1,7 @@
 """Routes of queries, of verification, of enrolment, and of a live rig: sensor pictures and grasps."""
 
 import base64
+import random
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
@@ -141,8 +142,8 @@ def _require_writable(parts: Service) -> None:
 
 # Live rig -------------------------------------------------------------------------------------------------------------
 
-MAX_OBJECT_NAMES = 1000
-"""Maximum number of objects among which a random one is chosen for a grasp."""
+DRAWN_PHOTOS = 20
+"""Number of random photos of whose objects one is grasped."""
 
 
 @router.post("/v1/grasp", tags=["live"])
@@ -178,17 +179,15 @@ async def grasp(
 
 
 def _object_ids(searcher: Searcher, name: str | None) -> list[str]:
-    """Return `[name]` if a name is given, else ids of objects spread over the catalogue; raises HttpProblem."""
-    shard, photos = searcher.shard, searcher.manifest.photos
+    """Return `[name]` if a name is given, else the objects of random photos; raises HttpProblem."""
+    shard = searcher.shard
     if name is not None:
         name = resolve_object(shard, name)
         if not shard.page([], name, 0, 1).total:
             raise HttpProblem("unknown", f"The index has no object {name!r}. /v1/catalogue lists the objects.")
         return [name]
-    step = max(1, photos // MAX_OBJECT_NAMES)
-    return sorted(
-        {photo.object_id for number in range(0, photos, step) for photo in shard.page([], None, number, 1).photos}
-    )
+    drawn = (random.randrange(searcher.manifest.photos) for _ in range(DRAWN_PHOTOS))
+    return [photo.object_id for number in drawn for photo in shard.page([], None, number, 1).photos]
 
 
 @router.get(
