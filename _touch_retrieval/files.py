@@ -8,7 +8,6 @@ Only regular files are opened for reading: a pipe cannot block the reader, and n
 import errno
 import hashlib
 import json
-import math
 import os
 import secrets
 import shutil
@@ -125,18 +124,11 @@ def parse_json(text: str | bytes, *, own: bool = False) -> Any:
         own: Whether `json.dumps` wrote it: it may contain paths that are not UTF-8, which msgspec refuses.
 
     Raises:
-        ValueError: The text is not JSON, has a number that is not finite, or is nested too deep.
+        ValueError: The text is not JSON, or is nested too deep.
     """
     try:
         if own:
-            return json.loads(text, parse_constant=_finite, parse_float=_finite)
+            return json.loads(text)
         return msgspec.json.decode(decode_text(text) if isinstance(text, bytes) else text)
     except RecursionError as error:
         raise ValueError("it is nested too deep") from error
-
-
-def _finite(number: str) -> float:
-    value = float(number)
-    if not math.isfinite(value):
-        raise ValueError(f"{number} is not a finite number")
-    return value

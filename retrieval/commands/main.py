@@ -19,14 +19,10 @@ import typer
 from retrieval.commands.options import Command
 from retrieval.console.interruption import record_interrupts
 from retrieval.console.memory import keep_freed_memory
-from retrieval.console.output import checked_stdout, discard_stdout, prepare_streams, printable, say, show
+from retrieval.console.output import checked_stdout, discard_stdout, prepare_streams, say, show
 from retrieval.console.progress import Bar, show_progress
 from retrieval.version import __version__
 
-MAX_MESSAGE, MESSAGE_TAIL = 500, 150
-"""Maximum characters of a printed message, and how many of them come from its end, which usually contains the remedy.
-
-Text from a hostile file can have any length."""
 _BAD_PATH_ERRNOS = {
     *(errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.EACCES, errno.EPERM, errno.EROFS),
     *(errno.EINVAL, errno.ENAMETOOLONG, errno.ELOOP, errno.EEXIST),
@@ -140,8 +136,5 @@ def _explain(context: Any, error: BaseException, interrupts: list[int]) -> int:
 
 def _fail(context: Any, message: str, code: int) -> int:
     words = ["retrieve"] if context is None else ["retrieve", context.invoked_subcommand]
-    message = printable(message)
-    if len(message) > MAX_MESSAGE:
-        message = f"{message[: MAX_MESSAGE - MESSAGE_TAIL]} ... {message[-MESSAGE_TAIL:]}"
     say(f"{' '.join(filter(None, words))}: {message}")
     return code

@@ -15,8 +15,6 @@ from retrieval.errors import BadInput, ImageError, IncompleteSearch, RetrievalEr
 
 MEDIA_TYPE = "application/problem+json"
 PREFIX = "urn:touch-retrieval:problem:"
-MAX_DETAIL_CHARACTERS = 2000
-"""Maximum length of a detail, because text from a hostile request may have any length."""
 
 KINDS: Mapping[str, tuple[int, str]] = {
     "malformed": (400, "The request is malformed"),
@@ -57,10 +55,8 @@ class HttpProblem(HTTPException):
 
     def response(self) -> JSONResponse:
         """Return the problem document as a response."""
-        (status, title), detail = KINDS[self.kind], self.detail
-        if len(detail) > MAX_DETAIL_CHARACTERS:
-            detail = detail[:MAX_DETAIL_CHARACTERS] + " ..."
-        document = {"type": PREFIX + self.kind, "title": title, "status": status, "detail": detail}
+        status, title = KINDS[self.kind]
+        document = {"type": PREFIX + self.kind, "title": title, "status": status, "detail": self.detail}
         return DocumentResponse(document, status, {"cache-control": "no-store", **(self.headers or {})}, MEDIA_TYPE)
 
 
