@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from copy import copy
 from dataclasses import asdict
 from itertools import chain, compress
 from pathlib import Path
@@ -74,7 +73,7 @@ class Searcher:
         check = checkpoint.gel_check
         self.reader = TouchReader(checkpoint.config, encoder, check is not None and check.level_above is not None)
         self.catalogue = Path(self.manifest.about["catalogue"])
-        self._process = os.getpid()
+        self._process, self._is_closed = os.getpid(), False
 
     @classmethod
     def open(
@@ -112,9 +111,8 @@ class Searcher:
         return cls(Path(index), shard, stored, find_export(stored, threads) or _torch_encoder(stored, threads))
 
     def close(self) -> None:
-        """Release the index and the model; running queries continue. A second call does nothing."""
-        for name in ("shard", "encoder", "reader", "scorer"):
-            vars(self).pop(name, None)
+        """Refuse further queries; running ones continue. Index and model are freed with the searcher."""
+        self._is_closed = True
 
     @property
     def generation(self) -> Generation:
@@ -129,13 +127,12 @@ class Searcher:
     @property
     def folder_shard(self) -> FolderShard:
         """The shard of an opened index folder. Raises BadInput for a sharded index."""
-        shard = self._snapshot().shard
-        if not isinstance(shard, FolderShard):
+        if not isinstance(self.shard, FolderShard):
             raise BadInput(f"{self.index} is a sharded index, but one index folder is required; open one of its shards")
-        return shard
+        return self.shard
 
     def __enter__(self) -> Searcher:
-        self._snapshot()  # refuses a closed searcher
+        self._require_open()
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -200,14 +197,15 @@ class Searcher:
         Touches are encoded in batches, so logits differ by at most 1e-4 from single queries. If the touches of one
         object are invalid, the error names the object and no query runs.
         """
-        opened, clock = self._snapshot(), Stopwatch()
+        self._require_open()
+        clock = Stopwatch()
         counts: list[object] = [top] if candidates is None else [top, candidates]
         if not all(isinstance(count, int | np.integer) and count >= 1 for count in counts):
             raise BadInput(f"top and candidates must be whole numbers of 1 or more; got {top} and {candidates}")
         require_prior(none_prior)
         prefixes = [f"object {number}, " if len(objects) > 1 else "" for number in range(1, len(objects) + 1)]
         parsed = [
-            parse_grasps(touches, opened.reader.fingers, of=of) for touches, of in zip(objects, prefixes, strict=True)
+            parse_grasps(touches, self.reader.fingers, of=of) for touches, of in zip(objects, prefixes, strict=True)
         ]
         given = [None] * len(objects) if opening_mm is None else opening_mm
         if len(given) != len(objects):
@@ -218,7 +216,7 @@ class Searcher:
         ]
         if not parsed:
             return []
-        codes, shown = opened._encoded([grasp for grasps in parsed for grasp in grasps], background, clock)
+        codes, shown = self._encoded([grasp for grasps in parsed for grasp in grasps], background, clock)
         found, start = list[tuple[list[str], ShardResult | None]](), 0
         for grasps, openings_mm in zip(parsed, openings, strict=True):
             span = slice(start, start := start + len(grasps))
@@ -228,12 +226,12 @@ class Searcher:
                 require_distinct(compress(grasps, used), compress(codes.pictures[span], used))
                 measured_mm = np.array(openings_mm, np.float64)[used]  # None becomes NaN
                 query = EncodedQuery(codes.embeddings[span][used], codes.partials[span][used], measured_mm)
-                result = opened.shard.search(query, top, candidates)
+                result = self.shard.search(query, top, candidates)
             clock.add({stage: result.timing_ms[stage] if result else 0.0 for stage in ("candidates", "rerank")})
             found.append((classes.tolist(), result))
         timing_ms = clock.finish(len(parsed))
         return [
-            opened._result(grasps, openings_mm, classes, timing_ms, result, none_prior)
+            self._result(grasps, openings_mm, classes, timing_ms, result, none_prior)
             for grasps, openings_mm, (classes, result) in zip(parsed, openings, found, strict=True)
         ]
 
@@ -257,8 +255,8 @@ class Searcher:
         >>> scores.shape, logits.shape
         ((1, 2), (2,))
         """
-        opened = self._snapshot()
-        codes, _ = opened._encoded(parse_grasps(touches, opened.reader.fingers), background, Stopwatch())
+        self._require_open()
+        codes, _ = self._encoded(parse_grasps(touches, self.reader.fingers), background, Stopwatch())
         return EncodedTouches(codes.embeddings, codes.partials)
 
     def verify(
@@ -278,16 +276,16 @@ class Searcher:
             BadInput: The catalogue lacks the object, the rate is too small for the model's validation objects, or the
                 model has no error rates.
         """
-        opened = self._snapshot()
-        name, bounds, posterior = opened.expected_object(expect, far)
-        grasps = parse_grasps(touches, opened.reader.fingers)
+        self._require_open()
+        name, bounds, posterior = self.expected_object(expect, far)
+        grasps = parse_grasps(touches, self.reader.fingers)
         names = [[image.name for image in grasp] for grasp in grasps]
-        codes, classes = opened._encoded(grasps, background, Stopwatch())
+        codes, classes = self._encoded(grasps, background, Stopwatch())
         if (fault := _fault(classes)) is not None:
             return Verification(expect, fault, names, classes.tolist(), [], None)
         used = classes == CONTACT
         require_distinct(compress(grasps, used), compress(codes.pictures, used))
-        logits = opened.folder_shard.object_logits(name, codes.partials[used][:MAX_GRASPS])
+        logits = self.folder_shard.object_logits(name, codes.partials[used][:MAX_GRASPS])
         ratios = [float(posterior.log_ratio(logit, count)) for count, logit in enumerate(logits, 1)]
         return Verification(expect, bounds.decide(np.array(ratios)), names, classes.tolist(), ratios, bounds)
 
@@ -345,13 +343,13 @@ class Searcher:
         >>> retrieval.remove_enrolled("index", "spoon")
         ('spoon', 1)
         """
-        opened, stored = self._snapshot(), self.checkpoint
-        name, fingers = opened.enrolled_name(object_id), opened.reader.fingers
+        self._require_open()
+        stored, name, fingers = self.checkpoint, self.enrolled_name(object_id), self.reader.fingers
         grasps = [list(map(with_file, grasp)) for grasp in parse_grasps(touches, fingers)]
         openings = parse_openings(opening_mm, len(grasps))
         frames = [] if background is None else parse_grasps(background, fingers, noun="background")[0]
         frames = list(map(with_file, frames))
-        codes, classes = opened._encoded(grasps, [frame.image for frame in frames] or None, Stopwatch())
+        codes, classes = self._encoded(grasps, [frame.image for frame in frames] or None, Stopwatch())
         for grasp, shows in zip(grasps, classes, strict=True):
             if shows != CONTACT:
                 raise BadInput(f"{_names(grasp)}: {shows}; enrol grasps in which the object is pressed into the gels")
@@ -403,17 +401,14 @@ class Searcher:
             raise BadInput(f"the name of an object must be printable text, got {object_id!r}")
         return like[0] if like else new
 
-    def _snapshot(self) -> Searcher:
-        """Return a copy with references to all resources, so that `close` in another thread cannot break a query."""
-        opened = copy(self)
-        if "shard" not in vars(opened):
+    def _require_open(self) -> None:
+        if self._is_closed:
             raise BadInput(f"this searcher of {self.index} is closed; open the index again")
-        if opened._process != os.getpid():  # its threads and their locks do not survive a fork
+        if self._process != os.getpid():  # its threads and their locks do not survive a fork
             raise BadInput(
                 f"this searcher of {self.index} was opened before this process was forked; start processes with the "
                 'method "spawn" of multiprocessing, and open the index in each of them'
             )
-        return opened
 
     def _encoded(
         self, grasps: Sequence[Sequence[InputImage]], background: Sequence[AnyImage] | None, clock: Stopwatch
