@@ -15,7 +15,7 @@
     oracle, documents, pages                    expected search results; parsers of documents and pages
     verification                                a calibration of verifications with given bounds
     hard_case                                   one stiff or extreme input
-    hostile_pictures                            pictures that are slow to decode
+    hostile_pictures                            small picture files of many pixels
     plugins                                     entry points of a package that is not installed
     serving, browser, ray_processes, waiting    other processes, and waits with a limit
 

@@ -6,7 +6,6 @@ Pillow reads and checks every file. (OpenCV fills the missing part of a truncate
 
 import hashlib
 import io
-import struct
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -17,7 +16,6 @@ import numpy.typing as npt
 from PIL import Image, ImageOps, UnidentifiedImageError, features
 
 from _touch_retrieval.files import read_regular
-from retrieval.data.picture_structure import check_structure
 from retrieval.data.resize import RgbImage, Samples, to_float
 from retrieval.errors import ImageError
 
@@ -35,7 +33,6 @@ MAX_SIDE, MAX_ASPECT = 65_535, 200
 MAX_BYTES = 512 * 2**20
 
 _EIGHT_BIT_MODES = frozenset({"1", "L", "P", "RGB", "RGBX", "CMYK", "YCbCr", "LA", "PA", "RGBA", "RGBa"})
-_STRIP = 1 << 20  # pixels
 _BITS, _PHOTOMETRIC = 258, 262
 
 # Pillow warns of sizes and damaged metadata. Filters belong to the process: a thread must not change them for a while.
@@ -94,8 +91,6 @@ def decode(data: bytes, name: str | Path, min_side: int | None = None) -> Sample
 
 def picture_size(data: bytes, name: str | Path) -> tuple[int, int]:
     """Return (width, height) from a picture's header, without decoding. Raises ImageError."""
-    if (size := _webp_size(data)) != (1, 1):
-        return size
     with _image_errors(name), _open_image(data, name) as image:
         width, height = image.size
         return width, height
@@ -141,8 +136,6 @@ def _image_errors(name: str | Path) -> Iterator[None]:
 def _open_image(data: bytes, name: str | Path) -> Image.Image:
     if not data:
         raise ImageError(name, "the file is empty")
-    check_pixels(_webp_size(data), name)
-    check_structure(data, name)
     return Image.open(io.BytesIO(data), formats=_decoders(data, name))
 
 
@@ -218,41 +211,13 @@ def _too_large(size: str) -> str:
     return f"{size} pixels; at most {MAX_PIXELS} are decoded: make the picture smaller"
 
 
-def _webp_size(data: bytes) -> tuple[int, int]:
-    """Return (width, height) from a WebP header, else (1, 1).
-
-    Pillow allocates a WebP canvas when it opens the file, so the size must be checked before that.
-    """
-    chunk = data[12:16]
-    if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(data) < 30:
-        return 1, 1
-    if chunk == b"VP8X":
-        return int.from_bytes(data[24:27], "little") + 1, int.from_bytes(data[27:30], "little") + 1
-    if chunk == b"VP8L":
-        bits = int.from_bytes(data[21:25], "little")
-        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
-    width, height = struct.unpack_from("<HH", data, 26)
-    return max(width & 0x3FFF, 1), max(height & 0x3FFF, 1)
-
-
 def _eight_bit_rgb(image: Image.Image, name: str | Path) -> Samples:
     if image.mode not in _EIGHT_BIT_MODES:
         raise ImageError(name, f"pixel type {image.mode} is not supported; save it as 8 or 16-bit PNG")
     if not image.has_transparency_data:
-        return _rgb(image)
+        return np.array(image.convert("RGB"))
     samples = to_float(np.asarray(image.convert("RGBA")))
     return _on_white(samples[..., :3], samples[..., 3:])
-
-
-def _rgb(image: Image.Image) -> npt.NDArray[np.uint8]:
-    """Return the samples of an opaque image of 8 bits, copied in strips because Pillow's conversion copies twice."""
-    width, height = image.size
-    rgb = np.empty((height, width, 3), np.uint8)
-    rows = max(1, _STRIP // width)
-    for top in range(0, height, rows):
-        strip = image.crop((0, top, width, min(top + rows, height)))
-        rgb[top : top + rows] = np.asarray(strip if strip.mode == "RGB" else strip.convert("RGB"))
-    return rgb
 
 
 def encode_image(pixels: npt.NDArray[np.uint8], ending: str = ".png") -> bytes:

@@ -2,8 +2,7 @@
 
 Small pictures, such as those of sensors, are decoded in parallel. Large ones are decoded one at a time, so that small
 ones do not wait for them and their memory does not add up. The number of threads bounds this also for pictures of
-requests that have ended. `retrieval.data.picture_structure` bounds the time of a picture, to 2 s for the slowest one
-of maximum size that we could construct.
+requests that have ended.
 """
 
 import asyncio

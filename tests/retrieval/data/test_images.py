@@ -214,6 +214,7 @@ REFUSED = {
     "float": (saved(Image.new("F", (2, 2)), "TIFF"), "pixel type .*F.*not supported"),
     "12-bit": (tiff(np.zeros((2, 2, 1), np.uint16), bits=12), "not supported|truncated"),
     "bomb": (png(2, 8, np.zeros((1, 1, 3)), size=(6000, 10000)), "10000 x 6000 = 60000000 pixels; at most 20000000"),
+    "thin": (png(2, 8, np.zeros((1, 1, 3)), size=(20_000_000, 1)), "1 x 20000000 pixels; a side may have at most"),
     "bomb that raises": (png(2, 8, np.zeros((1, 1, 3)), size=(30000, 30000)), "far more pixels; at most"),
 }
 
@@ -221,7 +222,7 @@ REFUSED = {
 @pytest.mark.parametrize("name", REFUSED)
 def test_unusable_pictures_are_refused_with_the_reason(name, monkeypatch):
     data, reason = REFUSED[name]
-    if "bomb" in name:  # refused by its header
+    if "bomb" in name or name == "thin":  # refused by its header
         monkeypatch.setattr(ImageFile.ImageFile, "load", None)
     with pytest.raises(ImageError, match=reason) as caught:
         decode_rgb(data, "shot.png")
@@ -245,24 +246,6 @@ def test_a_large_jpeg_that_cannot_be_decoded_smaller_is_refused_before_it_is_dec
     monkeypatch.setattr(images, "MAX_PIXELS", 1_000)
     for data in (jpeg_of(300, 400), jpeg_of(30, 40, progressive=True)):
         with pytest.raises(ImageError, match="at most 1000"):
-            decode_rgb(data, "x")
-
-
-def webp_headers(width, height):
-    canvas = (width - 1).to_bytes(3, "little") + (height - 1).to_bytes(3, "little")
-    yield b"VP8X" + struct.pack("<I", 10) + bytes(4) + canvas
-    yield (b"VP8L" + struct.pack("<I", 9) + b"\x2f" + struct.pack("<I", width - 1 | (height - 1) << 14) + bytes(5))
-    yield b"VP8 " + struct.pack("<I", 10) + bytes(3) + b"\x9d\x01\x2a" + struct.pack("<HH", width, height)
-
-
-def test_a_webp_bomb_is_refused_before_pillow_opens_it_since_opening_allocates(monkeypatch):
-    def opened(*_, **__):
-        raise AssertionError("opened")
-
-    monkeypatch.setattr(images.Image, "open", opened)
-    for header in webp_headers(12000, 5000):
-        data = b"RIFF" + struct.pack("<I", 4 + len(header)) + b"WEBP" + header
-        with pytest.raises(ImageError, match="12000 x 5000"):
             decode_rgb(data, "x")
 
 
