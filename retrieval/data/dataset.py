@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Grasp:
-    """The files of one grasp.
+    """One grasp, successful or not, and its files.
 
     Attributes:
         photo_file: The photo; None in a recording of touches only.
@@ -40,6 +40,10 @@ class Grasp:
         backgrounds: No-contact frames of the same fingers, if recorded.
         opening_mm: Distance between the fingers, if recorded.
         session: Name of the sitting in which the grasp was recorded, if stated; it does not restrict splits.
+        outcome: "held", "missed", "slipped", "no_plan"; "failed" for another failure; "unknown" if not recorded.
+        accepted: Whether a matcher is trained on it.
+        after: Frames after the lift, one file per finger in order, or empty.
+        time_s: Time since the recording began.
     """
 
     grasp_id: str
@@ -50,6 +54,15 @@ class Grasp:
     backgrounds: tuple[Path, ...]
     opening_mm: float | None = None
     session: str | None = None
+    outcome: str = "unknown"
+    accepted: bool = True
+    after: tuple[Path, ...] = ()
+    time_s: float | None = None
+
+    @property
+    def held(self) -> bool:
+        """Whether the gripper lifted the object."""
+        return self.outcome == "held"
 
     @property
     def photo(self) -> Path:
@@ -86,43 +99,20 @@ def load_grasps(recording: AnyRecording) -> list[Grasp]:
     ['mug', 'mug', 'tin', 'tin']
     """
     folder = folder_of(recording)
-    return require_accepted(folder, load_all_attempts(folder))
+    return require_accepted(folder, load_all_grasps(folder))
 
 
-def require_accepted(folder: Path, attempts: Iterable["Attempt"]) -> list[Grasp]:
-    """Return the accepted grasps of `load_all_attempts(folder)`. Raises DatasetError like `load_grasps`."""
-    grasps = [attempt.grasp for attempt in attempts if attempt.accepted]
+def require_accepted(folder: Path, grasps: Iterable[Grasp]) -> list[Grasp]:
+    """Return the accepted grasps of `load_all_grasps(folder)`. Raises DatasetError like `load_grasps`."""
+    grasps = [grasp for grasp in grasps if grasp.accepted]
     if not grasps:
         raise DatasetError(f"{folder} contains no successful grasp")
     finger_count(grasps)
     return grasps
 
 
-@dataclass(frozen=True)
-class Attempt:
-    """One closing of the gripper, successful or not.
-
-    Attributes:
-        outcome: "held", "missed", "slipped", "no_plan"; "failed" for another failure; "unknown" if not recorded.
-        accepted: Whether a matcher is trained on it.
-        after: Frames after the lift, one file per finger in order, or empty.
-        time_s: Time since the recording began.
-    """
-
-    grasp: Grasp
-    outcome: str
-    accepted: bool
-    after: tuple[Path, ...]
-    time_s: float | None
-
-    @property
-    def held(self) -> bool:
-        """Whether the gripper lifted the object."""
-        return self.outcome == "held"
-
-
-def load_all_attempts(folder: Path) -> list[Attempt]:
-    """Read all attempts of a recording, in the order of collection. Raises DatasetError if it cannot be read."""
+def load_all_grasps(folder: Path) -> list[Grasp]:
+    """Read all grasps of a recording, in the order of collection. Raises DatasetError if it cannot be read."""
     try:
         recording = read_recording(folder)
     except RobotError as error:
@@ -134,17 +124,15 @@ def load_all_attempts(folder: Path) -> list[Attempt]:
         return tuple(folder / files[finger] for finger in sorted(files))
 
     return [
-        Attempt(
-            Grasp(
-                grasp_id=line.grasp_id,
-                object_id=line.object_id,
-                sequence_id=line.sequence_id,
-                photo_file=None if line.photo is None else folder / line.photo,
-                touches=in_finger_order(line.touches),
-                backgrounds=in_finger_order(line.touches_before),
-                opening_mm=line.opening_mm,
-                session=line.session,
-            ),
+        Grasp(
+            grasp_id=line.grasp_id,
+            object_id=line.object_id,
+            sequence_id=line.sequence_id,
+            photo_file=None if line.photo is None else folder / line.photo,
+            touches=in_finger_order(line.touches),
+            backgrounds=in_finger_order(line.touches_before),
+            opening_mm=line.opening_mm,
+            session=line.session,
             outcome=line.outcome or {None: "unknown", True: "held", False: "failed"}[line.grasped],
             accepted=line.grasped is not False,
             after=in_finger_order(line.touches_after),
@@ -154,16 +142,16 @@ def load_all_attempts(folder: Path) -> list[Attempt]:
     ]
 
 
-def load_attempts(folder: Path) -> list[Attempt]:
+def load_attempts(folder: Path) -> list[Grasp]:
     """Read the successful AND the failed grasps of a recording, in the order of collection.
 
     Grasps without `outcome` and `grasped`, and plans without a grasp, are left out. Raises DatasetError.
     """
-    attempts = [attempt for attempt in load_all_attempts(folder) if attempt.outcome not in ("unknown", "no_plan")]
-    if not attempts:
+    grasps = [grasp for grasp in load_all_grasps(folder) if grasp.outcome not in ("unknown", "no_plan")]
+    if not grasps:
         raise DatasetError(f"no grasp in {folder} has a recorded result; grasped or outcome is required")
-    finger_count([attempt.grasp for attempt in attempts])
-    return attempts
+    finger_count(grasps)
+    return grasps
 
 
 NOT_STATED = "not stated"

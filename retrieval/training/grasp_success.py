@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from retrieval.console.progress import Bar
-from retrieval.data.dataset import Attempt, ImageCache, load_attempts, make_split, recording_licence
+from retrieval.data.dataset import Grasp, ImageCache, load_attempts, make_split, recording_licence
 from retrieval.errors import DatasetError
 from retrieval.metrics.intervals import grouped_interval
 from retrieval.model.checkpoint import require_writable, write_tensors
@@ -42,7 +42,7 @@ LEARNING_RATE = 3e-3  # halved after each quarter of the steps, as the authors d
 VALIDATION = 0.25  # fraction of the objects, as the authors use
 BRIGHTNESS, CONTRAST = 20 / 255, 0.1  # largest change of the lamps between two frames
 
-Differences = Callable[[Sequence[Attempt]], list[list[NDArray[np.float32]]]]
+Differences = Callable[[Sequence[Grasp]], list[list[NDArray[np.float32]]]]
 
 
 def train_gate(
@@ -66,15 +66,14 @@ def train_gate(
         CheckpointError: `out` cannot be written.
     """
     require_writable(out)
-    attempts = load_attempts(recording)
-    settings = settings or GateSettings(frame="after" if all(attempt.after for attempt in attempts) else "during")
-    _require_frames(attempts, settings.frame)
-    split = make_split([attempt.grasp for attempt in attempts], validation=VALIDATION, test=0, seed=seed)
+    grasps = load_attempts(recording)
+    settings = settings or GateSettings(frame="after" if all(grasp.after for grasp in grasps) else "during")
+    _require_frames(grasps, settings.frame)
+    split = make_split(grasps, validation=VALIDATION, test=0, seed=seed)
     train, validation = (
-        [attempt for attempt in attempts if attempt.grasp.object_id in objects]
-        for objects in (split.train, split.validation)
+        [grasp for grasp in grasps if grasp.object_id in objects] for objects in (split.train, split.validation)
     )
-    held = sum(attempt.held for attempt in train)
+    held = sum(grasp.held for grasp in train)
     if held in (0, len(train)):
         raise DatasetError(
             f"the training objects of seed {seed} must have both successful and failed grasps; got {held} successful "
@@ -82,11 +81,11 @@ def train_gate(
         )
     load = ImageCache(settings.preprocessing().load_touch)
 
-    def differences(attempts: Sequence[Attempt]) -> list[list[NDArray[np.float32]]]:
+    def differences(grasps: Sequence[Grasp]) -> list[list[NDArray[np.float32]]]:
         """Return the differences of the fingers of each grasp."""
         return [
-            [load(*pair) for pair in zip(_frames(attempt, settings.frame), attempt.grasp.backgrounds, strict=True)]
-            for attempt in attempts
+            [load(*pair) for pair in zip(_frames(grasp, settings.frame), grasp.backgrounds, strict=True)]
+            for grasp in grasps
         ]
 
     logits: list[float] = []  # each grasp's highest logit
@@ -96,9 +95,9 @@ def train_gate(
             for part in batches(validation, BATCH):
                 logits += map(max, gate.score(differences(part)))
                 bar.advance(len(part))
-    is_held, accepted = np.array([attempt.held for attempt in validation]), np.array(logits) >= 0
-    is_correct, outcomes = accepted == is_held, [attempt.outcome for attempt in validation]
-    owner = np.array([attempt.grasp.object_id for attempt in validation])
+    is_held, accepted = np.array([grasp.held for grasp in validation]), np.array(logits) >= 0
+    is_correct, outcomes = accepted == is_held, [grasp.outcome for grasp in validation]
+    owner = np.array([grasp.object_id for grasp in validation])
     by_object = [is_correct[owner == name].tolist() for name in np.unique(owner)]
     metrics = {
         "frame": settings.frame,
@@ -117,8 +116,8 @@ def train_gate(
     provenance = {
         "iterations": iterations,
         "seed": seed,
-        **made_from(recording, (attempt.grasp for attempt in attempts), [recording_licence(recording)]),
-        "outcomes": dict(Counter(attempt.outcome for attempt in attempts)),
+        **made_from(recording, grasps, [recording_licence(recording)]),
+        "outcomes": dict(Counter(grasp.outcome for grasp in grasps)),
         "metrics": metrics,
     }
     header = {"task": TASK, "gate": dataclasses.asdict(settings), "split": split.to_dict(), "provenance": provenance}
@@ -126,14 +125,13 @@ def train_gate(
     return metrics
 
 
-def _frames(attempt: Attempt, frame: str) -> tuple[Path, ...]:
-    return attempt.after if frame == "after" else attempt.grasp.touches
+def _frames(grasp: Grasp, frame: str) -> tuple[Path, ...]:
+    return grasp.after if frame == "after" else grasp.touches
 
 
-def _require_frames(attempts: Sequence[Attempt], frame: str) -> None:
-    for attempt in attempts:
-        grasp = attempt.grasp
-        for moment, files in (("before", grasp.backgrounds), (frame, _frames(attempt, frame))):
+def _require_frames(grasps: Sequence[Grasp], frame: str) -> None:
+    for grasp in grasps:
+        for moment, files in (("before", grasp.backgrounds), (frame, _frames(grasp, frame))):
             if len(files) != len(grasp.touches):
                 raise DatasetError(
                     f"a gate compares the frames before and {frame} of each finger; {grasp.grasp_id} has "
@@ -141,17 +139,17 @@ def _require_frames(attempts: Sequence[Attempt], frame: str) -> None:
                 )
 
 
-def _train_net(attempts: list[Attempt], differences: Differences, iterations: int, seed: int) -> GraspNet:
+def _train_net(grasps: list[Grasp], differences: Differences, iterations: int, seed: int) -> GraspNet:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         net = GraspNet()
-    first = touch_batch(differences(draw_batch(attempts, 0, seed)[0]))
+    first = touch_batch(differences(draw_batch(grasps, 0, seed)[0]))
     net.scale.fill_(max(float(first.square().mean().sqrt()), 1 / 255))  # at least a grey level
 
     def loss(step: int, _: int) -> Tensor:
-        batch, rng = draw_batch(attempts, step, seed)
+        batch, rng = draw_batch(grasps, step, seed)
         images = augment(touch_batch(differences(batch)), rng)
-        return gate_loss(net(images), torch.tensor([float(attempt.held) for attempt in batch]))
+        return gate_loss(net(images), torch.tensor([float(grasp.held) for grasp in batch]))
 
     optimizer, plan = torch.optim.Adam(net.parameters()), Plan(iterations, LEARNING_RATE, "halving")
     train_loop(net, optimizer, plan, lambda steps: steps, loss, title="training")
@@ -163,12 +161,12 @@ def gate_loss(logits: Tensor, held: Tensor) -> Tensor:
     return match_loss(logits.amax(1), held)
 
 
-def draw_batch(attempts: Sequence[Attempt], step: int, seed: int) -> tuple[list[Attempt], np.random.Generator]:
+def draw_batch(grasps: Sequence[Grasp], step: int, seed: int) -> tuple[list[Grasp], np.random.Generator]:
     """Draw equal numbers of held and failed grasps, from seed and step only; also return the random generator."""
     rng = np.random.default_rng([seed, step])
-    drawn: list[Attempt] = []
+    drawn: list[Grasp] = []
     for held in (True, False):
-        kind = [attempt for attempt in attempts if attempt.held == held]
+        kind = [grasp for grasp in grasps if grasp.held == held]
         drawn += [kind[row] for row in rng.choice(len(kind), BATCH // 2, replace=len(kind) < BATCH // 2)]
     return drawn, rng
 

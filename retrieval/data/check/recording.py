@@ -14,7 +14,7 @@ from retrieval.data.check.drift import check_drift, check_sessions
 from retrieval.data.check.opening import check_openings
 from retrieval.data.check.pictures import Finding, ImageRecords, findings_for, read_pictures
 from retrieval.data.check.split import check_split
-from retrieval.data.dataset import Attempt, Grasp, Split, load_all_attempts, require_accepted
+from retrieval.data.dataset import Grasp, Split, load_all_grasps, require_accepted
 
 
 def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
@@ -36,20 +36,20 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
     >>> {finding.severity for finding in retrieval.check_recording(Path("lab"))} <= {"note", "warning", "error"}
     True
     """
-    attempts = load_all_attempts(folder)
-    accepted = require_accepted(folder, attempts)
-    records, broken = read_pictures({path for attempt in attempts for path in _pictures(attempt)})
+    grasps = load_all_grasps(folder)
+    accepted = require_accepted(folder, grasps)
+    records, broken = read_pictures({path for grasp in grasps for path in _pictures(grasp)})
     findings = [Finding("error", "broken", f"{path.relative_to(folder)}: {reason}") for path, reason in broken.items()]
     findings += _single_grasps(accepted)
     if any(grasp.photos for grasp in accepted):
         without = [grasp.grasp_id for grasp in accepted if not grasp.photos]
         findings += findings_for("error", "no-photo", "no photo, unlike in the others,", without, accepted)
-    findings += _duplicates(folder, [attempt.grasp for attempt in attempts], records)
-    readable = [attempt for attempt in attempts if not broken.keys() & set(_pictures(attempt))]
+    findings += _duplicates(folder, grasps, records)
+    readable = [grasp for grasp in grasps if not broken.keys() & set(_pictures(grasp))]
 
-    def unnamed(attempts: Sequence[Attempt]) -> list[Grasp]:
+    def unnamed(grasps: Sequence[Grasp]) -> list[Grasp]:
         named = {name for finding in findings for name in finding.grasps}
-        return [attempt.grasp for attempt in attempts if attempt.grasp.grasp_id not in named]
+        return [grasp for grasp in grasps if grasp.grasp_id not in named]
 
     findings += _same_or_flat_images(readable, records)
     # Exchanged channels of one finger look like another finger, so they are checked before the fingers.
@@ -60,11 +60,11 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
         appearance.check_moments,
     ):
         findings += check(unnamed(readable), records)
-    used = [attempt for attempt in readable if attempt.accepted]
+    used = [grasp for grasp in readable if grasp.accepted]
     findings += _shared_backgrounds(unnamed(used), records)
     findings += _repeated_touches(unnamed(used), records)
-    if all(attempt.time_s is not None for attempt in used):
-        used.sort(key=lambda attempt: attempt.time_s or 0.0)
+    if all(grasp.time_s is not None for grasp in used):
+        used.sort(key=lambda grasp: grasp.time_s or 0.0)
     findings += check_drift(unnamed(used), records)
     findings += check_sessions(accepted)
     findings += check_openings(accepted)
@@ -75,16 +75,15 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
 
 def check_gel_layout(folder: Path) -> list[Finding]:
     """Return the findings of `check_colour_layout`; only the gel images are read. Raises DatasetError."""
-    grasps = [attempt.grasp for attempt in load_all_attempts(folder)]
+    grasps = load_all_grasps(folder)
     gels = {grasp.grasp_id: {*grasp.touches, *grasp.backgrounds} for grasp in grasps}
     records, broken = read_pictures(set().union(*gels.values()))
     readable = [grasp for grasp in grasps if not broken.keys() & gels[grasp.grasp_id]]
     return list(appearance.check_colour_layout(readable, records))
 
 
-def _pictures(attempt: Attempt) -> tuple[Path, ...]:
-    grasp = attempt.grasp
-    return (*grasp.photos, *grasp.touches, *grasp.backgrounds, *attempt.after)
+def _pictures(grasp: Grasp) -> tuple[Path, ...]:
+    return (*grasp.photos, *grasp.touches, *grasp.backgrounds, *grasp.after)
 
 
 def _single_grasps(grasps: Sequence[Grasp]) -> Iterator[Finding]:
@@ -109,17 +108,16 @@ def _duplicates(folder: Path, grasps: Sequence[Grasp], records: ImageRecords) ->
             yield Finding("error", "duplicate", f"{len(objects)} objects share one image: {abbreviate_list(where)}")
 
 
-def _same_or_flat_images(attempts: Sequence[Attempt], records: ImageRecords) -> Iterator[Finding]:
+def _same_or_flat_images(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
     """Find grasps with the same bytes for two of their images, or with an image of a single colour."""
     names: dict[tuple[str, str, str], list[str]] = defaultdict(list)
-    for attempt in attempts:
-        grasp = attempt.grasp
+    for grasp in grasps:
         photos, touches = [records[path] for path in grasp.photos], [records[path] for path in grasp.touches]
         backgrounds = [records[path] for path in grasp.backgrounds]
         digests = {touch.digest for touch in touches}
         is_touch = any(photo.digest in digests for photo in photos)
         # A grasp that missed may leave the gel untouched.
-        is_frozen = attempt.accepted and digests & {frame.digest for frame in backgrounds}
+        is_frozen = grasp.accepted and digests & {frame.digest for frame in backgrounds}
         for is_faulty, severity, kind, text in (
             (is_touch, "error", "same-modality", "photo and touch are the same image"),
             (len(digests) < len(touches), "warning", "same-fingers", "two fingers have the same image"),
@@ -136,7 +134,7 @@ def _same_or_flat_images(attempts: Sequence[Attempt], records: ImageRecords) -> 
             if is_faulty:
                 names[severity, kind, text].append(grasp.grasp_id)
     for finding, grasp_ids in names.items():
-        yield from findings_for(*finding, grasp_ids, [attempt.grasp for attempt in attempts])
+        yield from findings_for(*finding, grasp_ids, grasps)
 
 
 def _repeated_touches(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:

@@ -90,7 +90,7 @@ def test_failed_grasps_are_read_for_the_gate_and_left_out_for_the_matcher(attemp
     read = load_attempts(attempts)
     assert [item.outcome for item in read] == list(OUTCOMES) * len(OBJECTS)
     assert [item.held for item in read] == [True, True, False, False] * len(OBJECTS)
-    assert [path.stem for path in read[0].after] == [path.stem + "_after" for path in read[0].grasp.touches]
+    assert [path.stem for path in read[0].after] == [path.stem + "_after" for path in read[0].touches]
     assert len(load_grasps(attempts)) == 2 * len(OBJECTS)
 
 
@@ -102,7 +102,7 @@ def test_the_outcome_counts_and_without_it_the_field_grasped(tmp_path):
         for number, fields in enumerate(({"grasped": True}, {"grasped": False}, {}, {"outcome": "no_plan"})):
             writer.append(str(number), "mug", {"photo": LEAN, "touch_a": LEAN}, **fields)
     read = load_attempts(tmp_path / "grasped")
-    assert [(item.grasp.grasp_id, item.outcome) for item in read] == [("0", "held"), ("1", "failed")]
+    assert [(item.grasp_id, item.outcome) for item in read] == [("0", "held"), ("1", "failed")]
 
 
 # Training --------------------------------------------------------------------------------------------------

@@ -37,7 +37,7 @@ def test_grasps_are_in_the_order_of_their_numbers_with_their_pictures_and_failed
         size = (18, 32) if column == "photo" else (32, 24)
         np.testing.assert_array_equal(rgb(tmp_path / "out" / grasp.images()[column]), pixels(seed, size))
     assert [grasp.sequence_id for grasp in recording.grasps] == ["soda_can-1"] * 10 + ["lemon-2"] * 2 + ["soda_can-3"]
-    failed = [attempt.grasp.grasp_id for attempt in load_attempts(tmp_path / "out") if not attempt.held]
+    failed = [attempt.grasp_id for attempt in load_attempts(tmp_path / "out") if not attempt.held]
     assert failed == [f"{FIRST}-i0", f"{FIRST}-i5", f"{FIRST}-i10", "calandra_corl2017_001-i0"]
     assert len(load_grasps(tmp_path / "out")) == 9
 
