@@ -142,15 +142,10 @@ def read_header(path: Path) -> dict[str, Any]:
     """Read our JSON header of a `.safetensors` file, with its "sha256". Raises CheckpointError if there is none."""
     try:
         open_regular(path).close()
-    except FileNotFoundError as error:
-        raise CheckpointError(f"there is no checkpoint at {path}; `retrieve train` makes one") from error
-    except OSError as error:
-        raise CheckpointError(
-            f"{path} cannot be read ({error.strerror}); give the .safetensors file of a checkpoint"
-        ) from error
-    try:
         with safe_open(path, framework="np") as file:
             text = (file.metadata() or {}).get(HEADER)
+    except FileNotFoundError as error:
+        raise CheckpointError(f"there is no checkpoint at {path}; `retrieve train` makes one") from error
     except (SafetensorError, OSError) as error:
         raise unreadable(path, error) from error
     if text is None:

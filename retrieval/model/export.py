@@ -78,7 +78,7 @@ def export_to_cache(checkpoint: Checkpoint) -> Path | None:
         The file; None if an export exists already or cannot be written. Queries work without it.
     """
     path = cached_export_path(checkpoint.digest)
-    if path is None or path.is_file() or checkpoint.path.with_suffix(EXPORT_SUFFIX).is_file():
+    if path.is_file() or checkpoint.path.with_suffix(EXPORT_SUFFIX).is_file():
         return None
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)

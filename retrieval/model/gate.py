@@ -95,10 +95,8 @@ class GraspSuccessGate:
         """Return each finger's log-odds of success.
 
         Raises:
-            BadInput: There are no fingers, a frame is missing, or a frame is not a picture.
+            BadInput: A frame is missing, or is not a picture.
         """
-        if not fingers:
-            raise BadInput("a grasp must have the frames of at least one finger; got none")
         names = sorted(fingers)
         return dict(zip(names, self.score([[self._difference(name, fingers[name]) for name in names]])[0], strict=True))
 

@@ -68,15 +68,12 @@ def open_session(model: Path | bytes, checkpoint: str, threads: int | None = Non
     return session
 
 
-def cached_export_path(digest: str) -> Path | None:
-    """Return the path of an automatic export of the checkpoint with this digest; None if the user has no home folder.
+def cached_export_path(digest: str) -> Path:
+    """Return the path of an automatic export of the checkpoint with this digest.
 
     It is `$XDG_CACHE_HOME/touch-retrieval/DIGEST.onnx`, by default under `~/.cache`.
     """
-    try:
-        cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    except RuntimeError:
-        return None
+    cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     return Path(cache, "touch-retrieval", f"{digest}{EXPORT_SUFFIX}")
 
 
@@ -87,7 +84,7 @@ def find_export(checkpoint: CheckpointInfo, threads: int | None = None) -> OnnxE
     not used, and a warning is logged.
     """
     places = checkpoint.path.with_suffix(EXPORT_SUFFIX), cached_export_path(checkpoint.digest)
-    files = [path for path in places if path is not None and path.is_file()]
+    files = [path for path in places if path.is_file()]
     if not files or find_spec("onnxruntime") is None:
         return None
     try:

@@ -4,13 +4,12 @@ import hashlib
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from itertools import chain
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from retrieval.data.resize import RgbImage, resize
 from retrieval.errors import BadInput, IncompleteSearch, NumericalError
@@ -166,11 +165,6 @@ class TouchReader:
 
         Of several bad images, the first is reported.
         """
-        for source in (source for grasp in grasps for source in grasp):
-            # A Pillow image reads its file on the first access to its pixels, which two threads must not do at once.
-            if isinstance(source.image, Image.Image):
-                with suppress(Exception):  # `read` reports it
-                    source.image.load()
 
         def view(source: InputImage, reference: RgbImage | None) -> tuple[RgbImage, float, bytes]:
             image = self._resized(source)

@@ -40,7 +40,7 @@ from retrieval.model.config import Config, TrainingConfig, named_config
 from retrieval.model.encode import default_device
 from retrieval.model.fusion import Matcher
 from retrieval.model.losses import LOSSES
-from retrieval.model.losses.loss import EncodedBatch, Loss, match_loss
+from retrieval.model.losses.loss import EncodedBatch, match_loss
 from retrieval.model.towers.tower import Tower
 from retrieval.training.batches import FeatureSource, FrozenFeatures, LoadedBatch, TrainedFeatures
 from retrieval.training.calibration.checkpoint import calibrate_checkpoint
@@ -145,9 +145,7 @@ class Trainer:
         # On a CPU, PyTorch's default optimizer reads every tensor eight times. The fused optimizer reads it once. On
         # CUDA the default optimizer is fast.
         self.optimizer = torch.optim.Adam(groups, lr=settings.learning_rate, fused=self.device.type == "cpu")
-        clamps = [term.clamp for term in self.losses.modules() if isinstance(term, Loss)]
-        for clamp in (self.matcher.clamp_scale, *clamps):
-            self.optimizer.register_step_post_hook(lambda *_, clamp=clamp: clamp())
+        self.optimizer.register_step_post_hook(lambda *_: self.matcher.clamp_scale())
         held_out = split.select(grasps, "validation")
         self.validation = self._sampler(held_out).evaluation_pairs() if split.validation else None
         self.features: FeatureSource = (

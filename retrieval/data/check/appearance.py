@@ -11,7 +11,6 @@ from string import ascii_lowercase
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.console.output import abbreviate_list
 from retrieval.data.check.pictures import Finding, ImageRecords, SmallImages, findings_for, fingers_of, small_images
 from retrieval.data.dataset import Grasp
 
@@ -69,10 +68,7 @@ def check_swapped_modalities(grasps: Sequence[Grasp], records: ImageRecords) -> 
     centre = np.median(touches, axis=0)
     closer = distance(photos, centre) < distance(touches, centre) / 2
     names = [grasp.grasp_id for grasp, suspect in zip(grasps, closer, strict=True) if suspect]
-    others = {grasp.sequence_id for grasp, suspect in zip(grasps, closer, strict=True) if not suspect}
-    whole = {grasp.sequence_id for grasp in grasps} - others
-    where = f", throughout the sequence(s) {abbreviate_list(sorted(filter(None, whole)))}," if whole - {None} else ""
-    yield from findings_for("error", "swapped", f"touch and photo look swapped{where}", names, grasps)
+    yield from findings_for("error", "swapped", "touch and photo look swapped", names, grasps)
 
 
 def swapped_fingers(a: SmallImages, b: SmallImages) -> Rows | None:

@@ -31,10 +31,7 @@ def check_drift(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Find
     changed.
     """
     by_order = _by_order(grasps)
-    if by_order is None:
-        yield Finding(
-            "note", "unchecked-light", "light that identifies the object cannot be checked: no object has two grasps"
-        )
+    if by_order is None:  # no object has two grasps
         return
     frames: dict[tuple[str, ...], Grasp] = {}
     if all(len(grasp.backgrounds) == len(grasp.touches) for grasp in grasps):
@@ -56,8 +53,6 @@ def check_drift(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Find
         f"the no-contact frames alone identify the object in {_percent(by_frame)}, the order of their capture alone in "
         f"{_percent(by_frame_order)} ({by_frame.queries} different frames of {by_frame.objects} objects)"
     )
-    if left_out := len({grasp.object_id for grasp in different}) - by_frame.objects:
-        text += f"; {left_out} object(s) with one no-contact frame for all grasps are left out"
     if is_above_chance(by_frame):
         yield Finding("warning", "drift", f"{text}: light or gel drifted, and {_ADVICE}")
     else:

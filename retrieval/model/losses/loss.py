@@ -53,9 +53,6 @@ class Loss(nn.Module):
         """Return the loss (scalar, float32) of a batch."""
         raise NotImplementedError
 
-    def clamp(self) -> None:
-        """Clamp parameters to their range, after each step."""
-
 
 def match_loss(logits: Tensor, labels: Tensor) -> Tensor:
     """Return the mean binary cross-entropy of match logits (P,) against labels (P,) of 0 and 1.

@@ -189,7 +189,6 @@ def test_a_sequence_with_swapped_folders_and_exchanged_channels_are_named(broken
         ("error", "swapped", broken.names(sorted((*FOLDERS, 21)))),
         ("warning", "colour-layout", broken.names(COLOURS)),
     }
-    assert "throughout the sequence(s) one folder," in found[0].message
 
 
 @pytest.mark.parametrize(
