@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image, ImageOps, UnidentifiedImageError, features
+from PIL import Image, ImageOps, UnidentifiedImageError
 
 from _touch_retrieval.files import read_regular
 from retrieval.data.resize import RgbImage, Samples, to_float
@@ -161,12 +161,8 @@ def _brands(data: bytes) -> set[bytes]:
 def _decoders(data: bytes, name: str | Path) -> tuple[str, ...]:
     """Return the names of Pillow's decoders for a file. Raises ImageError if the decoder is not installed."""
     brands = _brands(data)
-    if brands & _AVIF_BRANDS:
-        if not features.check("avif"):
-            raise ImageError(name, "an AVIF picture, and this Pillow was built without AVIF: pip install -U pillow")
-        return ("AVIF",)
-    if not brands & _HEIC_BRANDS:
-        return ("BMP", "JPEG", "PNG", "TIFF", "WEBP")
+    if brands & _AVIF_BRANDS or not brands & _HEIC_BRANDS:
+        return ("AVIF", "BMP", "JPEG", "PNG", "TIFF", "WEBP")
     try:
         from pillow_heif import register_heif_opener
     except ImportError:

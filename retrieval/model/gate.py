@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from _touch_retrieval.documents import check_fields
-from retrieval.data.preprocessing import Preprocessing
+from retrieval.data.preprocessing import Preprocessing, Side
 from retrieval.data.resize import to_float
 from retrieval.errors import BadInput, CheckpointError, ConfigError, NumericalError
 from retrieval.model.checkpoint import load_weights, read_tensors
@@ -29,12 +29,11 @@ TASK = "grasp-success"
 class GateSettings:
     """Input of a gate: side of the image in pixels, and the frame that it compares with the no-contact frame."""
 
-    touch_px: int = 64
+    touch_px: Side = 64
     frame: Literal["after", "during"] = "after"
 
     def __post_init__(self) -> None:
         check_fields(self, "gate", ConfigError)
-        self.preprocessing()
 
     def preprocessing(self) -> Preprocessing:
         """Return the preprocessing that makes float32 differences (touch_px, touch_px, 3) in -1..1."""

@@ -118,11 +118,11 @@ def parse_grasps(touches: AnyTouches, fingers: int, *, noun: str = "touch", of: 
     if _is_image(touches):
         grasps: list[list[Any]] = [[touches]]
     else:
-        items = _items(touches, of)
+        items = _items(touches)
         images = [_is_image(item) for item in items]
         if any(images) and not all(images):
             raise BadInput(f"{of}a list mixes images with lists of images; {_NESTING_HINT}")
-        grasps = [items] if any(images) else [_items(item, of) for item in items]
+        grasps = [items] if any(images) else [_items(item) for item in items]
     if wrong := [image for grasp in grasps for image in grasp if not _is_image(image)]:
         raise BadInput(
             f"{of}an image must be {_IMAGE_TYPES}, got {type(wrong[0]).__name__}; {_NESTING_HINT}; query several "
@@ -150,10 +150,8 @@ def _is_image(item: object) -> bool:
     return isinstance(item, str | os.PathLike | bytes | bytearray | memoryview | Image.Image | GelImage)
 
 
-def _items(value: object, of: str) -> list[Any]:
-    if isinstance(value, Sequence | np.ndarray):
-        return list(value)
-    raise BadInput(f"{of}an image must be {_IMAGE_TYPES}, got {type(value).__name__}; {_NESTING_HINT}")
+def _items(value: object) -> list[Any]:
+    return list(value) if isinstance(value, Sequence | np.ndarray) else [value]
 
 
 def _name(image: AnyImage, grasp: str, finger: int) -> str:

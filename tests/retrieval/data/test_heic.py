@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 import pytest
-from PIL import Image, features
+from PIL import Image
 
 from retrieval.data import images
 from retrieval.data.images import decode_rgb
@@ -49,11 +49,8 @@ def test_a_file_cut_at_any_length_is_refused(kind):
 
 def test_a_missing_decoder_is_an_error_that_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
-    monkeypatch.setattr(features, "check", lambda name: False)
     with pytest.raises(ImageError, match=r"photo\.heic: a HEIC picture.*pip install 'touch-retrieval\[heif\]'"):
         decode_rgb(HEIC, "photo.heic")
-    with pytest.raises(ImageError, match=r"this Pillow was built without AVIF"):
-        decode_rgb(AVIF, "photo.avif")
 
 
 def test_a_header_with_too_many_pixels_is_refused_before_decoding(monkeypatch):
