@@ -173,21 +173,6 @@ class Posterior:
         posteriors, if_present = (np.exp(np.minimum(logs - total, 0.0)) for total in (whole, present))
         return PosteriorProbabilities(math.exp(none - whole), posteriors, math.exp(mass.unscored - whole), if_present)
 
-    def more_grasps(self, logit: float, objects: int, grasps: int, none_prior: float = NONE_PRIOR) -> int | None:
-        """Estimate how many more grasps make the best object, with logit l, more likely than "none of these".
-
-        They are assumed to have the mean match logit of the g grasps so far. n grasps suffice if
-
-            slope * n / (1 + dependence * (n - 1)) * l / g + offset  >  log objects + log (p / (1 - p))
-
-        None if `MAX_GRASPS` in total do not suffice; the prior p is above 0.
-        """
-        needed = math.log(objects) + math.log(none_prior) - math.log1p(-none_prior) - self.offset
-        for total in range(grasps + 1, MAX_GRASPS + 1):
-            if self.weight(total) * total * logit / grasps > needed:
-                return total - grasps
-        return None
-
 
 def require_prior(none_prior: float) -> None:
     """Raise BadInput unless `none_prior` is a valid prior probability of "none of these"."""

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from retrieval.errors import BadInput
-from retrieval.model.gel_check import CONTACT, NO_CONTACT, NOT_A_GEL
+from retrieval.model.gel_check import NO_CONTACT, NOT_A_GEL
 from retrieval.model.verification import ACCEPT, ANOTHER_GRASP, REJECT, DecisionBounds
 
 MATCH, NONE_OF_THESE, UNCALIBRATED = "match", "none of these", "uncalibrated"
@@ -124,9 +124,6 @@ class QueryResult:
         none_probability: Probability that the object is out of catalogue.
         posterior: Formula of the probabilities and its numbers (`retrieval.model.posterior`).
         results: The ranking.
-        more_grasps: If the verdict is "none of these" and the ranking is clear (`CLEAR_PROBABILITY`): number of further
-            grasps like these after which "match" is expected (`Posterior.more_grasps`). None otherwise, and if too many
-            are needed.
         opening_mm: Opening of the jaws in each grasp, None where none was measured; None if there is no opening at all.
 
     >>> with retrieval.open("index") as searcher:
@@ -145,7 +142,6 @@ class QueryResult:
     none_probability: float | None
     posterior: dict[str, Any] | None
     results: list[Match]
-    more_grasps: int | None = None
     opening_mm: list[float | None] | None = None
 
     @property
@@ -162,13 +158,7 @@ class QueryResult:
         references = "Reference touches" if best.reference is None else "More reference touches"
         if best.probability_if_present <= CLEAR_PROBABILITY:
             return f"The ranking is not clear. {references} of its first objects would help."
-        if self.more_grasps is None:
-            return (
-                "The ranking is clear, but more grasps would hardly change the verdict. "
-                f"{references} of {best.object_id} would help."
-            )
-        like = "this one" if self.grasps.count(CONTACT) == 1 else "these"
-        return f'Another grasp would help: {self.more_grasps} more like {like} would make the verdict "match".'
+        return f"The ranking is clear. {references} of {best.object_id}, or further grasps, would help."
 
     @property
     def unlisted_probability(self) -> float | None:
@@ -184,7 +174,7 @@ class QueryResult:
             folders = [Path(document["index"][name]) for name in ("catalogue", "path")]
             matches = [_match(match, *folders) for match in document["results"]]
             query = {name: document["query"][name] for name in ("touches", "grasps")}
-            names = ("index", "timing_ms", "verdict", "none_probability", "posterior", "more_grasps")
+            names = ("index", "timing_ms", "verdict", "none_probability", "posterior")
             query["opening_mm"] = document["query"].get("opening_mm")
             return cls(**query, results=matches, **{name: document[name] for name in names})
         except (KeyError, TypeError) as error:
@@ -200,7 +190,6 @@ class QueryResult:
             "verdict": self.verdict,
             "none_probability": self.none_probability,
             "unlisted_probability": self.unlisted_probability,
-            "more_grasps": self.more_grasps,
             "advice": self.advice,
             "posterior": self.posterior,
             "results": [match.to_dict() for match in self.results],

@@ -35,7 +35,6 @@ from retrieval.model.touch_reader import (
 from retrieval.model.touches import AnyImage, AnyTouches, InputImage, parse_grasps, with_file
 from retrieval.model.verification import MAX_GRASPS, DecisionBounds
 from retrieval.search.answer import (
-    CLEAR_PROBABILITY,
     MATCH,
     NONE_OF_THESE,
     UNCALIBRATED,
@@ -432,14 +431,12 @@ class Searcher:
         """Return the answer; `found` is None without a grasp with contact."""
         manifest, posterior, count = self.manifest, self.posterior, classes.count(CONTACT)
         has_openings = any(opening is not None for opening in openings_mm)
-        probabilities, formula, more_grasps = None, None, None
+        probabilities, formula = None, None
         verdict = _fault(classes) or UNCALIBRATED
         if found is not None and posterior is not None:
             logits = [ranked.logit for ranked in found.best]
             probabilities = posterior.probabilities_given(logits, found.mass, count, none_prior)
             verdict = MATCH if probabilities.objects.max() > probabilities.none else NONE_OF_THESE
-            if verdict == NONE_OF_THESE and probabilities.objects_if_present[0] > CLEAR_PROBABILITY:
-                more_grasps = posterior.more_grasps(logits[0], found.mass.objects, count, none_prior)
             formula = {
                 **asdict(posterior),
                 "none_prior": none_prior,
@@ -494,7 +491,6 @@ class Searcher:
                 )
                 for place, ranked in enumerate(found.best if found else ())
             ],
-            more_grasps=more_grasps,
             opening_mm=openings_mm if has_openings else None,
         )
 

@@ -75,24 +75,6 @@ def test_where_none_rounds_to_one_the_probability_if_present_is_exact_and_the_qu
     assert found.objects_if_present[0] == pytest.approx(exact)
 
 
-@pytest.mark.parametrize(
-    ("dependence", "logit", "grasps", "prior", "more"),
-    [
-        # Of four objects at even odds w l must exceed log 4 = 1.386. At dependence 0.5, 1 to 5 grasps of logit 1 weigh
-        # 1, 1.333, 1.5, 1.6 and 1.667 together.
-        (0.5, 1.0, 1, 0.5, 2),
-        (0.5, 1.1, 1, 0.5, 1),  # 1.1 * 1.333 = 1.467
-        (0.5, 0.8, 1, 0.5, None),  # 0.8 * 1.667 = 1.333
-        (0.5, 2.0, 2, 0.5, 1),  # a sum of two grasps of logit 1
-        (0.5, 4.1, 5, 0.5, None),  # no estimate beyond five grasps
-        (0.0, 0.5, 1, 0.5, 2),  # three independent ones: 1.5
-        (0.5, 2.0, 1, 0.8, 2),  # log 4 + log (0.8 / 0.2) = 2.773; 2.667, 3
-    ],
-)
-def test_the_further_grasps_to_a_match_equal_those_calculated_by_hand(dependence, logit, grasps, prior, more):
-    assert Posterior(1.0, 0.0, dependence).more_grasps(logit, 4, grasps, prior) == more
-
-
 def test_an_objects_logit_averages_the_likelihoods_of_its_photos():
     posterior = Posterior(0.8, 0.3, 0.5)
     scores, owner, counts = np.array([2.0, -1.0, 0.5, 3.0]), np.array([0, 1, 0, 1]), np.array([2, 3])

@@ -258,29 +258,6 @@ def test_probabilities_equal_normalised_likelihoods_with_none_of_these_and_follo
     assert if_present == pytest.approx([term / math.fsum(terms) for term in terms], abs=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("missing", "scale", "more"),
-    [
-        (110, 10_000, 1),  # with dependence 0.5 and logit 100, two grasps weigh 133, three 150, five 167
-        (200, 10_000, None),
-        (110, 0.01, None),  # one more would suffice, but the ranking is not clear
-    ],
-)
-def test_more_grasps_are_advised_if_the_ranking_is_clear_and_few_suffice(
-    missing, scale, more, searcher, touch, monkeypatch
-):
-    """The best object has logit 100, and a match needs the evidence `missing`."""
-    head = searcher.scorer
-    give_posterior(monkeypatch, searcher, Posterior(1.0, math.log(8) - missing, dependence=0.5))
-    scaled = dataclasses.replace(head, out=scale * head.out, out_bias=scale * head.out_bias)
-    for _ in range(2):
-        monkeypatch.setattr(searcher.shard, "scorer", scaled)
-        result = searcher.query([touch])
-        scaled = dataclasses.replace(scaled, out_bias=scaled.out_bias + 100 - result.top.logit)
-    assert result.top.logit == pytest.approx(100, rel=1e-4)
-    assert (result.verdict, result.more_grasps) == ("none of these", more)
-
-
 def test_objects_with_equal_probabilities_are_still_ranked_by_logit(searcher, touch, monkeypatch):
     """Float64 probabilities of logits that are 745 below the best are all 0; ranked by probability, they would tie."""
     head, partials = searcher.scorer, searcher.encode(touch).partials

@@ -103,14 +103,14 @@ def test_probabilities_if_present_and_the_advice_of_the_service_are_shown(opened
     """The page itself computes neither of them."""
     document = searcher.query(files[:2], none_prior=0.999).to_dict()
     assert document["verdict"] == "none of these"
-    document |= {"advice": "Another grasp would help: 2 more."}
+    document |= {"advice": "Further grasps would help."}
     for place, match in enumerate(document["results"]):
         match["probability_if_present"] = 0.625 / 2**place
     show_answer(document, opened, files)
     best = document["results"][0]["object_id"]
     verdict = opened.locator(".verdict")
     verdict.get_by_text(f"If it contains the object, this is {best} with probability 62.5\u00a0%.").wait_for()
-    assert verdict.locator(".advice").inner_text() == "Another grasp would help: 2 more."
+    assert verdict.locator(".advice").inner_text() == "Further grasps would help."
     shown = opened.locator(".photo.object .if-present").all_inner_texts()
     assert shown[:2] == ["62.5\u00a0% if present", "31.3\u00a0% if present"]
     assert len(shown) == len(document["results"])

@@ -147,7 +147,6 @@ class RecogniserNode:
         answer = Answer(verdict=result.verdict, sentence=verdict_sentence(result), grasps=result.grasps)
         answer.header.stamp = self.node.get_clock().now().to_msg()
         answer.none_probability = _or_nan(result.none_probability)
-        answer.more_grasps = result.more_grasps or 0
         answer.results = [
             ObjectHypothesis(
                 class_id=match.object_id,
