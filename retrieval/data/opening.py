@@ -26,11 +26,7 @@ def parse_openings(openings: Openings, grasps: int, of: str = "") -> list[float 
     """
     if openings is None:
         return [None] * grasps
-    given: Sequence[object] = (
-        openings
-        if isinstance(openings, Sequence | np.ndarray) and not isinstance(openings, str | bytes)
-        else [openings]
-    )
+    given: list[object] = np.atleast_1d(np.array(openings, dtype=object)).tolist()
     if len(given) != grasps:
         raise BadInput(
             f"{of}give one opening for each grasp, or none: got {len(given)} opening(s) for {grasps} grasp(s); None "
