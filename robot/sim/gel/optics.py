@@ -19,7 +19,6 @@ import cv2
 import numpy as np
 
 from robot.sim.gel.surface import Array, Field, Surface, resized
-from robot.sim.jit import jit
 
 # Near-field LEDs -------------------------------------------------------------------------------------------
 
@@ -108,15 +107,17 @@ class LedOptics:
 
     def colours(self, surface: Surface, slopes: tuple[Array, Array]) -> Array:
         """Return the picture (rows, cols, 3) of the surface with these slopes, those of its flaws included."""
-        field = surface.field
-        (leds, strengths), (x, y) = _leds(self.bars, field), field.positions()
-        shades = np.ones((len(self.bars), field.rows, field.cols), np.float32)
+        field, (slope_x, slope_y) = surface.field, slopes
+        steep = np.float32(1) / np.sqrt(np.float32(1) + slope_x * slope_x + slope_y * slope_y)
+        lights = [_light_of(bar, field, slope_x, slope_y) * steep for bar in self.bars]
         if self.shadow > 0 and surface.displacement_mm.any():
-            for shade, cast in zip(shades, cast_shadows(surface, self.bars), strict=True):
-                shade -= np.float32(self.shadow) * cast
-        axes, mix, ambient = (x.ravel(), y.ravel()), np.array(self.mix, np.float32), np.float32(self.ambient)
-        out, backdrop = np.empty((field.rows, field.cols, 3), np.float32), backdrop_of(self.backdrops, field)
-        _shade_by_bars(np.stack(slopes), leds, strengths, axes, shades, mix, ambient, backdrop, out)
+            for light, cast in zip(lights, cast_shadows(surface, self.bars), strict=True):
+                light *= 1 - np.float32(self.shadow) * cast
+        backdrop, ambient = backdrop_of(self.backdrops, field), np.float32(self.ambient)
+        out = np.empty_like(backdrop)
+        for channel, mix in enumerate(np.array(self.mix, np.float32)):
+            mixed = sum(share * light for share, light in zip(mix, lights, strict=True))
+            out[..., channel] = backdrop[..., channel] * (ambient + (1 - ambient) * mixed)
         return out if self.gamma == 1 else backdrop * (out / backdrop) ** np.float32(self.gamma)
 
 
@@ -128,21 +129,19 @@ def backdrop_of(backdrops: tuple[GaussianBackdrop, ...], field: Field) -> Array:
     return whole
 
 
-@lru_cache(maxsize=16)
-def _leds(bars: tuple[LedBar, ...], field: Field) -> tuple[Array, Array]:
-    """Return places (bars, points, 3) and strengths (bars, points, rows, cols) of the LEDs, for `_shade_by_bars`.
-
-    Bars with fewer points than the longest are padded with LEDs of strength 0.
-    """
-    points = max(bar.points for bar in bars)
-    places = np.zeros((len(bars), points, 3), np.float32)
-    strengths = np.zeros((len(bars), points, field.rows, field.cols), np.float32)
-    for number, bar in enumerate(bars):
-        places[number, : bar.points] = bar.positions()
-        strengths[number, : bar.points] = led_strengths(bar, field)
-    return places, strengths
+def _light_of(bar: LedBar, field: Field, slope_x: Array, slope_y: Array) -> Array:
+    """Return the light (rows, cols) of a bar on a surface with these slopes, before it is divided by |normal|."""
+    x, y = field.positions()
+    light = np.zeros((field.rows, field.cols), np.float32)
+    for (led_x, led_y, led_z), strength in zip(
+        bar.positions().astype(np.float32), led_strengths(bar, field), strict=True
+    ):
+        towards = led_z - slope_x * (led_x - x) - slope_y * (led_y - y)
+        light += strength * np.maximum(towards, 0)
+    return light
 
 
+@lru_cache(maxsize=48)
 def led_strengths(bar: LedBar, field: Field) -> Array:
     """Return the strength (points, rows, cols) of each LED at each pixel.
 
@@ -159,40 +158,6 @@ def led_strengths(bar: LedBar, field: Field) -> Array:
         flat += strengths[-1] * led[2]
     flat = np.maximum(flat, np.finfo(np.float64).tiny)
     return np.stack([strength / flat for strength in strengths]).astype(np.float32)
-
-
-@jit
-def _shade_by_bars(slopes, leds, strengths, axes, shades, mix, ambient, backdrop, out):  # type: ignore[no-untyped-def]
-    """Write the picture (rows, cols, 3) of LedOptics into `out`; all arrays are float32.
-
-    `slopes` (2, rows, cols); `leds` (bars, points, 3) in mm; `strengths` (bars, points, rows, cols): an LED contributes
-    its strength times (normal . vector to it), or 0; `axes`: x (cols,) and y (rows,) in mm; `shades` (bars, rows,
-    cols): fraction of a bar's light that reaches a pixel; `mix` (3, bars); `backdrop` (rows, cols, 3).
-    """
-    bars, points = leds.shape[0], leds.shape[1]
-    rows, cols = slopes.shape[1], slopes.shape[2]
-    x, y = axes
-    light, steep, one = np.empty((bars, cols), np.float32), np.empty(cols, np.float32), np.float32(1)
-    for row in range(rows):
-        for i in range(cols):
-            s, t = slopes[0, row, i], slopes[1, row, i]
-            steep[i] = one / np.sqrt(one + s * s + t * t)
-        for bar in range(bars):
-            for i in range(cols):
-                light[bar, i] = 0
-            for point in range(points):
-                led_x, led_y, led_z = leds[bar, point, 0], leds[bar, point, 1] - y[row], leds[bar, point, 2]
-                for i in range(cols):
-                    towards = led_z - slopes[0, row, i] * (led_x - x[i]) - slopes[1, row, i] * led_y
-                    light[bar, i] += strengths[bar, point, row, i] * (towards if towards > 0 else np.float32(0))
-            for i in range(cols):
-                light[bar, i] *= steep[i] * shades[bar, row, i]
-        for channel in range(3):
-            for i in range(cols):
-                mixed = np.float32(0)
-                for bar in range(bars):
-                    mixed += mix[channel, bar] * light[bar, i]
-                out[row, i, channel] = backdrop[row, i, channel] * (ambient + (one - ambient) * mixed)
 
 
 # Shadows ---------------------------------------------------------------------------------------------------

@@ -25,7 +25,6 @@ from robot.sim.gel.fitted_optics import FittedOptics, load_fitted
 from robot.sim.gel.marks import Flaws, Markers, flaw_maps, marker_darkening
 from robot.sim.gel.optics import MINI_BACKDROPS, MINI_BARS, GaussianBackdrop, LedBar, LedOptics
 from robot.sim.gel.surface import Array, Field, Surface
-from robot.sim.jit import jit
 
 Picture = NDArray[np.uint8]
 Optics = LedOptics | FittedOptics
@@ -119,11 +118,10 @@ class GelSensor:
 
     def capture(self, clean: Array, seed: int) -> Picture:
         """Return the camera's picture of `clean`: noisy, rounded, clipped to 0..255, reduced and compressed."""
-        rows, values = clean.shape[0], clean.shape[1] * 3  # a row's colours one after the other
-        tile, place = _draw_noise(self.field.rows, self.field.cols, seed)
-        noisy, flat = np.empty((rows, values), np.uint8), np.ascontiguousarray(clean).reshape(rows, values)
-        _add_camera_noise(flat, tile, place, np.float32(self.noise.read), np.float32(self.noise.shot), noisy)
-        picture: Picture = noisy.reshape(clean.shape)
+        read, shot = np.float32(self.noise.read), np.float32(self.noise.shot)
+        spread = np.sqrt(np.maximum(clean, 0) * shot + read * read)
+        noisy = np.rint(clean + spread * _draw_noise(self.field.rows, self.field.cols, seed))
+        picture: Picture = np.clip(noisy, 0, 255).astype(np.uint8)
         if self.detail < 1:
             height, width = (max(1, round(self.detail * size)) for size in picture.shape[:2])
             small = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
@@ -143,45 +141,23 @@ _TILE_MARGIN = 64
 
 
 @lru_cache(maxsize=4)
-def _tile(rows: int, cols: int, is_mirrored: bool) -> Array:
-    """Return noise (rows + margin, (cols + margin) * 3), with the columns in reverse order if mirrored."""
+def _tile(rows: int, cols: int) -> Array:
     shape = (rows + _TILE_MARGIN, cols + _TILE_MARGIN, 3)
-    drawn = np.random.default_rng([0x6E15, rows, cols]).standard_normal(shape, dtype=np.float32)
-    return np.ascontiguousarray(drawn[:, ::-1] if is_mirrored else drawn).reshape(shape[0], -1)
+    return np.random.default_rng([0x6E15, rows, cols]).standard_normal(shape, dtype=np.float32)
 
 
-def _draw_noise(rows: int, cols: int, seed: int) -> tuple[Array, tuple[int, int, int, int]]:
-    """Return a large tile of standard normal noise and the place of a window in it, as `_add_camera_noise` takes them.
+def _draw_noise(rows: int, cols: int, seed: int) -> Array:
+    """Return a window (rows, cols, 3) of a large tile of standard normal noise.
 
     Fresh random values would cost more than the optics. 64 x 64 places, mirrored and of either sign, do not repeat
     visibly for a person or a tower.
     """
     rng = np.random.default_rng([seed, 0x7015E])
-    down, right = (int(value) for value in rng.integers(0, _TILE_MARGIN, 2))
-    keeps_rows, keeps_cols, is_positive = (bool(value) for value in rng.integers(0, 2, 3))
-    first_row, step = (down, 1) if keeps_rows else (down + rows - 1, -1)
-    first_col = right if keeps_cols else _TILE_MARGIN - right
-    return _tile(rows, cols, not keeps_cols), (first_row, step, 3 * first_col, 1 if is_positive else -1)
-
-
-@jit
-def _add_camera_noise(clean, tile, place, read, shot, out):  # type: ignore[no-untyped-def]
-    """Write rounded grey levels with noise of variance read^2 + shot * level into `out` (rows, n) uint8.
-
-    `clean` (rows, n) are grey levels, n is columns times 3; `tile` has noise of variance 1; `place` is the first row,
-    the step from row to row (1 or -1) and the first value of a row in the tile, then the noise's sign.
-    """
-    square = read * read
-    first_row, step, first, sign = place
-    for row in range(out.shape[0]):
-        levels, greys = clean[row], out[row]  # slices of one row are faster than two indices
-        noise = tile[first_row + step * row, first : first + len(greys)]
-        for i in range(len(greys)):
-            level = levels[i]
-            spread = np.float32(sign) * np.sqrt((level if level > 0 else np.float32(0)) * shot + square)
-            grey = np.rint(level + spread * noise[i])
-            grey = grey if grey > 0 else np.float32(0)
-            greys[i] = np.int32(grey if grey < 255 else np.float32(255))
+    down, right = rng.integers(0, _TILE_MARGIN, 2)
+    keeps_rows, keeps_cols, is_positive = rng.integers(0, 2, 3)
+    window = _tile(rows, cols)[down : down + rows, right : right + cols]
+    window = window[:: 1 if keeps_rows else -1, :: 1 if keeps_cols else -1]
+    return window if is_positive else -window
 
 
 # Drawing sensors -------------------------------------------------------------------------------------------
