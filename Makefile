@@ -45,5 +45,5 @@ $(VENV)/installed: pyproject.toml $(CONSTRAINTS)
 	$(PYTHON) -m venv --clear $(VENV)
 # PyTorch first, pinned: other versions may install gigabytes of CUDA libraries, which the tests do not use.
 	$(BIN)/python -m pip install --quiet -c $(CONSTRAINTS) torch
-	$(BIN)/python -m pip install --quiet -c $(CONSTRAINTS) -e '.[test,docs,sim,mesh,heif,calibration,evaluation,onnx,gripper,sawyer,realsense,importers,serve,hub,cluster,transformers]'
+	$(BIN)/python -m pip install --quiet -c $(CONSTRAINTS) -e '.[test,docs,sim,mesh,heif,calibration,evaluation,onnx,sawyer,realsense,importers,serve,hub,cluster,transformers]'
 	@touch $@

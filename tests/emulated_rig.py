@@ -1,6 +1,6 @@
 """A rig with the real drivers and emulated devices that have one common state.
 
-The gripper's driver is connected to an emulated WSG-50 over TCP or a pseudo-terminal, the gels' driver to computed
+The gripper's driver is connected to an emulated WSG-50 over TCP, the gels' driver to computed
 cameras through OpenCV's interface. The arm, which reaches its target at once, and the camera are from this file. The
 gripper's line, the arm and the camera can have faults.
 """
@@ -22,7 +22,7 @@ from robot.rig import Rig
 from tests import views
 from tests.emulators.wsg50.faults import LineFaults
 from tests.emulators.wsg50.gripper import HOLDING, EmulatedWSG50
-from tests.emulators.wsg50.server import serve_pty, serve_tcp
+from tests.emulators.wsg50.server import serve
 from tests.fake_rig import LENS, PX, WORKSPACE, chord
 from tests.fake_video import FakeVideoDevice
 
@@ -31,7 +31,6 @@ FRAMES = 4
 QUICK = AttemptSettings(
     GraspSettings(lift_mm=100.0), settle_s=0.1, hold_s=0.1, travel_mm_s=1000.0, closing_mm_s=400.0, retries=4
 )
-SERVERS = {"tcp": serve_tcp, "pty": serve_pty}
 
 
 class EmulatedRigState:
@@ -108,13 +107,13 @@ class EmulatedGel(FakeVideoDevice):
 class EmulatedRig(Rig):
     """The rig. Objects are cylinders by name with a random position for each attempt."""
 
-    def __init__(self, url, shared, paths):
+    def __init__(self, port, shared, paths):
         self.shared = shared
-        quick = {"timeout_s": 0.25, "reconnect_s": 0.02, "acknowledge_faults": True, "max_speed_mm_s": 400.0}
+        quick = {"timeout_s": 1.0, "acknowledge_faults": True, "max_speed_mm_s": 400.0}
         gel = {"warmup_s": 0.0, "timeout_s": 1.0, "frozen_s": 0.2}
         super().__init__(
             EmulatedArm(shared),
-            WSG50(port=url, **quick),
+            WSG50(host="127.0.0.1", port=port, **quick),
             {finger: OpencvTactile(finger=finger, device=path, **gel) for finger, path in paths.items()},
             EmulatedCamera(shared),
             info={"source": "emulated rig", "sensor": "emulated gel"},
@@ -132,13 +131,13 @@ class EmulatedRig(Rig):
 
 
 @contextlib.contextmanager
-def emulated_rig(seed=0, *, port="tcp", rate=0.0):
+def emulated_rig(seed=0, *, rate=0.0):
     """Yield an EmulatedRig, not connected; its devices exist while the context is open."""
     shared = EmulatedRigState(seed, rate)
     paths = {finger: f"/dev/v4l/by-id/usb-Emulated_Gel_{finger}-video-index0" for finger in "ab"}
     gels = {path: EmulatedGel(shared, finger) for finger, path in paths.items()}
     with (
-        SERVERS[port](shared.emulator, shared.line) as url,
+        serve(shared.emulator, shared.line) as port,
         patch.object(opencv_stream, "open_capture", lambda device: gels[device].open(device)),
     ):
-        yield EmulatedRig(url, shared, paths)
+        yield EmulatedRig(port, shared, paths)

@@ -22,7 +22,7 @@ from robot.recording.folder import read_recording
 from robot.sight import hand_eye
 from tests import views
 from tests.emulators.wsg50.gripper import EmulatedWSG50
-from tests.emulators.wsg50.server import serve_tcp
+from tests.emulators.wsg50.server import serve
 from tests.fake_rig import LENS, FakeRig
 
 FILE = """
@@ -39,7 +39,8 @@ jaw_speed_mm_s = 400
 driver = "manual"
 [gripper]
 driver = "wsg50"
-port = "{port}"
+host = "127.0.0.1"
+port = {port}
 [sensors.a]
 driver = "tests.replay_rig:FolderSensor"
 path = "{folder}/a"
@@ -93,12 +94,12 @@ def replay_file(emulator=None):
     emulator = emulator or EmulatedWSG50(speed_up=50.0, referenced=True)
     with (
         tempfile.TemporaryDirectory() as name,
-        serve_tcp(emulator) as url,
+        serve(emulator) as port,
         patch("robot.rig.input", lambda: "", create=True),
     ):
         folder = Path(name)
         record(folder)
-        (folder / "rig.toml").write_text(FILE.format(port=url, folder=folder))
+        (folder / "rig.toml").write_text(FILE.format(port=port, folder=folder))
         yield folder / "rig.toml"
 
 

@@ -2,8 +2,8 @@
 
 Cameras: /dev/v4l/by-id contains a link for each, named by maker, model and serial number, independent of the socket;
 by-path names the socket, for cameras without a name of their own. "-video-index0" gives the pictures, higher numbers
-only metadata. /sys/class/video4linux/*/name is the camera's own name. Serial ports: those that pyserial lists.
-RealSense cameras are listed by their package if it is installed.
+only metadata. /sys/class/video4linux/*/name is the camera's own name. RealSense cameras are listed by their package
+if it is installed.
 """
 
 import logging
@@ -22,7 +22,7 @@ _GEL_SENSORS = {"digit": "digit", "gelsight mini": "gelsight_mini", "gelsight": 
 class DiscoveredDevice:
     """A connected device: its stable name, its own name, and the lines for its table in a rig's file."""
 
-    kind: Literal["camera", "serial port", "realsense"]
+    kind: Literal["camera", "realsense"]
     device: str
     label: str
     toml: str
@@ -30,7 +30,7 @@ class DiscoveredDevice:
 
 def discover(dev: Path = DEV, sys: Path = SYS) -> list[DiscoveredDevice]:
     """Return all connected devices, cameras first; `dev` and `sys` are the system's device folders."""
-    return [*find_cameras(dev, sys), *find_serial_ports(dev), *_find_realsenses()]
+    return [*find_cameras(dev, sys), *_find_realsenses()]
 
 
 def camera_names(dev: Path = DEV) -> list[str]:
@@ -57,18 +57,6 @@ def find_cameras(dev: Path = DEV, sys: Path = SYS) -> list[DiscoveredDevice]:
         more = "" if named else "\nallow_index = true"
         cameras.append(DiscoveredDevice("camera", name, label, f'driver = "{driver}"\ndevice = "{name}"{more}'))
     return cameras
-
-
-def find_serial_ports(dev: Path = DEV) -> list[DiscoveredDevice]:
-    """Return the serial ports with hardware, by stable name where they have one; any of them may be the gripper."""
-    try:
-        from serial.tools import list_ports
-    except ImportError:
-        return []
-    stable = {path.resolve(): str(path) for path in sorted((dev / "serial" / "by-id").glob("*"))}
-    ports = [port for port in list_ports.comports() if port.hwid != "n/a"]  # a ttyS0 without hardware is left out
-    names = [(stable.get(Path(port.device).resolve(), port.device), port.description) for port in ports]
-    return [DiscoveredDevice("serial port", name, label, f'driver = "wsg50"\nport = "{name}"') for name, label in names]
 
 
 def _find_realsenses() -> list[DiscoveredDevice]:

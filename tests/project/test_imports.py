@@ -95,10 +95,10 @@ def run_blocked(code, blocked):
 
 
 SERVE = ("fastapi", "starlette", "uvicorn", "pydantic", "httpx")
-HEAVY = ("torch", "faiss", "cv2", "sklearn", "matplotlib", "serial", "numpy", "PIL", "scipy", "rich", "jinja2", *SERVE)
+HEAVY = ("torch", "faiss", "cv2", "sklearn", "matplotlib", "numpy", "PIL", "scipy", "rich", "jinja2", *SERVE)
 
 
-DEVICE_PACKAGES = ("serial", "websockets", "pyrealsense2", "roslibpy", "trimesh", "torch", "faiss")
+DEVICE_PACKAGES = ("websockets", "pyrealsense2", "roslibpy", "trimesh", "torch", "faiss")
 OF_ROBOT = [
     str(path.relative_to(ROOT).with_suffix("")).replace("/", ".").removesuffix(".__init__") for path in modules("robot")
 ]
@@ -122,7 +122,6 @@ def test_packages_can_be_imported_without_what_they_do_not_need(imports, blocked
 @pytest.mark.parametrize(
     ("role", "table", "message"),
     [
-        ("gripper", {"driver": "wsg50", "port": "/dev/null"}, "pip install 'touch-retrieval[gripper]'"),
         ("camera", {"driver": "realsense"}, "pip install 'touch-retrieval[realsense]'"),
     ],
 )

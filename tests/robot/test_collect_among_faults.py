@@ -11,13 +11,12 @@ from tests.fake_video import own_threads
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("port", ["tcp", "pty"])
-def test_a_collection_among_faults_has_complete_grasps_and_never_leaves_the_jaws_closing(tmp_path, port):
+def test_a_collection_among_faults_has_complete_grasps_and_never_leaves_the_jaws_closing(tmp_path):
     """After each stop it starts again, as a person would."""
     stops, tallies, faults = [], [], 0
     options = {"objects": [f"can-{number}" for number in range(5)], "seed": 2, "settings": CollectSettings(2)}
     while not tallies:
-        with emulated_rig(2 + len(stops), port=port, rate=0.05) as rig:
+        with emulated_rig(2 + len(stops), rate=0.05) as rig:
             try:
                 tallies = collect(lambda rig=rig: rig, tmp_path / "r", **options)
             except DeviceError as error:

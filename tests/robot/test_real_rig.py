@@ -22,7 +22,7 @@ TABLES = {
     "limits": "workspace_lower_mm = [-100, -100, 10]\nworkspace_upper_mm = [100, 100, 300]\nforce_n = 15\n"
     "jaw_speed_mm_s = 40\narm_speed_mm_s = 90",
     "arm": 'driver = "manual"',
-    "gripper": 'driver = "wsg50"\nport = "socket://127.0.0.1:1"',
+    "gripper": 'driver = "wsg50"\nhost = "127.0.0.1"',
     "sensors.a": 'driver = "uvc"\ndevice = "/dev/v4l/by-id/usb-gel-video-index0"',
     "camera": 'driver = "uvc"\ndevice = "/dev/v4l/by-id/usb-cam-video-index0"',
     "object": "x_mm = 0\ny_mm = 5\nheight_mm = 100\nradius_mm = 30",
@@ -134,9 +134,9 @@ def test_a_camera_with_depth_requires_a_recent_calibration(load):
 
 BAD = {
     "an unknown driver": ({"arm": 'driver = "kuka"'}, r"\[arm\]: driver must be one of .*, sawyer; got 'kuka'"),
-    "no driver": ({"gripper": 'port = "a"'}, r"\[gripper\]: driver must be one of own, wsg50; got None"),
-    "an unknown key": ({"gripper": 'driver = "wsg50"\nport = "a"\nbort = 1'}, r"\[gripper\] has no setting 'bort'"),
-    "a key too few": ({"gripper": 'driver = "wsg50"'}, r"\[gripper\] requires 'port'"),
+    "no driver": ({"gripper": 'host = "a"'}, r"\[gripper\]: driver must be one of own, wsg50; got None"),
+    "an unknown key": ({"gripper": 'driver = "wsg50"\nhost = "a"\nbort = 1'}, r"\[gripper\] has no setting 'bort'"),
+    "a key too few": ({"gripper": 'driver = "wsg50"'}, r"\[gripper\] requires 'host'"),
     "an unknown finger": ({"sensors.c": 'driver = "uvc"'}, r"\[sensors.b\] or both; got .*c"),
     "a limit of zero": ({"limits": TABLES["limits"] + "\nstate_age_s = 0"}, r"\[limits\]: state_age_s must be"),
     "a force above the limit": ({"grasp": "force_n = [5, 16]"}, "force_n must be at most 15"),

@@ -18,7 +18,7 @@ from tests.fake_rig import FakeRig
 RIGS = {
     "fake": lambda: contextlib.nullcontext(FakeRig(5)),
     "sim": lambda: contextlib.nullcontext(load_rig("sim", seed=5)),
-    "emulated": lambda: emulated_rig(5, port="pty"),
+    "emulated": lambda: emulated_rig(5),
 }
 """Rigs by name, each a context in which its devices exist."""
 

@@ -1,17 +1,17 @@
-"""Driver of the WSG-50 parallel gripper (Weiss Robotics, SCHUNK). Tested with an emulator, not yet with a gripper.
+"""Driver of the WSG-50 parallel gripper (Weiss Robotics, SCHUNK) over TCP. Tested with an emulator, not with a gripper.
 
 Before use, set on the gripper's web page:
 
-* The binary command interface: on.
+* The binary command interface over TCP: on.
 * "Part width tolerance" and "clamping travel": their maximum. The width of the object is unknown, so GRASP is sent with
   `grasp_width_mm`, by default 0. (The driver of the Robotics Library gives the same advice.)
-* "Error state on TCP disconnect": on. Then the jaws stop if this program is killed. Over a serial line they do not.
+* "Error state on TCP disconnect": on. Then the jaws stop if this program is killed, or if the connection is lost.
 
-Replies, results of motions and automatic updates arrive interleaved and are distinguished only by their ids; a reply
-can be lost, late or duplicated. Therefore the link synchronises after every error: before the next command, the gripper
-must echo a fresh token. It answers in the order of its commands, so all packets before the echo are old and are
-dropped. A motion has ended when the gripper reports that it is still, in a possible end state of the motion; replies
-only trigger a read. A motion command is never sent twice. During a motion the state arrives as automatic updates every
+Replies, results of motions and automatic updates arrive interleaved and are distinguished only by their ids. The
+gripper answers in the order of its commands. Before each motion it must echo a fresh token: all packets before the
+echo, such as the result of a motion that was stopped, are old and are dropped. A command without an answer closes the
+connection. A motion has ended when its result has arrived and the gripper reports that it is still, in a possible end
+state of the motion. A motion command is never sent twice. During a motion the state arrives as automatic updates every
 few milliseconds; without them the motion is stopped.
 
 There is no reader thread: the waiting caller reads, because updates matter only during a wait.
@@ -21,8 +21,8 @@ import contextlib
 import itertools
 import logging
 import math
-import os
 import select
+import socket
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -33,20 +33,17 @@ from msgspec import Meta
 from robot.devices import Clock, Gripper
 from robot.drivers.wsg50 import codec
 from robot.drivers.wsg50.codec import (
-    MAX_PAYLOAD,
     CommandId,
     GraspingState,
     GripperLimits,
     Packet,
     Status,
     SystemState,
-    WireError,
     command_name,
     decode,
     encode,
 )
 from robot.errors import DeviceError, RobotConfigError
-from robot.extras import import_extra
 from robot.readings import GripperState, GripperStatus
 from robot.settings import TypedSettings
 
@@ -55,23 +52,12 @@ _log = logging.getLogger(__name__)
 
 # The link -----------------------------------------------------------------------------------------------------
 
-_TRIES = 3
-_PADDING = bytes(MAX_PAYLOAD + 8)
-"""Completes any packet whose rest the gripper may still expect, and begins none."""
 _CHUNK = 1 << 16
 """Bytes of a read, more than ten seconds of updates, in case this program was suspended."""
 
 
 class LinkLost(DeviceError):
-    """The port cannot be opened, was lost, or was closed by the gripper."""
-
-
-class NoReply(DeviceError):
-    """The gripper did not answer in time, or received a damaged command; it may have executed the command."""
-
-
-class NoEcho(NoReply):
-    """The gripper does not answer at all, so retries are useless."""
+    """The gripper cannot be reached, does not answer, or closed the connection."""
 
 
 class StillMoving(DeviceError):
@@ -86,136 +72,90 @@ class CommandFailed(DeviceError):
 
 
 class Link:
-    """The link to one gripper. Its methods raise LinkLost, NoReply, CommandFailed or WireError, all DeviceErrors.
-
-    `name` is a path, or a URL of pyserial such as socket://192.168.1.20:1000. Each answer may take `timeout_s`.
+    """The TCP connection to one gripper. Its methods raise LinkLost, CommandFailed or WireError, all DeviceErrors.
 
     Attributes:
         updates: For each updating command, its last parameters and their time of arrival (s, time.monotonic).
-        has_echoed: Whether a gripper has answered over the open port.
-        needs_sync: Whether the next command must synchronise first.
     """
 
-    def __init__(self, name: str, *, baud: int = 115200, stop_bits: int = 1, timeout_s: float = 1.0) -> None:
-        self.name, self.baud, self.stop_bits, self.timeout_s = name, baud, stop_bits, timeout_s
+    def __init__(self, host: str, port: int, timeout_s: float) -> None:
+        self.address, self.timeout_s = (host, port), timeout_s
         self.updates: dict[int, tuple[bytes, float]] = {}
-        self.has_echoed = False
-        self._port: Any = None
+        self._socket: socket.socket | None = None
         self._buffer = bytearray()
-        self.needs_sync = True
-        self._tokens = itertools.count(int.from_bytes(os.urandom(6), "little"))
+        self._tokens = itertools.count()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it is connected."""
+        return self._socket is not None
 
     def open(self) -> None:
-        """Open the port if it is closed; send nothing."""
-        if self._port is not None:
+        """Connect unless it is connected; send nothing."""
+        if self._socket is not None:
             return
-        serial = import_extra("serial", "a WSG-50", "gripper", DeviceError)
         try:
-            self._port = serial.serial_for_url(
-                self.name,
-                baudrate=self.baud,
-                stopbits=self.stop_bits,
-                timeout=0,
-                write_timeout=self.timeout_s,
-                exclusive=True,
-            )
-        except Exception as error:  # pyserial raises termios.error, ValueError and others too
-            raise LinkLost(f"the gripper's port {self.name} cannot be opened: {_first_line(error)}") from error
+            self._socket = socket.create_connection(self.address, self.timeout_s)
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        except OSError as error:
+            raise LinkLost(f"{self._name} cannot be reached: {error}; is it on and connected?") from error
         self.updates.clear()
-        self.needs_sync = True
+        self._buffer.clear()
 
     def close(self) -> None:
-        """Close the port if it is open; never raises."""
-        port, self._port, self.has_echoed = self._port, None, False
-        sock = getattr(port, "_socket", None)
-        with contextlib.suppress(Exception):  # also that of None, which was closed before
-            port.close()
-        if sock is not None:  # pyserial leaves its socket open if the peer closed first
-            sock.close()
+        """Close the connection if it is open."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
 
     def query(self, packet: Packet, parse: Callable[[bytes], _T]) -> _T:
-        """Send an idempotent command and return its parsed reply; send it again if no valid reply arrives."""
-        for left in reversed(range(_TRIES)):
-            try:
-                self.begin(packet)
-                return parse(self._result(packet.id))
-            except NoEcho:
-                raise
-            except (NoReply, WireError):
-                if not left:
-                    raise
-                self.needs_sync = True
-        raise AssertionError("the loop returns or raises")
+        """Send a command and return its parsed reply."""
+        self._write(packet)
+        for status, parameters in self._replies(packet.id, self.timeout_s):
+            if status is Status.CMD_PENDING:
+                continue
+            if status is not Status.SUCCESS:
+                raise CommandFailed(packet.id, status)
+            return parse(parameters)
+        raise self._silence(command_name(packet.id))
 
     def send(self, packet: Packet) -> None:
-        """Send an idempotent command as `query` does."""
+        """Send a command and wait for its reply."""
         self.query(packet, bytes)
 
+    def sync(self) -> None:
+        """Have the gripper echo a fresh token, and drop all packets before it."""
+        token = next(self._tokens).to_bytes(8, "little")
+        self._write(Packet(CommandId.LOOP, token))
+        echo = Packet(CommandId.LOOP, bytes(2) + token)
+        if not any(packet == echo for packet in self._packets(self.timeout_s)):
+            raise self._silence(command_name(CommandId.LOOP))
+
     def begin(self, packet: Packet) -> None:
-        """Send a command whose replies `poll` returns; synchronise first if necessary."""
-        self.pump(0.0)
-        if self.needs_sync:
-            self.sync()
-        self.needs_sync = True
-        self._write(encode(packet))
+        """Send a command whose replies `poll` returns, after synchronising."""
+        self.sync()
+        self._write(packet)
 
     def poll(self, command_id: int, timeout_s: float) -> Status | None:
         """Return the status of the next reply to a command, PENDING too, or None after `timeout_s`."""
         return next((status for status, _ in self._replies(command_id, timeout_s)), None)
 
-    def send_urgent(self, packet: Packet) -> None:
-        """Send a stop at once, without synchronisation, and wait for a reply; an older reply is sufficient."""
-        try:
-            self._write(encode(packet))
-            self._result(packet.id)
-        finally:
-            self.needs_sync = True
+    @property
+    def _name(self) -> str:
+        return f"the gripper at {self.address[0]}:{self.address[1]}"
 
-    def sync(self) -> None:
-        """Synchronise: have the gripper echo a fresh token, and drop all packets before it."""
-        for number in range(_TRIES):
-            if number:
-                self.pad()
-            self._buffer.clear()  # also an incomplete packet, whose rest may never arrive
-            token = next(self._tokens).to_bytes(8, "little")
-            self._write(encode(Packet(CommandId.LOOP, token)))
-            echo = Packet(CommandId.LOOP, bytes(2) + token)
-            if any(packet == echo for packet in self._packets(self.timeout_s)):
-                self.needs_sync, self.has_echoed = False, True
-                return
-        raise NoEcho(f"the gripper at {self.name} did not answer within {self.timeout_s:g} s; is it on and connected?")
-
-    def pad(self) -> None:
-        """Complete a packet whose damaged length would swallow the next command; call it before a repetition."""
-        self._write(_PADDING)
-
-    def pump(self, seconds: float) -> None:
-        """Process the packets that arrive within `seconds`; 0: those that have arrived."""
-        for packet in self._packets(seconds):
-            self.needs_sync |= packet.id not in codec.UPDATING
-
-    def _result(self, command_id: int) -> bytes:
-        """Return the parameters of the final reply to the last command."""
-        for status, parameters in self._replies(command_id, self.timeout_s):
-            if status is Status.CMD_PENDING:
-                continue
-            self.needs_sync = False
-            if status is Status.CHECKSUM_ERROR:
-                raise NoReply(f"the gripper received {command_name(command_id)} damaged (CHECKSUM_ERROR)")
-            if status is not Status.SUCCESS:
-                raise CommandFailed(command_id, status)
-            return parameters
-        raise NoReply(f"the gripper did not answer {command_name(command_id)} within {self.timeout_s:g} s")
+    def _silence(self, command: str) -> LinkLost:
+        """Close the connection and return the error."""
+        self.close()
+        return LinkLost(f"{self._name} did not answer {command} within {self.timeout_s:g} s; is it on and connected?")
 
     def _replies(self, command_id: int, seconds: float) -> Iterator[tuple[Status, bytes]]:
         """Yield status and parameters of the replies to a command that arrive within `seconds`."""
-        for packet in self._packets(seconds):
-            if packet.id == command_id and len(packet.payload) >= 2:
-                yield codec.reply(packet)
+        return (codec.reply(packet) for packet in self._packets(seconds) if packet.id == command_id)
 
     def _packets(self, seconds: float) -> Iterator[Packet]:
         """Yield the packets that arrive within `seconds`, and store updates."""
-        deadline, is_last = time.monotonic() + seconds, False
+        deadline = time.monotonic() + seconds
         while True:
             used, packet = decode(self._buffer)
             del self._buffer[:used]
@@ -224,36 +164,30 @@ class Link:
                     self.updates[packet.id] = (packet.payload[2:], time.monotonic())
                 yield packet
                 continue
-            if is_last:
-                return
-            wait_s = deadline - time.monotonic()
-            is_last = wait_s <= 0
-            with self._open_port() as port:
-                if select.select([port.fileno()], [], [], max(0.0, wait_s))[0]:
-                    self._buffer += port.read(_CHUNK)  # its time-out is 0, so it does not wait
+            with self._connected() as connection:
+                if not select.select([connection], [], [], max(0.0, deadline - time.monotonic()))[0]:
+                    return
+                data = connection.recv(_CHUNK)
+                if not data:
+                    raise OSError("the gripper closed it")
+            self._buffer += data
 
-    def _write(self, data: bytes) -> None:
-        with self._open_port() as port:
-            while data:
-                data = data[port.write(data) :]
+    def _write(self, packet: Packet) -> None:
+        with self._connected() as connection:
+            connection.sendall(encode(packet))
 
     @contextlib.contextmanager
-    def _open_port(self) -> Iterator[Any]:
-        """Give the port; if it was lost, close it and raise LinkLost."""
+    def _connected(self) -> Iterator[socket.socket]:
+        """Give the connection; if it was lost, close it and raise LinkLost."""
         try:
-            if self._port is None:
+            if self._socket is None:
                 raise OSError("it is closed")
-            yield self._port
-        except (OSError, ValueError, TypeError) as error:  # select gets None from a closed port
+            yield self._socket
+        except OSError as error:
             self.close()
             raise LinkLost(
-                f"the gripper's port {self.name} was lost: {_first_line(error)}; check its cable and power, "
-                "recover() opens it again"
+                f"the connection to {self._name} was lost: {error}; check its cable and power, recover() opens it again"
             ) from error
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error) or type(error).__name__).splitlines()[0]
 
 
 # The gripper --------------------------------------------------------------------------------------------------
@@ -275,7 +209,7 @@ _CLOSED_STATES = {GraspingState.HOLDING, GraspingState.NO_PART, GraspingState.PA
 
 _UPDATED = (CommandId.SYSTEM_STATE, CommandId.GRASPING_STATE)
 _UPDATE_MS = 20
-"""Period of the state updates during a motion: 25 bytes, two frames with a status and a state."""
+"""Period of the state updates during a motion."""
 
 _REACHED_MM, _SAME_MM = 1.0, 0.1
 """Tolerance of a reached target, and distance below which no motion is needed."""
@@ -286,8 +220,8 @@ _HOMING_S = 30.0
 _SLACK_S = 2.0
 """Extra time of a motion, for acceleration and the link."""
 _POLL_S = 0.01
-_LONGEST_WAIT_S = 5.0
-"""Longest wait between two tries to connect; doubling 20 times would take days."""
+_RECONNECT_S = (0.0, 0.2, 1.0, 5.0)
+"""Waits before the tries to open a lost connection."""
 _ROUNDING = 1e-6
 """Accepted relative excess of the force limit, a rounding error of 32-bit numbers."""
 _ACTION = (
@@ -301,34 +235,26 @@ class WSG50Settings(TypedSettings):
     """Settings of a WSG-50. Forces are those on each finger.
 
     Attributes:
-        port: A path, or socket://192.168.1.20:1000.
-        baud: Baud rate of a serial line, as set in the gripper (the default is not verified).
-        stop_bits: Stop bits of a serial line, as set in the gripper (the default is not verified).
+        host: Address of the gripper.
         timeout_s: Longest wait for an answer.
         acknowledge_faults: Whether to log and acknowledge a FAST STOP; if false, a person must acknowledge it.
         grasp_width_mm: Nominal width of the object, sent with each GRASP; 0 if unknown.
         min_part_mm: A smaller opening means that the fingers touch each other and hold no part.
         opening_speed_mm_s: Speed of opening and pre-positioning.
         finger_share: Fraction of the gripper's force on each finger; see `to_finger_force`.
-        reconnect_tries: Number of tries to open a lost port again.
-        reconnect_s: First wait between two tries, which doubles up to 5 s.
         max_force_n: Upper limit of forces.
         max_speed_mm_s: Upper limit of speeds.
         max_state_age_s: The jaws are stopped if no state arrives for this long during a motion.
     """
 
-    port: str
-    # The updates take at most half of the line: 2 x 25 x 11 x 50 bits/s.
-    baud: Annotated[int, Meta(ge=28_000, le=4_000_000)] = 115200
-    stop_bits: Annotated[int, Meta(ge=1, le=2)] = 1
+    host: str
+    port: Annotated[int, Meta(ge=1, le=65535)] = 1000
     timeout_s: Annotated[float, Meta(ge=1e-3, le=600)] = 1.0
     acknowledge_faults: bool = False
     grasp_width_mm: Annotated[float, Meta(ge=0, le=1000)] = 0.0
     min_part_mm: Annotated[float, Meta(ge=0, le=1000)] = 1.0
     opening_speed_mm_s: Annotated[float, Meta(ge=1e-3, le=1e4)] = 80.0
     finger_share: Annotated[float, Meta(ge=0.1, le=1.0)] = 0.5
-    reconnect_tries: Annotated[int, Meta(ge=1, le=20)] = 5
-    reconnect_s: Annotated[float, Meta(ge=0, le=5)] = 0.2
     max_force_n: Annotated[float, Meta(ge=1e-3, le=1e4)] = 40.0
     max_speed_mm_s: Annotated[float, Meta(ge=1e-3, le=1e4)] = 420.0
     max_state_age_s: Annotated[float, Meta(ge=0.04, le=60)] = 0.5
@@ -351,8 +277,8 @@ class GripperReading:
 
     system: SystemState
     grasping: GraspingState
-    opening_mm: float = math.nan
-    force_n: float = math.nan
+    opening_mm: float
+    force_n: float
 
     @property
     def is_moving(self) -> bool:
@@ -384,7 +310,7 @@ class WSG50(Gripper):
             max_speed_mm_s=options.max_speed_mm_s,
             clock=clock,
         )
-        self._link = Link(options.port, baud=options.baud, stop_bits=options.stop_bits, timeout_s=options.timeout_s)
+        self._link = Link(options.host, options.port, options.timeout_s)
         self._limits = TYPICAL_LIMITS
         self._may_be_moving = False
         """Whether a motion was started and the jaws have not been still since."""
@@ -397,10 +323,10 @@ class WSG50(Gripper):
         self._set_up()
 
     def _close(self) -> None:
-        """If the jaws move, stop them. Then send DISCONNECT, without which the gripper enters FAST STOP over TCP."""
+        """If the jaws move, stop them. Then send DISCONNECT, without which the gripper enters FAST STOP."""
         try:
-            if self._link.has_echoed or self._may_be_moving:  # else no motion was started
-                self._stop_if_moving()  # also if the link was lost: over a serial line the jaws still move
+            if self._link.is_open or self._may_be_moving:
+                self._stop_if_moving()
                 self._stop_updates()
                 self._link.send(Packet(CommandId.DISCONNECT))
         finally:
@@ -416,34 +342,29 @@ class WSG50(Gripper):
         }
 
     def _recover(self) -> None:
-        """Open a lost link again, with increasing waits, then restore reference and settings as on connecting."""
+        """Open a lost connection again, then restore reference and settings as on connecting."""
         with self._moving("cannot recover"):
-            tries = self._options.reconnect_tries
-            for number in range(tries):
-                try:
-                    self._connect()
-                    return
-                except (LinkLost, NoEcho) as error:
-                    self._link.close()
-                    if number == tries - 1:
-                        raise DeviceError(f"{self.name} cannot be reached after {tries} tries: {error}") from error
-                    wait_s = min(self._options.reconnect_s * 2**number, _LONGEST_WAIT_S)
-                    _log.warning("%s: no connection (%s); trying again in %.2g s", self.name, error, wait_s)
+            for tries_left, wait_s in zip(reversed(range(len(_RECONNECT_S))), _RECONNECT_S, strict=True):
                 time.sleep(wait_s)
+                try:
+                    self._link.open()
+                    self._link.sync()
+                    break
+                except LinkLost as error:
+                    if not tries_left:
+                        raise
+                    _log.warning("%s: %s; connecting again", self.name, error)
+            self._set_up()
 
     def _stop(self) -> None:
-        """Stop the jaws; after a motion, open a lost link again first. The waits do not grow: the jaws may move."""
-        tries = self._options.reconnect_tries if self._may_be_moving else 1
-        for tries_left in reversed(range(tries)):
-            try:
-                self._link.open()
-                self._stop_over_link()
-                return
-            except LinkLost:
-                if not tries_left:
-                    raise
-            _log.warning("%s: lost the link during a possible motion: opening it again to stop the jaws", self.name)
-            time.sleep(self._options.reconnect_s)
+        """Stop the jaws; if the connection is lost during a possible motion, open it again to do so."""
+        try:
+            self._stop_over_link()
+        except LinkLost:
+            if not self._may_be_moving:
+                raise
+            _log.warning("%s: lost the connection during a possible motion: opening it again to stop", self.name)
+            self._stop_over_link()
 
     def _state(self) -> GripperState:
         return self._as_state(self._read())
@@ -528,60 +449,31 @@ class WSG50(Gripper):
         reading = self._read_until_still(deadline)
         if done(reading):
             return reading
-        answer = "nothing" if status is None else status.name
         stop = f", FAST STOP: {reading.system.faults}" if reading.system & SystemState.FAST_STOP else ""
         raise DeviceError(
-            f"the gripper answered {answer} to {command_name(packet.id)} and rests at "
+            f"the gripper answered {status.name} to {command_name(packet.id)} and rests at "
             f"{reading.opening_mm:.1f} mm, {reading.grasping.name.lower()}{stop}; check it, then call recover()"
         )
 
-    def _watch(self, packet: Packet, deadline: float) -> Status | None:
-        """Send the motion and return its last answer, or None if the gripper is still and has not answered."""
+    def _watch(self, packet: Packet, deadline: float) -> Status:
+        """Send the motion and return its result."""
         link = self._link
         for command in _UPDATED:
             link.send(codec.update(command, _UPDATE_MS))
         self._may_be_moving = True
         link.begin(packet)
-        still_since = time.monotonic()
-        while True:
-            status = link.poll(packet.id, _POLL_S)
-            now = time.monotonic()
-            if status not in (None, Status.CMD_PENDING):
-                break
-            self._check_updates(now)
-            system, grasping = (link.updates[command][0] for command in _UPDATED)
-            try:
-                is_moving = GripperReading(codec.system_state(system), codec.grasping_state(grasping)).is_moving
-            except WireError:
-                is_moving = True  # unknown: read again
-            if is_moving or status is Status.CMD_PENDING:
-                still_since = now
-            if now - still_since > link.timeout_s:
-                break
+        while (status := link.poll(packet.id, _POLL_S)) in (None, Status.CMD_PENDING):
+            now, limit_s = time.monotonic(), self._options.max_state_age_s
+            if (age_s := now - link.updates[CommandId.SYSTEM_STATE][1]) > limit_s:
+                raise DeviceError(
+                    f"the state of the moving gripper must be at most {limit_s:g} s old, got {age_s:.2g} s; is the "
+                    "link overloaded?"
+                )
             if now > deadline:
                 raise DeviceError(f"the gripper did not end {command_name(packet.id)} in time and still moves")
-        link.needs_sync = True
         self._stop_updates()
+        assert status is not None, "the loop ends with a status"
         return status
-
-    def _check_updates(self, now: float) -> None:
-        """Watchdog: send FAST STOP and raise DeviceError if updates are missing."""
-        limit_s = self._options.max_state_age_s
-        if now - self._link.updates[CommandId.SYSTEM_STATE][1] <= limit_s:
-            return
-        self._link.pump(0.0)  # this program may have been suspended: process the updates that have arrived
-        age = time.monotonic() - self._link.updates[CommandId.SYSTEM_STATE][1]
-        if age <= limit_s:
-            return
-        error = DeviceError(
-            f"the state of the moving gripper must be at most {limit_s:g} s old, got {age:.2g} s: sent FAST STOP; is "
-            "the link overloaded?"
-        )
-        try:
-            self._link.send_urgent(Packet(CommandId.FAST_STOP))
-        except DeviceError as second:
-            error.add_note(str(second))
-        raise error
 
     def _read_until_still(self, deadline: float) -> GripperReading:
         """Return the gripper's state when it is still; raise DeviceError at the deadline."""
@@ -590,40 +482,29 @@ class WSG50(Gripper):
                 raise StillMoving(
                     f"the gripper should be still, but moves at {reading.opening_mm:.1f} mm: switch off its power"
                 )
-            self._link.pump(_POLL_S)
+            time.sleep(_POLL_S)
         return reading
 
     # Stopping.
 
     def _stop_over_link(self) -> None:
         """Stop the jaws, by FAST STOP if STOP fails, and wait until they are still; raise DeviceError if they move."""
-        limit_s = self._options.max_state_age_s + self._link.timeout_s
-        self._send_until_answered(CommandId.STOP, CommandId.STOP, CommandId.FAST_STOP, CommandId.FAST_STOP)
-        try:
-            self._read_until_still(time.monotonic() + limit_s)
-        except StillMoving:
-            self._send_until_answered(CommandId.FAST_STOP, CommandId.FAST_STOP)
-            self._read_until_still(time.monotonic() + limit_s)
+        self._link.open()
+        for command in (CommandId.STOP, CommandId.FAST_STOP):
+            with contextlib.suppress(CommandFailed):  # received; the state tells whether it was executed
+                self._link.send(Packet(command))
+            try:
+                self._read_until_still(time.monotonic() + self._options.max_state_age_s + self._link.timeout_s)
+                break
+            except StillMoving:
+                if command is CommandId.FAST_STOP:
+                    raise
+                _log.warning("%s: STOP has failed: sending FAST STOP", self.name)
         self._stop_updates()
 
     def _stop_updates(self) -> None:
         for command in _UPDATED:
             self._link.send(codec.query(command))
-
-    def _send_until_answered(self, *commands: CommandId) -> None:
-        """Send commands one after the other until one is answered."""
-        for number, command in enumerate(commands, start=1):
-            if command is CommandId.FAST_STOP:
-                _log.warning("%s: STOP has failed: sending FAST STOP", self.name)
-            try:
-                self._link.send_urgent(Packet(command))
-                return
-            except CommandFailed:
-                return  # received; the state is read next
-            except NoReply:
-                if number == len(commands):
-                    raise
-                self._link.pad()
 
     def _stop_if_moving(self) -> None:
         """Stop the jaws if they move or may move; else STOP would drop a held object."""
@@ -672,8 +553,7 @@ class WSG50(Gripper):
         if not self._options.acknowledge_faults:
             raise DeviceError(f"{self.name} is in FAST STOP: {system.faults}; {_ACTION}")
         _log.warning("%s is in FAST STOP (%s): acknowledging it", self.name, system.faults)
-        with contextlib.suppress(CommandFailed):  # a repeated command has nothing to acknowledge
-            self._link.send(codec.ACKNOWLEDGE)
+        self._link.send(codec.ACKNOWLEDGE)
         if self._query(CommandId.SYSTEM_STATE, codec.system_state) & SystemState.FAST_STOP:
             raise DeviceError(f"{self.name} is still in FAST STOP after acknowledgement: {system.faults}")
 

@@ -1,4 +1,4 @@
-"""Faults of the line of an emulated WSG-50: lost, damaged, late and split packets, and cuts.
+"""Faults of the line of an emulated WSG-50: late and split packets, missing answers, and cuts.
 
 A line is a stream: a late packet delays all packets behind it, and the order never changes.
 """
@@ -10,7 +10,7 @@ from collections import Counter
 from robot.drivers.wsg50.codec import encode
 
 DELAY_S = 0.05
-KINDS = ("dropped", "corrupted", "delayed", "split", "disconnect")
+KINDS = ("dropped", "delayed", "split", "disconnect")
 
 
 class LineFaults:
@@ -40,13 +40,11 @@ class LineFaults:
             return self._damaged(kind, encode(packet))
 
     def _damaged(self, kind, data):
-        bit, cut = self._random.randrange(8 * len(data)), self._random.randrange(1, len(data))
+        cut = self._random.randrange(1, len(data))
         return {
             None: [(0, data)],
             "dropped": [],
-            "corrupted": [(0, (int.from_bytes(data) ^ 1 << bit).to_bytes(len(data)))],
             "delayed": [(DELAY_S, data)],
             "split": [(0, data[:cut]), (DELAY_S, data[cut:])],
             "disconnect": [(0, None)],
-            "long": [(0, data[:4] + b"\xff\x00" + data[6:])],  # claims 255 bytes: the next packets are its payload
         }[kind]

@@ -1,24 +1,19 @@
-"""An emulated WSG-50 on a real port, TCP or pseudo-terminal, with line faults.
+"""An emulated WSG-50 on a TCP port, with faults of the line.
 
-    python -m tests.emulators.wsg50.server --tcp 10000 --object-mm 40
-    python -m tests.emulators.wsg50.server --pty
+    python -m tests.emulators.wsg50.server --port 1000 --object-mm 40
 
 or in a program:
 
-    with serve_tcp(EmulatedWSG50(object_mm=40.0)) as url, WSG50(port=url) as gripper:
+    with serve(EmulatedWSG50(object_mm=40.0)) as port, WSG50(host="127.0.0.1", port=port) as gripper:
         gripper.grasp(10.0)
 """
 
 import argparse
 import contextlib
-import os
 import select
 import socket
-import tempfile
 import threading
 import time
-import tty
-from pathlib import Path
 
 from robot.drivers.wsg50.codec import decode, encode
 from tests.emulators.wsg50.faults import LineFaults
@@ -33,8 +28,8 @@ class _Cut(Exception):
 
 
 @contextlib.contextmanager
-def serve_tcp(emulator, faults=None, *, port=0):
-    """Serve one client at a time on 127.0.0.1 and yield the URL for the driver. Port 0 chooses a free port."""
+def serve(emulator, faults=None, *, port=0):
+    """Serve one client at a time on 127.0.0.1 and yield the port. Port 0 chooses a free one."""
     with socket.create_server(("127.0.0.1", port)) as server:
         server.settimeout(0.02)
 
@@ -47,27 +42,7 @@ def serve_tcp(emulator, faults=None, *, port=0):
             return None
 
         with _served(emulator, faults, wait_for_client):
-            yield f"socket://127.0.0.1:{server.getsockname()[1]}"
-
-
-@contextlib.contextmanager
-def serve_pty(emulator, faults=None):
-    """Serve a pseudo-terminal and yield its path, which stays the same after a cut.
-
-    A cut or closed serial line does not raise a FAST STOP, because the gripper does not notice it.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "wsg50"
-        first = [_Terminal(path)]
-
-        def wait_for_client(stop):
-            return None if stop.is_set() else first.pop() if first else _Terminal(path)
-
-        with _served(emulator, faults, wait_for_client):
-            yield str(path)
-
-
-# Lines to one client; reading and writing raise OSError after it disconnected.
+            yield server.getsockname()[1]
 
 
 class _Socket:
@@ -81,32 +56,6 @@ class _Socket:
         return self._client.recv(_CHUNK)
 
 
-class _Terminal:
-    """The gripper's end of a pseudo-terminal; `path` is a link to the other end."""
-
-    def __init__(self, path):
-        self._own, self._other = os.openpty()
-        tty.setraw(self._other)  # stays open, so that clients can reconnect
-        os.set_blocking(self._own, False)
-        fresh = path.with_suffix(".new")
-        fresh.symlink_to(os.ttyname(self._other))
-        fresh.replace(path)
-
-    def fileno(self):
-        return self._own
-
-    def read(self):
-        return os.read(self._own, _CHUNK)
-
-    def write(self, data):
-        with contextlib.suppress(BlockingIOError):  # without a reader the bytes are lost, as on a wire
-            os.write(self._own, data)
-
-    def close(self):
-        os.close(self._own)
-        os.close(self._other)
-
-
 @contextlib.contextmanager
 def _served(emulator, faults, wait_for_client):
     """Serve one client after another in a thread, whatever they send."""
@@ -118,8 +67,7 @@ def _served(emulator, faults, wait_for_client):
             with contextlib.suppress(OSError, _Cut):  # the client disconnected
                 _Session(emulator, faults, line).run(stop)
             line.close()
-            if isinstance(line, _Socket):
-                emulator.disconnected()
+            emulator.disconnected()
 
     thread = threading.Thread(target=work, name="wsg50 emulator", daemon=True)
     thread.start()
@@ -182,15 +130,14 @@ def _packets(buffer):
 def main():
     """Serve until Ctrl-C; the first printed line is the address for clients."""
     parser = argparse.ArgumentParser(description="An emulated WSG-50 gripper.")
-    port = parser.add_mutually_exclusive_group(required=True)
-    port.add_argument("--tcp", type=int, metavar="PORT", help="listen on 127.0.0.1 (0: any free port)")
-    port.add_argument("--pty", action="store_true", help="create a pseudo-terminal")
+    parser.add_argument("--port", type=int, default=1000, help="port of 127.0.0.1 (0: any free port)")
     parser.add_argument("--object-mm", type=float, help="width of an object between the jaws")
     options = parser.parse_args()
-    emulator = EmulatedWSG50(object_mm=options.object_mm)
-    serving = serve_pty(emulator) if options.pty else serve_tcp(emulator, port=options.tcp)
-    with contextlib.suppress(KeyboardInterrupt), serving as address:
-        print(address, flush=True)
+    with (
+        contextlib.suppress(KeyboardInterrupt),
+        serve(EmulatedWSG50(object_mm=options.object_mm), port=options.port) as port,
+    ):
+        print(f"127.0.0.1:{port}", flush=True)
         threading.Event().wait()
 
 

@@ -2,7 +2,6 @@
 
 import sys
 import tomllib
-from types import SimpleNamespace
 
 import pytest
 
@@ -13,14 +12,13 @@ from tests.fake_video import FakeRealSense
 
 @pytest.fixture(autouse=True)
 def _nothing_installed(monkeypatch):
-    for name in ("pyrealsense2", "serial", "serial.tools"):
-        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
 
 
 @pytest.fixture
 def roots(tmp_path):
     """Empty /dev and /sys."""
-    for name in ("dev/v4l/by-id", "dev/serial/by-id", "sys/class/video4linux"):
+    for name in ("dev/v4l/by-id", "sys/class/video4linux"):
         (tmp_path / name).mkdir(parents=True)
     return tmp_path / "dev", tmp_path / "sys"
 
@@ -78,16 +76,6 @@ def test_a_camera_without_a_name_of_its_own_is_named_by_its_socket(roots):
     own, socket = str(dev / "v4l/by-id/usb-Maker_Gel-video-index0"), str(by_path / "pci-usb-0:1:1.0-video-index0")
     assert discover.camera_names(dev) == [own, socket]
     assert [(each.device, each.label) for each in discover.find_cameras(*roots)] == [(own, "Gel"), (socket, "Gel")]
-
-
-def test_serial_ports_with_hardware_are_found_by_their_stable_names(roots, monkeypatch):
-    link = roots[0] / "serial" / "by-id" / "usb-FTDI_7"
-    link.symlink_to(roots[0] / "ttyUSB0")
-    devices = {str(roots[0] / "ttyUSB0"): "USB VID:PID=1:2", "/dev/ttyACM7": "USB", "/dev/ttyS0": "n/a"}
-    ports = [SimpleNamespace(device=device, hwid=hwid, description="") for device, hwid in devices.items()]
-    tools = SimpleNamespace(list_ports=SimpleNamespace(comports=lambda: ports))
-    monkeypatch.setitem(sys.modules, "serial.tools", tools)
-    assert [each.device for each in discover.find_serial_ports(roots[0])] == [str(link), "/dev/ttyACM7"]
 
 
 def test_depth_cameras_are_listed_by_their_installed_packages(roots, monkeypatch):

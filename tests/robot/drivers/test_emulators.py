@@ -11,8 +11,7 @@ from tests.waiting import first_line, run_process
 @pytest.mark.parametrize(
     ("arguments", "address"),
     [
-        (["wsg50.server", "--tcp", "0", "--object-mm", "40"], "socket://127.0.0.1:"),
-        (["wsg50.server", "--pty"], "/"),
+        (["wsg50.server", "--port", "0", "--object-mm", "40"], "127.0.0.1:"),
         (["sawyer.server", "--port", "0"], "ws://127.0.0.1:"),
     ],
 )
