@@ -19,7 +19,6 @@ from retrieval.training.recipes import RECIPES
 
 if TYPE_CHECKING:
     from retrieval.model.config import Config
-    from retrieval.training.loop import OnStep
 
 
 def train(
@@ -52,23 +51,19 @@ def train(
     ] = None,
     iterations: Iterations = None,
     split: SplitFile = None,
-    tracker: Annotated[
-        str | None,
-        typer.Option(help="report each step to a tracker that a package registers, or to module:function of yours"),
-    ] = None,
 ) -> None:
     """Train a matcher by the best of several recipes, or a grasp-success gate for `collect`."""
     from retrieval.model.checkpoint import require_writable
 
     require_writable(out)
     if task == "grasp-success":
-        others = {"recipe": recipe, "model": model, "config": config, "split": split, "init": init, "tracker": tracker}
+        others = {"recipe": recipe, "model": model, "config": config, "split": split, "init": init}
         refuse_options("does not apply to --task grasp-success, which takes --iterations", **others)
         _train_gate(recording, out, iterations)
     elif config is not None:
         refuse_options("does not apply with --config", recipe=recipe, model=model, task=task != "match")
         settings = training_config(config, iterations, init=init)
-        _train_with_config(recording, out, settings, split, _tracked(tracker, out))
+        _train_with_config(recording, out, settings, split)
     else:
         refuse_options("needs --config", iterations=iterations)
         from retrieval.data.check.recording import check_gel_layout
@@ -78,20 +73,10 @@ def train(
         for finding in check_gel_layout(recording):
             say(f"{finding.severity}: {finding.message}")
         options: dict[str, Any] = {"recipe": recipe, "model": model, "init": init or "imagenet"}
-        options["on_step"] = _tracked(tracker, out)
         if task == "touches":
-            refuse_options("does not apply to --task touches", recipe=recipe, model=model, tracker=tracker)
+            refuse_options("does not apply to --task touches", recipe=recipe, model=model)
         made = train_model(recording, out, touches_only=task == "touches", split=read_split(split), **options)
         print_comparison(made)
-
-
-def _tracked(tracker: str | None, out: Path) -> "OnStep | None":
-    if tracker is None:
-        return None
-    from retrieval.training.trackers import TRACKERS
-
-    on_step: OnStep = TRACKERS.resolve(tracker)(out)
-    return on_step
 
 
 def _train_gate(recording: Path, out: Path, iterations: int | None) -> None:
@@ -115,19 +100,13 @@ def _train_gate(recording: Path, out: Path, iterations: int | None) -> None:
     say(f"accepted: {', '.join(accepted)}")
 
 
-def _train_with_config(
-    recording: Path,
-    out: Path,
-    settings: "Config",
-    split: Path | None,
-    on_step: "OnStep | None",
-) -> None:
+def _train_with_config(recording: Path, out: Path, settings: "Config", split: Path | None) -> None:
     from retrieval.training.initial_weights import training_licences
     from retrieval.training.trainer import train_matcher
 
     for licence in training_licences(recording, settings.training):
         say(f"licence of {licence.source}: {licence}")
-    checkpoint = train_matcher(recording, out, settings, split=read_split(split), on_step=on_step)
+    checkpoint = train_matcher(recording, out, settings, split=read_split(split))
     accuracy = checkpoint.provenance["metrics"].get("validation_pair_accuracy")
     reached = "" if accuracy is None else f", pair accuracy of validation objects {accuracy:.3f} (chance 0.5)"
     say(f"{out}: best step {checkpoint.provenance['step']}{reached}")

@@ -5,7 +5,6 @@ import json
 import os
 import shutil
 import signal
-import sys
 from copy import deepcopy
 from pathlib import Path
 from pkgutil import resolve_name
@@ -18,7 +17,6 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from retrieval.commands.main import main
 from retrieval.data.dataset import Split, load_grasps, make_split
 from retrieval.data.pairs import PairSampler
 from retrieval.errors import BadInput, CheckpointError, ConfigError, DatasetError, JobInterrupted
@@ -30,6 +28,7 @@ from retrieval.training.augmentation import augment_photos
 from retrieval.training.batches import BatchImages, TrainedFeatures
 from retrieval.training.initial_weights import build_matcher
 from retrieval.training.loop import state_path
+from retrieval.training.train import train
 from retrieval.training.trainer import (
     Trainer,
     WeightedLosses,
@@ -39,7 +38,6 @@ from retrieval.training.trainer import (
     train_matcher,
 )
 from tests.conftest import TINY
-from tests.documents import ROOT, blocks
 
 CPU = torch.device("cpu")
 
@@ -437,15 +435,8 @@ def test_a_checkpoint_with_other_towers_cannot_start_a_training(model):
         build_matcher(with_training(with_matcher(TINY, tower="resnet18"), start=str(model)))
 
 
-def test_a_tracker_of_the_documentation_is_told_of_each_step_of_a_training(recording, tmp_path, monkeypatch):
-    (text,) = (block for block in blocks("python", ROOT / "docs" / "extending.md") if "def trackio" in block)
-    (tmp_path / "trackers.py").write_text(text)
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setitem(sys.modules, "trackio", tracker := Mock())
-    out = str(tmp_path / "m.safetensors")
-    command = ["train", str(recording), "--config", "tiny", "--iterations", "2", "--out", out]
-    assert main([*command, "--tracker", "trackers:trackio"]) == 0
-    tracker.init.assert_called_once_with(project="touch-retrieval", name="m")
-    assert [call.kwargs["step"] for call in tracker.log.call_args_list] == [0, 1, 2]
-    assert {"loss", "learning_rate", "validation_auc"} <= tracker.log.call_args.args[0].keys()
-    assert main([*command, "--tracker", "none"]) == 2
+def test_a_callback_is_told_of_each_step_of_a_training(recording, tmp_path):
+    told = {}
+    train(recording, tmp_path / "m.safetensors", with_training(TINY, iterations=2), on_step=told.__setitem__)
+    assert list(told) == [0, 1, 2]
+    assert {"loss", "learning_rate", "validation_auc"} <= told[2].keys()
