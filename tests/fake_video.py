@@ -87,13 +87,10 @@ class FakeCapture:
 
 
 class FakeRealSense:
-    """The module pyrealsense2 with one or more cameras: 4 x 3 pixels, depth scale 0.5 mm.
+    """The module pyrealsense2 with one or more cameras: 4 x 3 pixels, depth scale 0.5 mm."""
 
-    `distortion` are the coefficients of the colour lens, which shifts pixels along x by the first coefficient.
-    """
-
-    def __init__(self, serials=("123",), distortion=(0.0,) * 5):
-        self.serials, self.distortion = serials, distortion
+    def __init__(self, serials=("123",)):
+        self.serials = serials
         self.waiting = 0
         self.started, self.stopped, self.streams = [], 0, []
         self.silent = False
@@ -121,14 +118,10 @@ class FakeRealSense:
         assert stream == "colour"
         return SimpleNamespace(process=lambda frames: frames)
 
-    def rs2_project_point_to_pixel(self, lens, point):
-        x, y, z = point
-        return [x / z * lens.fx + lens.ppx + lens.coeffs[0], y / z * lens.fy + lens.ppy]
-
     def _profile(self):
         if self.silent:
             raise RuntimeError("Couldn't resolve requests")
-        lens = SimpleNamespace(width=4, height=3, fx=10.0, fy=11.0, ppx=1.5, ppy=1.0, coeffs=list(self.distortion))
+        lens = SimpleNamespace(width=4, height=3, fx=10.0, fy=11.0, ppx=1.5, ppy=1.0, coeffs=[0.0] * 5)
         video = SimpleNamespace(get_intrinsics=lambda: lens, fps=lambda: 30)
         sensor = SimpleNamespace(get_depth_scale=lambda: 0.0005)
         return SimpleNamespace(

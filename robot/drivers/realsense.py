@@ -1,8 +1,8 @@
 """Intel RealSense through pyrealsense2: colour, and depth aligned to the colour camera.
 
 Facts used (librealsense): depth is in units of the sensor's depth scale (m), 0 where unknown. `align` maps it to the
-colour stream's pixels. Pixel coordinates count from the centre of the first pixel. rs2_project_point_to_pixel applies
-the distortion model of the colour stream. Automatic exposure settles within about 30 pictures.
+colour stream's pixels. Pixel coordinates count from the centre of the first pixel. Automatic exposure settles within
+about 30 pictures.
 """
 
 import contextlib
@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
@@ -45,8 +44,7 @@ class RealSenseSettings(TypedSettings):
 class RealSense(Camera):
     """A RealSense depth camera; the fields of RealSenseSettings are keyword arguments of the constructor.
 
-    A picture with lens distortion is undistorted by the vendor's model, and `settings` reports it. Depth takes the
-    nearest pixel, because interpolation would invent depth at edges.
+    `settings` reports the distortion of the colour lens, which is not corrected: a few pixels in the corners.
     """
 
     Settings = RealSenseSettings
@@ -59,7 +57,6 @@ class RealSense(Camera):
         self._align: Any = None
         self._intrinsics: Intrinsics | None = None
         self._scale_m = 0.0
-        self._undistortion: npt.NDArray[np.float32] | None = None
         self._reported: dict[str, Any] = {}
 
     def _connect(self) -> None:
@@ -90,21 +87,18 @@ class RealSense(Camera):
         return serial or connected[0]
 
     def _read_parameters(self, rs: Any, profile: Any, serial: str) -> None:
-        """Read the depth scale, the intrinsics and the distortion."""
+        """Read the depth scale and the intrinsics."""
         video = profile.get_stream(rs.stream.color).as_video_stream_profile()
         lens = video.get_intrinsics()
         self._scale_m = float(profile.get_device().first_depth_sensor().get_depth_scale())
-        coefficients = list(map(float, lens.coeffs))
         self._intrinsics = Intrinsics(lens.fx, lens.fy, lens.ppx, lens.ppy)
-        self._undistortion = _undistortion(rs, lens) if any(coefficients) else None
         self._reported = {
             "serial": serial,
             "width": int(lens.width),
             "height": int(lens.height),
             "fps": int(video.fps()),
             "depth_scale_m": self._scale_m,
-            "distortion": coefficients,
-            "undistorted": self._undistortion is not None,
+            "distortion": list(map(float, lens.coeffs)),
         }
 
     def _settings(self) -> dict[str, Any]:
@@ -141,18 +135,5 @@ class RealSense(Camera):
                 frames = self._align.process(frames)
             colour = np.array(frames.get_color_frame().get_data())  # a copy: the package reuses the memory
             raw = np.array(frames.get_depth_frame().get_data()) if depth else None
-        if (lens_map := self._undistortion) is not None:
-            colour = np.asarray(cv2.remap(colour, lens_map, None, cv2.INTER_LINEAR), np.uint8)
-            raw = None if raw is None else cv2.remap(raw, lens_map, None, cv2.INTER_NEAREST, borderValue=0)
         depth_m = None if raw is None else np.where(raw > 0, raw * np.float32(self._scale_m), np.float32(np.nan))
         return RGBD(colour, depth_m, self._intrinsics, time_s)
-
-
-def _undistortion(rs: Any, lens: Any) -> npt.NDArray[np.float32]:
-    """Return the (H, W, 2) distorted pixel coordinates of each pixel of the undistorted picture."""
-    coordinates = np.empty((lens.height, lens.width, 2), np.float32)
-    for row in range(lens.height):
-        y = (row - lens.ppy) / lens.fy
-        for column in range(lens.width):
-            coordinates[row, column] = rs.rs2_project_point_to_pixel(lens, [(column - lens.ppx) / lens.fx, y, 1.0])
-    return coordinates

@@ -40,26 +40,9 @@ def test_a_realsense_returns_colour_and_depth_in_metres_with_its_intrinsics(inst
         lens = image.intrinsics
         assert (lens.fx, lens.fy, lens.cx, lens.cy) == (10.0, 11.0, 1.5, 1.0)
         assert eye.settings()["depth_scale_m"] == 0.0005
-        assert eye.settings()["undistorted"] is False
     assert rs.started == ["123"]
     assert rs.streams == [("depth", 640, 480, "z16", 30), ("colour", 640, 480, "rgb8", 30)]
     assert rs.stopped == 1
-
-
-def test_a_realsense_with_a_distorted_lens_is_undistorted_by_the_vendors_model(install):
-    """The lens shifts the picture by one pixel to the right, so all moves left and the last column is unknown."""
-    install(FakeRealSense(distortion=(1.0, 0.0, 0.0, 0.0, 0.0)))
-    with realsense() as eye:
-        image = eye.read()
-        assert eye.settings()["undistorted"] is True
-        assert eye.settings()["distortion"][0] == 1.0
-    assert image.colour[0, :3, 0].tolist() == [10, 20, 30]
-    np.testing.assert_allclose(image.depth_m[0], [0.5, 0.5, 1.0, np.nan], rtol=1e-6)
-    # With a shift of half a pixel, interpolated depth would be that of a surface at 0.75 m, which is not there.
-    install(FakeRealSense(distortion=(0.5, 0.0, 0.0, 0.0, 0.0)))
-    with realsense() as eye:
-        depth = eye.read().depth_m
-    assert set(depth[np.isfinite(depth)].tolist()) <= {0.5, 1.0}
 
 
 @pytest.mark.parametrize(
