@@ -54,8 +54,7 @@ def find_cameras(dev: Path = DEV, sys: Path = SYS) -> list[DiscoveredDevice]:
         label = _text(folder / "name") or Path(name).name
         words = f"{label} {Path(name).name}".lower().replace("_", " ")
         driver = next((driver for word, driver in _GEL_SENSORS.items() if word in words), "uvc")
-        more = "" if named else "\nallow_index = true"
-        cameras.append(DiscoveredDevice("camera", name, label, f'driver = "{driver}"\ndevice = "{name}"{more}'))
+        cameras.append(DiscoveredDevice("camera", name, label, f'driver = "{driver}"\ndevice = "{name}"'))
     return cameras
 
 

@@ -98,7 +98,7 @@ class OpencvTactile(UsbDevice, TactileSensor):
         """Check the settings without using the device; raise RobotConfigError if invalid."""
         super().__init__(f"gel {finger}", finger, clock=clock)
         self._options = GelCameraSettings(**{**self.PRESET, **settings})
-        self._path = stable_path(self._options.device, self._options.allow_index)
+        self._path = stable_path(self._options.device)
         self._picture_px: list[int] = []
 
     def read_after(self, time_s: float, timeout_s: float) -> Frame:
@@ -210,7 +210,7 @@ class UvcCamera(UsbDevice, Camera):
         """Check the settings without using the device; raise RobotConfigError for one out of range."""
         super().__init__("usb camera", extrinsics, clock=clock)
         self._options = UvcSettings(**settings)
-        self._path = stable_path(self._options.device, self._options.allow_index)
+        self._path = stable_path(self._options.device)
 
     def _read(self, depth: bool) -> RGBD:
         frame = self._reader.newest()

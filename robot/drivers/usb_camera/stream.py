@@ -61,8 +61,7 @@ class UsbCameraSettings(TypedSettings):
     """Settings of a USB camera; what is None is not changed.
 
     Attributes:
-        device: Path in /dev/v4l/by-id, or in by-path (the socket).
-        allow_index: Whether `device` may be a number or a path such as /dev/video0.
+        device: Path in /dev/v4l/by-id, or in by-path (the socket); such as /dev/video0 only on a system without them.
         fourcc: Pixel format, such as "MJPG".
         exposure_ms: Exposure, if not automatic.
         white_balance_k: Colour temperature, if not automatic.
@@ -75,7 +74,6 @@ class UsbCameraSettings(TypedSettings):
     """
 
     device: str
-    allow_index: bool = False
     width: Annotated[int, Meta(ge=1, le=20_000)] | None = None
     height: Annotated[int, Meta(ge=1, le=20_000)] | None = None
     fps: Annotated[float, Meta(gt=0, le=1000)] | None = None
@@ -224,21 +222,17 @@ def open_capture(device: str) -> Any:
     return cv2.VideoCapture(os.path.realpath(device), cv2.CAP_V4L2)
 
 
-def stable_path(device: str, allow_index: bool) -> str:
-    """Return the path of a `device` of a rig's file; raise RobotConfigError unless it is stable or `allow_index`."""
-    path = f"/dev/video{device}" if device.isascii() and device.isdigit() else device
-    if not os.path.isabs(path):
-        raise RobotConfigError(f"a camera must be named by its absolute path, got {device!r}.{_connected_cameras()}")
-    if allow_index or not _NUMBERED.fullmatch(os.path.normpath(path)):
-        return path
-    known = (
-        _connected_cameras()
-        or " This system has no stable names: set allow_index = true if only one camera is ever plugged in"
-    )
-    raise RobotConfigError(
-        "a camera must be named by a stable path in /dev/v4l/by-id, "
-        f"got {device!r}, a number that another camera may have after a restart.{known}"
-    )
+def stable_path(device: str) -> str:
+    """Return the path of a `device` of a rig's file; raise RobotConfigError if the system has a stable one instead."""
+    known = _connected_cameras()
+    if not os.path.isabs(device):
+        raise RobotConfigError(f"a camera must be named by its absolute path, got {device!r}.{known}")
+    if known and _NUMBERED.fullmatch(os.path.normpath(device)):
+        raise RobotConfigError(
+            "a camera must be named by a stable path in /dev/v4l/by-id, "
+            f"got {device!r}, a number that another camera may have after a restart.{known}"
+        )
+    return device
 
 
 def _connected_cameras() -> str:

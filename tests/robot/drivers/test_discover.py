@@ -61,7 +61,7 @@ def test_without_stable_names_cameras_are_found_by_number(roots):
     plug_camera(roots, None, 2, "Webcam")
     plug_camera(roots, None, 3, "Webcam", index="1")
     (found,) = discover.discover(*roots)
-    assert tomllib.loads(found.toml) == {"driver": "uvc", "device": str(roots[0] / "video2"), "allow_index": True}
+    assert tomllib.loads(found.toml) == {"driver": "uvc", "device": str(roots[0] / "video2")}
 
 
 def test_a_camera_without_a_name_of_its_own_is_named_by_its_socket(roots):

@@ -48,17 +48,17 @@ def plug(dev, monkeypatch):
     return plugged
 
 
-@pytest.mark.parametrize("device", ["0", "/dev/video2", "/dev//video2", "/dev/v4l/by-id/../../video2"])
+@pytest.mark.parametrize("device", ["/dev/video2", "/dev//video2", "/dev/v4l/by-id/../../video2"])
 def test_a_camera_named_by_a_number_is_refused_with_the_names_of_those_connected(plug, device):
     name = plug(FakeVideoDevice())
     with pytest.raises(RobotConfigError, match=f"another camera may have after a restart. Connected: {name}$"):
         OpencvTactile(finger="a", device=device)
 
 
-def test_a_camera_without_a_stable_name_needs_allow_index_and_a_missing_one_is_named(plug, dev):
-    with pytest.raises(RobotConfigError, match="set allow_index = true"):
-        OpencvTactile(finger="a", device="0")
-    assert stable_path("3", allow_index=True) == stable_path("/dev/video3", allow_index=True) == "/dev/video3"
+def test_a_camera_has_a_number_only_where_no_name_is_stable_and_a_missing_one_is_named(plug, dev):
+    assert stable_path("/dev/video3") == "/dev/video3"
+    with pytest.raises(RobotConfigError, match="absolute path, got '3'"):
+        stable_path("3")
     name = plug(FakeVideoDevice())
     with pytest.raises(DeviceError, match=f"usb-Other does not exist.*Connected: {name}"):
         OpencvTactile(finger="a", device=str(dev / "v4l" / "by-id" / "usb-Other")).connect()
