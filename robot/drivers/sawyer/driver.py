@@ -8,9 +8,8 @@ detection), so the workspace must be free.
 
 At every step the joint state must be fresh (`max_state_age_s`), the robot enabled, no collision reported and the arm
 near its commands; else the arm holds its position. /robot/state and the collision state are slower: they may be 2 s
-old. A robot without a collision state can be used; `refused` then reports that collisions are not detected. If
-commands stop (the program or the network failed), the robot ends the motion after _COMMAND_TIMEOUT_S. This driver
-never resets an emergency stop.
+old. If commands stop (the program or the network failed), the robot ends the motion after _COMMAND_TIMEOUT_S. This
+driver never resets an emergency stop.
 
 The link uses `websockets`, because roslibpy sends a message that was published during a connection loss seconds later,
 without an error, and drops rosbridge's errors. Here nothing is sent twice and nothing is queued: a lost connection
@@ -215,7 +214,6 @@ def _shorten(text: object) -> str:
 _STATE_TOPICS = (codec.JOINT_STATES, codec.ROBOT_STATE, codec.TIP_STATES, codec.COLLISION)
 _SLOW_STATE_AGE_S = 2.0
 """Oldest accepted /robot/state and collision state, which are slower than the joint states."""
-_COLLISIONS = "collision state"
 _MAX_LAG_RAD = 0.35
 """An arm this far behind its commands is blocked; a lag of half a second at 0.5 rad/s is 0.25 rad."""
 _MAX_TURN_RAD = 0.5
@@ -228,8 +226,8 @@ _TICK_S, _COMMAND_TIMEOUT_S = 0.01, 0.2
 """Time between two commands; time without commands after which the robot ends the motion."""
 _ARRIVAL_RAD, _SETTLE_S = 0.01, 5.0
 """Tolerance of every joint at the goal, and time to arrive after the last command."""
-_BACK_OFF_S, _LONGEST_BACK_OFF_S = 0.25, 5.0
-"""First and longest wait between two tries to connect; without the limit, doubling 20 times would take days."""
+_RECONNECT_S = (0.0, 0.25, 1.0, 5.0)
+"""Waits before the tries to connect again."""
 _MARGIN_MM = 20.0
 """A motion may begin this far outside the workspace, after a stop or a push."""
 
@@ -260,7 +258,6 @@ class SawyerSettings(TypedSettings):
     speed_ratio: Annotated[float, Meta(ge=0.01, le=1)] = 0.3
     joint_speed_rad_s: Annotated[float, Meta(ge=0.01, le=1.5)] = 0.5
     timeout_s: Annotated[float, Meta(ge=0.05, le=60)] = 2.0
-    reconnect_tries: Annotated[int, Meta(ge=1, le=20)] = 5
     enable: bool = False
     max_speed_mm_s: float = 200.0
     max_state_age_s: Annotated[float, Meta(ge=0.02, le=5)] = 0.5
@@ -280,26 +277,17 @@ class Sawyer(Arm):
         self._url = f"ws://{options.host}:{options.port}"
 
     def _connect(self) -> None:
-        self._sees_collisions = False
         self._open_link()
-        self.refused.pop(_COLLISIONS, None)
-        try:
-            self._link.wait_for(codec.COLLISION[0])
-            self._sees_collisions = True
-        except DeviceError:
-            self._link.check()
-            self.refused[_COLLISIONS] = "no messages: collisions are not detected"
-            _LOG.warning("%s: no messages on %s: collisions are not detected", self.name, codec.COLLISION[0])
         self._make_ready()
 
     def _open_link(self) -> None:
-        """Open a new link and wait for each state once, also the collision state if it was available on connecting."""
+        """Open a new link and wait for each state once."""
         self._link = RosbridgeLink(self._url, timeout_s=self._options.timeout_s, clock=self.clock)
         self._link.open()
         for topic, kind in (*_STATE_TOPICS, codec.SPEED_RATIO, codec.COMMAND_TIMEOUT):
             self._link.subscribe(topic, kind)
         self._link.advertise(*codec.JOINT_COMMAND)
-        for topic, _ in _STATE_TOPICS if self._sees_collisions else _STATE_TOPICS[:-1]:
+        for topic, _ in _STATE_TOPICS:
             self._link.wait_for(topic)
         self._set("speed_ratio", codec.SPEED_RATIO, self._options.speed_ratio)
         self._set("command_timeout_s", codec.COMMAND_TIMEOUT, _COMMAND_TIMEOUT_S)
@@ -348,9 +336,9 @@ class Sawyer(Arm):
         return codec.parse(arrivals[-1].message, codec.Float).data if arrivals else None
 
     def _recover(self) -> None:
-        """Connect again with back-off if the link or a state is lost; raise DeviceError if a person must act."""
-        tries = self._options.reconnect_tries
-        for number in range(tries + 1):
+        """Connect again if the link or a state is lost; raise DeviceError if a person must act."""
+        for number, wait_s in enumerate((0.0, *_RECONNECT_S)):
+            time.sleep(wait_s)
             try:
                 if number:
                     self._open_link()
@@ -361,10 +349,9 @@ class Sawyer(Arm):
                 break
             except DeviceError as error:
                 self._link.close()
-                if number == tries:
+                if number == len(_RECONNECT_S):
                     raise
-                _LOG.warning("%s: %s; connecting again, try %d of %d", self.name, error, number + 1, tries)
-            time.sleep(min(_BACK_OFF_S * 2**number, _LONGEST_BACK_OFF_S) if number else 0.0)
+                _LOG.warning("%s: %s; connecting again", self.name, error)
         if self._has_collided_since(-math.inf, newest=True):
             raise DeviceError(f"{self.name}: recovery is refused: {codec.COLLIDED}")
         self._make_ready()
@@ -511,10 +498,8 @@ class Sawyer(Arm):
         return codec.parse(arrivals[-1].message, codec.RobotState)
 
     def _collisions(self) -> Sequence[ReceivedMessage]:
-        """Return the collision states; empty only if there was none on connecting either."""
         arrivals = self._link.history(codec.COLLISION[0])
-        if arrivals or self._sees_collisions:
-            self._check_arrives(codec.COLLISION[0], arrivals, "a collision")
+        self._check_arrives(codec.COLLISION[0], arrivals, "a collision")
         return arrivals
 
     def _check_arrives(self, topic: str, arrivals: Sequence[ReceivedMessage], event: str) -> None:
