@@ -12,7 +12,6 @@
     [camera]
     driver = "realsense"
     hand_eye = "hand_eye.json"                # camera pose in the rig's frame, from `retrieve rig calibrate`
-    hand_eye_days = 30                        # oldest accepted calibration
     [gel.a]                                   # known material constants (robot.gel_settings)
     [grasp]                                   # random grasps (robot.grasping.settings.GraspSettings)
     [attempt]                                 # speeds, waits, retries (robot.grasping.settings.AttemptSettings)
@@ -77,8 +76,6 @@ DRIVERS: Mapping[str, Registry[type[Device]]] = {
 }
 """Drivers by role and name; installed packages register drivers of all roles in one group of entry points."""
 
-MAX_HAND_EYE_AGE_DAYS = 30.0
-"""Oldest accepted calibration, unless the camera's table sets `hand_eye_days`; a camera may be moved over time."""
 MIN_WAIT_S = 0.1
 """Shortest wait between a motion and the picture of its result: three frames of a gel at 30 frames/s."""
 
@@ -170,12 +167,9 @@ def load_driver(role: str, table: Mapping[str, Any], where: str, **arguments: An
 
 def _camera(table: Mapping[str, Any]) -> Camera:
     settings = dict(table)
-    file, days = settings.pop("hand_eye", None), settings.pop("hand_eye_days", MAX_HAND_EYE_AGE_DAYS)
-    extrinsics = np.eye(4)
+    file, extrinsics = settings.pop("hand_eye", None), np.eye(4)
     if file is not None:
-        path = Path(typed(file, str, "[camera]: hand_eye", error=RobotConfigError))
-        typed(days, float, "[camera]: hand_eye_days", error=RobotConfigError)
-        extrinsics = hand_eye.load_hand_eye(path, days)
+        extrinsics = hand_eye.load_hand_eye(Path(typed(file, str, "[camera]: hand_eye", error=RobotConfigError)))
     camera: Camera = load_driver("camera", settings, "[camera]", extrinsics=extrinsics)
     if camera.has_depth and file is None:
         raise RobotConfigError(

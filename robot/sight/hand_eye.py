@@ -7,7 +7,7 @@ Points are (N, 3) in mm, in the camera frame of robot.devices and in the rig's f
 import json
 import warnings
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -34,8 +34,8 @@ _MIN_EXTENT_MM = 25.0
 """Points of a smaller extent are in metres, centimetres or inches, or too near to each other for a rotation."""
 _UNIT_RATIO = 5.0
 """If one extent exceeds the other by this factor, the smaller one has another unit: a motion keeps distances."""
-_SAME_MM = 10.0
-"""Points within this distance are one point that was measured again."""
+_MIN_TRANSLATION_MM = 10.0
+"""A camera that is nearer to the rig's origin has a translation in metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,20 +54,21 @@ class HandEye:
             write_atomically(path, f"{document}\n".encode())
 
 
-def fit_hand_eye(camera_mm: npt.ArrayLike, rig_mm: npt.ArrayLike, *, written: datetime | None = None) -> HandEye:
+def fit_hand_eye(camera_mm: npt.ArrayLike, rig_mm: npt.ArrayLike) -> HandEye:
     """Fit the rotation and translation from camera points to rig points, by least squares.
 
     Args:
-        camera_mm: (N, 3) points in the camera frame, at least 4 different ones that do not lie on one line.
+        camera_mm: (N, 3) points in the camera frame, at least 4, not on one line.
         rig_mm: (N, 3) the same points in the rig's frame.
-        written: Time of the calibration; now by default.
 
     Raises:
         RobotConfigError: The points are too few, on one line, in metres or not finite.
     """
     camera, rig = np.asarray(camera_mm, np.float64), np.asarray(rig_mm, np.float64)
-    if camera.shape != rig.shape or camera.ndim != 2 or camera.shape[1] != 3:
-        raise RobotConfigError(f"points must be two arrays of N x 3 mm, got {camera.shape} and {rig.shape}")
+    if camera.shape != rig.shape or camera.ndim != 2 or camera.shape[1] != 3 or len(camera) < 4:
+        raise RobotConfigError(
+            f"points must be two arrays of N x 3 mm, N at least 4, got {camera.shape} and {rig.shape}; measure more"
+        )
     if not (np.isfinite(camera).all() and np.isfinite(rig).all()):
         raise RobotConfigError("points must be finite numbers of mm; measure the others again")
     arms = [points - points.mean(0) for points in (camera, rig)]
@@ -79,11 +80,6 @@ def fit_hand_eye(camera_mm: npt.ArrayLike, rig_mm: npt.ArrayLike, *, written: da
                 f"{other:.3g}; if they are in metres, multiply them by 1000 (centimetres: 10, inches: 25.4), else "
                 "measure points that are farther apart"
             )
-    distinct = min(map(_distinct, (camera, rig)))
-    if distinct < 4:
-        raise RobotConfigError(
-            f"a calibration requires at least 4 different points, got {distinct}; measure more, {_SAME_MM:g} mm apart"
-        )
     for name, arm in zip(("camera", "rig"), arms, strict=True):
         along, across, _ = np.linalg.svd(arm, compute_uv=False)
         if across < MIN_SPREAD * along:
@@ -95,15 +91,7 @@ def fit_hand_eye(camera_mm: npt.ArrayLike, rig_mm: npt.ArrayLike, *, written: da
     rigid[:3, :3] = rotation.as_matrix()
     rigid[:3, 3] = rig.mean(0) - rotation.apply(camera.mean(0))
     residuals = np.linalg.norm(rotation.apply(arms[0]) - arms[1], axis=1)
-    return HandEye(rigid, residuals, (written or datetime.now(UTC)).replace(microsecond=0))
-
-
-def _distinct(points: Points) -> int:
-    kept: list[Points] = []
-    for point in points:
-        if all(np.linalg.norm(point - other) > _SAME_MM for other in kept):
-            kept.append(point)
-    return len(kept)
+    return HandEye(rigid, residuals, datetime.now(UTC).replace(microsecond=0))
 
 
 def read_pairs(path: Path) -> tuple[Points, Points]:
@@ -123,27 +111,15 @@ class _Document:
     residuals_mm: tuple[float, ...]
 
 
-def load_hand_eye(path: Path, max_age_days: float) -> Points:
-    """Return the (4, 4) motion of a saved calibration that is at most `max_age_days` old.
-
-    Raises:
-        RobotConfigError: The file is not a calibration, or it is too old.
-    """
+def load_hand_eye(path: Path) -> Points:
+    """Return the (4, 4) motion of a saved calibration; raise RobotConfigError if the file is not one."""
     try:
         document = typed(read_json_object(path, RobotConfigError), _Document)
     except ValueError as error:
         raise RobotConfigError(
             f"{path} is not a hand-eye calibration: {error}; make it again with `retrieve rig calibrate`"
         ) from error
-    age = datetime.now(UTC) - document.written.astimezone(UTC)
-    if age < -timedelta(days=1):  # clocks differ
-        raise RobotConfigError(f"{path} was written {-age.days} days in the future; set the clock, or calibrate again")
-    if age > timedelta(days=max_age_days):
-        raise RobotConfigError(
-            f"{path} must be at most {max_age_days:g} days old, got {age / timedelta(days=1):.0f}; calibrate again, or "
-            "allow more days"
-        )
     rigid = np.array(document.rigid)
-    if (far := float(np.linalg.norm(rigid[:3, 3]))) < _SAME_MM:
+    if (far := float(np.linalg.norm(rigid[:3, 3]))) < _MIN_TRANSLATION_MM:
         raise RobotConfigError(f"{path}: its translation must be in mm, got {far:.3g}; multiply one in metres by 1000")
     return rigid

@@ -35,9 +35,9 @@ def check(folder, get):
         assert message in " ".join(capsys.readouterr().err.split())
         assert not out.exists()
     fit_hand_eye(CAMERA, rig).save(out)
-    load_hand_eye(out, 1)
+    load_hand_eye(out)
     fit = fit_hand_eye(CAMERA, rig)  # as another program writes it
     fit.rigid[:3, 3] /= 1000
     fit.save(out)
     with pytest.raises(RobotConfigError, match="translation must be in mm"):
-        load_hand_eye(out, 1)
+        load_hand_eye(out)
