@@ -18,24 +18,21 @@ app = typer.Typer(name="rig", help=HELP, short_help=HELP, subcommand_metavar="TA
 @app.command(cls=Command)
 def check(
     *,
-    rig: Annotated[str | None, typer.Option(help="rig by name or TOML file (default: list connected devices)")] = None,
+    rig: Annotated[str | None, typer.Option(help="rig by name or TOML file (default: list connected cameras)")] = None,
     no_motion: Annotated[bool, typer.Option("--no-motion", help="do not move the arm or the jaws")] = False,
 ) -> None:
-    """List connected devices, or test each device of a rig with small motions."""
-    from robot.drivers.discover import discover
+    """List connected cameras, or test each device of a rig with small motions."""
+    from robot.drivers.discover import find_cameras
     from robot.rig import load_rig
     from robot.rig_check import check_rig
 
     if rig is None:
-        devices = discover()
-        for device in devices:
-            for line in (f"# {device.kind}: {device.label}", *device.toml.splitlines(), ""):
+        cameras = find_cameras()
+        for camera in cameras:
+            for line in (f"# {camera.label}", *camera.toml.splitlines(), ""):
                 show(line)
-        say(
-            f"{len(devices)} device(s) found; copy the lines above into a rig file"
-            if devices
-            else "no device was found"
-        )
+        found = f"{len(cameras)} camera(s) found; copy the lines above into a rig file"
+        say(found if cameras else "no camera was found")
         return
     rows = []
     for row in check_rig(load_rig(rig, seed=0), motion=not no_motion):

@@ -1,36 +1,25 @@
-"""Discovery of connected devices, each with the lines that name it in a rig's file.
+"""Discovery of connected cameras, each with the lines that name it in a rig's file.
 
-Cameras: /dev/v4l/by-id contains a link for each, named by maker, model and serial number, independent of the socket;
-by-path names the socket, for cameras without a name of their own. "-video-index0" gives the pictures, higher numbers
-only metadata. /sys/class/video4linux/*/name is the camera's own name. RealSense cameras are listed by their package
-if it is installed.
+/dev/v4l/by-id contains a link for each, named by maker, model and serial number, independent of the socket; by-path
+names the socket, for cameras without a name of their own. "-video-index0" gives the pictures, higher numbers only
+metadata. /sys/class/video4linux/*/name is the camera's own name.
 """
 
-import logging
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
-from typing import Literal
 
-log = logging.getLogger(__name__)
 DEV, SYS = Path("/dev"), Path("/sys")
-_GEL_SENSORS = {"digit": "digit", "gelsight mini": "gelsight_mini", "gelsight": "gelsight"}
+_DRIVERS = {"realsense": "realsense", "digit": "digit", "gelsight mini": "gelsight_mini", "gelsight": "gelsight"}
 """Words in a camera's name and the driver for it; the first match is used."""
 
 
 @dataclass(frozen=True)
-class DiscoveredDevice:
-    """A connected device: its stable name, its own name, and the lines for its table in a rig's file."""
+class DiscoveredCamera:
+    """A connected camera: its stable name, its own name, and the lines for its table in a rig's file."""
 
-    kind: Literal["camera", "realsense"]
     device: str
     label: str
     toml: str
-
-
-def discover(dev: Path = DEV, sys: Path = SYS) -> list[DiscoveredDevice]:
-    """Return all connected devices, cameras first; `dev` and `sys` are the system's device folders."""
-    return [*find_cameras(dev, sys), *_find_realsenses()]
 
 
 def camera_names(dev: Path = DEV) -> list[str]:
@@ -42,8 +31,11 @@ def camera_names(dev: Path = DEV) -> list[str]:
     return [*map(str, by_id), *sorted(sockets.values())]
 
 
-def find_cameras(dev: Path = DEV, sys: Path = SYS) -> list[DiscoveredDevice]:
-    """Return cameras by stable name, or by number on a system without stable names."""
+def find_cameras(dev: Path = DEV, sys: Path = SYS) -> list[DiscoveredCamera]:
+    """Return cameras by stable name, or by number on a system without stable names.
+
+    `dev` and `sys` are the system's device folders.
+    """
     named = camera_names(dev)
     names = named or [str(dev / path.name) for path in sorted((sys / "class" / "video4linux").glob("video*"))]
     cameras = []
@@ -53,27 +45,10 @@ def find_cameras(dev: Path = DEV, sys: Path = SYS) -> list[DiscoveredDevice]:
             continue  # several numbers belong to one camera; its `index` 0 gives the pictures
         label = _text(folder / "name") or Path(name).name
         words = f"{label} {Path(name).name}".lower().replace("_", " ")
-        driver = next((driver for word, driver in _GEL_SENSORS.items() if word in words), "uvc")
-        cameras.append(DiscoveredDevice("camera", name, label, f'driver = "{driver}"\ndevice = "{name}"'))
+        driver = next((driver for word, driver in _DRIVERS.items() if word in words), "uvc")
+        device = "" if driver == "realsense" else f'\ndevice = "{name}"'
+        cameras.append(DiscoveredCamera(name, label, f'driver = "{driver}"{device}'))
     return cameras
-
-
-def _find_realsenses() -> list[DiscoveredDevice]:
-    """List the cameras with the maker's package, if it is installed; log a warning if it fails."""
-    try:
-        rs = import_module("pyrealsense2")
-        info = rs.camera_info
-        devices = rs.context().query_devices()
-        names = [(device.get_info(info.serial_number), device.get_info(info.name)) for device in devices]
-    except ModuleNotFoundError:
-        return []
-    except Exception as error:  # a failing package must not hide the other devices
-        log.warning("RealSense cameras could not be listed: %s", error)
-        return []
-    return [
-        DiscoveredDevice("realsense", serial, name, f'driver = "realsense"\nserial = "{serial}"')
-        for serial, name in names
-    ]
 
 
 def _text(path: Path) -> str:

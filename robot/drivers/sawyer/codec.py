@@ -115,12 +115,6 @@ class CollisionState(msgspec.Struct):
     collision_state: bool
 
 
-class Float(msgspec.Struct):
-    """std_msgs/Float64."""
-
-    data: _Number
-
-
 class _IKAnswer(msgspec.Struct):
     result_type: Annotated[list[int], msgspec.Meta(min_length=1, max_length=1)]
     joints: Annotated[list[_JointState], msgspec.Meta(min_length=1, max_length=1)]

@@ -284,28 +284,15 @@ class Sawyer(Arm):
         """Open a new link and wait for each state once."""
         self._link = RosbridgeLink(self._url, timeout_s=self._options.timeout_s, clock=self.clock)
         self._link.open()
-        for topic, kind in (*_STATE_TOPICS, codec.SPEED_RATIO, codec.COMMAND_TIMEOUT):
+        for topic, kind in _STATE_TOPICS:
             self._link.subscribe(topic, kind)
         self._link.advertise(*codec.JOINT_COMMAND)
         for topic, _ in _STATE_TOPICS:
             self._link.wait_for(topic)
-        self._set("speed_ratio", codec.SPEED_RATIO, self._options.speed_ratio)
-        self._set("command_timeout_s", codec.COMMAND_TIMEOUT, _COMMAND_TIMEOUT_S)
-
-    def _set(self, name: str, topic: tuple[str, str], value: float) -> None:
-        """Publish a setting and read it back from its topic; note a difference in `refused`."""
-        since = self.clock()
-        self._link.advertise(*topic, latch=True)
-        self._link.publish(topic[0], {"data": value})
-        self.refused.pop(name, None)
-        try:
-            found = codec.parse(self._link.wait_for(topic[0], since_s=since).message, codec.Float).data
-        except DeviceError:
-            self._link.check()
-            self.refused[name] = f"requested {value:g}, cannot be read back"
-            return
-        if abs(found - value) > 1e-6:
-            self.refused[name] = f"requested {value:g}, has {found:g}"
+        settings = (codec.SPEED_RATIO, self._options.speed_ratio), (codec.COMMAND_TIMEOUT, _COMMAND_TIMEOUT_S)
+        for topic_and_kind, value in settings:  # the robot does not report them
+            self._link.advertise(*topic_and_kind, latch=True)
+            self._link.publish(topic_and_kind[0], {"data": value})
 
     def _make_ready(self) -> None:
         """Enable the motors if allowed and sufficient; raise DeviceError if the arm may not move."""
@@ -327,13 +314,9 @@ class Sawyer(Arm):
         return {
             "url": self._url,
             "tip": self._options.tip,
-            "speed_ratio": self._read_back(codec.SPEED_RATIO),
-            "command_timeout_s": self._read_back(codec.COMMAND_TIMEOUT),
+            "speed_ratio": self._options.speed_ratio,
+            "command_timeout_s": _COMMAND_TIMEOUT_S,
         }
-
-    def _read_back(self, topic: tuple[str, str]) -> float | None:
-        arrivals = self._link.history(topic[0])
-        return codec.parse(arrivals[-1].message, codec.Float).data if arrivals else None
 
     def _recover(self) -> None:
         """Connect again if the link or a state is lost; raise DeviceError if a person must act."""

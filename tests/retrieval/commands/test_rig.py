@@ -33,9 +33,9 @@ def test_a_check_prints_a_line_for_each_device_and_exits_with_1_if_one_fails(cap
 
 
 def test_a_check_without_a_rig_and_without_devices_finds_none(capsys, monkeypatch):
-    monkeypatch.setattr("robot.drivers.discover.discover", list)
+    monkeypatch.setattr("robot.drivers.discover.find_cameras", list)
     assert main(["rig", "check"]) == 0
-    assert capsys.readouterr().err == "no device was found\n"
+    assert capsys.readouterr().err == "no camera was found\n"
 
 
 POINTS = """camera_x_mm,camera_y_mm,camera_z_mm,rig_x_mm,rig_y_mm,rig_z_mm

@@ -64,17 +64,17 @@ PRINTING = """
 import sys
 from retrieval.commands.main import main
 from robot.drivers import discover
-discover.discover = lambda: [discover.DiscoveredDevice("camera", "/dev/x", "gel", "a = 1")]
+discover.find_cameras = lambda: [discover.DiscoveredCamera("/dev/x", "gel", "a = 1")]
 sys.exit(main(["rig", "check"]))
 """
-FOUND = "1 device(s) found; copy the lines above into a rig file"
+FOUND = "1 camera(s) found; copy the lines above into a rig file"
 
 
 @pytest.mark.parametrize(
     ("streams", "code", "output"),
     [
         (">/dev/full", 1, "retrieve rig: Standard output cannot be written: No space left on device\n"),
-        ("2>/dev/full", 0, "# camera: gel\na = 1\n\n"),
+        ("2>/dev/full", 0, "# gel\na = 1\n\n"),
         (">&-", 0, f"{FOUND}\n"),
         (">&- 2>&-", 0, ""),
     ],
