@@ -55,7 +55,7 @@ def apply_gate(gate: Gate, touches: Mapping[str, GraspFrames]) -> tuple[bool, fl
 
 @dataclass(frozen=True)
 class ContactAreaGate(TypedSettings):
-    """A gate that accepts a grasp when the gel of any finger (or of all) changed its colour over a large enough area.
+    """A gate that accepts a grasp when the gel of any finger changed its colour over a large enough area.
 
     It compares the frame after the lift, if recorded, with the no-contact frame, because after a slip the gel has
     no contact. If there is no frame after the lift, it uses the frame with closed jaws.
@@ -65,18 +65,15 @@ class ContactAreaGate(TypedSettings):
             this number of grey levels.
         least_share: Smallest fraction of changed pixels, 0 to 1.
         blur_px: Side of the average.
-        every_finger: Whether every finger's gel must have changed.
     """
 
     noise_levels: Annotated[float, Meta(ge=0.1, le=254)] = 8.0
     least_share: Annotated[float, Meta(ge=1e-6, le=1)] = 0.01
     blur_px: Annotated[int, Meta(ge=1, le=1000)] = 5
-    every_finger: bool = False
 
     def __call__(self, touches: Mapping[str, GraspFrames]) -> bool:
         """Return whether the grasp is accepted; raise RobotConfigError if a no-contact frame is missing."""
-        enough = (self.changed_fraction(frames) >= self.least_share for frames in touches.values())
-        return (all if self.every_finger else any)(enough)  # stops at the first finger that decides
+        return any(self.changed_fraction(frames) >= self.least_share for frames in touches.values())
 
     def changed_fraction(self, frames: GraspFrames) -> float:
         """Return the fraction of changed pixels, 0 to 1."""

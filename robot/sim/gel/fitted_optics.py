@@ -19,12 +19,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from _touch_retrieval.documents import typed
 from robot.sim.gel.surface import Array, Field, Surface, resized
-
-Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
