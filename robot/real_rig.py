@@ -103,7 +103,7 @@ class ObjectSettings(TypedSettings):
 
     def fit(self) -> CylinderFit:
         """Return the fit that a depth camera would have measured."""
-        return CylinderFit(**vars(self), error_mm=5.0, method="given", half_mm=(self.radius_mm, self.radius_mm))
+        return CylinderFit(**vars(self), method="given", half_mm=(self.radius_mm, self.radius_mm))
 
 
 class RealRig(Rig):

@@ -2,9 +2,9 @@
 
 The file lies in the recording's folder. A line contains object_id, number, outcome, accepted and ended_s (seconds of
 rig time since the recording began), and the session if it has a name. If there was a grasp, it adds grasp_id, the
-gate's score and fit (method and error of the cylinder); else it adds the reason. The outcome "ungraspable" ends the
-attempts at its object. A line is written before its grasp. After a crash, only the last line may be incomplete or
-without its grasp; such a line is ignored.
+gate's score and fit (method, position and size of the cylinder); else it adds the reason. The outcome "ungraspable"
+ends the attempts at its object. A line is written before its grasp. After a crash, only the last line may be
+incomplete or without its grasp; such a line is ignored.
 """
 
 import contextlib

@@ -1,4 +1,4 @@
-"""Cylinder fit of the object on the table: position, height, radius and standard error of the centre.
+"""Cylinder fit of the object on the table: position, height and radius.
 
 A depth picture shows only one side of the object. An upright cylinder, a box and a lying cylinder (robot.sight.solids)
 are fitted to the points above the table (robot.sight.cloud); the one with the smallest BIC is returned. If none is
@@ -39,14 +39,7 @@ MIN_SIDE_POINTS = 10
 MIN_ARC_DEG = 60.0
 _SECTOR_DEG = 10.0
 _MIN_CUT_OFF_ARC_DEG = 90.0
-_MIN_TOP_FRACTION = 0.05
 _MAX_LOSS, _OUTLIER_MM = 0.35, 2.0
-_CRUDE_MM, _ROUGH_MM, _GUESS_MM = 3.0, 6.0, 10.0
-"""Smallest standard errors of the centre when the hidden side is guessed.
-
-`_CRUDE_MM` for a box, a lying cylinder or an enclosing circle; `_ROUGH_MM` for an enclosing circle if no simple solid
-fits; `_GUESS_MM` for a box whose top is not visible.
-"""
 
 
 @dataclass(frozen=True)
@@ -54,7 +47,6 @@ class CylinderFit:
     """An upright cylinder on the table in the rig's frame, and the footprint of the object.
 
     Attributes:
-        error_mm: Standard error of the centre, without the error of the camera calibration.
         method: Method of the fit; see the top of the file.
         half_mm: Half sizes of the footprint along `yaw_rad` and across; both are the radius for a round object.
     """
@@ -63,7 +55,6 @@ class CylinderFit:
     y_mm: float
     height_mm: float
     radius_mm: float
-    error_mm: float
     method: str
     half_mm: tuple[float, float]
     yaw_rad: float = 0.0
@@ -87,7 +78,7 @@ class CylinderFit:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for the attempt log, rounded to micrometres."""
-        sizes = ("x_mm", "y_mm", "height_mm", "radius_mm", "error_mm")
+        sizes = ("x_mm", "y_mm", "height_mm", "radius_mm")
         return {name: round(getattr(self, name), 3) for name in sizes} | {"method": self.method}
 
 
@@ -114,20 +105,15 @@ def fit_cylinder(image: RGBD, extrinsics: npt.ArrayLike, region: Region | None =
     if is_cut_off and best.arc_deg < _MIN_CUT_OFF_ARC_DEG:
         raise PlanError("the object touches the border of the picture, and its visible part is too small to locate it")
     solid = best.solid
-    residual_mm = OUTLIER_CUT * noise * math.sqrt(_loss(solid, points, noise))
-    error_mm = max(best.error_mm, 0.5 * residual_mm)
-    return CylinderFit(
-        solid.x, solid.y, solid.height, min(solid.half), error_mm, best.method, solid.half, solid.yaw_rad
-    )
+    return CylinderFit(solid.x, solid.y, solid.height, min(solid.half), best.method, solid.half, solid.yaw_rad)
 
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A fitted solid, its method, the standard error of its centre in mm, and the visible arc of a circle."""
+    """A fitted solid, its method, and the visible arc of a circle."""
 
     solid: Solid
     method: str
-    error_mm: float
     arc_deg: float = 0.0
 
 
@@ -135,15 +121,14 @@ def _best_candidate(points: Array, top: float, noise: float, rays: Rays) -> _Can
     eye = rays.pose[:2, 3]
     box = fit_cuboid(points, top, eye)
     lying = (fit_lying_cylinder(points, box, along, eye) for along in (True, False))
-    has_top = (np.abs(points[:, 2] - top) < 2 * noise).mean() > _MIN_TOP_FRACTION
     candidates = [
         _upright_candidate(points, top, noise, rays, box),
-        _Candidate(box, "box", _CRUDE_MM if has_top else _GUESS_MM),
-        *(_Candidate(solid, "lying", _CRUDE_MM) for solid in lying if solid is not None),
+        _Candidate(box, "box"),
+        *(_Candidate(solid, "lying") for solid in lying if solid is not None),
     ]
     best = min(candidates, key=lambda candidate: candidate.solid.misfit(points, noise, rays.pose[:3, 3]))
     if best.method != "circle" and _loss(best.solid, points, noise) > _MAX_LOSS:
-        return _enclosing_candidate(points, top, _ROUGH_MM)
+        return _enclosing_candidate(points, top)
     return best
 
 
@@ -182,21 +167,11 @@ def _upright_candidate(points: Array, top: float, noise: float, rays: Rays, box:
     centre = np.array([circle.x, circle.y])
     whole = refine_circle(points[:, :2], centre, circle.radius, noise, largest, away, top - points[:, 2])
     if whole is not None:
-        circle, side = whole, points[:, :2]
+        circle = whole
     if arc < MIN_ARC_DEG or circle.inliers.sum() < MIN_SIDE_POINTS:
         return _enclosing_candidate(points, top)
     solid = UprightCylinder(circle.x, circle.y, (circle.radius, circle.radius), top)
-    return _Candidate(solid, "circle", _circle_error(circle, side, arc), arc)
-
-
-def _circle_error(circle: Circle, side: Array, arc_deg: float) -> float:
-    """Return the standard error of the centre by the least-squares covariance.
-
-    Residuals of neighbouring points are correlated, so each sector of the arc is treated as one measurement.
-    """
-    off = np.hypot(*(side[circle.inliers] - [circle.x, circle.y]).T) - circle.radius
-    per_sector = circle.inliers.sum() / (arc_deg / _SECTOR_DEG)
-    return float(np.sqrt(np.trace(circle.covariance[:2, :2]) * np.mean(off**2) * per_sector))
+    return _Candidate(solid, "circle", arc)
 
 
 def _arc_deg(circle: Circle, side: Array) -> float:
@@ -207,11 +182,11 @@ def _arc_deg(circle: Circle, side: Array) -> float:
     return float((count >= 2).sum() * _SECTOR_DEG)
 
 
-def _enclosing_candidate(points: Array, top: float, error_mm: float = _CRUDE_MM) -> _Candidate:
+def _enclosing_candidate(points: Array, top: float) -> _Candidate:
     """Return the smallest circle around the points in plan, without the outermost points, which may be outliers."""
     plan = points[:, :2]
     low, high = np.quantile(plan, [0.02, 0.98], axis=0)
     inner = plan[((plan > low - _OUTLIER_MM) & (plan < high + _OUTLIER_MM)).all(1)]
     (x, y), radius = cv2.minEnclosingCircle(inner.astype(np.float32))
     solid = UprightCylinder(float(x), float(y), (float(radius), float(radius)), top)
-    return _Candidate(solid, "enclosing circle", error_mm)
+    return _Candidate(solid, "enclosing circle")

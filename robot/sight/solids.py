@@ -143,12 +143,11 @@ def rotate_plan(plan: Array, yaw_rad: float) -> Array:
 
 @dataclass(frozen=True)
 class Circle:
-    """A circle in plan, and the (3, 3) covariance of x, y and radius for a noise of 1 mm on each inlier."""
+    """A circle in plan, and the mask (N,) of the points that it was fitted to."""
 
     x: float
     y: float
     radius: float
-    covariance: Array
     inliers: npt.NDArray[np.bool_]
 
 
@@ -208,7 +207,7 @@ def refine_circle(
             return None
         if np.abs(move).max() < 1e-2 and step > 1:
             break
-    return Circle(float(centre[0]), float(centre[1]), radius, np.asarray(np.linalg.inv(normal), np.float64), weight > 0)
+    return Circle(float(centre[0]), float(centre[1]), radius, weight > 0)
 
 
 def _tukey(scaled: Array) -> Array:

@@ -352,7 +352,7 @@ def test_with_a_given_place_no_depth_is_read_and_the_object_is_put_back_there():
     rig = FakeRig(3)
     rig.prepare("round-0", 0)
     solid = rig.shared.solid
-    round_fit = (solid.x, solid.y, solid.height, solid.radius, 1.0, "given", (solid.radius, solid.radius))
+    round_fit = (solid.x, solid.y, solid.height, solid.radius, "given", (solid.radius, solid.radius))
     rig.object_fit = CylinderFit(*round_fit)
     attempt, calls = attempted(rig, attempt=AttemptSettings(outputs=("before",)))
     assert attempt.fit["method"] == "given"

@@ -60,7 +60,7 @@ def test_a_prompt_appears_when_the_object_changes_or_has_a_given_position_and_ne
     for object_id, number in [("mug", 0), ("mug", 1), ("cup", 0), ("mug", 2)]:
         rig.prepare(object_id, number)
     assert [text.split()[1] for text in requests] == ["mug", "cup", "mug"]
-    rig.object_fit = CylinderFit(5.0, -2.5, 100.0, 30.0, 1.0, "given", (30.0, 30.0))  # the attempt may have moved it
+    rig.object_fit = CylinderFit(5.0, -2.5, 100.0, 30.0, "given", (30.0, 30.0))  # the attempt may have moved it
     for number in range(2):
         rig.prepare("mug", number)
     assert requests[3:] == ["Put mug at x 5, y -2.5 mm, remove all other objects, then press Enter."] * 2

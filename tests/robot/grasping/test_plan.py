@@ -15,7 +15,7 @@ from robot.readings import Region
 from robot.sight.cylinder import CylinderFit
 from tests.fake_rig import WORKSPACE, FakeRig
 
-FIT = CylinderFit(12.0, -7.0, 100.0, 30.0, 0.5, "circle", (30.0, 30.0))
+FIT = CylinderFit(12.0, -7.0, 100.0, 30.0, "circle", (30.0, 30.0))
 STROKE = 110.0
 
 

@@ -7,7 +7,7 @@ import pytest
 from robot.errors import RecordingError
 from robot.recording.attempt_log import AttemptLog, LoggedAttempt, acceptance_table, read_attempts, tally
 
-HELD = LoggedAttempt("mug", 0, "held", True, 12.5, "mug-0000", 0.75, {"method": "circle", "error_mm": 0.3})
+HELD = LoggedAttempt("mug", 0, "held", True, 12.5, "mug-0000", 0.75, {"method": "circle", "radius_mm": 30.5})
 NO_PLAN = LoggedAttempt("mug", 1, "no_plan", False, 13.0, reason="the object is wider than the stroke")
 MISSED = LoggedAttempt("mug", 2, "missed", False, 20.0, "mug-0002", 0.0)
 SLIPPED = LoggedAttempt("cup, blue", 0, "slipped", True, 31.0, "cup-0000", 1.0)

@@ -1,7 +1,7 @@
 """Cylinder fits to one-sided noisy depth pictures: their accuracy, also in difficult cases.
 
 The truth is known: tests/views.py renders the pictures in closed form. Bounds of the centre's error are for 1.5 to 3 mm
-of noise at 0.9 m, with and without 10 % of outliers. The fit's standard error must have the size of the errors.
+of noise at 0.9 m, with and without 10 % of outliers.
 """
 
 import math
@@ -33,8 +33,6 @@ def off_centre(fit):
 def test_a_standing_cylinder_is_found(radius, height, bound):
     for fit, within in zip(fits(UprightCylinder(radius, height, X, Y), {}, NOISY), (bound, 3.0), strict=True):
         assert off_centre(fit) < within
-        assert off_centre(fit) < 3 * fit.error_mm
-        assert fit.error_mm < 4.0
         assert fit.radius_mm == pytest.approx(radius, abs=2.5)
         assert fit.height_mm == pytest.approx(height, abs=2.0)
         assert fit.method == "circle"
@@ -54,7 +52,6 @@ def test_a_box_becomes_its_inscribed_cylinder(name):
     for fit in fits(box, {}, {"outliers": 0.1}):
         assert fit.method == "box"
         assert off_centre(fit) < 4.0
-        assert off_centre(fit) < 3 * fit.error_mm
         assert fit.radius_mm == pytest.approx(min(box.length, box.width) / 2, abs=4.0)
         assert fit.height_mm == pytest.approx(box.height, abs=3.0)
         turn = (fit.yaw_rad - box.yaw + math.pi / 4) % (math.pi / 2) - math.pi / 4
@@ -66,7 +63,6 @@ def test_a_lying_cylinder_is_not_confused_with_an_upright_one_or_a_box(yaw):
     for fit in fits(LyingCylinder(25, 120, X, Y, yaw), {}, NOISY):
         assert fit.method == "lying"
         assert off_centre(fit) < 3.5
-        assert off_centre(fit) < 3 * fit.error_mm
         assert fit.radius_mm == pytest.approx(25, abs=2)
         assert fit.height_mm == pytest.approx(50, abs=4)
         assert fit.half_mm[0] == pytest.approx(60, abs=5)
@@ -79,7 +75,7 @@ def test_a_ball_is_round():
     assert fit.method not in ("box", "lying")
 
 
-def test_a_short_arc_gives_no_circle_and_a_large_error():
+def test_a_short_arc_gives_no_circle():
     """Only a strip of 26 degrees of the side has depth, and nothing of the top."""
     image, pose = view(UprightCylinder(60, 150, X, Y)), views.camera_pose()
     height = image.depth_m * 1000 * Rays.from_image(image, pose).along(np.array([0.0, 0.0, 1.0])) + pose[2, 3]
@@ -88,7 +84,6 @@ def test_a_short_arc_gives_no_circle_and_a_large_error():
     depth = np.where((height > 5) & ~(strip & (height < 140)), np.nan, image.depth_m).astype(np.float32)
     fit = fit_cylinder(RGBD(image.colour, depth, image.intrinsics, 0.0), pose)
     assert fit.method in ("box", "enclosing circle")
-    assert fit.error_mm >= 3.0
 
 
 def test_glass_an_empty_table_and_unknown_depth_are_clear_errors():
@@ -132,7 +127,7 @@ def width_by_points(fit, yaw, finger):
 @pytest.mark.parametrize("half_mm", [(75.0, 10.0), (10.0, 75.0)])
 @pytest.mark.parametrize("yaw", [0.3, 1.2, 2.0])
 def test_the_width_of_a_box_is_its_extent_where_the_fingers_pass(yaw, half_mm):
-    fit = CylinderFit(0, 0, 100, 10, 1, "box", half_mm, 0.3)
+    fit = CylinderFit(0, 0, 100, 10, "box", half_mm, 0.3)
     assert fit.width_mm(yaw, 25.0) == pytest.approx(width_by_points(fit, yaw, 25.0), abs=1.0)
 
 
@@ -141,6 +136,6 @@ def test_fingers_that_pass_between_the_corners_meet_the_end_of_a_box():
 
     Rotated by 0.2 rad, the strip leaves through the same end: 2 (10 + 12.5 sin 0.2) / cos 0.2.
     """
-    fit = CylinderFit(0, 0, 100, 10, 1, "box", (10.0, 75.0))
+    fit = CylinderFit(0, 0, 100, 10, "box", (10.0, 75.0))
     assert fit.width_mm(0.0, 25.0) == pytest.approx(20.0)
     assert fit.width_mm(0.2, 25.0) == pytest.approx(25.4736, abs=1e-3)
