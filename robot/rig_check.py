@@ -21,7 +21,7 @@ from robot.rig import Rig
 JAW_MM, ARM_MM, ARM_MM_S = 5.0, 10.0, 20.0
 MEASURE_S, _POLL_S = 2.0, 0.002
 _REPEATS = 20
-"""Number of state queries for the response time, and of paired gel reads for the skew."""
+"""Number of paired gel reads for the skew."""
 
 
 @dataclass(frozen=True)
@@ -76,24 +76,23 @@ def _check_arm(rig: Rig, motion: bool) -> dict[str, str]:
     arm = rig.arm
     if arm.is_manual:
         return {"moved": "by a person"}
-    measured = {"motion": "none"}
-    if motion:
-        start = arm.pose()
-        up_mm = ARM_MM if start.z_mm + ARM_MM <= arm.workspace.upper[2] else -ARM_MM
-        target = replace(start, z_mm=start.z_mm + up_mm)
-        speed, began = min(ARM_MM_S, arm.max_speed_mm_s), rig.clock()
-        reached = arm.move_to(target, speed)
-        seconds = rig.clock() - began
-        arm.move_to(start, speed)
-        off_mm = np.linalg.norm(np.subtract(reached.as_tuple()[:3], target.as_tuple()[:3]))
-        measured = {"moved": f"{ARM_MM:g} mm in {seconds:.2f} s", "off by": f"{off_mm:.2f} mm"}
-    return measured | _round_trip(rig, arm.pose)
+    start = arm.pose()
+    if not motion:
+        return {"motion": "none"}
+    up_mm = ARM_MM if start.z_mm + ARM_MM <= arm.workspace.upper[2] else -ARM_MM
+    target = replace(start, z_mm=start.z_mm + up_mm)
+    speed, began = min(ARM_MM_S, arm.max_speed_mm_s), rig.clock()
+    reached = arm.move_to(target, speed)
+    seconds = rig.clock() - began
+    arm.move_to(start, speed)
+    off_mm = np.linalg.norm(np.subtract(reached.as_tuple()[:3], target.as_tuple()[:3]))
+    return {"moved": f"{ARM_MM:g} mm in {seconds:.2f} s", "off by": f"{off_mm:.2f} mm"}
 
 
 def _check_gripper(rig: Rig, motion: bool) -> dict[str, str]:
     gripper = rig.gripper
     state = gripper.state()
-    measured = {"status": state.status, "opening": f"{state.opening_mm:.2f} mm"} | _round_trip(rig, gripper.state)
+    measured = {"status": state.status, "opening": f"{state.opening_mm:.2f} mm"}
     measured["force"] = f"{gripper.min_force_n:g} to {gripper.max_force_n:g} N on each finger"
     if motion and state.status == "idle":
         target_mm = state.opening_mm - JAW_MM if state.opening_mm >= JAW_MM else state.opening_mm + JAW_MM
@@ -103,15 +102,6 @@ def _check_gripper(rig: Rig, motion: bool) -> dict[str, str]:
     elif motion:
         measured["motion"] = f"none, because it is {state.status}"
     return measured
-
-
-def _round_trip(rig: Rig, query: Callable[[], Any]) -> dict[str, str]:
-    times = []
-    for _ in range(_REPEATS):
-        began = rig.clock()
-        query()
-        times.append(rig.clock() - began)
-    return {"answer to a query in": f"{1000 * median(times):.2f} ms"}
 
 
 def _check_frames(rig: Rig, device: Camera | TactileSensor) -> dict[str, str]:

@@ -36,7 +36,6 @@ def test_every_device_is_checked_moved_back_and_closed(rig):
 def test_without_motion_arm_and_jaws_do_not_move(rig):
     rows = list(check_rig(rig, motion=False))
     assert rows[0].measured["motion"] == "none"
-    assert rows[0].measured["answer to a query in"].startswith("0.00 ms")
     assert {"arm", "open", "grasp"}.isdisjoint(rig.shared.calls)
 
 

@@ -213,6 +213,8 @@ _UPDATE_MS = 20
 
 _REACHED_MM, _SAME_MM = 1.0, 0.1
 """Tolerance of a reached target, and distance below which no motion is needed."""
+_MIN_PART_MM = 1.0
+"""With a smaller opening the fingers touch each other and hold no part."""
 _REGRIP_MM = 5.0
 """Opening motion that releases a held object before another grasp."""
 _HOMING_S = 30.0
@@ -239,11 +241,9 @@ class WSG50Settings(TypedSettings):
         timeout_s: Longest wait for an answer.
         acknowledge_faults: Whether to log and acknowledge a FAST STOP; if false, a person must acknowledge it.
         grasp_width_mm: Nominal width of the object, sent with each GRASP; 0 if unknown.
-        min_part_mm: A smaller opening means that the fingers touch each other and hold no part.
-        opening_speed_mm_s: Speed of opening and pre-positioning.
         finger_share: Fraction of the gripper's force on each finger; see `to_finger_force`.
         max_force_n: Upper limit of forces.
-        max_speed_mm_s: Upper limit of speeds.
+        max_speed_mm_s: Upper limit of speeds, and the speed of opening.
         max_state_age_s: The jaws are stopped if no state arrives for this long during a motion.
     """
 
@@ -252,8 +252,6 @@ class WSG50Settings(TypedSettings):
     timeout_s: Annotated[float, Meta(ge=1e-3, le=600)] = 1.0
     acknowledge_faults: bool = False
     grasp_width_mm: Annotated[float, Meta(ge=0, le=1000)] = 0.0
-    min_part_mm: Annotated[float, Meta(ge=0, le=1000)] = 1.0
-    opening_speed_mm_s: Annotated[float, Meta(ge=1e-3, le=1e4)] = 80.0
     finger_share: Annotated[float, Meta(ge=0.1, le=1.0)] = 0.5
     max_force_n: Annotated[float, Meta(ge=1e-3, le=1e4)] = 40.0
     max_speed_mm_s: Annotated[float, Meta(ge=1e-3, le=1e4)] = 420.0
@@ -376,8 +374,8 @@ class WSG50(Gripper):
         if abs(reading.opening_mm - opening_mm) > _SAME_MM:
             if opening_mm < reading.opening_mm:  # it may close on something
                 self._set_force(self.min_force_n)
-            speed = self._opening_speed()
-            reading = self._run_at(speed, codec.move(opening_mm, speed), _is_at(opening_mm))
+            packet = codec.move(opening_mm, self.max_speed_mm_s)
+            reading = self._run_at(self.max_speed_mm_s, packet, _is_at(opening_mm))
         return self._as_state(reading)
 
     def _grasp(self, force_n: float, speed_mm_s: float) -> GripperState:
@@ -421,22 +419,19 @@ class WSG50(Gripper):
     def _as_state(self, reading: GripperReading) -> GripperState:
         self._check_fault(reading)
         status = _STATUS_OF[reading.grasping]
-        if status == "holding" and reading.opening_mm < self._options.min_part_mm:
+        if status == "holding" and reading.opening_mm < _MIN_PART_MM:
             status = "no_part"
         return GripperState(reading.opening_mm, self._options.to_finger_force(reading.force_n), status)
 
     # Motions.
 
     def _release(self, width_mm: float) -> GripperReading:
-        speed = self._opening_speed()
-        return self._run_at(speed, codec.command(CommandId.RELEASE, width_mm, speed), _is_at(width_mm))
+        packet = codec.command(CommandId.RELEASE, width_mm, self.max_speed_mm_s)
+        return self._run_at(self.max_speed_mm_s, packet, _is_at(width_mm))
 
     def _wider_opening(self, reading: GripperReading) -> float:
         """Return an opening slightly wider than the current one, to release the object."""
         return min(reading.opening_mm + _REGRIP_MM, self.stroke_mm)
-
-    def _opening_speed(self) -> float:
-        return min(max(self._options.opening_speed_mm_s, self._limits.min_speed_mm_s), self.max_speed_mm_s)
 
     def _run_at(self, speed_mm_s: float, packet: Packet, done: IsDone) -> GripperReading:
         seconds = self._limits.stroke_mm / speed_mm_s + _SLACK_S + self._options.timeout_s

@@ -18,7 +18,7 @@ from tests.emulators.wsg50.gripper import EmulatedWSG50
 from tests.emulators.wsg50.server import serve
 from tests.waiting import wait_until
 
-QUICK = {"timeout_s": 2.0, "max_state_age_s": 0.5, "opening_speed_mm_s": 400.0}
+QUICK = {"timeout_s": 2.0, "max_state_age_s": 0.5}
 DISCONNECT, HOME, STOP, FAST_STOP, ACK, GRASP, RELEASE = 0x07, 0x20, 0x22, 0x23, 0x24, 0x25, 0x26
 
 
