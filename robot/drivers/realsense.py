@@ -111,15 +111,10 @@ class RealSense(Camera):
                 pipeline.stop()
 
     def _recover(self) -> None:
-        """Close the camera despite errors, then connect completely or not at all."""
+        """Close the camera despite errors, then connect; a failed recovery can be repeated."""
         with contextlib.suppress(DeviceError, OSError):
             self._close()
-        try:
-            self._connect()
-        except BaseException:
-            with contextlib.suppress(DeviceError, OSError):
-                self._close()
-            raise
+        self._connect()
 
     def _wait(self) -> Any:
         return self._pipeline.wait_for_frames(round(1000 * self._options.timeout_s))
