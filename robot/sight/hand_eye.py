@@ -34,8 +34,8 @@ _MIN_EXTENT_MM = 25.0
 """Points of a smaller extent are in metres, centimetres or inches, or too near to each other for a rotation."""
 _UNIT_RATIO = 5.0
 """If one extent exceeds the other by this factor, the smaller one has another unit: a motion keeps distances."""
-_MIN_TRANSLATION_MM = 10.0
-"""A camera that is nearer to the rig's origin has a translation in metres."""
+_SAME_MM = 10.0
+"""Points within this distance are one point that was measured again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,17 +58,15 @@ def fit_hand_eye(camera_mm: npt.ArrayLike, rig_mm: npt.ArrayLike) -> HandEye:
     """Fit the rotation and translation from camera points to rig points, by least squares.
 
     Args:
-        camera_mm: (N, 3) points in the camera frame, at least 4, not on one line.
+        camera_mm: (N, 3) points in the camera frame, at least 4 different ones that do not lie on one line.
         rig_mm: (N, 3) the same points in the rig's frame.
 
     Raises:
         RobotConfigError: The points are too few, on one line, in metres or not finite.
     """
     camera, rig = np.asarray(camera_mm, np.float64), np.asarray(rig_mm, np.float64)
-    if camera.shape != rig.shape or camera.ndim != 2 or camera.shape[1] != 3 or len(camera) < 4:
-        raise RobotConfigError(
-            f"points must be two arrays of N x 3 mm, N at least 4, got {camera.shape} and {rig.shape}; measure more"
-        )
+    if camera.shape != rig.shape or camera.ndim != 2 or camera.shape[1] != 3:
+        raise RobotConfigError(f"points must be two arrays of N x 3 mm, got {camera.shape} and {rig.shape}")
     if not (np.isfinite(camera).all() and np.isfinite(rig).all()):
         raise RobotConfigError("points must be finite numbers of mm; measure the others again")
     arms = [points - points.mean(0) for points in (camera, rig)]
@@ -80,6 +78,11 @@ def fit_hand_eye(camera_mm: npt.ArrayLike, rig_mm: npt.ArrayLike) -> HandEye:
                 f"{other:.3g}; if they are in metres, multiply them by 1000 (centimetres: 10, inches: 25.4), else "
                 "measure points that are farther apart"
             )
+    distinct = min(map(_distinct, (camera, rig)))
+    if distinct < 4:
+        raise RobotConfigError(
+            f"a calibration requires at least 4 different points, got {distinct}; measure more, {_SAME_MM:g} mm apart"
+        )
     for name, arm in zip(("camera", "rig"), arms, strict=True):
         along, across, _ = np.linalg.svd(arm, compute_uv=False)
         if across < MIN_SPREAD * along:
@@ -92,6 +95,14 @@ def fit_hand_eye(camera_mm: npt.ArrayLike, rig_mm: npt.ArrayLike) -> HandEye:
     rigid[:3, 3] = rig.mean(0) - rotation.apply(camera.mean(0))
     residuals = np.linalg.norm(rotation.apply(arms[0]) - arms[1], axis=1)
     return HandEye(rigid, residuals, datetime.now(UTC).replace(microsecond=0))
+
+
+def _distinct(points: Points) -> int:
+    kept: list[Points] = []
+    for point in points:
+        if all(np.linalg.norm(point - other) > _SAME_MM for other in kept):
+            kept.append(point)
+    return len(kept)
 
 
 def read_pairs(path: Path) -> tuple[Points, Points]:
@@ -120,6 +131,6 @@ def load_hand_eye(path: Path) -> Points:
             f"{path} is not a hand-eye calibration: {error}; make it again with `retrieve rig calibrate`"
         ) from error
     rigid = np.array(document.rigid)
-    if (far := float(np.linalg.norm(rigid[:3, 3]))) < _MIN_TRANSLATION_MM:
+    if (far := float(np.linalg.norm(rigid[:3, 3]))) < _SAME_MM:
         raise RobotConfigError(f"{path}: its translation must be in mm, got {far:.3g}; multiply one in metres by 1000")
     return rigid
