@@ -60,14 +60,6 @@ class BestStep:
     metrics: dict[str, float] = field(default_factory=dict)
 
 
-class TrainingInterrupted(JobInterrupted):
-    """Ctrl-C stopped a run, whose state is stored; `best` is the best step so far, with its weights in the module."""
-
-    def __init__(self, message: str, best: BestStep) -> None:
-        super().__init__(message)
-        self.best = best
-
-
 @dataclass(frozen=True)
 class StateFile:
     """The file of an unfinished run (`state_path`): all weights, those of the best step, the optimiser, and the step.
@@ -120,13 +112,12 @@ def train_loop(
     Raises:
         NumericalError: The loss is not finite; no parameter has changed in this step.
         CheckpointError: The state file is damaged or belongs to another run.
-        TrainingInterrupted: After Ctrl-C.
+        JobInterrupted: After Ctrl-C; the state is stored.
     """
     done, best, best_weights = 0, BestStep(), dict[str, Tensor]()
     if state and state.path.exists():
         with suppress(CheckpointError) if state.is_replaceable else nullcontext():
             done, best, best_weights = _load(state, module, optimizer)
-    is_stopped = False
     tell: OnStep = on_step or (lambda *_: None)
     with (
         interruption() if state else nullcontext(threading.Event()) as stop,
@@ -153,28 +144,28 @@ def train_loop(
             done += 1
             scores = [f"  best {name.replace('_', ' ')} {score:.3f}" for name, score in best.metrics.items()]
             bar.advance(note="".join([f"loss {value:.3f}", *scores[:1]]))
-            is_stopped = stop.is_set()
-            values = {"loss": value, "learning_rate": rate}
-            if is_stopped or done % plan.validate_every == 0 or done == plan.steps:
+            is_due, values = (
+                done % plan.validate_every == 0 or done == plan.steps,
+                {"loss": value, "learning_rate": rate},
+            )
+            if is_due:
                 reached = BestStep(done, validate() if validate else {})
                 values |= reached.metrics
                 if not reached.metrics:
                     best = reached
                 elif not best.metrics or next(iter(reached.metrics.values())) > next(iter(best.metrics.values())):
                     best, best_weights = reached, _copied(module)
-                if state:
-                    _save(state, module, optimizer, done, best, best_weights)
             tell(done, values)
-            if is_stopped:
-                break
+            is_stopped = stop.is_set()
+            if state and (is_due or is_stopped):
+                _save(state, module, optimizer, done, best, best_weights)
+                if is_stopped:
+                    raise JobInterrupted(
+                        f"Stopped at step {done} of {plan.steps}. The state is stored in {state.path}; run the same "
+                        "command to continue."
+                    )
     if best_weights:
         module.load_state_dict(best_weights)
-    if state and is_stopped:
-        raise TrainingInterrupted(
-            f"Stopped at step {done} of {plan.steps}. The state is stored in {state.path}; run the same command to "
-            "continue.",
-            best,
-        )
     return best
 
 

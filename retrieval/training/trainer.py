@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from _touch_retrieval.registry import code_digest
+from retrieval.console.interruption import resumable
 from retrieval.console.progress import Bar
 from retrieval.data.camera import USUAL_CAMERA, PhotoCamera
 from retrieval.data.check.split import require_fit
@@ -27,7 +28,6 @@ from retrieval.data.dataset import (
     recording_camera,
 )
 from retrieval.data.pairs import PairBatch, PairSampler
-from retrieval.errors import JobInterrupted
 from retrieval.metrics.pairs import negative_log_likelihood, pair_accuracy, pair_auc
 from retrieval.model.checkpoint import (
     Checkpoint,
@@ -58,7 +58,6 @@ from retrieval.training.loop import (
     OnStep,
     Plan,
     StateFile,
-    TrainingInterrupted,
     freeze_batch_norm,
     state_path,
     train_loop,
@@ -75,9 +74,8 @@ def train_matcher(
 ) -> Checkpoint:
     """Train on a recording and write the checkpoint with the best validation score to `out`.
 
-    An unfinished run of `out` continues from the state file next to it. Ctrl-C ends after the current step with a
-    usable checkpoint; a second Ctrl-C stops immediately. Arguments and errors are those of `retrieval.train`, whose
-    `config` this function takes.
+    An unfinished run of `out` continues from the state file next to it. Ctrl-C stops after the current step, a second
+    one immediately. Arguments and errors are those of `retrieval.train`, whose `config` this function takes.
     """
     folder, config = folder_of(recording), named_config(config)[0]
     require_writable(out)
@@ -182,29 +180,26 @@ class Trainer:
 
         Raises:
             CheckpointError: The state file belongs to another run.
-            JobInterrupted: After Ctrl-C.
+            JobInterrupted: After Ctrl-C; the next call continues.
         """
         settings, touches = self.config.training, self.config.training.touches_per_batch
         made_from = {name: self.provenance.get(name) for name in _MADE_FROM}
         identity = {"config": self.config.to_dict(), "split": self.split.to_dict(), **made_from}
-        state, interrupted = StateFile(state_path(self.out), identity, is_replaceable=replace), None
-        try:
-            best = train_loop(
-                self.modules,
-                self.optimizer,
-                Plan(settings.iterations, settings.learning_rate, settings.schedule, settings.validate_every),
-                lambda steps: self.features.batches(
-                    self.matcher, ((step, self.sampler.batch(step, touches)) for step in steps)
-                ),
-                self.loss,
-                title="training",
-                validate=self.validate,
-                state=state,
-                step_context=self.features.step_context,
-                on_step=on_step,
-            )
-        except TrainingInterrupted as stopped:
-            best, interrupted = stopped.best, f"{stopped} {self.out} can already rank photos."
+        state = StateFile(state_path(self.out), identity, is_replaceable=replace)
+        best = train_loop(
+            self.modules,
+            self.optimizer,
+            Plan(settings.iterations, settings.learning_rate, settings.schedule, settings.validate_every),
+            lambda steps: self.features.batches(
+                self.matcher, ((step, self.sampler.batch(step, touches)) for step in steps)
+            ),
+            self.loss,
+            title="training",
+            validate=self.validate,
+            state=state,
+            step_context=self.features.step_context,
+            on_step=on_step,
+        )
         made = Checkpoint(
             self.out,
             digest="",
@@ -213,20 +208,16 @@ class Trainer:
             matcher=self.matcher.eval(),
             split=self.split,
         )
-        try:
+        with resumable(state.path), Bar("calibrating", 1, "model") as bar:
+            train = [grasp for part in self.sampler.grasps for grasp in part]
+            held_out = self.validation.grasps if self.validation else []
+            if self.config.matcher.candidate_width:
+                made = add_candidate_encoder(made, self.config, self.features, train, held_out)
+            if self.has_images:
+                made = calibrate_checkpoint(made, self.features, train, held_out)
             store_checkpoint(made, self.out)
-            if not interrupted:
-                with Bar("calibrating", 1, "model") as bar:
-                    store_checkpoint(self._completed(made), self.out)
-                    bar.advance()
-                state.path.unlink()
-        except KeyboardInterrupt:
-            interrupted = (
-                f"Stopped before the last parts were fitted. {self.out} can already rank photos; run the same "
-                "command to add these parts."
-            )
-        if interrupted:
-            raise JobInterrupted(interrupted)
+            state.path.unlink()
+            bar.advance()
         return load_checkpoint(self.out)
 
     def run_or_reuse(self, *, on_step: OnStep | None = None) -> Checkpoint:
@@ -272,14 +263,6 @@ class Trainer:
             "validation_pair_accuracy": pair_accuracy(logits, pairs.labels),
             "validation_nll": negative_log_likelihood(logits, pairs.labels),
         }
-
-    def _completed(self, made: Checkpoint) -> Checkpoint:
-        """Add the parts that are fitted after training: candidate encoder, calibrations and gel check."""
-        train = [grasp for part in self.sampler.grasps for grasp in part]
-        held_out = self.validation.grasps if self.validation else []
-        if self.config.matcher.candidate_width:
-            made = add_candidate_encoder(made, self.config, self.features, train, held_out)
-        return calibrate_checkpoint(made, self.features, train, held_out) if self.has_images else made
 
 
 def set_training_mode(matcher: Matcher, settings: TrainingConfig) -> None:
