@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from retrieval.methods.late_fusion import LateFusion, trained_checkpoint
 from retrieval.methods.method import Array
 from retrieval.model.checkpoint import Checkpoint
-from retrieval.training.distil import feature_partials, with_candidate_encoder
+from retrieval.training.distil import distil, feature_partials
 from retrieval.training.features import Features
 
 
@@ -28,14 +28,14 @@ class RetrieveRerank(LateFusion):
         checkpoint, settings = self.settings.model, self.settings.config
         if checkpoint is None:
             checkpoint = trained_checkpoint(self.settings, train, validation)
-            config = checkpoint.config.with_candidate_encoder_of(settings)
-            if self.settings.start and config.matcher.candidate_width:  # that of the start still fits
-                checkpoint.matcher.candidate_encoder = self.settings.start.matcher.candidate_encoder
-                checkpoint.matcher.config = config.matcher
+            config, matcher = checkpoint.config.with_candidate_encoder_of(settings), checkpoint.matcher
+            if config.matcher.candidate_width:
+                if self.settings.start:  # its candidate encoder still fits
+                    matcher.candidate_encoder = self.settings.start.matcher.candidate_encoder
+                    matcher.config = config.matcher
+                else:
+                    distil(matcher, *feature_partials(matcher, train), config)
                 checkpoint = dataclasses.replace(checkpoint, config=config)
-            elif config.matcher.candidate_width:
-                partials = (feature_partials(checkpoint.matcher, part) for part in (train, validation))
-                checkpoint = with_candidate_encoder(checkpoint, config, *partials)
         self._use_checkpoint(checkpoint)
 
     def _use_checkpoint(self, checkpoint: Checkpoint) -> None:

@@ -46,8 +46,6 @@ POOL_FRACTION = 0.75
 """Largest fraction of a batch that comes from the pool."""
 WARMUP_DIVISOR = 6
 """The first 1 / WARMUP_DIVISOR of the steps uses no pool, since an untrained student cannot choose from it."""
-CANDIDATE_FRACTION = 0.01
-"""Fraction of the photos that are candidates when a candidate encoder is evaluated."""
 MAX_GRASPS = 8192
 """Largest number of grasps whose partial activations are blended."""
 MAX_QUERIES = 512
@@ -55,18 +53,15 @@ MAX_QUERIES = 512
 
 
 def distil(matcher: Matcher, touch_partials: Tensor, photo_partials: Tensor, settings: Config) -> None:
-    """Train a candidate encoder from `matcher.head`, and add it and its sizes (`matcher.config`) to `matcher`.
+    """Train a candidate encoder from `matcher.head`, and add it to `matcher`; the other weights do not change.
 
     The partial activations (N, P) and (M, P) are those of touches and photos of training objects; their cells are not
-    used. `settings` have the sizes of the candidate encoder, the steps and the seed. The other weights do not change.
+    used. `settings` are those of the matcher with the candidate encoder.
 
     Raises:
         NumericalError: The loss is not finite; the matcher is unchanged.
     """
-    seed, steps, sizes = settings.training.seed, settings.training.distil_steps, settings.matcher
-    config = dataclasses.replace(
-        matcher.config, candidate_width=sizes.candidate_width, candidate_linear=sizes.candidate_linear
-    )
+    seed, steps, config = settings.training.seed, settings.training.distil_steps, settings.matcher
     touch_partials, photo_partials = (part[:, : config.pooled_width] for part in (touch_partials, photo_partials))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -152,18 +147,6 @@ def blend(partials: Tensor, count: int, generator: torch.Generator) -> Tensor:
     return torch.lerp(partials[second], partials[first], weight)
 
 
-def exhaustive_top1_ranks(matcher: Matcher, touch_partials: Tensor, photo_partials: Tensor) -> NDArray[np.int64]:
-    """Return the rank (T,), from 0, of each touch's exhaustive top-1 photo in the candidate encoder's order."""
-    assert matcher.candidate_encoder is not None
-    encoder, pooled = matcher.candidate_encoder, matcher.config.pooled_width
-    with torch.inference_mode():
-        # One touch at a time saves memory.
-        logits = torch.cat([matcher.head.all_logits(touch, photo_partials) for touch in torch.split(touch_partials, 1)])
-        similarity = encoder.touch(touch_partials[:, :pooled]) @ encoder.photo(photo_partials[:, :pooled]).T
-        nearer = similarity > similarity.gather(1, logits.argmax(1)[:, None])
-    return nearer.sum(1).cpu().numpy()
-
-
 @torch.inference_mode()
 def feature_partials(matcher: Matcher, features: Features) -> tuple[Tensor, Tensor]:
     """Return partial activations (G, P) of the touches and of the photos of features."""
@@ -181,47 +164,24 @@ def select_queries(touch_partials: Tensor, seed: int) -> NDArray[np.float16] | N
     return np.asarray(partials[chosen.sort().values].numpy()) if len(chosen) else None
 
 
-def with_candidate_encoder(
-    checkpoint: Checkpoint,
-    config: Config,
-    train: tuple[Tensor, Tensor],
-    validation: tuple[Tensor, Tensor] | None = None,
-) -> Checkpoint:
-    """Return `checkpoint` with a distilled candidate encoder, its metric, and validation touches (`queries`).
-
-    Args:
-        checkpoint: The checkpoint. Its matcher is reused and modified.
-        config: Sets the size of the candidate encoder, the steps and the seed.
-        train: Partial activations of touches (N, P) and of photos (M, P) of training objects.
-        validation: The same of validation objects, if any. The metric ranks all photos by these touches.
-    """
-    matcher, metrics, seed = checkpoint.matcher, checkpoint.provenance["metrics"], config.training.seed
-    distil(matcher, *train, config)
-    queries = None if validation is None else select_queries(validation[0], seed)
-    if validation is not None and queries is not None:
-        touches = torch.from_numpy(queries).to(validation[1].device).float()
-        photos = torch.cat([train[1], validation[1]])
-        is_candidate = exhaustive_top1_ranks(matcher, touches, photos) < max(1, round(CANDIDATE_FRACTION * len(photos)))
-        metrics = metrics | {"candidate_agreement_at_1_percent": float(is_candidate.mean())}
-    provenance = checkpoint.provenance | {"metrics": metrics}
-    return dataclasses.replace(checkpoint, config=config, provenance=provenance, queries=queries)
-
-
 def add_candidate_encoder(
     checkpoint: Checkpoint, config: Config, source: FeatureSource, train: Sequence[Grasp], validation: Sequence[Grasp]
 ) -> Checkpoint:
-    """Return `checkpoint` with a candidate encoder distilled on recorded grasps, as by `with_candidate_encoder`.
+    """Return `checkpoint` with a candidate encoder distilled on recorded grasps, and validation touches (`queries`).
 
-    At most `MAX_GRASPS` random grasps of each part are used. The matcher must be on the device of `source`. `train` has
-    grasps, `validation` may be empty.
+    At most `MAX_GRASPS` random grasps of each part are used. The matcher, which is reused and modified, must be on the
+    device of `source`. `train` has grasps, `validation` may be empty.
     """
-    matcher, partials = checkpoint.matcher, []
-    for grasps in filter(None, (train, validation)):
-        order = torch.randperm(len(grasps), generator=torch.Generator().manual_seed(config.training.seed))[:MAX_GRASPS]
-        sample = [grasps[row] for row in order.tolist()]
-        touches, photos = recorded_features(matcher, source, sample)
-        with torch.inference_mode():
-            photo_partials = matcher.photo_encoding(torch.stack(list(photos.values()))).partial
-            partials.append((matcher.touch_encoding(touches).partial, photo_partials))
+    matcher, seed = checkpoint.matcher, config.training.seed
+
+    @torch.inference_mode()
+    def partials(grasps: Sequence[Grasp]) -> tuple[Tensor, Tensor]:
+        order = torch.randperm(len(grasps), generator=torch.Generator().manual_seed(seed))[:MAX_GRASPS]
+        touches, photos = recorded_features(matcher, source, [grasps[row] for row in order.tolist()])
+        photo_partials = matcher.photo_encoding(torch.stack(list(photos.values()))).partial
+        return matcher.touch_encoding(touches).partial, photo_partials
+
+    queries = select_queries(partials(validation)[0], seed) if validation else None
     with source.step_context():
-        return with_candidate_encoder(checkpoint, config, *partials)
+        distil(matcher, *partials(train), config)
+    return dataclasses.replace(checkpoint, config=config, queries=queries)

@@ -256,6 +256,11 @@ def whole(recording, tmp_path_factory):
     return trainer_for(recording, tmp_path_factory.mktemp("whole") / "m.safetensors", WITH_ENCODER).run()
 
 
+def test_a_checkpoint_with_a_candidate_encoder_has_the_touches_of_validation_objects(whole, recording):
+    assert whole.matcher.candidate_encoder is not None
+    assert len(whole.queries) == len(whole.split.select(load_grasps(recording), "validation"))
+
+
 @pytest.mark.parametrize(
     ("where", "stop"),
     [
