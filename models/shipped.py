@@ -116,7 +116,7 @@ TRAINED_SHARE = 0.7
 """Share of the trained weights in the towers; the rest are those of the start model."""
 CELL_SHARE = 0.5
 """The same in the networks of the late interaction."""
-FOREIGN = ForeignPictures(8000, margin=-3.0, has_false_colours=False)
+FOREIGN = ForeignPictures(8000, margin=-3.0)
 """Foreign pictures of its check of touches: more than in an ordinary training. The margin is lower than for gels of one
 kind: otherwise too many photos would be taken for gel images."""
 FITTED = 10

@@ -273,7 +273,7 @@ def inputs(made: Checkpoint, folder: Path, jobs: int) -> Iterator[tuple[str, str
     yield "no-contact gels", NO_CONTACT, [files(grasp.backgrounds) for grasp in grasps][:INPUTS]
     photos = [read_rgb(path) for path in sorted((folder / "photographed").glob("*.png"))[:200]]
     drawn: dict[str, list[RgbImage]] = {}
-    for name, picture in draw_foreign(INPUTS, 240, photos, [], seed=99):
+    for name, picture in draw_foreign(INPUTS, 240, photos, seed=99):
         drawn.setdefault(name, []).append(picture)
     for name, level in (("black", 0.0), ("white", 1.0)):
         yield name, NOT_A_GEL, [alike(np.full((240, 320, 3), level, dtype=np.float32))]

@@ -1,12 +1,12 @@
 """Fit the gel check: is this a gel image, and does it show contact (`retrieval.model.gel_check`)?
 
 The gel head is fitted on features of touches and no-contact frames of training objects and on foreign pictures:
-synthetic ones (plain, noise, clouds, ramps, stripes), photos, pieces of photos, and gel images in false colours. The
-thresholds are chosen on touches and no-contact frames of validation objects.
+synthetic ones (plain, noise, clouds, ramps, stripes), photos, and pieces of photos. The thresholds are chosen on touches
+and no-contact frames of validation objects.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import cycle, pairwise
 from pathlib import Path
@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from retrieval.data.dataset import Grasp
@@ -37,7 +37,7 @@ PENALTY = 0.02
 """Penalty on the squared weights of the check's linear layer, for features of unit variance. The penalty is smaller if
 there are more foreign pictures."""
 _MAX_PHOTOS, _PHOTO_PX = 400, 256
-"""Largest number of photos, and of gel images, for foreign pictures; shorter side of these photos in pixels."""
+"""Largest number of photos for foreign pictures, and their shorter side in pixels."""
 
 
 @dataclass(frozen=True)
@@ -47,13 +47,10 @@ class ForeignPictures:
     Attributes:
         count: Their number for fitting; half as many others test the check.
         margin: Margin of their threshold in log-odds (`MARGIN`).
-        has_false_colours: Whether gel images in false colours are foreign. They are not if the gels have lamps of many
-            makes.
     """
 
     count: int = 700
     margin: float = MARGIN
-    has_false_colours: bool = True
 
 
 FOREIGN = ForeignPictures()
@@ -68,13 +65,11 @@ class GelCheckFeatures:
         touch: (G, fingers, F) of touches.
         no_contact: (U, fingers, F) of no-contact frames; U = 0 if none are recorded.
         foreign: (N, F) of foreign pictures.
-        is_plainly_foreign: (N,) False for gel images in false colours.
     """
 
     touch: Tensor
     no_contact: Tensor
     foreign: Tensor
-    is_plainly_foreign: NDArray[np.bool_]
 
     @classmethod
     def of(
@@ -93,12 +88,10 @@ class GelCheckFeatures:
         fingers = matcher.config.fingers
         frames = _no_contact_images(settings, grasps, fingers)
         rows = np.linspace(0, len(grasps) - 1, min(_MAX_PHOTOS, len(grasps))).round().astype(int)
-        sample = [grasps[row] for row in rows]
         # Whole photos, not the model's views of them: a photo given instead of a gel image is mostly background.
-        photos = [_small_photo(path) for grasp in sample for path in grasp.photos]
-        recoloured = sample if foreign.has_false_colours else []
-        gels = [settings.load_touch(grasp.touches[0], *grasp.backgrounds[:1]) for grasp in recoloured]
-        names, drawn = zip(*draw_foreign(foreign.count, settings.touch_px, photos, gels, seed), strict=True)
+        photos = [_small_photo(path) for row in rows for path in grasps[row].photos]
+        # A touch needs one picture per finger, so each foreign picture is repeated.
+        pictures = [[each] * fingers for _, each in draw_foreign(foreign.count, settings.touch_px, photos, seed)]
         pooled = matcher.touch_tower.feature_count
 
         def of_fingers(features: Tensor) -> Tensor:
@@ -108,9 +101,7 @@ class GelCheckFeatures:
         return cls(
             of_fingers(touches),
             of_fingers(touch_features(matcher, frames)) if frames else torch.zeros(0, fingers, pooled),
-            # A touch needs one picture per finger, so each foreign picture is repeated.
-            of_fingers(touch_features(matcher, [[picture] * fingers for picture in drawn]))[:, 0],
-            np.array([name != "false colours" for name in names]),
+            of_fingers(touch_features(matcher, pictures))[:, 0],
         )
 
 
@@ -208,7 +199,7 @@ def fit_gel_check(
     rates = {
         "touches_rejected_as_foreign": _fraction(check.classify(touch), NOT_A_GEL),
         "touches_rejected_as_no_contact": _fraction(check.classify(touch), NO_CONTACT),
-        "foreign_rejected": _fraction(check.classify(foreign[test.is_plainly_foreign]), NOT_A_GEL),
+        "foreign_rejected": _fraction(check.classify(foreign), NOT_A_GEL),
     }
     if len(no_contact):
         rates["no_contact_accepted"] = _fraction(check.classify(no_contact), CONTACT)
@@ -232,30 +223,19 @@ def _fraction(verdicts: Sequence[str], name: str) -> float:
 # Foreign pictures ------------------------------------------------------------------------------------------
 
 
-_Draw = Callable[[np.random.Generator, int], np.ndarray]
-
-
-def draw_foreign(
-    count: int, px: int, photos: Sequence[RgbImage], gels: Sequence[RgbImage], seed: int = 0
-) -> Iterator[tuple[str, RgbImage]]:
+def draw_foreign(count: int, px: int, photos: Sequence[RgbImage], seed: int = 0) -> Iterator[tuple[str, RgbImage]]:
     """Yield `count` foreign pictures (px, px, 3) float32 in 0..1, each with the name of its kind; kinds alternate.
 
-    `photos` (H, W, 3) are resized and cut into pieces, `gels` (H, W, 3) recoloured; both may be empty. `px` is at
-    least 8.
+    `photos` (H, W, 3) are resized and cut into pieces; they may be empty. `px` is at least 8.
     """
-    kinds = dict(SYNTHETIC_KINDS)
-    if photos:
-        kinds |= {"photo": _of_one(photos, _whole), "piece of a photo": _of_one(photos, _piece)}
-    if gels:
-        kinds["false colours"] = _of_one(gels, _false_colours)
-    for number, (name, draw) in zip(range(count), cycle(kinds.items()), strict=False):
-        picture = draw(np.random.default_rng([seed, number]), px)
+    names = [*SYNTHETIC_KINDS, *(PHOTO_KINDS if photos else ())]
+    for number, name in zip(range(count), cycle(names), strict=False):
+        rng = np.random.default_rng([seed, number])
+        if name in SYNTHETIC_KINDS:
+            picture = SYNTHETIC_KINDS[name](rng, px)
+        else:
+            picture = PHOTO_KINDS[name](rng, px, photos[int(rng.integers(len(photos)))])
         yield name, np.ascontiguousarray(np.clip(picture, 0, 1), dtype=np.float32)
-
-
-def _of_one(pictures: Sequence[RgbImage], change: Callable[[RgbImage, np.random.Generator, int], np.ndarray]) -> _Draw:
-    """Return a function that changes a random one of the pictures."""
-    return lambda rng, px: change(pictures[int(rng.integers(len(pictures)))], rng, px)
 
 
 def _plain(rng: np.random.Generator, px: int) -> np.ndarray:
@@ -294,39 +274,20 @@ def _stripes(rng: np.random.Generator, px: int) -> np.ndarray:
     return np.asarray(one + (other - one) * weight)
 
 
-SYNTHETIC_KINDS: dict[str, _Draw] = {
-    "plain": _plain,
-    "noise": _noise,
-    "clouds": _clouds,
-    "ramp": _ramp,
-    "stripes": _stripes,
-}
-
-
-def _whole(photo: RgbImage, rng: np.random.Generator, px: int) -> np.ndarray:
+def _whole(rng: np.random.Generator, px: int, photo: RgbImage) -> np.ndarray:
     """Resize the photo like a gel image, and make it lighter or darker."""
     return rng.uniform(0.5, 1.4) * _resized(photo, px, cv2.INTER_AREA)
 
 
-def _piece(photo: RgbImage, rng: np.random.Generator, px: int) -> np.ndarray:
+def _piece(rng: np.random.Generator, px: int, photo: RgbImage) -> np.ndarray:
     """Cut a square of at least 0.3 of the photo's shorter side, and make it lighter or darker."""
     side = max(1, int(min(photo.shape[:2]) * rng.uniform(0.3, 1)))
     top, left = (int(rng.integers(length - side + 1)) for length in photo.shape[:2])
     return rng.uniform(0.5, 1.4) * _resized(photo[top : top + side, left : left + side], px, cv2.INTER_AREA)
 
 
-def _false_colours(gel: RgbImage, rng: np.random.Generator, px: int) -> np.ndarray:
-    """Return a gel image with exchanged, grey, negative, tinted or mixed channels, as if under other lamps."""
-    picture = _resized(gel, px, cv2.INTER_AREA)
-    orders = ((0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
-    changes: tuple[Callable[[], np.ndarray], ...] = (
-        lambda: picture[..., orders[int(rng.integers(5))]],
-        lambda: np.repeat(picture.mean(2, keepdims=True), 3, axis=2) * rng.uniform(0.4, 1.6),
-        lambda: 1 - picture,
-        lambda: picture * rng.uniform(0.2, 2, 3),
-        lambda: picture @ (np.eye(3) + rng.normal(0, 0.5, (3, 3))),
-    )
-    return changes[int(rng.integers(5))]()
+SYNTHETIC_KINDS = {"plain": _plain, "noise": _noise, "clouds": _clouds, "ramp": _ramp, "stripes": _stripes}
+PHOTO_KINDS = {"photo": _whole, "piece of a photo": _piece}
 
 
 def _resized(picture: np.ndarray, px: int, interpolation: int) -> np.ndarray:

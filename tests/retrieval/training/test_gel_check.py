@@ -48,26 +48,20 @@ def test_levels_compare_no_contact_frames_of_one_object_and_touches_with_their_o
 
 
 def test_every_kind_of_foreign_picture_is_drawn():
-    photo, gel = np.full((40, 60, 3), 0.4, dtype=np.float32), np.full((30, 40, 3), 0.6, dtype=np.float32)
-    drawn = dict(draw_foreign(8, 16, [photo], [gel], seed=3))
-    assert set(drawn) == {*SYNTHETIC_KINDS, "photo", "piece of a photo", "false colours"}
+    drawn = dict(draw_foreign(7, 16, [np.full((40, 60, 3), 0.4, dtype=np.float32)], seed=3))
+    assert set(drawn) == {*SYNTHETIC_KINDS, "photo", "piece of a photo"}
     assert all(picture.shape == (16, 16, 3) and 0 <= picture.min() <= picture.max() <= 1 for picture in drawn.values())
 
 
 def pictures(seed, no_contact=60):
-    """Return features (8) around three distant centres: touches, no-contact gels and foreign pictures.
-
-    Half of the foreign pictures have false colours and are among the touches.
-    """
+    """Return features (8) around three distant centres: touches, no-contact gels and foreign pictures."""
     rng = np.random.default_rng(seed)
 
     def around(place, *shape):
         return torch.from_numpy(place + rng.normal(size=(*shape, 8))).float()
 
     places = np.eye(8)[:3] * 9
-    foreign = torch.cat([around(places[2], 40), around(places[0], 40)])
-    is_plainly_foreign = np.repeat([True, False], 40)
-    return GelCheckFeatures(around(places[0], 80, 2), around(places[1], no_contact, 2), foreign, is_plainly_foreign)
+    return GelCheckFeatures(around(places[0], 80, 2), around(places[1], no_contact, 2), around(places[2], 80))
 
 
 def test_distant_kinds_are_separated_on_other_pictures_of_the_same_kinds():
@@ -126,7 +120,3 @@ def test_the_gel_head_of_a_matcher_with_cells_reads_the_features_without_them(re
     assert [part.shape[-1] for part in (found.touch, found.no_contact, found.foreign)] == [pooled] * 3
     expected = touch_features(matcher, images).view(6, 2, -1)[..., :pooled]
     assert torch.equal(found.touch, expected)
-    assert list(found.is_plainly_foreign) == [True] * 7 + [False]  # the last one has false colours
-    any_colours = ForeignPictures(8, has_false_colours=False)
-    found = GelCheckFeatures.of(matcher, settings, grasps, touch_features(matcher, images), any_colours, seed=0)
-    assert found.is_plainly_foreign.all()
