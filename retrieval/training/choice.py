@@ -67,11 +67,10 @@ def fit_best(
         features = comparison.features(recipes[best])
         fitted = recipes[best].fit(features, "final", is_final=True)
         parts = [part for part in held_out[best] if part.touches.has_trials]
-        pooled_parts = [part.pooled for part in parts if part.pooled is not None]
         fitted = with_sensor_calibrations(fitted, problem.grasps, features)
         refused = np.array(features.grasp_ids)[refused_touches(fitted, torch.from_numpy(features.touch_rows))]
         is_refused = [np.isin(part.grasp_ids, refused) for part in parts]
-        fitted = with_calibrations(fitted, [part.touches for part in parts], pooled_parts, refused=is_refused)
+        fitted = with_calibrations(fitted, [part.touches for part in parts], is_refused)
     table = _table(
         accuracies, identification(low_pass), _groups(comparison.folds), across_sessions=comparison.across_sessions
     )
@@ -140,13 +139,11 @@ class HeldOut:
 
     Attributes:
         touches: The touches, with match logits.
-        pooled: The same without late interaction; None for a model without cells.
         object_ids: The objects, by their numbers in `touches`.
         grasp_ids: The grasp of each touch.
     """
 
     touches: ScoredTouches
-    pooled: ScoredTouches | None
     object_ids: tuple[str, ...]
     grasp_ids: tuple[str, ...]
 
@@ -192,16 +189,9 @@ class Comparison:
         if self.across_sessions:
             own = sessions[:, None] == sessions
         tensors = torch.from_numpy(features.touch_rows), torch.from_numpy(features.photo)
-        owners = features.owner, features.owner
-        has_cells = bool(fitted.config.matcher.cell_dim)
-        scored = [
-            score_touches(fitted.matcher, tensors, owners, own, pooled=pooled)
-            for pooled in ((False, True) if has_cells else (False,))
-        ]
-        if self.across_sessions:
-            scored = [dataclasses.replace(touches, touch_group=sessions) for touches in scored]
-        objects = tuple(sorted(set(features.object_ids)))
-        return HeldOut(scored[0], scored[1] if has_cells else None, objects, features.grasp_ids)
+        group = sessions if self.across_sessions else None
+        scored = score_touches(fitted.matcher, tensors, (features.owner, features.owner), own, group)
+        return HeldOut(scored, tuple(sorted(set(features.object_ids))), features.grasp_ids)
 
 
 def objects_of_two_sessions(grasps: Sequence[Grasp]) -> set[str]:

@@ -55,32 +55,26 @@ def calibrate_checkpoint(
     if not train or not grasps:
         return checkpoint
     touches, photos = recorded_features(matcher, source, grasps)
-    scored = [
-        each
-        for pooled in ((False, True) if matcher.config.cell_dim else (False,))
-        if (each := score_grasps(matcher, grasps, touches, photos, pooled=pooled)) is not None
-    ]
+    scored = score_grasps(matcher, grasps, touches, photos)
     checkpoint = dataclasses.replace(checkpoint, opening=fit_opening([*train, *validation]))
     checkpoint = with_gel_check(checkpoint, source, train, validation, foreign=foreign, max_grasps=max_grasps)
-    if not scored:
+    if scored is None:
         return checkpoint
-    refused = [refused_touches(checkpoint, touches)]
-    return with_calibrations(checkpoint, scored[:1], scored[1:], seed=seed, refused=refused)
+    return with_calibrations(checkpoint, [scored], [refused_touches(checkpoint, touches)], seed=seed)
 
 
 def with_calibrations(
     checkpoint: Checkpoint,
     scored: Sequence[ScoredTouches],
-    pooled: Sequence[ScoredTouches],
+    refused: Sequence[NDArray[np.bool_]],
     *,
     seed: int = 0,
-    refused: Sequence[NDArray[np.bool_]] | None = None,
 ) -> Checkpoint:
     """Return the checkpoint with calibrations on touches of objects outside the fit, of one matcher or several.
 
-    `pooled` are the touches without late interaction, for an index without cells; empty for a model without cells.
-    `refused` is as for `fit_verification`.
+    `refused`: whether the gel check refuses each touch of each part (`fit_verification`).
     """
+    pooled = [part.pooled for part in scored if part.pooled is not None]
     posterior = fit_posterior(*scored, seed=seed)
     return dataclasses.replace(
         checkpoint,

@@ -1,8 +1,8 @@
 """Fit the gel check: is this a gel image, and does it show contact (`retrieval.model.gel_check`)?
 
 The gel head is fitted on features of touches and no-contact frames of training objects and on foreign pictures:
-synthetic ones (plain, noise, clouds, ramps, stripes), photos, and pieces of photos. The thresholds are chosen on touches
-and no-contact frames of validation objects.
+synthetic ones (plain, noise, clouds, ramps, stripes), photos, and pieces of photos. The thresholds are chosen on
+touches and no-contact frames of validation objects.
 """
 
 import dataclasses

@@ -36,6 +36,7 @@ class ScoredTouches:
         photo_embeddings: (N, d') embeddings, for verification.
         touch_group: (T,) number of the session or sequence of each touch, in the order of capture. Then reference
             touches and queries are of different ones.
+        pooled: The same without late interaction, as in an index without cells; None for a model without cells.
     """
 
     logits: NDArray[np.floating[Any]]
@@ -45,6 +46,7 @@ class ScoredTouches:
     touch_embeddings: Embeddings = field(default_factory=lambda: _NO_EMBEDDINGS)
     photo_embeddings: Embeddings = field(default_factory=lambda: _NO_EMBEDDINGS)
     touch_group: Numbers | None = None
+    pooled: "ScoredTouches | None" = None
 
     @property
     def has_trials(self) -> bool:
@@ -76,30 +78,29 @@ def score_touches(
     features: tuple[Tensor, Tensor],
     owners: tuple[Numbers, Numbers],
     own: NDArray[np.bool_],
-    *,
-    pooled: bool = False,
+    touch_group: Numbers | None = None,
 ) -> ScoredTouches:
-    """Score touches with photos, given their features (T, fingers * F) and (N, F') and their objects (T,) and (N,).
-
-    `pooled`: without late interaction, as an index without cells does.
-    """
+    """Score touches with photos, given their features (T, fingers * F) and (N, F') and their objects (T,) and (N,)."""
     touch_partials = matcher.touch_encoding(features[0]).partial.cpu().numpy()
     photo_partials, photo_embeddings = (part.cpu().numpy() for part in matcher.photo_encoding(features[1]))
     scorer = matcher.head.scorer
-    if pooled:
-        photo_partials = photo_partials[:, : scorer.pooled_width]
-    logits = np.stack([scorer.logits(partial[None], photo_partials) for partial in touch_partials])
     touch_embeddings = unit_embeddings(touch_partials, scorer.cosine_columns)
-    return ScoredTouches(logits, *owners, own, touch_embeddings, photo_embeddings)
+
+    def scored(photos: Embeddings) -> ScoredTouches:
+        logits = np.stack([scorer.logits(partial[None], photos) for partial in touch_partials])
+        return ScoredTouches(logits, *owners, own, touch_embeddings, photo_embeddings, touch_group)
+
+    pooled = scored(photo_partials[:, : scorer.pooled_width]) if matcher.config.cell_dim else None
+    return dataclasses.replace(scored(photo_partials), pooled=pooled)
 
 
 def score_grasps(
-    matcher: Matcher, grasps: Sequence[Grasp], touches: Tensor, photos: dict[Path, Tensor], *, pooled: bool = False
+    matcher: Matcher, grasps: Sequence[Grasp], touches: Tensor, photos: dict[Path, Tensor]
 ) -> ScoredTouches | None:
     """Score the touches of grasps with their photos (`recorded_features`); None for too few objects or photos."""
     touch_owner = np.unique([grasp.object_id for grasp in grasps], return_inverse=True)[1]
     owner_of = {grasp.photo: owner for grasp, owner in zip(grasps, touch_owner, strict=True)}
     owners = touch_owner, np.array([owner_of[photo] for photo in photos])
     own = np.array([[grasp.photo == photo for photo in photos] for grasp in grasps])
-    scored = score_touches(matcher, (touches, torch.stack(list(photos.values()))), owners, own, pooled=pooled)
+    scored = score_touches(matcher, (touches, torch.stack(list(photos.values()))), owners, own)
     return scored if scored.has_trials else None

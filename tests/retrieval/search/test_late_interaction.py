@@ -129,7 +129,7 @@ def test_the_pooled_posterior_is_fitted_on_the_logits_of_the_matcher_without_cel
     short = {photo: features[:count] for photo, features in photos.items()}
     short_touches = touches.reshape(12, 2, -1)[..., :each].reshape(12, -1)
     expected = score_grasps(pooled, grasps, short_touches, short)
-    found = score_grasps(matcher, grasps, touches, photos, pooled=True)
+    found = score_grasps(matcher, grasps, touches, photos).pooled
     np.testing.assert_allclose(found.logits, expected.logits, atol=1e-5)
     monkeypatch.setattr(calibration, "recorded_features", lambda *_, **__: (touches, photos))
     monkeypatch.setattr(calibration, "_sample_grasps", lambda some, *_: some)  # keeps their order

@@ -100,7 +100,7 @@ def test_every_object_is_held_out_once_and_objects_of_one_sequence_together(reco
 
 def held_out(logits, touch_owner, photo_owner, own, names):
     scored = ScoredTouches(np.array(logits, float), np.array(touch_owner), np.array(photo_owner), np.array(own, bool))
-    return HeldOut(scored, None, tuple(names), tuple(f"grasp-{row}" for row in range(len(logits))))
+    return HeldOut(scored, tuple(names), tuple(f"grasp-{row}" for row in range(len(logits))))
 
 
 def test_accuracy_of_hand_made_scores():
