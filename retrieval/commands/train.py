@@ -96,8 +96,6 @@ def _train_gate(recording: Path, out: Path, iterations: int | None) -> None:
         f"{result['validation_grasps']} grasps of {result['validation_objects']} other objects; always predicting "
         f"the more frequent class: {result['chance']:.3f}"
     )
-    accepted = [f"{part} of {whole} {name}" for name, (part, whole) in result["accepted"].items()]
-    say(f"accepted: {', '.join(accepted)}")
 
 
 def _train_with_config(recording: Path, out: Path, settings: "Config", split: Path | None) -> None:

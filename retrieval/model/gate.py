@@ -4,40 +4,22 @@ As in the authors' collection code, one network serves all fingers, and its inpu
 frame. A grasp succeeds if ANY finger's probability is at least 1/2. This network is smaller than theirs.
 """
 
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from _touch_retrieval.documents import check_fields
-from retrieval.data.preprocessing import Preprocessing, Side
+from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import to_float
-from retrieval.errors import BadInput, CheckpointError, ConfigError, NumericalError
+from retrieval.errors import BadInput, CheckpointError, NumericalError
 from retrieval.model.checkpoint import load_weights, read_tensors
 from retrieval.model.encode import one_thread, touch_batch
 
 TASK = "grasp-success"
-
-
-@dataclass(frozen=True)
-class GateSettings:
-    """Input of a gate: side of the image in pixels, and the frame that it compares with the no-contact frame."""
-
-    touch_px: Side = 64
-    frame: Literal["after", "during"] = "after"
-
-    def __post_init__(self) -> None:
-        check_fields(self, "gate", ConfigError)
-
-    def preprocessing(self) -> Preprocessing:
-        """Return the preprocessing that makes float32 differences (touch_px, touch_px, 3) in -1..1."""
-        return Preprocessing(touch_px=self.touch_px, background="difference")
 
 
 class GraspNet(nn.Module):
@@ -76,50 +58,47 @@ such frame (`robot.grasping.gates.GraspFrames`)."""
 
 
 class GraspSuccessGate:
-    """Classifier of grasps, a function of {finger: frames} for any number of fingers."""
+    """Classifier of grasps, a function of {finger: frames} for any number of fingers.
 
-    def __init__(self, net: GraspNet, settings: GateSettings) -> None:
-        self.net, self.settings = net.eval(), settings
-        self._preprocessing = settings.preprocessing()
+    Attributes:
+        frame: The frame that is compared with the no-contact frame: "after" the lift, or "during" the grasp.
+    """
+
+    preprocessing: ClassVar = Preprocessing(touch_px=64, background="difference")
+
+    def __init__(self, net: GraspNet, frame: str) -> None:
+        self.net, self.frame = net.eval(), frame
 
     def __call__(self, fingers: Mapping[str, FingerFrames]) -> bool:
         """Return whether the grasp succeeded: whether any finger's probability is at least 1/2.
 
         Raises:
-            BadInput: As for `logits`.
+            BadInput: There are no fingers, a frame is missing, or a frame is not a picture.
         """
-        return max(self.logits(fingers).values()) >= 0
-
-    def logits(self, fingers: Mapping[str, FingerFrames]) -> dict[str, float]:
-        """Return each finger's log-odds of success.
-
-        Raises:
-            BadInput: A frame is missing, or is not a picture.
-        """
-        names = sorted(fingers)
-        return dict(zip(names, self.score([[self._difference(name, fingers[name]) for name in names]])[0], strict=True))
+        if not fingers:
+            raise BadInput("a grasp must have the frames of at least one finger; got none")
+        differences = [self._difference(name, frames) for name, frames in sorted(fingers.items())]
+        return max(self.score(touch_batch([differences]))[0]) >= 0
 
     @torch.inference_mode()
-    def score(self, differences: Sequence[Sequence[NDArray[np.float32]]]) -> list[list[float]]:
-        """Return the logits of grasps, each given by its fingers' differences.
+    def score(self, differences: Tensor) -> list[list[float]]:
+        """Return the logits of grasps' fingers, given differences (B, fingers, 3, px, px).
 
         Raises:
             NumericalError: A logit is not finite. A NaN is not above 0, so the grasp would be classified as failed.
         """
         with one_thread():
-            logits: list[list[float]] = self.net(touch_batch(differences)).tolist()
-        if bad := [number for number, each in enumerate(logits) if not all(map(math.isfinite, each))]:
-            raise NumericalError(f"logits of a gate must be finite, got {logits[bad[0]]}; train the gate again")
-        return logits
+            logits: Tensor = self.net(differences)
+        if not logits.isfinite().all():
+            raise NumericalError(f"logits of a gate must be finite, got {logits.tolist()}; train the gate again")
+        return logits.tolist()  # type: ignore[no-any-return]
 
     def _difference(self, finger: str, frames: FingerFrames) -> NDArray[np.float32]:
-        frame, before = getattr(frames, self.settings.frame), frames.before
+        frame, before = getattr(frames, self.frame), frames.before
         if frame is None or before is None:
-            missing = "before" if before is None else self.settings.frame
-            raise BadInput(
-                f"this gate compares the frames before and {self.settings.frame}; finger {finger} has none {missing}"
-            )
-        return self._preprocessing.touch(to_float(frame), to_float(before))
+            missing = "before" if before is None else self.frame
+            raise BadInput(f"this gate compares the frames before and {self.frame}; finger {finger} has none {missing}")
+        return self.preprocessing.touch(to_float(frame), to_float(before))
 
 
 def load_gate(path: Path) -> GraspSuccessGate:
@@ -135,9 +114,5 @@ def load_gate(path: Path) -> GraspSuccessGate:
             f"train a gate with `retrieve train --task {TASK}`"
         )
     net = GraspNet()
-    try:
-        settings = GateSettings(**header["gate"])
-        load_weights(net, state)
-    except (BadInput, TypeError, KeyError) as error:
-        raise CheckpointError(f"{path} is not a gate that this version can use: {error}") from error
-    return GraspSuccessGate(net, settings)
+    load_weights(net, state)
+    return GraspSuccessGate(net, header["frame"])

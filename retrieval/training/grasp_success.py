@@ -16,8 +16,7 @@ A gate selects the touches that a matcher later trains on, so it makes them easi
 """
 
 import dataclasses
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +26,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from retrieval.console.progress import Bar
-from retrieval.data.dataset import Grasp, ImageCache, load_attempts, make_split, recording_licence
+from retrieval.data.dataset import Attempt, load_attempts, make_split, recording_licence
 from retrieval.errors import DatasetError
 from retrieval.metrics.intervals import grouped_interval
 from retrieval.model.checkpoint import require_writable, write_tensors
-from retrieval.model.encode import batches, one_thread, touch_batch
-from retrieval.model.gate import TASK, GateSettings, GraspNet, GraspSuccessGate
+from retrieval.model.encode import one_thread, touch_batch
+from retrieval.model.gate import TASK, GraspNet, GraspSuccessGate
 from retrieval.model.losses.loss import match_loss
+from retrieval.training.batches import BatchImages
 from retrieval.training.initial_weights import made_from
 from retrieval.training.loop import Plan, train_loop
 
@@ -42,114 +42,86 @@ LEARNING_RATE = 3e-3  # halved after each quarter of the steps, as the authors d
 VALIDATION = 0.25  # fraction of the objects, as the authors use
 BRIGHTNESS, CONTRAST = 20 / 255, 0.1  # largest change of the lamps between two frames
 
-Differences = Callable[[Sequence[Grasp]], list[list[NDArray[np.float32]]]]
 
-
-def train_gate(
-    recording: Path, out: Path, *, iterations: int = 400, seed: int = 0, settings: GateSettings | None = None
-) -> dict[str, Any]:
+def train_gate(recording: Path, out: Path, *, iterations: int = 400, seed: int = 0) -> dict[str, Any]:
     """Train a gate on the successful and failed grasps of a recording and write it to `out`.
 
-    A quarter of the objects are for validation. Training takes half a minute, plus 15 ms for each grasp.
-
-    By default, the gate uses the frame after the lift, or the frame during the grasp if any grasp lacks the former. The
-    same seed gives the same gate.
+    A quarter of the objects are for validation. Training takes half a minute, plus 15 ms for each grasp. The gate uses
+    the frame after the lift, or the frame during the grasp if any grasp lacks the former. The same seed gives the same
+    gate.
 
     Returns:
         The metrics in the file: the frame that the gate uses; "train_grasps", "train_held", "validation_grasps" and
         "validation_objects"; the "accuracy" on validation objects, its 95 % "interval" (grasps of one object are
-        dependent) and "chance", the accuracy of always predicting the more frequent class; and (accepted, all) grasps
-        by outcome, "accepted".
+        dependent) and "chance", the accuracy of always predicting the more frequent class.
 
     Raises:
-        DatasetError: The recording lacks successful grasps, failed grasps, or required frames.
+        DatasetError: The recording lacks successful grasps, failed grasps, or no-contact frames.
         CheckpointError: `out` cannot be written.
     """
     require_writable(out)
-    grasps = load_attempts(recording)
-    settings = settings or GateSettings(frame="after" if all(grasp.after for grasp in grasps) else "during")
-    _require_frames(grasps, settings.frame)
-    split = make_split(grasps, validation=VALIDATION, test=0, seed=seed)
+    attempts = load_attempts(recording)
+    frame = "after" if all(attempt.after for attempt in attempts) else "during"
+    split = make_split([attempt.grasp for attempt in attempts], validation=VALIDATION, test=0, seed=seed)
     train, validation = (
-        [grasp for grasp in grasps if grasp.object_id in objects] for objects in (split.train, split.validation)
+        [attempt for attempt in attempts if attempt.grasp.object_id in objects]
+        for objects in (split.train, split.validation)
     )
-    held = sum(grasp.held for grasp in train)
-    if held in (0, len(train)):
+    is_held, is_held_validation = (np.array([attempt.held for attempt in part]) for part in (train, validation))
+    if is_held.all() or not is_held.any():
         raise DatasetError(
-            f"the training objects of seed {seed} must have both successful and failed grasps; got {held} successful "
-            f"of {len(train)}; collect without a gate to record failures too"
+            f"the training objects of seed {seed} must have both successful and failed grasps; got {is_held.sum()} "
+            f"successful of {len(train)}; collect without a gate to record failures too"
         )
-    load = ImageCache(settings.preprocessing().load_touch)
-
-    def differences(grasps: Sequence[Grasp]) -> list[list[NDArray[np.float32]]]:
-        """Return the differences of the fingers of each grasp."""
-        return [
-            [load(*pair) for pair in zip(_frames(grasp, settings.frame), grasp.backgrounds, strict=True)]
-            for grasp in grasps
-        ]
-
-    logits: list[float] = []  # each grasp's highest logit
     with one_thread():
-        gate = GraspSuccessGate(_train_net(train, differences, iterations, seed), settings)
-        with Bar("validating", len(validation), "grasps") as bar:
-            for part in batches(validation, BATCH):
-                logits += map(max, gate.score(differences(part)))
-                bar.advance(len(part))
-    is_held, accepted = np.array([grasp.held for grasp in validation]), np.array(logits) >= 0
-    is_correct, outcomes = accepted == is_held, [grasp.outcome for grasp in validation]
-    owner = np.array([grasp.object_id for grasp in validation])
+        gate = GraspSuccessGate(_train_net(_differences(train, frame), is_held, iterations, seed), frame)
+        differences = _differences(validation, frame).split(BATCH)
+        accepted = np.array([max(logits) >= 0 for part in differences for logits in gate.score(part)])
+    is_correct = accepted == is_held_validation
+    owner = np.array([attempt.grasp.object_id for attempt in validation])
     by_object = [is_correct[owner == name].tolist() for name in np.unique(owner)]
     metrics = {
-        "frame": settings.frame,
+        "frame": frame,
         "train_grasps": len(train),
-        "train_held": held,
+        "train_held": int(is_held.sum()),
         "validation_grasps": len(validation),
         "validation_objects": len(by_object),
         "accuracy": float(is_correct.mean()),
         "interval": grouped_interval(by_object),
-        "chance": float(max(is_held.mean(), 1 - is_held.mean())),
-        "accepted": {
-            name: (sum(accepted[[each == name for each in outcomes]].tolist()), count)
-            for name, count in sorted(Counter(outcomes).items())
-        },
+        "chance": float(max(is_held_validation.mean(), 1 - is_held_validation.mean())),
     }
     provenance = {
         "iterations": iterations,
         "seed": seed,
-        **made_from(recording, grasps, [recording_licence(recording)]),
-        "outcomes": dict(Counter(grasp.outcome for grasp in grasps)),
+        **made_from(recording, (attempt.grasp for attempt in attempts), [recording_licence(recording)]),
         "metrics": metrics,
     }
-    header = {"task": TASK, "gate": dataclasses.asdict(settings), "split": split.to_dict(), "provenance": provenance}
+    header = {"task": TASK, "frame": frame, "split": split.to_dict(), "provenance": provenance}
     write_tensors(out, gate.net.state_dict(), header)
     return metrics
 
 
-def _frames(grasp: Grasp, frame: str) -> tuple[Path, ...]:
-    return grasp.after if frame == "after" else grasp.touches
+def _differences(attempts: Sequence[Attempt], frame: str) -> Tensor:
+    """Return the differences (B, fingers, 3, px, px) of a frame of each grasp from its no-contact frames."""
+    images, differences = BatchImages(GraspSuccessGate.preprocessing), []
+    with Bar("reading", len(attempts), "grasps") as bar:
+        for attempt in attempts:
+            touches = attempt.after if frame == "after" else attempt.grasp.touches
+            differences.append(images.touch(dataclasses.replace(attempt.grasp, touches=touches)))
+            bar.advance()
+    return touch_batch(differences)
 
 
-def _require_frames(grasps: Sequence[Grasp], frame: str) -> None:
-    for grasp in grasps:
-        for moment, files in (("before", grasp.backgrounds), (frame, _frames(grasp, frame))):
-            if len(files) != len(grasp.touches):
-                raise DatasetError(
-                    f"a gate compares the frames before and {frame} of each finger; {grasp.grasp_id} has "
-                    f"{len(files)} {moment} for {len(grasp.touches)} finger(s); record them (touch_a_{moment})"
-                )
-
-
-def _train_net(grasps: list[Grasp], differences: Differences, iterations: int, seed: int) -> GraspNet:
+def _train_net(differences: Tensor, is_held: NDArray[np.bool_], iterations: int, seed: int) -> GraspNet:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         net = GraspNet()
-    first = touch_batch(differences(draw_batch(grasps, 0, seed)[0]))
+    first = differences[draw_batch(is_held, 0, seed)[0]]
     net.scale.fill_(max(float(first.square().mean().sqrt()), 1 / 255))  # at least a grey level
 
     def loss(step: int, _: int) -> Tensor:
-        batch, rng = draw_batch(grasps, step, seed)
-        images = augment(touch_batch(differences(batch)), rng)
-        return gate_loss(net(images), torch.tensor([float(grasp.held) for grasp in batch]))
+        rows, rng = draw_batch(is_held, step, seed)
+        return gate_loss(net(augment(differences[rows], rng)), torch.from_numpy(is_held[rows]).float())
 
     optimizer, plan = torch.optim.Adam(net.parameters()), Plan(iterations, LEARNING_RATE, "halving")
     train_loop(net, optimizer, plan, lambda steps: steps, loss, title="training")
@@ -161,14 +133,11 @@ def gate_loss(logits: Tensor, held: Tensor) -> Tensor:
     return match_loss(logits.amax(1), held)
 
 
-def draw_batch(grasps: Sequence[Grasp], step: int, seed: int) -> tuple[list[Grasp], np.random.Generator]:
-    """Draw equal numbers of held and failed grasps, from seed and step only; also return the random generator."""
+def draw_batch(is_held: NDArray[np.bool_], step: int, seed: int) -> tuple[NDArray[np.int64], np.random.Generator]:
+    """Draw the rows of equal numbers of held and failed grasps, from seed and step only; also return the generator."""
     rng = np.random.default_rng([seed, step])
-    drawn: list[Grasp] = []
-    for held in (True, False):
-        kind = [grasp for grasp in grasps if grasp.held == held]
-        drawn += [kind[row] for row in rng.choice(len(kind), BATCH // 2, replace=len(kind) < BATCH // 2)]
-    return drawn, rng
+    kinds = np.flatnonzero(is_held), np.flatnonzero(~is_held)
+    return np.concatenate([rng.choice(kind, BATCH // 2, replace=len(kind) < BATCH // 2) for kind in kinds]), rng
 
 
 def augment(images: Tensor, rng: np.random.Generator) -> Tensor:
