@@ -1,11 +1,6 @@
 """CCA of concatenated towers (`retrieval.training.cca`), as `retrieve train` fits it."""
 
-from contextlib import suppress
-from dataclasses import asdict
-
-from retrieval.errors import BadInput
 from retrieval.methods.method import Array, Method
-from retrieval.training.calibration.posterior import fit_posterior
 from retrieval.training.cca import fit_projections, select_settings, tower_widths, unit_rows
 from retrieval.training.features import Features
 from retrieval.training.selection import held_out_folds
@@ -14,8 +9,8 @@ from retrieval.training.selection import held_out_folds
 class CcaTowers(Method):
     """CCA on the features of concatenated towers: a pair's score is the cosine of its two encodings.
 
-    Settings are chosen by ranking on validation objects. With `fit_on_validation` they are chosen by cross-validation
-    within all objects, and the held-out objects also calibrate the cosines ("posterior" in `best_params`).
+    Settings are chosen by ranking on validation objects; with `fit_on_validation`, by cross-validation within all
+    objects.
     """
 
     is_seeded = False
@@ -27,13 +22,9 @@ class CcaTowers(Method):
             folds = held_out_folds(known, self.settings.kind_of, seed=self.settings.seed)
         choice = select_settings(known, blocks, folds)
         self.best_params = {**choice.settings._asdict(), "validation_auc": choice.auc}
+        self._projections = choice.projections
         if not self.settings.fit_on_validation:
             self._projections = fit_projections(train, blocks, [choice.settings])[choice.settings]
-            return
-        self._projections = choice.projections
-        with suppress(BadInput):  # too few held-out objects, or one photo of each
-            posterior = fit_posterior(*choice.held_out_touches)
-            self.best_params["posterior"] = asdict(posterior)
 
     def _encode_touch(self, touch: Array) -> Array:
         return unit_rows(self._projections.touch(touch.reshape(len(touch), -1)))

@@ -74,7 +74,7 @@ def test_choices_report_each_fold(tmp_path, monkeypatch):
     assert len(by_choice) == 4
     assert summary.value[0] == pytest.approx(np.mean(by_choice))
     assert summary.low[0] <= summary.value[0] <= summary.high[0]
-    assert set(row.best_params[0][0]) >= {"ridge", "photo_ridge", "directions", "power", "posterior"}
+    assert set(row.best_params[0][0]) >= {"ridge", "photo_ridge", "directions", "power"}
     assert "all touches share one no-contact frame" in entry.controls["no_contact"].reason
     permuted = entry.controls["permuted"].measures["topn_k9"]
     assert permuted.low[0] < 1 / 9 < permuted.high[0]
