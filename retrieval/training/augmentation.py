@@ -7,22 +7,15 @@ from torch import Tensor
 from torch.nn import functional
 
 
-def augment(
-    images: Tensor,
-    kind: str,
-    rng: np.random.Generator,
-    flipped: NDArray[np.bool_] | None = None,
-    visible: float = 1.0,
-) -> Tensor:
-    """Return augmented images (B, 3, side, side') with the same relief.
+def augment(images: Tensor, kind: str, rng: np.random.Generator, flipped: NDArray[np.bool_]) -> Tensor:
+    """Return augmented images (B, 3, H, W) with the same relief.
 
     Images are turned by up to .1 rad, scaled by up to 8 %, shifted, flipped, relit, and get noise. Photos are also
     desaturated, since colour carries no information on relief. A gel's colours come from its lamps, which keep their
     places. So a gel image is only flipped top to bottom (the same press with a turned finger), and its channels are
     scaled equally.
 
-    `images` (B, 3, H, W) are in 0..1, `kind` is "photo" or "touch", `flipped` (B,) says which images are flipped
-    (default: each with probability 1/2), and `visible` is the fraction of a side that is kept.
+    `images` (B, 3, H, W) are in 0..1, `kind` is "photo" or "touch", and `flipped` (B,) says which images are flipped.
     """
     count = len(images)
 
@@ -30,12 +23,12 @@ def augment(
         return torch.from_numpy(rng.uniform(low, high, (count, *shape)).astype(np.float32))
 
     turn, size = draw(-0.1, 0.1), draw(0.92, 1.08)
-    flip = torch.from_numpy(np.where(rng.random(count) < 0.5 if flipped is None else flipped, -1.0, 1.0)).float()
+    flip = torch.from_numpy(np.where(flipped, -1.0, 1.0)).float()
     across, down = (flip, torch.ones(count)) if kind == "photo" else (torch.ones(count), flip)
-    cosine, sine = torch.cos(turn) * size * visible, torch.sin(turn) * size * visible
-    shift = draw(-0.1, 0.1, 2) if visible < 1 else draw(-0.05, 0.05, 2)
+    cosine, sine, shift = torch.cos(turn) * size, torch.sin(turn) * size, draw(-0.05, 0.05, 2)
     maps = torch.stack([across * cosine, -down * sine, shift[:, 0], across * sine, down * cosine, shift[:, 1]], 1)
-    result = sample_grid(images, maps.view(count, 2, 3), visible)
+    grid = functional.affine_grid(maps.view(count, 2, 3), list(images.shape), align_corners=False)
+    result = functional.grid_sample(images.contiguous(), grid, padding_mode="reflection", align_corners=False)
     if kind == "photo":
         grey, towards = result.mean(1, keepdim=True), draw(0.0, 1.0, 1, 1, 1)
         result = torch.lerp(result, grey.expand_as(result), (towards + 0.5).clamp(max=1.0) * (towards > 0.25))
@@ -60,10 +53,3 @@ def augment_photos(photos: Tensor, views: int, flipped: NDArray[np.bool_], rng: 
     each = torch.stack(photos.chunk(views, dim=3), dim=1)
     result = augment(each.flatten(0, 1), "photo", rng, flipped.repeat(views)).view_as(each)
     return torch.cat(list(result.unbind(1)), dim=3).contiguous(memory_format=torch.channels_last)
-
-
-def sample_grid(images: Tensor, maps: Tensor, visible: float) -> Tensor:
-    """Return images (B, 3, ...), a fraction `visible` of each side, sampled by affine maps (B, 2, 3) of coordinates."""
-    side = [max(round(visible * length), 1) for length in images.shape[2:]]
-    grid = functional.affine_grid(maps, [len(images), 3, *side], align_corners=False)
-    return functional.grid_sample(images.contiguous(), grid, padding_mode="reflection", align_corners=False)
