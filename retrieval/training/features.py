@@ -184,16 +184,6 @@ def _tower_digest(tower: Tower) -> str:
     return tensors_digest(tower.state_dict(), f"{type(tower).__name__} {tower.output} {tower.cells}")
 
 
-_UNITS = {
-    "touch": "touches",
-    "low_pass": "low-pass touches",
-    "no_contact": "no-contact frames",
-    "photo": "photos",
-    "margin": "margins of photos",
-}
-"""What progress calls the images of each variant."""
-
-
 def _encoded_once(
     cache: Path | None,
     made_by: tuple[str, ...],
@@ -208,7 +198,7 @@ def _encoded_once(
     features (B, F) of a list of images, `files` the files of an item. Raises DatasetError if one cannot be read.
     """
     with (
-        Bar("encoding", len(items), _UNITS[made_by[0]]) as bar,
+        Bar("encoding", len(items), "touches or photos") as bar,
         worker_pool() as pool,
         Cache(cache / "cache.sqlite") if cache else nullcontext() as store,
     ):
