@@ -197,16 +197,16 @@ def train_towers(folder: Path, **settings: Any) -> Checkpoint:
     images, parts = training_images(folder, PARTS), [recording_of(folder, part) for part in PARTS]
     start, config = load_checkpoint(shipped_model(2)), load_config(TOWERS)
     training = dataclasses.replace(config.training, start=str(start.path), **settings)
+    stated = StatedFields(config.preprocessing, parts)
     trainer = InvariantTrainer(
         dataclasses.replace(config, training=training),
         split_of(images.grasps, []),
         images.grasps,
         folder / "towers.safetensors",
         {"source": "simulated rigs", "data_digest": data_digest(images.grasps)},
+        TrainedFeatures(dataclasses.replace(config, preprocessing=stated), default_device()),
         references=references(start, images, folder / "features"),
     )
-    stated = StatedFields(config.preprocessing, parts)
-    trainer.features = TrainedFeatures(dataclasses.replace(config, preprocessing=stated), trainer.device)
     return averaged(start, trainer.run_or_reuse(), TRAINED_SHARE)
 
 
@@ -230,11 +230,11 @@ def train_cells(made: Checkpoint, folder: Path, **settings: Any) -> Checkpoint:
         grasps,
         folder / f"cells-{made.config.matcher.fingers}.safetensors",
         {"source": "simulated rigs", "data_digest": data_digest(grasps)},
+        FrozenFeatures(known),
         parts=CELLS,
         references=expected,
         weights=made.matcher.state_dict(),
     )
-    trainer.features = FrozenFeatures(config, known)
     return with_parts(made, averaged(made, trainer.run_or_reuse(), CELL_SHARE), CELLS)
 
 
@@ -421,7 +421,7 @@ def calibrated(made: Checkpoint, folder: Path, fingers: int) -> Checkpoint:
     validation, verification, gels, varied = (of_fingers(part, fingers) for part in parts)
     every, device = [*validation, *verification, *gels, *varied], default_device()
     features = encode_recording(every, made.matcher, made.config, folder / "features")
-    source = FrozenFeatures(made.config, features_by_image(every, features, device))
+    source = FrozenFeatures(features_by_image(every, features, device))
     names = sorted({grasp.object_id for grasp in gels})
     fitting, others = ([grasp for grasp in gels if grasp.object_id in names[side::2]] for side in (0, 1))
     held_out = [*validation, *others]

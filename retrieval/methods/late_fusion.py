@@ -12,13 +12,12 @@ from retrieval.data.dataset import Grasp, Split
 from retrieval.methods.method import Array, Method, MethodSettings
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
+from retrieval.model.encode import default_device
 from retrieval.model.fusion import Matcher
-from retrieval.training.features import Features
+from retrieval.training.batches import FrozenFeatures
+from retrieval.training.features import Features, features_by_image
 from retrieval.training.initial_weights import build_matcher, tower_weights
 from retrieval.training.trainer import Trainer
-
-SOURCE = {"source": "features of a recording"}
-"""Provenance of a head that is trained on features."""
 
 
 class LateFusion(Method):
@@ -78,7 +77,9 @@ def trained_checkpoint(settings: MethodSettings, train: Features, validation: Fe
     weights = start.matcher.state_dict() if start else tower_weights(frozen_matcher(settings.config))
     with nullcontext(settings.folder) if settings.folder else tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"late_fusion-{settings.seed}.safetensors"
-        return Trainer(config, split, grasps, path, SOURCE, known, weights).run_or_reuse()
+        source = FrozenFeatures(features_by_image(grasps, known, default_device()))
+        made_from = {"source": "features of a recording", "data_digest": known.digest}
+        return Trainer(config, split, grasps, path, made_from, source, weights).run_or_reuse()
 
 
 def frozen_matcher(config: Config) -> Matcher:

@@ -144,52 +144,37 @@ class TrainedFeatures:
             return matcher.touch_features(loaded.touches), matcher.photo_features(loaded.photos)
 
     def eval_features(self, matcher: Matcher, grasps: Sequence[Grasp], photos: Sequence[Path]) -> tuple[Tensor, Tensor]:
-        """Return features of touches and photos, encoded without gradients."""
-        return _encoded(matcher, self.images, grasps, photos)
+        """Return features of the touches of grasps, and of photos, encoded without gradients."""
+        with worker_pool() as pool:
+            touch = touch_features(matcher, map_in_order(pool, self.images.touch, grasps)) if grasps else torch.zeros(0)
+            photo = photo_features(matcher, map_in_order(pool, self.images.photo, photos)) if photos else torch.zeros(0)
+        return touch, photo
 
 
 class FrozenFeatures:
-    """Features of frozen towers: each image is encoded once."""
+    """Features of frozen towers, by grasp id (of the touch) and by photo file (`features_by_image`)."""
 
     step_context = staticmethod(one_thread)  # of a training step: more do not speed up the head's small products
 
-    def __init__(self, config: Config, known: Mapping[str | Path, Tensor], camera: PhotoCamera = USUAL_CAMERA) -> None:
-        """Start with features by grasp id (of the touch) and by photo file that need no encoding."""
-        self.images = BatchImages(config.preprocessing, camera)  # images are read once
-        self._features: dict[str | Path, Tensor] = dict(known)
+    def __init__(self, features: Mapping[str | Path, Tensor]) -> None:
+        self._features = features
 
     def batches(self, matcher: Matcher, batches: Iterable[tuple[int, PairBatch]]) -> Iterator[LoadedBatch]:
-        """Yield the features of each batch, given with its step; new images are encoded when their batch comes."""
+        """Yield the features of each batch, given with its step."""
         return (LoadedBatch(batch, *self.eval_features(matcher, batch.grasps, batch.photos)) for _, batch in batches)
 
     def train_features(self, matcher: Matcher, loaded: LoadedBatch) -> tuple[Tensor, Tensor]:
-        """Return the features of the batch's touches and photos, as constants of the step."""
-        return loaded.touches.clone(), loaded.photos.clone()
+        """Return the features of the batch's touches and photos."""
+        return loaded.touches, loaded.photos
 
-    @torch.inference_mode()
     def eval_features(self, matcher: Matcher, grasps: Sequence[Grasp], photos: Sequence[Path]) -> tuple[Tensor, Tensor]:
-        """Return the features of touches and photos; new images are encoded."""
-        new = {grasp.grasp_id: grasp for grasp in grasps if grasp.grasp_id not in self._features}
-        new_photos = [path for path in photos if path not in self._features]
-        touch, photo = _encoded(matcher, self.images, list(new.values()), new_photos)
-        self._features |= zip(new, touch, strict=True)
-        self._features |= zip(new_photos, photo, strict=True)
+        """Return the features of touches and photos."""
         touches = torch.stack([self._features[grasp.grasp_id] for grasp in grasps])
         return touches, torch.stack([self._features[path] for path in photos]) if photos else touches[:0]
 
 
 FeatureSource = TrainedFeatures | FrozenFeatures
 """The source of a training run's features."""
-
-
-def _encoded(
-    matcher: Matcher, images: BatchImages, grasps: Sequence[Grasp], photos: Sequence[Path]
-) -> tuple[Tensor, Tensor]:
-    """Return features of the touches of grasps, and of photos, encoded without gradients."""
-    with worker_pool() as pool:
-        touch = touch_features(matcher, map_in_order(pool, images.touch, grasps)) if grasps else torch.zeros(0)
-        photo = photo_features(matcher, map_in_order(pool, images.photo, photos)) if photos else torch.zeros(0)
-    return touch, photo
 
 
 @torch.inference_mode()

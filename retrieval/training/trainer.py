@@ -45,7 +45,7 @@ from retrieval.model.towers.tower import Tower
 from retrieval.training.batches import FeatureSource, FrozenFeatures, LoadedBatch, TrainedFeatures
 from retrieval.training.calibration.checkpoint import calibrate_checkpoint
 from retrieval.training.distil import add_candidate_encoder
-from retrieval.training.features import Features, features_by_image
+from retrieval.training.features import encode_recording, features_by_image
 from retrieval.training.initial_weights import (
     TOWER_WEIGHTS,
     build_matcher,
@@ -115,21 +115,21 @@ class Trainer:
         grasps: list[Grasp],
         out: Path,
         provenance: Mapping[str, Any],
-        known: Features | None = None,
+        features: FeatureSource | None = None,
         weights: Mapping[str, Tensor] = MappingProxyType({}),
         camera: PhotoCamera = USUAL_CAMERA,
     ) -> None:
         """Prepare a run.
 
-        `provenance`: origin of the data (`made_from`). `known`: features of all grasps. They replace the images if the
-        towers are frozen. `weights`: weights that replace the initial ones of these names. `camera`: camera of the
-        photos.
+        `provenance`: origin of the data (`made_from`). `features`: features in place of the images, which are then not
+        read, also for no calibration. `weights`: weights that replace the initial ones of these names. `camera`: camera
+        of the photos.
         """
         settings = config.training
         self.config, self.split, self.out = config, split, out
         self.device = default_device()
         torch.manual_seed(settings.seed)
-        self.has_images = known is None
+        self.has_images = features is None
         self.matcher = build_matcher(config.without_candidate_encoder()).to(self.device)
         self.matcher.load_state_dict(weights, strict=False)
         self.sampler = self._sampler(split.select(grasps, "train"))
@@ -146,16 +146,15 @@ class Trainer:
         self.optimizer.register_step_post_hook(lambda *_: self.matcher.clamp_scale())
         held_out = split.select(grasps, "validation")
         self.validation = self._sampler(held_out).evaluation_pairs() if split.validation else None
-        self.features: FeatureSource = (
-            FrozenFeatures(config, features_by_image(grasps, known, self.device) if known else {}, camera)
-            if settings.freeze_towers
-            else TrainedFeatures(config, self.device, camera)
-        )
+        if features is None and settings.freeze_towers:
+            used = [*split.select(grasps, "train"), *held_out]
+            encoded = encode_recording(used, self.matcher, config, None, camera=camera)
+            features = FrozenFeatures(features_by_image(used, encoded, self.device))
+        self.features = features or TrainedFeatures(config, self.device, camera)
         set_training_mode(self.matcher, settings)
         towers = [module for module in self.matcher.modules() if isinstance(module, Tower)]
         self.provenance = {
             **provenance,
-            **({"data_digest": known.digest} if known else {}),
             **({"weights_digest": tensors_digest(weights, "")} if weights else {}),
             **({"camera": list(camera)} if camera != USUAL_CAMERA else {}),
             **code_digest(*map(type, (*self.losses.terms, *towers))),

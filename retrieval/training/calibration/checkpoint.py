@@ -134,7 +134,7 @@ def with_sensor_calibrations(checkpoint: Checkpoint, grasps: Sequence[Grasp], fe
     names, device = sorted({grasp.object_id for grasp in grasps}), default_device()
     halves = [[grasp for grasp in grasps if grasp.object_id in names[side::2]] for side in (0, 1)]
     checkpoint.matcher.to(device)
-    source = FrozenFeatures(checkpoint.config, features_by_image(grasps, features, device))
+    source = FrozenFeatures(features_by_image(grasps, features, device))
     return with_gel_check(dataclasses.replace(checkpoint, opening=fit_opening(grasps)), source, *halves)
 
 

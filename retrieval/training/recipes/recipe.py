@@ -13,8 +13,10 @@ from retrieval.data.dataset import DataLicence, Grasp, Split, make_split, record
 from retrieval.model.card import checkpoint_licences
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
+from retrieval.model.encode import default_device
 from retrieval.model.fusion import Matcher
-from retrieval.training.features import Features
+from retrieval.training.batches import FrozenFeatures
+from retrieval.training.features import Features, features_by_image
 from retrieval.training.initial_weights import build_matcher, training_licences
 from retrieval.training.linear import available_config, fit_linear
 from retrieval.training.loop import OnStep
@@ -164,6 +166,8 @@ class ContinuedHead(Recipe):
         split = make_split(grasps, validation=VALIDATION_FRACTION, test=0, seed=training.seed)
         config = config if is_final else config.without_candidate_encoder()
         out = problem.folder / f"{name}.safetensors"
-        trainer = Trainer(config, split, grasps, out, {"source": ""}, features, start.matcher.state_dict())
+        source = FrozenFeatures(features_by_image(grasps, features, default_device()))
+        made_from = {"source": "", "data_digest": features.digest}
+        trainer = Trainer(config, split, grasps, out, made_from, source, start.matcher.state_dict())
         fitted = trainer.run_or_reuse(on_step=problem.on_step if is_final else None)
         return dataclasses.replace(fitted, provenance={key: fitted.provenance[key] for key in ("step", "metrics")})
