@@ -75,7 +75,6 @@ class Method(ABC):
     def __init__(self, settings: MethodSettings) -> None:
         self.settings = settings
         self.best_params: dict[str, Any] = {}
-        self._shapes: tuple[tuple[int, ...], ...] = ()
 
     def fit(self, train: Features, validation: Features) -> None:
         """Fit on the grasps of training objects; choose settings on those of validation objects.
@@ -88,15 +87,14 @@ class Method(ABC):
                 f"training and validation objects must differ; {min(shared)!r} is in both; split the grasps by object"
             )
         self._fit(train, validation)
-        self._shapes = train.touch.shape[1:], train.photo.shape[1:]
 
     def encode_touch(self, touch: NDArray[Any]) -> Array:
-        """Return encodings (T, ...) of touch features (T, fingers, F). Raises BadInput unless shaped as in the fit."""
-        return self._encode_touch(_checked("touch features", touch, None, *self._shapes[0]))
+        """Return encodings (T, ...) of touch features (T, fingers, F), shaped as in the fit."""
+        return self._encode_touch(np.asarray(touch, dtype=np.float32))
 
     def encode_photo(self, photo: NDArray[Any]) -> Array:
-        """Return encodings (N, ...) of photo features (N, F). Raises BadInput unless shaped as in the fit."""
-        return self._encode_photo(_checked("photo features", photo, None, *self._shapes[1]))
+        """Return encodings (N, ...) of photo features (N, F), shaped as in the fit."""
+        return self._encode_photo(np.asarray(photo, dtype=np.float32))
 
     def score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
         """Return scores (T, N) of every touch with every photo: by default, inner products of the encodings.
@@ -104,7 +102,7 @@ class Method(ABC):
         Raises NumericalError for a score that is not finite.
         """
         scores = self._score(touch_encodings, photo_encodings)
-        return _checked("scores", scores, len(touch_encodings), len(photo_encodings))
+        return _checked_scores(scores, (len(touch_encodings), len(photo_encodings)))
 
     def score_sets(self, touch_encodings: Array, photo_encodings: Array, sets: NDArray[np.int64]) -> Array:
         """Return scores (S, N) of sets (S, G) of touches of one object with every photo.
@@ -113,7 +111,7 @@ class Method(ABC):
         object.
         """
         scores = self._score_sets(touch_encodings, photo_encodings, sets)
-        return _checked("scores", scores, len(sets), len(photo_encodings))
+        return _checked_scores(scores, (len(sets), len(photo_encodings)))
 
     @abstractmethod
     def _fit(self, train: Features, validation: Features) -> None: ...
@@ -140,17 +138,12 @@ def sum_over_sets(scores: Array, sets: NDArray[np.int64]) -> Array:
     return total.astype(np.float32)
 
 
-def _checked(name: str, array: NDArray[Any], *shape: int | None) -> Array:
-    """Return the array as float32 of a shape, in which None is any length.
-
-    A NaN or infinite value is an error: sorting would rank a NaN first.
-    """
-    array = np.asarray(array, dtype=np.float32)
-    expected = tuple(got if wanted is None else wanted for wanted, got in zip(shape, array.shape, strict=False))
-    if array.shape != expected or len(shape) != array.ndim:
-        text = ", ".join("B" if wanted is None else str(wanted) for wanted in shape)
-        raise BadInput(f"{name} must be an array of shape ({text}); got {array.shape}")
-    if not np.isfinite(array).all():
-        place = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise NumericalError(f"{name} must be finite; got {array[place]} at {place}")
-    return array
+def _checked_scores(scores: NDArray[Any], shape: tuple[int, int]) -> Array:
+    """Return finite scores of this shape as float32. Others are an error: sorting would rank a NaN first."""
+    scores = np.asarray(scores, dtype=np.float32)
+    if scores.shape != shape:
+        raise BadInput(f"scores must be an array of shape {shape}; got {scores.shape}")
+    if not np.isfinite(scores).all():
+        place = tuple(int(i) for i in np.argwhere(~np.isfinite(scores))[0])
+        raise NumericalError(f"scores must be finite; got {scores[place]} at {place}")
+    return scores

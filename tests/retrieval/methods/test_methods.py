@@ -110,18 +110,6 @@ def test_a_set_scores_the_sum_over_its_grasps_in_any_order(name):
         np.testing.assert_allclose(scores, single[sets].sum(1), rtol=1e-4, atol=1e-5)
 
 
-@every_method
-def test_features_of_another_shape_than_in_the_fit_or_not_finite_are_refused(name):
-    with pytest.raises(BadInput, match=r"touch features must be an array of shape \(B, 2, 256\)"):
-        fitted(name).encode_touch(TEST.touch[:, :1])
-    with pytest.raises(BadInput, match=r"photo features must be an array of shape \(B, 256\)"):
-        fitted(name).encode_photo(TEST.photo[:, :100])
-    photo = TEST.photo.copy()
-    photo[3, 5] = np.nan
-    with pytest.raises(NumericalError, match=r"photo features must be finite; got .* at \(3, 5\)"):
-        fitted(name).encode_photo(photo)
-
-
 def test_objects_in_both_parts_are_refused():
     with pytest.raises(BadInput, match="'object-0-00' is in both"):
         METHODS.load("chance")(MethodSettings(CONFIG)).fit(TRAIN, TRAIN)
