@@ -33,10 +33,10 @@ from retrieval.training.recipes.recipe import Problem, Recipe
 from retrieval.training.selection import (
     COMPARED,
     LOW_PASS,
-    MIN_OBJECTS_FOR_FOUR_FOLDS,
     accuracy_row,
     comparison_table,
     draw_folds,
+    objects_of_two_sessions,
 )
 
 CONTROL = "linear"
@@ -96,7 +96,7 @@ def _candidates(problem: Problem, recipe: str | type[Recipe] | None) -> tuple[li
             f"A fit needs at least {MIN_OBJECTS} objects with two grasps each, got {len(objects)} objects with "
             f"{len(problem.grasps)} grasps. Record more."
         )
-    testable = objects_of_two_sessions(problem.grasps) or objects
+    testable = objects_of_two_sessions(problem.grasps, MIN_OBJECTS) or objects
     split = problem.start.split
     unknown = testable.difference((*split.train, *split.validation) if split else ())
     kinds = {name: RECIPES.load(name) for name in (RECIPES.names() if recipe is None else [RECIPES.name_of(recipe)])}
@@ -156,7 +156,7 @@ class Comparison:
         self.problem, self.folds = problem, folds
         sessions = list(dict.fromkeys(grasp.session for grasp in problem.grasps))
         self._session_of = {grasp.grasp_id: sessions.index(grasp.session) for grasp in problem.grasps}
-        self.across_sessions = bool(objects_of_two_sessions(problem.grasps))
+        self.across_sessions = bool(objects_of_two_sessions(problem.grasps, MIN_OBJECTS))
         objects = sum(map(len, folds))
         self._max_touches = min(max(MAX_TOUCHES // objects, 2), MAX_TOUCHES_OF_OBJECT)
 
@@ -192,16 +192,6 @@ class Comparison:
         group = sessions if self.across_sessions else None
         scored = score_touches(fitted.matcher, tensors, (features.owner, features.owner), own, group)
         return HeldOut(scored, tuple(sorted(set(features.object_ids))), features.grasp_ids)
-
-
-def objects_of_two_sessions(grasps: Sequence[Grasp]) -> set[str]:
-    """Return the objects that were touched in two sessions, if they are half of all, or 12; else nothing."""
-    sessions: dict[str, set[str]] = {}
-    for grasp in grasps:
-        sessions.setdefault(grasp.object_id, set()).add(grasp.session or "")
-    repeated = {name for name, of_object in sessions.items() if len(of_object) > 1}
-    needed = max(MIN_OBJECTS, min(MIN_OBJECTS_FOR_FOUR_FOLDS, len(sessions) / 2))
-    return repeated if len(repeated) >= needed else set()
 
 
 def identification(parts: Sequence[HeldOut]) -> Measure:

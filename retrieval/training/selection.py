@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from retrieval.data.dataset import Grasp
 from retrieval.errors import BadInput, NumericalError
 from retrieval.metrics.intervals import bootstrap_interval
 from retrieval.metrics.measure import Measure, weight_below
@@ -16,6 +17,8 @@ GALLERY, MAX_FOLDS = 9, 5
 """Smallest usual number of objects of a fold, and largest number of folds."""
 MIN_OBJECTS = 6
 """Minimum number of objects: two folds of three."""
+MIN_OBJECTS_FOR_FOUR_FOLDS = 12
+"""Objects that four folds need, three in each; fewer objects make two folds."""
 LOW_PASS = "low-pass control"
 COMPARED = "compared"
 """Key of `comparison_table` in a checkpoint's provenance."""
@@ -53,6 +56,19 @@ def ranking_auc(
     return float(np.mean([values[owner == each].mean() for each in np.unique(owner)]))
 
 
+def objects_of_two_sessions(grasps: Sequence[Grasp], minimum: int) -> set[str]:
+    """Return the objects that were touched in two sessions, if they are half of all, or 12; else nothing.
+
+    Fewer than `minimum` are none.
+    """
+    sessions: dict[str, set[str]] = {}
+    for grasp in grasps:
+        sessions.setdefault(grasp.object_id, set()).add(grasp.session or "")
+    repeated = {name for name, of_object in sessions.items() if len(of_object) > 1}
+    needed = max(minimum, min(MIN_OBJECTS_FOR_FOUR_FOLDS, len(sessions) / 2))
+    return repeated if len(repeated) >= needed else set()
+
+
 def draw_folds(linked: Sequence[Sequence[str]]) -> list[tuple[str, ...]]:
     """Draw folds of objects, each left out once; the objects of a group stay together.
 
@@ -71,10 +87,6 @@ def draw_folds(linked: Sequence[Sequence[str]]) -> list[tuple[str, ...]]:
             "each object a sequence_id of its own."
         )
     return [tuple(sorted(fold)) for fold in folds]
-
-
-MIN_OBJECTS_FOR_FOUR_FOLDS = 12
-"""Objects that four folds need, three in each; fewer objects make two folds."""
 
 
 def held_out_folds(

@@ -53,11 +53,11 @@ from retrieval.training.selection import (
     COMPARED,
     LOW_PASS,
     MIN_OBJECTS,
-    MIN_OBJECTS_FOR_FOUR_FOLDS,
     accuracy_row,
     comparison_table,
     draw_folds,
     held_out_folds,
+    objects_of_two_sessions,
     ranking_auc,
     validation_rows,
 )
@@ -94,41 +94,34 @@ def fit_maps(
     }
 
 
-class Parts(NamedTuple):
-    """Parts of a recording: touches are compared with those of other parts only.
+def divide(grasps: Sequence[Grasp]) -> tuple[bool, Numbers, Numbers]:
+    """Divide the touches of a recording (G) into groups; a touch is compared with those of other turns only.
 
-    Attributes:
-        has_sessions: Whether the parts are sessions: half of the objects, or 12, have touches of two.
-        group: (G,) session; without several sessions the sequence, or the grasp itself; numbers in order of capture.
-        turn: (G,) the session, or the number of the group within its object, modulo `TURNS`.
+    Returns:
+        Whether the groups are sessions: half of the objects, or 12, have touches of two.
+        (G,) session; without several sessions the sequence, or the grasp itself; numbers in order of capture.
+        (G,) turn: the session, or the number of the group within its object, modulo `TURNS`.
+
+    Raises:
+        BadInput: Fewer than `MIN_OBJECTS` objects have two groups.
     """
-
-    has_sessions: bool
-    group: Numbers
-    turn: Numbers
-
-
-def divide(grasps: Sequence[Grasp]) -> Parts:
-    """Divide the touches of a recording. Raises BadInput if fewer than `MIN_OBJECTS` objects have two parts."""
-    objects = {grasp.object_id for grasp in grasps}
-    for has_sessions in (True, False):
-        names = [(grasp.session if has_sessions else grasp.sequence_id or grasp.grasp_id) or "" for grasp in grasps]
-        numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
-        group = np.array([numbers[name] for name in names])
-        turn, repeated = group.copy(), 0
-        for name in objects:
-            mine = [place for place, grasp in enumerate(grasps) if grasp.object_id == name]
-            found, number = np.unique(group[mine], return_inverse=True)
-            repeated += len(found) > 1
-            if not has_sessions:
-                turn[mine] = number % TURNS
-        needed = min(MIN_OBJECTS_FOR_FOUR_FOLDS, len(objects) / 2) if has_sessions else 0
-        if repeated >= max(MIN_OBJECTS, needed):  # fewer would calibrate the model alone
-            return Parts(has_sessions, group, turn)
-    raise BadInput(
-        f"a fit to touches needs {MIN_OBJECTS} objects with touches of two sequences; {repeated} object(s) have them: "
-        "touch the objects again, best in another session"
-    )
+    has_sessions = bool(objects_of_two_sessions(grasps, MIN_OBJECTS))
+    names = [(grasp.session if has_sessions else grasp.sequence_id or grasp.grasp_id) or "" for grasp in grasps]
+    numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
+    group = np.array([numbers[name] for name in names])
+    turn, repeated = group.copy(), 0
+    for name in {grasp.object_id for grasp in grasps}:
+        mine = [place for place, grasp in enumerate(grasps) if grasp.object_id == name]
+        found, number = np.unique(group[mine], return_inverse=True)
+        repeated += len(found) > 1
+        if not has_sessions:
+            turn[mine] = number % TURNS
+    if repeated < MIN_OBJECTS:
+        raise BadInput(
+            f"a fit to touches needs {MIN_OBJECTS} objects with touches of two sequences; {repeated} object(s) have "
+            "them: touch the objects again, best in another session"
+        )
+    return has_sessions, group, turn
 
 
 class Touches(NamedTuple):
@@ -137,8 +130,8 @@ class Touches(NamedTuple):
     Attributes:
         features: Features of G grasps, with those of the touches in place of those of photos.
         owner: (G,) objects.
-        group: (G,) as in `Parts`.
-        turn: (G,) as in `Parts`.
+        group: (G,) as of `divide`.
+        turn: (G,) as of `divide`.
     """
 
     features: Features
@@ -250,12 +243,12 @@ def fit_to_touches(recording: Path, grasps: Sequence[Grasp], init: str) -> tuple
     widths = [part.feature_count for part in matcher.touch_tower.backbones] * config.matcher.fingers
     folds_of = partial(held_out_folds, kind_of=object_kinds(recording), linked=linked, seed=seed)
     fit = partial(fit_touches, widths=widths, folds_of=folds_of)
-    parts = divide(grasps)
+    has_sessions, group, turn = divide(grasps)
     measures, encoded = dict[str, Measure](), dict[str, Touches]()
     for variant, suffix in (("touch", ""), ("low_pass", "_low_pass")):
         features = encode_recording(grasps, matcher, config, None, touch_variant=variant, photo_variant="none")
         features = dataclasses.replace(features, photo=features.touch_rows)
-        encoded[variant] = touches = Touches(features, features.owner, parts.group, parts.turn)
+        encoded[variant] = touches = Touches(features, features.owner, group, turn)
         with one_thread():
             measures |= {f"{name}{suffix}": measure for name, measure in _accuracies(touches, folds, fit)}
     with one_thread():
@@ -270,7 +263,7 @@ def fit_to_touches(recording: Path, grasps: Sequence[Grasp], init: str) -> tuple
         config=config,
         provenance={
             "step": 0,
-            COMPARED: _table(measures, parts.has_sessions),
+            COMPARED: _table(measures, has_sessions),
             "metrics": {f"{name}_top1": float(measure.by_object()[1].mean()) for name, measure in measures.items()},
         },
         matcher=matcher,

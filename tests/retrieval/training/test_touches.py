@@ -34,13 +34,13 @@ def test_codes_have_the_cosines_of_whitening_within_objects():
 
 def test_touches_are_divided_by_session_else_by_sequence_else_one_by_one():
     names = [name for name in "abcdef" for _ in range(4)]
-    sessions = divide([grasp(n, name, session="xy"[n % 2]) for n, name in enumerate(names)])
-    assert (sessions.has_sessions, sessions.turn.tolist()) == (True, [0, 1] * 12)
-    sequences = divide([grasp(n, name, f"{name}{n % 4 // 2}") for n, name in enumerate(names)])
-    assert (sequences.has_sessions, sequences.turn.tolist()) == (False, [0, 0, 1, 1] * 6)
-    assert divide([grasp(n, name) for n, name in enumerate(names)]).turn.tolist() == [0, 1, 2, 0] * 6
-    few = divide([grasp(n, f"{n % 44}", session="y" if n % 44 < 11 and n > 87 else "x") for n in range(132)])
-    assert not few.has_sessions  # 11 of 44 objects would calibrate the model alone
+    has_sessions, _, turn = divide([grasp(n, name, session="xy"[n % 2]) for n, name in enumerate(names)])
+    assert (has_sessions, turn.tolist()) == (True, [0, 1] * 12)
+    has_sessions, _, turn = divide([grasp(n, name, f"{name}{n % 4 // 2}") for n, name in enumerate(names)])
+    assert (has_sessions, turn.tolist()) == (False, [0, 0, 1, 1] * 6)
+    assert divide([grasp(n, name) for n, name in enumerate(names)])[2].tolist() == [0, 1, 2, 0] * 6
+    few = [grasp(n, f"{n % 44}", session="y" if n % 44 < 11 and n > 87 else "x") for n in range(132)]
+    assert not divide(few)[0]  # 11 of 44 objects would calibrate the model alone
     with pytest.raises(BadInput, match=r"6 objects with touches of two sequences; 5 object\(s\) have them"):
         divide([grasp(n, name, "f" if name == "f" else None) for n, name in enumerate(names)])
 
