@@ -19,7 +19,7 @@ from retrieval.model.fusion import Matcher
 from retrieval.model.posterior import SLOPE_BOUNDS
 from retrieval.model.towers.weights import GEL, SHIPPED
 from retrieval.training.calibration.scores import ScoredTouches
-from retrieval.training.cca import CcaSelection, select_settings, tower_widths
+from retrieval.training.cca import CcaProjections, select_settings, tower_widths
 from retrieval.training.features import Features
 from retrieval.training.initial_weights import downloaded_or
 
@@ -74,14 +74,13 @@ def fit_linear(features: Features, config: Config, folds: Sequence[Sequence[str]
     """
     choice = select_settings(features, tower_widths(config, features), folds)
     matcher = Matcher(config.matcher, len(config.preprocessing.views)).eval()
-    install_projections(matcher, choice)
+    install_projections(matcher, choice.projections, *_log_odds(choice.held_out_touches))
     return dataclasses.replace(config, training=config.training.with_given_weights()), matcher
 
 
 @torch.no_grad()
-def install_projections(matcher: Matcher, choice: CcaSelection) -> None:
+def install_projections(matcher: Matcher, projections: CcaProjections, scale: float, offset: float) -> None:
     """Make the match logit `scale * cosine + offset` of the projected features; the head's layers contribute 0."""
-    projections, (scale, offset) = choice.projections, _log_odds(choice.held_out_touches)
     for layer, found in ((matcher.touch_projection, projections.touch), (matcher.photo_projection, projections.photo)):
         assert isinstance(layer, nn.Linear)  # the preset has no hidden layer
         used = found.weight.shape[1]  # shorter encodings leave zeros, which do not change the cosine

@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from retrieval.data.dataset import DataLicence, Grasp, Split, finger_count, linked_objects, object_kinds
@@ -42,13 +41,14 @@ from retrieval.training.cca import (
     MAX_CALIBRATION_TOUCHES,
     MAX_CHOICE_TOUCHES,
     AffineMap,
+    CcaProjections,
     CcaSettings,
     Modality,
     unit_rows,
 )
 from retrieval.training.features import Features, encode_recording
 from retrieval.training.initial_weights import build_matcher, training_licences
-from retrieval.training.linear import available_config
+from retrieval.training.linear import available_config, install_projections
 from retrieval.training.selection import (
     COMPARED,
     LOW_PASS,
@@ -288,15 +288,9 @@ def _table(measures: Mapping[str, Measure], has_sessions: bool) -> dict[str, Any
 
 def _with_map(config: Config, matcher: Matcher, found: AffineMap) -> tuple[Config, Matcher]:
     """Return the matcher whose embedding of a touch is its code, with the same towers, and its configuration."""
-    settings = dataclasses.replace(config.matcher, embedding_dim=found.weight.shape[1])
+    settings = dataclasses.replace(config.matcher, embedding_dim=len(found.bias))
     made = Matcher(settings).eval()
     made.touch_tower = matcher.touch_tower
-    unused = {name: part for name, part in made.state_dict().items() if name.startswith(("head.", "photo_projection."))}
-    state = {name: torch.zeros_like(part) for name, part in unused.items()} | {
-        "touch_projection.weight": torch.from_numpy(found.weight.T),
-        "touch_projection.bias": torch.from_numpy(found.bias),
-        "photo_projection.bias": torch.eye(settings.embedding_dim)[0],  # an index requires unit embeddings
-        "cosine_scale": torch.tensor(1.0),
-    }
-    made.load_state_dict(state, strict=False)
+    no_photo = AffineMap(np.zeros((made.pooled_counts[1], len(found.bias))), np.eye(len(found.bias))[0])
+    install_projections(made, CcaProjections(found, no_photo), 1.0, 0.0)  # an index requires unit embeddings
     return dataclasses.replace(config, matcher=settings, training=config.training.with_given_weights()), made
