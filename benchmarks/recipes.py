@@ -50,9 +50,7 @@ def measure(
             grasps = [grasp for grasp in load_grasps(recording) if grasp.object_id not in rest]
             comparison = Comparison(pose(recording, grasps, Path(folder) / "parts", init=init), [left_out])
             recipes = {
-                name: recipe
-                for name in RECIPES
-                if not (recipe := RECIPES.load(name)).obstacle(comparison.problem, len(fitted))
+                name: recipe for name in RECIPES if not (recipe := RECIPES.load(name)).obstacle(comparison.problem)
             }
             for name, recipe in recipes.items():
                 fit = recipe(comparison.problem)

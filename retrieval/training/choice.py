@@ -105,7 +105,7 @@ def _candidates(problem: Problem, recipe: str | type[Recipe] | None) -> tuple[li
         say("The start model was trained on these objects, so recipes that use it cannot be tested and are left out")
     else:
         testable = unknown
-    obstacles = {name: kind.obstacle(problem, len(objects)) for name, kind in kinds.items()}
+    obstacles = {name: kind.obstacle(problem) for name, kind in kinds.items()}
     names = [name for name, obstacle in obstacles.items() if not obstacle]
     if not names:
         reason = next(iter(obstacles.values()), "the start model was trained on these objects")

@@ -6,7 +6,7 @@ Like the authors' classifier, it processes one finger at a time and combines the
   the grasp. An object that slips is absent after the lift, but it presses the gel like any other during the grasp. On
   569 grasps of the simulated rig, the later frame classified all grasps correctly on three splits. The frame during the
   grasp (accuracy 0.60 to 0.71) accepted half of the slips and rejected a fifth of the held grasps, three quarters for
-  some objects. `GateSettings(frame="during")` uses the touch itself, for rigs that do not lift.
+  some objects. It is for rigs that do not lift.
 * The loss uses the highest logit of the fingers, because only this logit decides. With the grasp's label on each
   finger, a finger without contact in a good grasp would teach that an empty gel is a success. And the maximum of two
   outputs that were fitted separately accepts more grasps than each of them.

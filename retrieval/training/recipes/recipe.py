@@ -85,8 +85,8 @@ class Recipe(ABC):
         self.problem, self.config, self.matcher = problem, problem.start.config, problem.start.matcher
 
     @classmethod
-    def obstacle(cls, problem: Problem, objects: int) -> str:
-        """Return why the recipe cannot be fitted to so many objects; empty if it can."""
+    def obstacle(cls, problem: Problem) -> str:
+        """Return why the recipe cannot be fitted; empty if it can."""
         fingers = problem.start.config.matcher.fingers
         if cls.uses_start and fingers != problem.fingers:
             return f"the start model takes {fingers} gel image(s) of a touch, and the recording has {problem.fingers}"
