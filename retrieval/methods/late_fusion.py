@@ -16,7 +16,7 @@ from retrieval.model.encode import default_device
 from retrieval.model.fusion import Matcher
 from retrieval.training.batches import FrozenFeatures
 from retrieval.training.features import Features, features_by_image
-from retrieval.training.initial_weights import build_matcher, tower_weights
+from retrieval.training.initial_weights import TOWER_WEIGHTS, build_matcher
 from retrieval.training.trainer import Trainer
 
 
@@ -73,8 +73,11 @@ def trained_checkpoint(settings: MethodSettings, train: Features, validation: Fe
         matcher=dataclasses.replace(config.matcher, fingers=train.touch.shape[1]),
         training=dataclasses.replace(config.training, seed=settings.seed, freeze_towers=True),
     )
-    start = settings.start
-    weights = start.matcher.state_dict() if start else tower_weights(frozen_matcher(settings.config))
+    if settings.start:
+        weights = settings.start.matcher.state_dict()
+    else:
+        towers = frozen_matcher(settings.config).state_dict()
+        weights = {name: part for name, part in towers.items() if name.startswith(TOWER_WEIGHTS)}
     with nullcontext(settings.folder) if settings.folder else tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"late_fusion-{settings.seed}.safetensors"
         source = FrozenFeatures(features_by_image(grasps, known, default_device()))

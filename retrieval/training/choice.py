@@ -205,12 +205,13 @@ def identification(parts: Sequence[HeldOut]) -> Measure:
     numbers = {name: number for number, name in enumerate(sorted(name for part in parts for name in part.object_ids))}
     measures = []
     for part in parts:
-        touches, rng = part.touches, np.random.default_rng([0, 8])
-        values, objects = np.zeros(len(touches.logits)), len(part.object_ids)
+        touches, objects, rng = part.touches, len(part.object_ids), np.random.default_rng([0, 8])
+        values, logits = np.zeros(len(touches.logits)), np.where(touches.own, -np.inf, touches.logits)
+        photos_of = [np.flatnonzero(touches.photo_owner == owner) for owner in range(objects)]
         for _ in range(DRAWS):
             keys = np.where(touches.own, -1.0, rng.random(touches.own.shape))
-            photos = np.stack([_drawn(keys, touches.photo_owner == owner) for owner in range(objects)], axis=1)
-            scores = np.where(photos < 0, -np.inf, np.take_along_axis(touches.logits, np.maximum(photos, 0), 1))
+            drawn = np.stack([photos[keys[:, photos].argmax(1)] for photos in photos_of], axis=1)
+            scores = np.take_along_axis(logits, drawn, 1)
             right = np.take_along_axis(scores, touches.touch_owner[:, None], 1)
             values += np.where((scores > right).any(1), 0.0, 1 / (scores == right).sum(1)) / DRAWS
         rows = np.flatnonzero(np.isfinite(right[:, 0]))
@@ -220,13 +221,6 @@ def identification(parts: Sequence[HeldOut]) -> Measure:
     if not measures:
         raise BadInput("no touch has another photo of its object; record at least two grasps of each object")
     return pooled(measures)
-
-
-def _drawn(keys: NDArray[np.float64], is_photo: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the photo (T,) with the highest key among those of an object; -1 if all its keys are negative."""
-    columns = np.flatnonzero(is_photo)
-    places = keys[:, columns].argmax(1)
-    return np.where(np.take_along_axis(keys[:, columns], places[:, None], 1)[:, 0] < 0, -1, columns[places])
 
 
 # The result ------------------------------------------------------------------------------------------------

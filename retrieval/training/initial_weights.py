@@ -73,11 +73,6 @@ def build_matcher(config: Config) -> Matcher:
     return matcher
 
 
-def tower_weights(matcher: Matcher) -> dict[str, Tensor]:
-    """Return the weights of a matcher's towers, by name."""
-    return {name: part for name, part in matcher.state_dict().items() if name.startswith(TOWER_WEIGHTS)}
-
-
 def _start_from(matcher: Matcher, path: Path) -> None:
     """Copy the weights of a checkpoint into a matcher.
 

@@ -177,7 +177,7 @@ def test_augmentation_flips_and_relights_each_finger_independently():
 REFUSED = {
     "no results": ({"outcomes": ("held",), "outcome": None, "grasped": None}, "has a recorded result"),
     "held grasps only": ({"outcomes": ("held",)}, "got 6 successful of 6"),
-    "no frame before": ({"columns": ("during", "after")}, "no-contact frame for each finger; a-0 has 0 for 2"),
+    "no frame before": ({"columns": ("during", "after")}, "no-contact frame for each finger; .-0 has 0 for 2"),
     "too few objects": ({"objects": OBJECTS[:3]}, "needs two objects in each"),
 }
 
