@@ -100,9 +100,7 @@ class TrainingConfig:
     depends on `workers`, so checkpoints and caches omit it.
 
     Attributes:
-        init: Initial weights of the towers: "random", "imagenet", "shipped", "gel" or the path of a state dict. If
-            towers are trained from "imagenet" and its weights cannot be downloaded, a line on stderr says so, and the
-            checkpoint's configuration states "random".
+        init: Initial weights of the towers: "random", "imagenet", "shipped", "gel" or the path of a state dict.
         init_touch: Initial weights of the touch tower, if not empty. The part "init" stands for the value of `init`.
         init_photo: The same for the photo tower.
         start: Checkpoint whose towers and head the training continues from, if not empty, instead of initial weights.

@@ -8,7 +8,6 @@ from typing import Any
 
 from torch import Tensor
 
-from retrieval.console.output import say
 from retrieval.data.dataset import (
     LICENCES,
     DataLicence,
@@ -29,32 +28,6 @@ from retrieval.model.towers.weights import GEL, SHIPPED
 
 TOWER_WEIGHTS = ("touch_tower.", "photo_tower.")
 """Prefixes of the names of the towers' weights in a matcher."""
-
-
-def with_available_weights(config: Config) -> Config:
-    """Return the configuration, or one with random initial weights if those of ImageNet cannot be downloaded.
-
-    A line on stderr states it. Frozen towers are never random: they would learn nothing.
-    """
-    settings = config.training
-    inits = {settings.tower_init(init) for init in (settings.init_touch, settings.init_photo)}
-    if inits != {"imagenet"} or settings.start or settings.freeze_towers:
-        return config
-    consequence = "The training starts from random weights, as with --init random"
-    return downloaded_or(dataclasses.replace(config, training=settings.with_given_weights()), config, consequence)
-
-
-def downloaded_or(replacement: Config, config: Config, consequence: str) -> Config:
-    """Return `config`, whose initial weights are ImageNet's; if they cannot be downloaded, its replacement.
-
-    A line on stderr states the reason and the consequence.
-    """
-    try:
-        build_matcher(config)
-    except CheckpointError as error:
-        say(f"{error}. {consequence}")
-        return replacement
-    return config
 
 
 def build_matcher(config: Config) -> Matcher:

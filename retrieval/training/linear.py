@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from retrieval.errors import BadInput
+from retrieval.console.output import say
+from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.config import Config, load_config
 from retrieval.model.encode import one_thread
 from retrieval.model.fusion import Matcher
@@ -21,7 +22,7 @@ from retrieval.model.towers.weights import GEL, SHIPPED
 from retrieval.training.calibration.scores import ScoredTouches
 from retrieval.training.cca import CcaProjections, select_settings, tower_widths
 from retrieval.training.features import Features
-from retrieval.training.initial_weights import downloaded_or
+from retrieval.training.initial_weights import build_matcher
 
 PRESET = "linear"
 PUBLISHED_TOWER = "mobilenet_v2"
@@ -59,10 +60,13 @@ def available_config(fingers: int, init: str) -> Config:
     if init in (GEL, SHIPPED):
         raise BadInput(f'The initial weights must be "imagenet", "random" or a file of MobileNetV2, got {init!r}.')
     config = linear_config(fingers, init)
-    if init != "imagenet":
-        return config
-    consequence = "Without them, the linear fit has the package's towers only: 9 points worse on VT60"
-    return downloaded_or(linear_config(fingers, NO_WEIGHTS), config, consequence)
+    if init == "imagenet":
+        try:
+            build_matcher(config)
+        except CheckpointError as error:
+            say(f"{error}. Without them, the linear fit has the package's towers only: 9 points worse on VT60")
+            return linear_config(fingers, NO_WEIGHTS)
+    return config
 
 
 @one_thread()

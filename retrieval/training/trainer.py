@@ -51,7 +51,6 @@ from retrieval.training.initial_weights import (
     build_matcher,
     made_from,
     training_licences,
-    with_available_weights,
 )
 from retrieval.training.loop import (
     RATE,
@@ -81,7 +80,6 @@ def train_matcher(
     require_writable(out)
     grasps = load_grasps(folder)
     config = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, fingers=finger_count(grasps)))
-    config = with_available_weights(config)
     settings = config.training
     if split is None:
         split = make_split(

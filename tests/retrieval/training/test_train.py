@@ -407,19 +407,12 @@ def test_a_checkpoint_that_cannot_be_written_is_an_error_before_the_first_step(r
             train_matcher(recording, tmp_path / name, TINY)
 
 
-def test_trained_towers_start_from_random_weights_without_a_download_and_the_checkpoint_says_so(
-    recording, tmp_path, monkeypatch, capsys
-):
+def test_without_the_download_a_training_from_published_weights_is_refused(recording, tmp_path, monkeypatch):
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     monkeypatch.setattr(torch.hub, "download_url_to_file", Mock(side_effect=URLError("no route to host")))
-    config = with_training(TINY.using(tower="resnet18"), init="imagenet", iterations=1)
-    made = train_matcher(recording, tmp_path / "m.safetensors", config)
-    assert made.config.training.init == "random"
-    *_, line = capsys.readouterr().err.splitlines()
-    assert "name the file with --init" in line
-    assert "The training starts from random weights" in line
-    with pytest.raises(CheckpointError, match=r"resnet18-f37072fd\.pth"):  # random ones would stay so
-        train_matcher(recording, tmp_path / "m.safetensors", with_training(config, freeze_towers=True))
+    config = with_training(TINY.using(tower="resnet18"), init="imagenet")
+    with pytest.raises(CheckpointError, match=r"resnet18-f37072fd\.pth elsewhere, and name the file with --init"):
+        train_matcher(recording, tmp_path / "m.safetensors", config)
 
 
 def test_a_checkpoint_names_the_unusual_camera_of_its_photos(recording, tmp_path):
