@@ -69,7 +69,7 @@ class ContrastiveEmbedding(Method):
         touch_held_out, photo_held_out = self._tensors(validation)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.settings.seed)  # initial weights and dropout
-            draws = ObjectSampler(torch.from_numpy(train.owner), torch.Generator().manual_seed(self.settings.seed))
+            owner, generator = torch.from_numpy(train.owner), torch.Generator().manual_seed(self.settings.seed)
             module = Projections(touch.shape[1], photo.shape[1], config.matcher.embedding_dim, dropout)
             optimizer = torch.optim.AdamW(  # biases and the temperature need not be small
                 [
@@ -80,9 +80,10 @@ class ContrastiveEmbedding(Method):
             optimizer.register_step_post_hook(lambda *_: module.clamp_scale())
 
             def loss(_: int, __: int) -> Tensor:
-                objects = draws.distinct_objects(OBJECTS_PER_BATCH).repeat(IMAGES_PER_OBJECT)
-                touches = module(touch[draws.rows(objects)], module.touch)
-                photos = module(photo[draws.rows(objects)], module.photo)
+                distinct = torch.randperm(int(owner.max()) + 1, generator=generator)[:OBJECTS_PER_BATCH]
+                objects = distinct.repeat(IMAGES_PER_OBJECT)
+                touches = module(touch[draw_rows(owner, objects, generator)], module.touch)
+                photos = module(photo[draw_rows(owner, objects, generator)], module.photo)
                 return contrastive_loss(touches, photos, objects, objects, module.log_scale)
 
             @torch.inference_mode()
@@ -122,21 +123,9 @@ def _tensor(standardise: Standardiser, features: NDArray[Any]) -> Tensor:
     return torch.from_numpy(standardise(features)).float()
 
 
-class ObjectSampler:
-    """Samples grasps by object, without a loop over items."""
-
-    def __init__(self, owner: Tensor, generator: torch.Generator) -> None:
-        """Index the rows by `owner` (n,), the object of each row, from 0."""
-        self._rows = torch.argsort(owner, stable=True)
-        self._counts = torch.bincount(owner)
-        self._starts = self._counts.cumsum(0) - self._counts
-        self._generator = generator
-
-    def distinct_objects(self, count: int) -> Tensor:
-        """Return (count,) objects, each at most once."""
-        return torch.randperm(len(self._counts), generator=self._generator)[:count]
-
-    def rows(self, objects: Tensor) -> Tensor:
-        """Return one row of each of `objects` (any shape), uniformly."""
-        drawn = torch.rand(objects.shape, generator=self._generator, dtype=torch.float64)
-        return self._rows[self._starts[objects] + (drawn * self._counts[objects]).long()]
+def draw_rows(owner: Tensor, objects: Tensor, generator: torch.Generator) -> Tensor:
+    """Return one row of each of `objects` (any shape), drawn uniformly; `owner` (n,) is the object of each row."""
+    counts = torch.bincount(owner)
+    starts = counts.cumsum(0) - counts
+    drawn = torch.rand(objects.shape, generator=generator, dtype=torch.float64)
+    return torch.argsort(owner, stable=True)[starts[objects] + (drawn * counts[objects]).long()]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from retrieval.methods.contrastive import ContrastiveEmbedding, ObjectSampler, Projections
+from retrieval.methods.contrastive import ContrastiveEmbedding, Projections, draw_rows
 from retrieval.methods.method import MethodSettings
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from retrieval.model.fusion import LOG_SCALE_MAX
@@ -45,13 +45,10 @@ def test_the_scale_is_clamped_at_a_hundred_and_has_a_gradient_there():
     assert gradient.item() > 1  # a clamp of the forward value would have none
 
 
-def test_rows_are_drawn_uniformly_from_the_requested_objects_and_a_batch_contains_an_object_once():
-    owner = [0, 1, 0, 2, 1, 1]
-    sampler = ObjectSampler(torch.tensor(owner), torch.Generator().manual_seed(0))
-    drawn = sampler.rows(torch.tensor([0, 1, 2]).repeat(3000))
-    assert all(owner[row] == place % 3 for place, row in enumerate(drawn.tolist()))
+def test_rows_are_drawn_uniformly_from_the_requested_objects():
+    owner, objects = torch.tensor([0, 1, 0, 2, 1, 1]), torch.tensor([0, 1, 2]).repeat(3000)
+    drawn = draw_rows(owner, objects, torch.Generator().manual_seed(0))
+    assert torch.equal(owner[drawn], objects)
     # Four standard deviations of 3,000 draws at 1/2 and at 1/3.
     expected = torch.tensor([1500, 1000, 1500, 3000, 1000, 1000])
     assert ((torch.bincount(drawn, minlength=6) - expected).abs() < 104).all()
-    assert sorted(sampler.distinct_objects(10).tolist()) == [0, 1, 2]
-    assert len(set(sampler.distinct_objects(2).tolist())) == 2
