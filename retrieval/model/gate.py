@@ -88,10 +88,10 @@ class GraspSuccessGate:
             NumericalError: A logit is not finite. A NaN is not above 0, so the grasp would be classified as failed.
         """
         with one_thread():
-            logits: Tensor = self.net(differences)
-        if not logits.isfinite().all():
-            raise NumericalError(f"logits of a gate must be finite, got {logits.tolist()}; train the gate again")
-        return logits.tolist()  # type: ignore[no-any-return]
+            logits: list[list[float]] = self.net(differences).tolist()
+        if not np.isfinite(logits).all():
+            raise NumericalError(f"logits of a gate must be finite, got {logits}; train the gate again")
+        return logits
 
     def _difference(self, finger: str, frames: FingerFrames) -> NDArray[np.float32]:
         frame, before = getattr(frames, self.frame), frames.before
