@@ -75,7 +75,7 @@ def train_gate(recording: Path, out: Path, *, iterations: int = 400, seed: int =
         )
     with one_thread():
         gate = GraspSuccessGate(_train_net(_differences(train, frame), is_held, iterations, seed), frame)
-        differences = _differences(validation, frame).split(BATCH)
+        differences = torch.split(_differences(validation, frame), BATCH)
         accepted = np.array([max(logits) >= 0 for part in differences for logits in gate.score(part)])
     is_correct = accepted == is_held_validation
     owner = np.array([attempt.grasp.object_id for attempt in validation])
