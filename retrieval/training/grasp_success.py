@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from retrieval.console.progress import Bar
-from retrieval.data.dataset import Attempt, load_attempts, make_split, recording_licence
+from retrieval.data.dataset import Grasp, load_attempts, make_split, recording_licence
 from retrieval.errors import DatasetError
 from retrieval.metrics.intervals import grouped_interval
 from retrieval.model.checkpoint import require_writable, write_tensors
@@ -60,14 +60,13 @@ def train_gate(recording: Path, out: Path, *, iterations: int = 400, seed: int =
         CheckpointError: `out` cannot be written.
     """
     require_writable(out)
-    attempts = load_attempts(recording)
-    frame = "after" if all(attempt.after for attempt in attempts) else "during"
-    split = make_split([attempt.grasp for attempt in attempts], validation=VALIDATION, test=0, seed=seed)
+    grasps = load_attempts(recording)
+    frame = "after" if all(grasp.after for grasp in grasps) else "during"
+    split = make_split(grasps, validation=VALIDATION, test=0, seed=seed)
     train, validation = (
-        [attempt for attempt in attempts if attempt.grasp.object_id in objects]
-        for objects in (split.train, split.validation)
+        [grasp for grasp in grasps if grasp.object_id in objects] for objects in (split.train, split.validation)
     )
-    is_held, is_held_validation = (np.array([attempt.held for attempt in part]) for part in (train, validation))
+    is_held, is_held_validation = (np.array([grasp.held for grasp in part]) for part in (train, validation))
     if is_held.all() or not is_held.any():
         raise DatasetError(
             f"the training objects of seed {seed} must have both successful and failed grasps; got {is_held.sum()} "
@@ -78,7 +77,7 @@ def train_gate(recording: Path, out: Path, *, iterations: int = 400, seed: int =
         differences = torch.split(_differences(validation, frame), BATCH)
         accepted = np.array([max(logits) >= 0 for part in differences for logits in gate.score(part)])
     is_correct = accepted == is_held_validation
-    owner = np.array([attempt.grasp.object_id for attempt in validation])
+    owner = np.array([grasp.object_id for grasp in validation])
     by_object = [is_correct[owner == name].tolist() for name in np.unique(owner)]
     metrics = {
         "frame": frame,
@@ -93,7 +92,7 @@ def train_gate(recording: Path, out: Path, *, iterations: int = 400, seed: int =
     provenance = {
         "iterations": iterations,
         "seed": seed,
-        **made_from(recording, (attempt.grasp for attempt in attempts), [recording_licence(recording)]),
+        **made_from(recording, grasps, [recording_licence(recording)]),
         "metrics": metrics,
     }
     header = {"task": TASK, "frame": frame, "split": split.to_dict(), "provenance": provenance}
@@ -101,13 +100,13 @@ def train_gate(recording: Path, out: Path, *, iterations: int = 400, seed: int =
     return metrics
 
 
-def _differences(attempts: Sequence[Attempt], frame: str) -> Tensor:
+def _differences(grasps: Sequence[Grasp], frame: str) -> Tensor:
     """Return the differences (B, fingers, 3, px, px) of a frame of each grasp from its no-contact frames."""
     images, differences = BatchImages(GraspSuccessGate.preprocessing), []
-    with Bar("reading", len(attempts), "grasps") as bar:
-        for attempt in attempts:
-            touches = attempt.after if frame == "after" else attempt.grasp.touches
-            differences.append(images.touch(dataclasses.replace(attempt.grasp, touches=touches)))
+    with Bar("reading", len(grasps), "grasps") as bar:
+        for grasp in grasps:
+            touches = grasp.after if frame == "after" else grasp.touches
+            differences.append(images.touch(dataclasses.replace(grasp, touches=touches)))
             bar.advance()
     return touch_batch(differences)
 

@@ -144,10 +144,8 @@ def train_loop(
             done += 1
             scores = [f"  best {name.replace('_', ' ')} {score:.3f}" for name, score in best.metrics.items()]
             bar.advance(note="".join([f"loss {value:.3f}", *scores[:1]]))
-            is_due, values = (
-                done % plan.validate_every == 0 or done == plan.steps,
-                {"loss": value, "learning_rate": rate},
-            )
+            is_due = done % plan.validate_every == 0 or done == plan.steps
+            values = {"loss": value, "learning_rate": rate}
             if is_due:
                 reached = BestStep(done, validate() if validate else {})
                 values |= reached.metrics
