@@ -77,8 +77,8 @@ PARTS = (
 )
 CELL_PARTS = (
     *PARTS,
-    *(Part("led", False, 113_000 + number, 200) for number in range(8, 16)),
-    *(Part("led", True, 126_000 + number, 200) for number in range(2, 8)),
+    *(Part("led", False, 113_000 + number, 200) for number in range(8, 25)),
+    *(Part("led", True, 126_000 + number, 200) for number in range(2, 9)),
 )
 """Recordings for the training of the towers, and of the late interaction."""
 OTHER_SENSORS = (
@@ -91,7 +91,11 @@ RECORDINGS, CALIBRATION = "recordings", "calibration"
 """Folders of the recordings."""
 CALIBRATED = {
     "validation": (Part("led", False, 150_000, 80, 6, gels=25), Part("led", True, 151_000, 50, 6, gels=25)),
-    "verification": (Part("led", False, 130_000, 100, 5, gels=25), Part("led", True, 131_000, 50, 5, gels=25)),
+    "verification": (
+        Part("led", False, 130_000, 100, 5, gels=25),
+        Part("led", True, 131_000, 50, 5, gels=25),
+        Part("led", True, 132_000, 100, 5, gels=25),
+    ),
     "gels": (
         Part("led", False, 140_000, 300, 1, gels=200),
         Part("gelsight", False, 142_000, 50, 1, gels=25),
@@ -110,12 +114,10 @@ TOWERS = RIGS / "shipped_towers.toml"
 """Configuration of the training of the towers."""
 TOWER_PARTS = ("touch_tower", "photo_tower")
 """Names of the towers in a matcher."""
-CELL_TRAINING = {"iterations": 500, "learning_rate": 7e-4}
+CELL_TRAINING = {"iterations": 900, "learning_rate": 5e-4}
 """Settings of the training of the late interaction that differ from those of the shipped checkpoint."""
 TRAINED_SHARE = 0.7
-"""Share of the trained weights in the towers; the rest are those of the start model."""
-CELL_SHARE = 0.5
-"""The same in the networks of the late interaction."""
+"""Share of the trained weights in the towers and in the late interaction; the rest are those of the start model."""
 FOREIGN = ForeignPictures(8000, margin=-3.0)
 """Foreign pictures of its check of touches: more than in an ordinary training. The margin is lower than for gels of one
 kind: otherwise too many photos would be taken for gel images."""
@@ -207,7 +209,7 @@ def train_towers(folder: Path, **settings: Any) -> Checkpoint:
         TrainedFeatures(dataclasses.replace(config, preprocessing=stated), default_device()),
         references=references(start, images, folder / "features"),
     )
-    return averaged(start, trainer.run_or_reuse(), TRAINED_SHARE)
+    return averaged(start, trainer.run_or_reuse())
 
 
 def train_cells(made: Checkpoint, folder: Path, **settings: Any) -> Checkpoint:
@@ -235,17 +237,17 @@ def train_cells(made: Checkpoint, folder: Path, **settings: Any) -> Checkpoint:
         references=expected,
         weights=made.matcher.state_dict(),
     )
-    return with_parts(made, averaged(made, trainer.run_or_reuse(), CELL_SHARE), CELLS)
+    return with_parts(made, averaged(made, trainer.run_or_reuse()), CELLS)
 
 
-def averaged(start: Checkpoint, trained: Checkpoint, share: float) -> Checkpoint:
+def averaged(start: Checkpoint, trained: Checkpoint) -> Checkpoint:
     """Return the trained model with weights averaged with those of the start model (Wortsman et al., CVPR 2022).
 
     It is as good as the trained model with other cameras and sensors, and nearly as good as the start model on the rig.
     """
     before = start.matcher.state_dict()
     weights = {
-        name: before[name].lerp(after, share) if after.is_floating_point() else after
+        name: before[name].lerp(after, TRAINED_SHARE) if after.is_floating_point() else after
         for name, after in trained.matcher.state_dict().items()
     }
     trained.matcher.load_state_dict(weights)
