@@ -1,8 +1,9 @@
 """Scanned or drawn meshes (STL, OBJ, PLY) as objects of the simulated rig; needs the extra `touch-retrieval[mesh]`.
 
-Scans are too coarse for a gel (a triangle of a scanned can is a few mm wide), so a mesh gets procedural relief like any
-other object: the hit is moved along the ray by the height of the relief over the cosine of the angle. Only geometry is
-read: no materials, textures, or files that a mesh names.
+Scans are too coarse for a gel: a triangle of a scanned can is a few mm wide. So a gel meets the curved surface that the
+normals of the corners describe, as the camera shows it, with procedural relief like that of any other object: the hit
+is moved along the ray by the height of both over the cosine of the angle. Only geometry is read: no materials,
+textures, or files that a mesh names.
 """
 
 import io
@@ -72,14 +73,27 @@ class Mesh:
 
     def normals_at(self, face: Faces, points: Vectors) -> Vectors:
         """Interpolate the corner normals at points (N, 3) on the faces."""
+        mixed = np.einsum("ij,ijk->ik", self._corner_weights(face, points), self.corner_normals[face])
+        return np.asarray(mixed / np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-300))
+
+    def curved_offset(self, face: Faces, points: Vectors) -> Vectors:
+        """Return offsets (N, 3) from points on the faces to the curved surface that the corner normals describe.
+
+        The mean of the point's projections onto the tangent planes of the corners (Phong tessellation, Boubekeur and
+        Alexa 2008), with weight 1/2: on a sphere or cylinder it is exact to second order. It is 0 at a crease.
+        """
+        corners, normals = self.vertices[self.faces[face]], self.corner_normals[face]
+        heights = np.einsum("ijk,ijk->ij", corners - points[:, None, :], normals)
+        return np.asarray(np.einsum("ij,ijk->ik", self._corner_weights(face, points) * heights / 2, normals))
+
+    def _corner_weights(self, face: Faces, points: Vectors) -> Vectors:
+        """Return the barycentric coordinates (N, 3) of points on the faces."""
         a, b, c = self.vertices[self.faces[face]].transpose(1, 0, 2)
         cross = np.cross(b - a, c - a)
         square = np.maximum(np.einsum("ij,ij->i", cross, cross), 1e-300)
         v = np.einsum("ij,ij->i", np.cross(points - a, c - a), cross) / square
         w = np.einsum("ij,ij->i", np.cross(b - a, points - a), cross) / square
-        weights = np.clip(np.stack([1 - v - w, v, w], axis=1), 0, 1)
-        mixed = np.einsum("ij,ijk->ik", weights, self.corner_normals[face])
-        return np.asarray(mixed / np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-300))
+        return np.clip(np.stack([1 - v - w, v, w], axis=1), 0, 1)
 
 
 class MeshBody(Body):
@@ -144,16 +158,18 @@ class MeshBody(Body):
         return face, offset / np.where(np.abs(speed) < 1e-12, 1e-12, speed)
 
     def _lift(self, face: Faces, origins: Vectors, directions: Vectors, distance: Vectors, step_mm: float) -> Vectors:
-        """Return how much earlier (or, if engraved, later) rays meet the relief than the mesh."""
-        if not self.wall:
-            return np.zeros(len(face))
-        normals = self.mesh.normals_at(face, origins + distance[:, None] * directions)
+        """Return how much earlier (or, if engraved, later) rays meet the curved surface with relief than the faces."""
+        points = origins + distance[:, None] * directions
+        normals = self.mesh.normals_at(face, points)
         cosine = np.maximum(-np.einsum("ij,ij->i", directions, normals), 0.35)
-        lift = np.zeros(len(face))
+        curved = np.einsum("ij,ij->i", self.mesh.curved_offset(face, points), normals) / cosine
+        if not self.wall:
+            return curved
+        lift = curved
         # Twice, because the ray meets the relief at another place than the mesh.
         for _ in range(2):
             points = origins + (distance - lift)[:, None] * directions
-            lift = self._height(points, normals, step_mm) / cosine
+            lift = curved + self._height(points, normals, step_mm) / cosine
         return lift
 
     def _height(self, points: Vectors, normals: Vectors, step_mm: float) -> Vectors:

@@ -104,6 +104,16 @@ def test_rays_meet_a_ball_at_the_root_of_the_quadratic(globe):
     np.testing.assert_allclose(globe.body.normals(points), radial, atol=0.03)
 
 
+def test_a_coarse_scan_of_a_ball_feels_as_round_as_it_looks(tmp_path):
+    body = load_mesh_object(saved(tmp_path / "coarse.stl", ball(30, subdivisions=2)), 0, relief="smooth").body
+    outwards = np.random.default_rng(0).standard_normal((2000, 3)) * [1, 1, 0.5]
+    outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
+    origins = body.mesh.vertices.mean(axis=0) + 60 * outwards
+    _, flat = body.first_faces(origins, -outwards)
+    assert np.abs(flat - 30).max() > 0.35  # facets of 18 degrees
+    np.testing.assert_allclose(body.cast(origins, -outwards), 30, atol=0.05)
+
+
 def test_a_cube_keeps_its_edges_and_faces(tmp_path):
     body = load_mesh_object(saved(tmp_path / "cube.obj", CUBE), 0, relief="smooth").body
     x = np.array([-19.9, -3.0, 19.9, 20.1])
