@@ -5,8 +5,8 @@ the centre of the workspace, with z up; the camera stands on the -y side. Every 
 finger; manufacturers often state the sum over both fingers, twice as much. Images are uint8 RGB, row 0 on top.
 
 The base classes check arguments and results: no value out of range reaches a driver, and no stale frame a recording. A
-driver implements `_connect`, `_close` and the abstract methods of its base class, which may raise DeviceError or
-OSError. All public methods raise DeviceError if they fail.
+driver implements `_connect`, `_close` and the abstract methods of its base class, which may raise any exception, such
+as those of a vendor's package. All public methods raise DeviceError if they fail.
 """
 
 import contextlib
@@ -20,13 +20,15 @@ from typing import Any, ClassVar, Self
 import numpy as np
 import numpy.typing as npt
 
-from robot.errors import DeviceError, RobotConfigError
+from robot.errors import DeviceError, RobotConfigError, RobotError
 from robot.readings import RGBD, Frame, GripperState, Pose, Region
 from robot.settings import TypedSettings
 
 MAX_AGE_S = 0.5
 _CLOCK_SLACK_S = 0.05
 """A frame's time may be this far ahead of the clock, because two clocks never agree exactly."""
+ARRIVED_MM, ARRIVED_DEG = 5.0, 5.0
+"""Largest distance and turn between the requested and the reached pose of a motion."""
 
 Clock = Callable[[], float]
 
@@ -97,13 +99,16 @@ class Device(ABC):
 
     @contextlib.contextmanager
     def _use(self, failure: str, *, connected: bool = True) -> Iterator[None]:
-        """Convert each OSError into a DeviceError; with `connected`, require that the device is."""
+        """Convert exceptions of a driver into DeviceErrors; with `connected`, require that the device is."""
         if connected and not self.is_connected:
             raise DeviceError(f"{self.name} must be connected before it is used; call connect() first")
         try:
             yield
-        except OSError as error:
-            raise DeviceError(f"{self.name} {failure}: {error.strerror or error or type(error).__name__}") from error
+        except RobotError:
+            raise
+        except Exception as error:
+            reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
+            raise DeviceError(f"{self.name} {failure}: {reason}") from error
 
     def _check(self, what: str, value: float, low: float, high: float, unit: str) -> None:
         if not low <= value <= high:  # also rejects NaN
@@ -192,14 +197,22 @@ class Arm(Actuator):
         self.workspace = workspace
 
     def move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
-        """Move to `pose`, inside the workspace, and return the pose reached."""
+        """Move to `pose`, inside the workspace, and return the pose reached, at most 5 mm and 5 degrees away."""
         if not self.workspace.contains(pose) or not math.isfinite(pose.yaw_rad):
             raise DeviceError(f"{self.name}: a pose must be in the workspace {self.workspace}, got {pose}")
         if pose.tilt_rad and not self.can_tilt:
             raise DeviceError(f"{self.name}: tilt must be 0, because the fingers always point down; got {pose}")
         self._check("speed", speed_mm_s, 1e-3, self.max_speed_mm_s, "mm/s")
         with self._moving("cannot move"):
-            return self._check_reported(self._move_to(pose, speed_mm_s))
+            reached = self._check_reported(self._move_to(pose, speed_mm_s))
+            off_mm = math.dist(reached.as_tuple()[:3], pose.as_tuple()[:3])
+            off_deg = math.degrees(abs(math.remainder(reached.yaw_rad - pose.yaw_rad, math.tau)))
+            if off_mm > ARRIVED_MM or off_deg > ARRIVED_DEG:
+                raise DeviceError(
+                    f"{self.name} must be within {ARRIVED_MM:g} mm and {ARRIVED_DEG:g} deg of its goal after a motion, "
+                    f"but it is {off_mm:.1f} mm and {off_deg:.1f} deg away; is it blocked?"
+                )
+            return reached
 
     def pose(self) -> Pose:
         """Return the current pose."""

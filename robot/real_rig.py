@@ -53,12 +53,9 @@ DRIVERS: Mapping[str, Registry[type[Device]]] = {
         "arm",
         "Arm",
         manual="robot.drivers.manual_arm:ManualArm",
-        own="robot.drivers.own_robot:OwnArm",
         sawyer="robot.drivers.sawyer.driver:Sawyer",
     ),
-    "gripper": _drivers(
-        "gripper", "Gripper", own="robot.drivers.own_robot:OwnGripper", wsg50="robot.drivers.wsg50.driver:WSG50"
-    ),
+    "gripper": _drivers("gripper", "Gripper", wsg50="robot.drivers.wsg50.driver:WSG50"),
     "sensors": _drivers(
         "sensors",
         "TactileSensor",

@@ -1,44 +1,62 @@
-"""A Robotiq 2F-85 behind its URCap on a Universal Robots controller, for `driver = "own"` of [gripper].
+"""A Robotiq 2F-85 behind its URCap on a Universal Robots controller.
 
-The URCap answers on TCP port 63352: "SET POS 255 GTO 1" with "ack", "GET POS" with "POS 255". POS is 0 when the jaws
-are open and 255 when they are closed; SPE and FOR are 0 to 255 for 20 to 150 mm/s and 20 to 235 N. OBJ is 0 during a
-motion, 1 or 2 at an object, 3 at the requested position. Activate the gripper on the teach pendant before use:
-activation moves the jaws.
+[gripper] has `driver = "robotiq_2f85:Robotiq2F85"`. The URCap answers on TCP port 63352: "SET POS 255 GTO 1" with
+"ack", "GET POS" with "POS 255". POS is 0 when the jaws are open and 255 when they are closed; SPE and FOR are 0 to 255
+for 20 to 150 mm/s and 20 to 235 N. OBJ is 0 during a motion, 1 or 2 at an object, 3 at the requested position. Activate
+the gripper on the teach pendant before use: activation moves the jaws.
 """
 
 import socket
 import time
+
+from robot import Gripper
+from robot.readings import GripperState
 
 STROKE_MM, SPEED_MM_S, FORCE_N = 85.0, (20.0, 150.0), (20.0, 235.0)
 ACTIVE, MOVING, AT_OBJECT, AT_POSITION = 3, 0, 2, 3
 TIMEOUT_S, POLL_S = 10.0, 0.02
 
 
-class Robotiq2F85:
+class Robotiq2F85(Gripper):
     """The gripper. Its force counts for both fingers: we take half of it as the force on each finger.
 
     Args:
-        host: Address of the robot's controller.
+        host: Address of the robot's controller, a key of [gripper].
         port: Port of the URCap.
     """
 
-    def __init__(self, host, port=63352):
-        self.link = socket.create_connection((host, port), TIMEOUT_S)
+    def __init__(
+        self, *, host: str, port: int = 63352, max_force_n=1000.0, max_speed_mm_s=1000.0, clock=time.monotonic
+    ):
+        super().__init__(
+            "Robotiq 2F-85",
+            stroke_mm=STROKE_MM,
+            min_force_n=FORCE_N[0] / 2,
+            max_force_n=min(max_force_n, FORCE_N[1] / 2),
+            max_speed_mm_s=min(max_speed_mm_s, SPEED_MM_S[1]),
+            clock=clock,
+        )
+        self.address, self.link, self.force_n = (host, port), None, None
+
+    def _connect(self):
+        self.link = socket.create_connection(self.address, TIMEOUT_S)
         self.answers = self.link.makefile("rb")
-        self.force_n = None
 
-    def open(self, opening_mm, speed_mm_s):
-        """Open or narrow the jaws."""
-        self.force_n = None
-        self._move(round(255 * (1 - opening_mm / STROKE_MM)), speed_mm_s, FORCE_N[0])
+    def _close(self):
+        if self.link is not None:
+            self.link.close()
 
-    def grasp(self, force_n, speed_mm_s):
-        """Close until the gripper has the force or is closed."""
+    def _open(self, opening_mm):
+        self.force_n = None
+        self._move(round(255 * (1 - opening_mm / STROKE_MM)), self.max_speed_mm_s, FORCE_N[0])
+        return self._state()
+
+    def _grasp(self, force_n, speed_mm_s):
         self._move(255, speed_mm_s, 2 * force_n)
         self.force_n = force_n
+        return self._state()
 
-    def state(self):
-        """Return opening, force on each finger and status."""
+    def _state(self):
         opening_mm = STROKE_MM * (1 - self._get("POS") / 255)
         at = self._get("OBJ")
         if at == MOVING:
@@ -49,22 +67,15 @@ class Robotiq2F85:
             status = "holding"
         else:
             status = "no_part"
-        force_n = self.force_n if status == "holding" else 0.0
-        return {"opening_mm": opening_mm, "force_n": force_n, "status": status}
+        return GripperState(opening_mm, self.force_n if status == "holding" else 0.0, status)
 
-    def stop(self):
-        """Stop the jaws."""
+    def _stop(self):
         self._set(GTO=0)
-
-    def disconnect(self):
-        """Close the connection."""
-        self.answers.close()
-        self.link.close()
 
     def _move(self, position, speed_mm_s, force_n):
         if self._get("STA") != ACTIVE:
             raise RuntimeError("the gripper is not active; activate it on the teach pendant (its jaws move)")
-        speed, force = _to_byte(min(speed_mm_s, SPEED_MM_S[1]), SPEED_MM_S), _to_byte(force_n, FORCE_N)
+        speed, force = _to_byte(speed_mm_s, SPEED_MM_S), _to_byte(force_n, FORCE_N)
         self._set(POS=position, SPE=speed, FOR=force, GTO=1)
         end_s = time.monotonic() + TIMEOUT_S
         while self._get("PRE") != position or self._get("OBJ") == MOVING:  # PRE: the position that it works towards

@@ -1,4 +1,4 @@
-"""A Universal Robots arm through ur_rtde (pip install ur-rtde), for `driver = "own"` of [arm].
+"""A Universal Robots arm through ur_rtde (pip install ur-rtde), for [arm]: `driver = "ur_arm:URArm"`.
 
 The TCP of the robot (set on the teach pendant, or by `tcp`) must be the flange or any point on its axis; `tool_mm` is
 its distance to the point between the fingertips. The robot must be in remote control.
@@ -11,14 +11,14 @@ import rtde_control
 import rtde_receive
 from scipy.spatial.transform import Rotation
 
-from robot import Pose
+from robot import Arm
 from robot.drivers.sawyer.codec import Mount
 
 ACCELERATION_M_S2, STOP_M_S2, POLL_S, TIMEOUT_S = 0.5, 2.0, 0.02, 60.0
 
 
-class URArm:
-    """The arm.
+class URArm(Arm):
+    """The arm; the keyword arguments are keys of [arm].
 
     Args:
         host: Address of the robot.
@@ -28,14 +28,37 @@ class URArm:
         tool_yaw_deg: Angle from the x axis of the TCP to the closing direction of finger a.
     """
 
-    def __init__(self, host, origin_mm, tool_mm, origin_yaw_deg=0.0, tool_yaw_deg=0.0):
-        self.mount = Mount(tuple(origin_mm), math.radians(origin_yaw_deg), tool_mm, math.radians(tool_yaw_deg))
-        self.receive = rtde_receive.RTDEReceiveInterface(host)
-        self.control = rtde_control.RTDEControlInterface(host)
+    def __init__(
+        self,
+        *,
+        host: str,
+        origin_mm: tuple[float, float, float],
+        tool_mm: float,
+        origin_yaw_deg: float = 0.0,
+        tool_yaw_deg: float = 0.0,
+        workspace,
+        max_speed_mm_s=1000.0,
+        clock=time.monotonic,
+    ):
+        super().__init__("UR arm", workspace, max_speed_mm_s=max_speed_mm_s, clock=clock)
+        self.host = host
+        self.mount = Mount(origin_mm, math.radians(origin_yaw_deg), tool_mm, math.radians(tool_yaw_deg))
+        self.control = None
 
-    def move_to(self, x_mm, y_mm, z_mm, yaw_rad, speed_mm_s):
-        """Move on a straight line; return when the arm has arrived."""
-        target = self._to_ur(x_mm, y_mm, z_mm, yaw_rad)
+    def _connect(self):
+        self.receive = rtde_receive.RTDEReceiveInterface(self.host)
+        self.control = rtde_control.RTDEControlInterface(self.host)
+
+    def _close(self):
+        """End the program on the robot."""
+        if self.control is not None:
+            self.control.stopScript()
+            self.control.disconnect()
+            self.receive.disconnect()
+
+    def _move_to(self, pose, speed_mm_s):
+        """Move on a straight line."""
+        target = self._to_ur(pose)
         if not self.control.isPoseWithinSafetyLimits(target):
             raise RuntimeError(f"the robot cannot reach {target} within its safety limits")
         before, end_s = self.control.getAsyncOperationProgress(), time.monotonic() + TIMEOUT_S
@@ -47,25 +70,17 @@ class URArm:
             if self.receive.isProtectiveStopped() or self.receive.isEmergencyStopped():
                 raise RuntimeError("the robot stopped itself; unlock it on the teach pendant")
             time.sleep(POLL_S)
+        return self._pose()
 
-    def pose(self):
-        """Return the pose of the point between the fingertips in the rig's frame."""
+    def _pose(self):
         x, y, z, *turn = self.receive.getActualTCPPose()
         quaternion = dict(zip("xyzw", Rotation.from_rotvec(turn).as_quat().tolist(), strict=True))
-        pose = self.mount.pose_of({"position": {"x": x, "y": y, "z": z}, "orientation": quaternion})
-        return {"x_mm": pose.x_mm, "y_mm": pose.y_mm, "z_mm": pose.z_mm, "yaw_rad": pose.yaw_rad}
+        return self.mount.pose_of({"position": {"x": x, "y": y, "z": z}, "orientation": quaternion})
 
-    def stop(self):
-        """Decelerate to a stop."""
+    def _stop(self):
         self.control.stopL(STOP_M_S2)
 
-    def disconnect(self):
-        """End the program on the robot."""
-        self.control.stopScript()
-        self.control.disconnect()
-        self.receive.disconnect()
-
-    def _to_ur(self, *pose):
-        tip = self.mount.tip_of(Pose(*pose))
+    def _to_ur(self, pose):
+        tip = self.mount.tip_of(pose)
         turn = Rotation.from_quat([tip["orientation"][axis] for axis in "xyzw"]).as_rotvec()
         return [*tip["position"].values(), *turn.tolist()]

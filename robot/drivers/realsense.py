@@ -18,7 +18,7 @@ from msgspec import Meta
 from robot.devices import Camera, Clock
 from robot.drivers.usb_camera.stream import MAX_CAMERA_WAIT_S
 from robot.errors import DeviceError
-from robot.extras import import_extra, package_errors
+from robot.extras import import_extra
 from robot.readings import RGBD, Intrinsics
 from robot.settings import TypedSettings
 
@@ -61,21 +61,20 @@ class RealSense(Camera):
 
     def _connect(self) -> None:
         rs = import_extra("pyrealsense2", "a RealSense camera", "realsense", DeviceError)
-        with package_errors("realsense cannot be started"):
-            serial = self._choose(
-                [str(device.get_info(rs.camera_info.serial_number)) for device in rs.context().query_devices()]
-            )
-            pipeline = rs.pipeline()
-            config, size = rs.config(), (self._options.width, self._options.height)
-            config.enable_device(serial)
-            config.enable_stream(rs.stream.depth, *size, rs.format.z16, self._options.fps)
-            config.enable_stream(rs.stream.color, *size, rs.format.rgb8, self._options.fps)
-            profile = pipeline.start(config)
-            self._pipeline = pipeline  # now `_close` stops it
-            self._align = rs.align(rs.stream.color)
-            self._read_parameters(rs, profile, serial)
-            for _ in range(self._options.warmup_frames):
-                self._wait()
+        serial = self._choose(
+            [str(device.get_info(rs.camera_info.serial_number)) for device in rs.context().query_devices()]
+        )
+        pipeline = rs.pipeline()
+        config, size = rs.config(), (self._options.width, self._options.height)
+        config.enable_device(serial)
+        config.enable_stream(rs.stream.depth, *size, rs.format.z16, self._options.fps)
+        config.enable_stream(rs.stream.color, *size, rs.format.rgb8, self._options.fps)
+        profile = pipeline.start(config)
+        self._pipeline = pipeline  # now `_close` stops it
+        self._align = rs.align(rs.stream.color)
+        self._read_parameters(rs, profile, serial)
+        for _ in range(self._options.warmup_frames):
+            self._wait()
 
     def _choose(self, connected: Sequence[str]) -> str:
         """Return the serial number of the camera to open; raise DeviceError if it is not unique or not connected."""
@@ -107,28 +106,29 @@ class RealSense(Camera):
     def _close(self) -> None:
         pipeline, self._pipeline = self._pipeline, None
         if pipeline is not None:
-            with package_errors("realsense cannot be stopped"):
-                pipeline.stop()
+            pipeline.stop()
 
     def _recover(self) -> None:
         """Close the camera despite errors, then connect; a failed recovery can be repeated."""
-        with contextlib.suppress(DeviceError, OSError):
+        with contextlib.suppress(Exception):
             self._close()
         self._connect()
 
     def _wait(self) -> Any:
-        return self._pipeline.wait_for_frames(round(1000 * self._options.timeout_s))
+        try:
+            return self._pipeline.wait_for_frames(round(1000 * self._options.timeout_s))
+        except RuntimeError as error:
+            raise DeviceError(f"realsense returned no picture: {error}; is it plugged into USB 3?") from error
 
     def _read(self, depth: bool) -> RGBD:
-        with package_errors("realsense returned no picture; is it plugged into USB 3?"):
-            if self._pipeline is None:
-                raise DeviceError("realsense was stopped by a failed recovery; call recover() again")
-            self._pipeline.poll_for_frames()  # drops frames taken before this call
-            frames = self._wait()
-            time_s = self.clock()
-            if depth:
-                frames = self._align.process(frames)
-            colour = np.array(frames.get_color_frame().get_data())  # a copy: the package reuses the memory
-            raw = np.array(frames.get_depth_frame().get_data()) if depth else None
+        if self._pipeline is None:
+            raise DeviceError("realsense was stopped by a failed recovery; call recover() again")
+        self._pipeline.poll_for_frames()  # drops frames taken before this call
+        frames = self._wait()
+        time_s = self.clock()
+        if depth:
+            frames = self._align.process(frames)
+        colour = np.array(frames.get_color_frame().get_data())  # a copy: the package reuses the memory
+        raw = np.array(frames.get_depth_frame().get_data()) if depth else None
         depth_m = None if raw is None else np.where(raw > 0, raw * np.float32(self._scale_m), np.float32(np.nan))
         return RGBD(colour, depth_m, self._intrinsics, time_s)

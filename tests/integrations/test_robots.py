@@ -14,13 +14,25 @@ from pathlib import Path
 import pytest
 
 from robot.devices import Arm
-from robot.drivers.own_robot import OwnArm, OwnGripper
 from robot.errors import DeviceError
 from robot.readings import Pose, Region
+from robot.real_rig import load_driver
 
 FOLDER = Path(__file__).parents[2] / "integrations" / "robots"
 WORKSPACE = Region((-150.0, -150.0, 10.0), (150.0, 150.0, 400.0))
 ORIGIN = {"origin_mm": [500.0, 100.0, -20.0], "tool_mm": 120.0}
+
+
+def load_arm(driver, **settings):
+    """The arm that a rig's file names."""
+    table = {"driver": driver, **settings}
+    return load_driver("arm", table, "[arm]", workspace=WORKSPACE, max_speed_mm_s=200.0, max_state_age_s=0.5)
+
+
+def load_gripper(driver, **settings):
+    """The gripper that a rig's file names."""
+    table = {"driver": driver, **settings}
+    return load_driver("gripper", table, "[gripper]", max_speed_mm_s=90.0, max_force_n=40.0, max_state_age_s=0.5)
 
 
 @pytest.fixture(autouse=True)
@@ -68,7 +80,7 @@ def ur(monkeypatch):
     fake = FakeUR()
     for module, name in (("rtde_control", "RTDEControlInterface"), ("rtde_receive", "RTDEReceiveInterface")):
         monkeypatch.setitem(sys.modules, module, types.SimpleNamespace(**{name: lambda host: fake}))
-    with OwnArm(workspace=WORKSPACE, robot="ur_arm:URArm", settings={"host": "ur", **ORIGIN}) as arm:
+    with load_arm("ur_arm:URArm", host="ur", **ORIGIN) as arm:
         yield fake, arm
     assert fake.calls[-1] == "stopScript"
 
@@ -165,9 +177,7 @@ def robotiq():
     with serving(socketserver.ThreadingTCPServer, URCap) as server:
         server.values, server.calls = {"POS": 0, "PRE": 0, "OBJ": 3, "STA": 3}, []
         server.object_at = round(255 * (1 - 40 / 85))
-        settings = {"host": "127.0.0.1", "port": server.server_address[1]}
-        ranges = {"stroke_mm": 85.0, "min_force_n": 10.0, "max_force_n": 40.0}
-        with OwnGripper(robot="robotiq_2f85:Robotiq2F85", settings=settings, **ranges) as gripper:
+        with load_gripper("robotiq_2f85:Robotiq2F85", host="127.0.0.1", port=server.server_address[1]) as gripper:
             yield server, gripper
 
 
@@ -189,7 +199,7 @@ def test_a_ur_arm_moves_at_the_requested_speed_and_reports_the_pose_of_the_rigs_
 def test_a_ur_arm_is_stopped_after_a_protective_stop(ur):
     fake, arm = ur
     fake.is_stopped = True
-    with pytest.raises(DeviceError, match=r"move_to of ur_arm:URArm failed: the robot stopped itself; unlock it"):
+    with pytest.raises(DeviceError, match="UR arm cannot move: the robot stopped itself; unlock it"):
         arm.move_to(Pose(0.0, 0.0, 100.0, 0.0), 100.0)
     assert fake.calls[-1] == "stopL"
 
@@ -197,7 +207,7 @@ def test_a_ur_arm_is_stopped_after_a_protective_stop(ur):
 @pytest.mark.parametrize("yaw_rad", [-2.0, 1.5])
 def test_a_franka_arm_moves_at_the_requested_speed_and_reports_the_pose_of_the_rigs_frame(franka, yaw_rad):
     robot, _ = franka
-    with OwnArm(workspace=WORKSPACE, robot="franka:FrankaArm", settings={"host": "fr3", **ORIGIN}) as arm:
+    with load_arm("franka:FrankaArm", host="fr3", **ORIGIN) as arm:
         moves_and_reports(arm, yaw_rad)
         assert robot.calls == [("speed", 0.15), "move"]
         arm.recover()
@@ -207,9 +217,7 @@ def test_a_franka_arm_moves_at_the_requested_speed_and_reports_the_pose_of_the_r
 
 def test_a_franka_hand_grasps_with_twice_the_force_on_each_finger(franka):
     _, hand = franka
-    with OwnGripper(
-        stroke_mm=80.0, min_force_n=5.0, max_force_n=35.0, robot="franka:FrankaHand", settings={"host": "fr3"}
-    ) as gripper:
+    with load_gripper("franka:FrankaHand", host="fr3") as gripper:
         assert gripper.open(60.0).status == "idle"
         state = gripper.grasp(20.0, 50.0)
         assert (state.status, state.force_n) == ("holding", 20.0)
@@ -245,18 +253,23 @@ def test_a_robotiq_gripper_that_is_not_active_does_not_move(robotiq):
 
 
 class Endpoint(BaseHTTPRequestHandler):
-    """A robot program of another computer: it stores poses, and refuses those below the table."""
+    """A robot program of another computer: it stores poses, refuses those below the table, and closes on an object."""
 
     def do_POST(self):
         values = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
-        content, status = b"", 200
-        if self.path == "/arm/pose":
-            content = json.dumps(self.server.at).encode()
-        elif values.pop("speed_mm_s", None) and values["z_mm"] < 50:
+        server, status = self.server, 200
+        server.calls.append(self.path)
+        answer = {"/arm/pose": server.at, "/jaws/state": server.jaws}.get(self.path)
+        content = b"" if answer is None else json.dumps(answer).encode()
+        if self.path == "/arm/move_to" and values["z_mm"] < 50:
             content, status = b"protective stop", 409
-        elif values:
-            self.server.at = values
-        self.server.calls.append(self.path)
+        elif self.path == "/arm/move_to":
+            del values["speed_mm_s"]
+            server.at = values
+        elif self.path == "/jaws/open":
+            server.jaws = {"opening_mm": values["opening_mm"], "force_n": 0.0, "status": "idle"}
+        elif self.path == "/jaws/grasp":
+            server.jaws = {"opening_mm": 40.0, "force_n": values["force_n"], "status": "holding"}
         self.send_response(status)
         self.send_header("Content-Length", str(len(content)))
         self.end_headers()
@@ -265,13 +278,30 @@ class Endpoint(BaseHTTPRequestHandler):
     def log_message(self, *_): ...
 
 
-def test_a_robot_on_another_computer_moves_stops_and_its_errors_keep_their_text():
+@pytest.fixture
+def endpoint():
+    """The server, and its address."""
     with serving(ThreadingHTTPServer, Endpoint) as server:
         server.at, server.calls = {"x_mm": 0.0, "y_mm": 0.0, "z_mm": 100.0, "yaw_rad": 0.0}, []
-        url = f"http://127.0.0.1:{server.server_address[1]}/arm"
-        with OwnArm(workspace=WORKSPACE, robot="remote:RemoteRobot", settings={"url": url}) as arm:
-            assert server.calls == ["/arm/pose"]
-            moves_and_reports(arm)
-            with pytest.raises(DeviceError, match=r"/arm/move_to answered 409: protective stop"):
-                arm.move_to(Pose(0.0, 0.0, 20.0, 0.0), 150.0)
-        assert server.calls[-1] == "/arm/stop"
+        server.jaws = {"opening_mm": 80.0, "force_n": 0.0, "status": "idle"}
+        yield server, f"http://127.0.0.1:{server.server_address[1]}"
+
+
+def test_an_arm_on_another_computer_moves_stops_and_its_errors_keep_their_text(endpoint):
+    server, url = endpoint
+    with load_arm("remote:RemoteArm", url=f"{url}/arm") as arm:
+        assert server.calls == ["/arm/pose"]
+        moves_and_reports(arm)
+        with pytest.raises(DeviceError, match=r"/arm/move_to answered 409: protective stop"):
+            arm.move_to(Pose(0.0, 0.0, 20.0, 0.0), 150.0)
+    assert server.calls[-1] == "/arm/stop"
+
+
+def test_a_gripper_on_another_computer_opens_and_grasps(endpoint):
+    server, url = endpoint
+    with load_gripper("remote:RemoteGripper", url=f"{url}/jaws", stroke_mm=85.0, min_force_n=5.0) as gripper:
+        assert gripper.open(70.0).opening_mm == 70.0
+        state = gripper.grasp(15.0, 40.0)
+        assert (state.status, state.force_n) == ("holding", 15.0)
+        gripper.stop()
+    assert server.calls[-1] == "/jaws/stop"

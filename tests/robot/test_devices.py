@@ -123,6 +123,30 @@ def test_a_pose_that_is_not_finite_is_never_returned(monkeypatch):
                 read()
 
 
+@pytest.mark.parametrize("fault", [RuntimeError("it broke"), OSError("it broke"), KeyboardInterrupt("it broke")])
+def test_an_exception_of_a_driver_stops_the_arm_and_is_a_device_error_unless_it_is_ctrl_c(fault, monkeypatch):
+    def fail(*_):
+        raise fault
+
+    stops = []
+    monkeypatch.setattr(FakeArm, "_move_to", fail)
+    monkeypatch.setattr(FakeArm, "_stop", lambda arm: stops.append(arm))
+    with FakeArm(FakeRigState(0)) as arm:
+        with pytest.raises(DeviceError if isinstance(fault, Exception) else KeyboardInterrupt, match="it broke"):
+            arm.move_to(Pose(0, 0, 100, 0), 100)
+        assert stops == [arm]
+
+
+def test_an_arm_that_does_not_arrive_is_stopped_and_the_message_says_how_far_it_is(monkeypatch):
+    stops = []
+    monkeypatch.setattr(FakeArm, "_move_to", lambda arm, pose, speed: Pose(pose.x_mm - 12, pose.y_mm, pose.z_mm, 0.5))
+    monkeypatch.setattr(FakeArm, "_stop", lambda arm: stops.append(arm))
+    with FakeArm(FakeRigState(0)) as arm:
+        with pytest.raises(DeviceError, match=r"within 5 mm and 5 deg of its goal .* is 12\.0 mm and 0\.0 deg away"):
+            arm.move_to(Pose(0, 0, 100, 0.5), 100)
+        assert stops == [arm]
+
+
 @pytest.mark.parametrize("outside", [-0.01, 0.01, math.nan])
 def test_a_force_or_an_opening_out_of_range_never_reaches_the_gripper(outside):
     force, opening = (FORCE_N[0], 0.0) if outside < 0 else (FORCE_N[1], STROKE_MM)

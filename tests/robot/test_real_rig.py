@@ -127,7 +127,7 @@ def test_a_camera_with_depth_requires_a_calibration(load):
 
 BAD = {
     "an unknown driver": ({"arm": 'driver = "kuka"'}, r"\[arm\]: driver must be one of .*, sawyer; got 'kuka'"),
-    "no driver": ({"gripper": 'host = "a"'}, r"\[gripper\]: driver must be one of own, wsg50; got None"),
+    "no driver": ({"gripper": 'host = "a"'}, r"\[gripper\]: driver must be one of wsg50; got None"),
     "an unknown key": ({"gripper": 'driver = "wsg50"\nhost = "a"\nbort = 1'}, r"\[gripper\] has no setting 'bort'"),
     "a key too few": ({"gripper": 'driver = "wsg50"'}, r"\[gripper\] requires 'host'"),
     "an unknown finger": ({"sensors.c": 'driver = "uvc"'}, r"\[sensors.b\] or both; got .*c"),

@@ -65,7 +65,7 @@ def test_a_silent_realsense_is_an_error_and_can_be_started_again(install):
         rs.silent = True
         with pytest.raises(DeviceError, match=r"realsense returned no picture.*Frame didn't arrive within 3000"):
             eye.read()
-        with pytest.raises(DeviceError, match="cannot be started"):
+        with pytest.raises(DeviceError, match="realsense cannot recover"):
             eye.recover()
         with pytest.raises(DeviceError, match=r"call recover\(\) again"):
             eye.read()
