@@ -27,7 +27,7 @@ from robot.settings import TypedSettings
 MAX_AGE_S = 0.5
 _CLOCK_SLACK_S = 0.05
 """A frame's time may be this far ahead of the clock, because two clocks never agree exactly."""
-ARRIVED_MM, ARRIVED_DEG = 5.0, 5.0
+ARRIVED_MM, ARRIVED_DEG = 10.0, 5.0
 """Largest distance and turn between the requested and the reached pose of a motion."""
 
 Clock = Callable[[], float]
@@ -197,7 +197,7 @@ class Arm(Actuator):
         self.workspace = workspace
 
     def move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
-        """Move to `pose`, inside the workspace, and return the pose reached, at most 5 mm and 5 degrees away."""
+        """Move to `pose`, inside the workspace, and return the pose reached, at most 10 mm and 5 degrees away."""
         if not self.workspace.contains(pose) or not math.isfinite(pose.yaw_rad):
             raise DeviceError(f"{self.name}: a pose must be in the workspace {self.workspace}, got {pose}")
         if pose.tilt_rad and not self.can_tilt:

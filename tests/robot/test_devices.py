@@ -142,7 +142,7 @@ def test_an_arm_that_does_not_arrive_is_stopped_and_the_message_says_how_far_it_
     monkeypatch.setattr(FakeArm, "_move_to", lambda arm, pose, speed: Pose(pose.x_mm - 12, pose.y_mm, pose.z_mm, 0.5))
     monkeypatch.setattr(FakeArm, "_stop", lambda arm: stops.append(arm))
     with FakeArm(FakeRigState(0)) as arm:
-        with pytest.raises(DeviceError, match=r"within 5 mm and 5 deg of its goal .* is 12\.0 mm and 0\.0 deg away"):
+        with pytest.raises(DeviceError, match=r"within 10 mm and 5 deg of its goal .* is 12\.0 mm and 0\.0 deg away"):
             arm.move_to(Pose(0, 0, 100, 0.5), 100)
         assert stops == [arm]
 
