@@ -42,7 +42,8 @@ def cache_key(group: str, *inputs: Any) -> str:
 class Cache:
     """Bytes by key in one SQLite file; use it as a context manager, on one thread.
 
-    Several processes may have it open. An error of the disk or of the file is an OSError with the path and what to do.
+    Several processes may have it open. A file that is no cache is replaced. An error of the disk is an OSError with the
+    path and what to do.
 
     Args:
         path: The file, such as out/cache.sqlite; it is created with its folder.
@@ -58,8 +59,13 @@ class Cache:
         self.path = path
         path.parent.mkdir(parents=True, exist_ok=True)
         with self._disk_errors():
-            self._connection = sqlite3.connect(path, timeout=60.0)  # the wait for another process that writes to it
-            self._connection.executescript(_SCHEMA)
+            try:
+                self._connection = self._open()
+            except sqlite3.OperationalError:  # cannot be opened, or the disk is full
+                raise
+            except sqlite3.DatabaseError:
+                path.unlink()
+                self._connection = self._open()
 
     def __enter__(self) -> Self:
         return self
@@ -101,6 +107,16 @@ class Cache:
         delete = "DELETE FROM entries WHERE key NOT IN (SELECT value FROM json_each(?))"
         with self._disk_errors(), self._connection:
             self._connection.execute(delete, (json.dumps(list(keys)),))
+
+    def _open(self) -> sqlite3.Connection:
+        connection = sqlite3.connect(self.path, timeout=60.0)  # the wait for another process that writes to it
+        try:
+            connection.executescript(_SCHEMA)
+            connection.execute("SELECT key, content, checksum FROM entries LIMIT 1").fetchone()
+        except BaseException:
+            connection.close()
+            raise
+        return connection
 
     @contextmanager
     def _disk_errors(self) -> Iterator[None]:

@@ -44,6 +44,16 @@ def test_a_killed_process_leaves_what_it_had_added(path):
         assert [cache.get("x/1"), cache.get("x/2")] == [b"x/1", b"x/2"]
 
 
+@pytest.mark.parametrize("content", [b"not a database", b"SQLite format 3\0" + bytes(5000)])
+def test_a_file_that_is_no_cache_is_replaced(path, content):
+    path.parent.mkdir()
+    path.write_bytes(content)
+    with Cache(path) as cache:
+        assert cache.keys("a") == set()
+        cache.add(ENTRIES)
+        assert cache.keys("a") == set(KEYS)
+
+
 def test_a_flipped_bit_gives_no_wrong_entry(filled):
     """Each entry is the one that was stored, missing, or one error that says what to delete."""
     whole, rng, lost, errors = filled.read_bytes(), np.random.default_rng(0), 0, []
