@@ -1,5 +1,6 @@
 """Text that cannot be encoded as UTF-8 is refused on input, or shown as U+FFFD. For catalogues: test_catalogue.py."""
 
+import base64
 import json
 import shutil
 
@@ -28,8 +29,8 @@ def test_a_catalogue_in_a_folder_whose_name_is_not_utf8_is_served_and_half_chara
         RecordingWriter(tmp_path / "recording", INFO) as writer,
         service(folder / "index", None, writer, history=tmp_path) as client,
     ):
-        files = [("gelsight", (path.name, path.read_bytes())) for path in touch]
-        assert client.post("/v1/query", files=files).status_code == 200
+        touches = [[base64.b64encode(path.read_bytes()).decode() for path in touch]]
+        assert client.post("/v1/query", json={"touches": touches}).status_code == 200
         assert client.get("/v1/index").status_code == 200
         assert client.get("/v1/catalogue", params={"object": "mug\ufffd"}).status_code == 200
         for path, body in (

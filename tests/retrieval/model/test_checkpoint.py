@@ -162,11 +162,10 @@ def with_header(text):
 
 
 FOREIGN = r"contains weights but no header of ours; .*`retrieve train --init`"
-DEEP = f'{{"format": {FORMAT}, "a": ' + "[" * 900 + "]" * 900 + "}"
 OTHERS = [
     (with_header(None), FOREIGN),
     (safetensors.torch.save({"weight": torch.ones(2)}, {"format": "pt"}), FOREIGN),
-    *[(with_header(text), r"header of .*m\.safetensors is damaged") for text in ("{", "3", "{}", "[" * 100_000, DEEP)],
+    *[(with_header(text), r"header of .*m\.safetensors is damaged") for text in ("{", "3", "{}", "[" * 100_000)],
     *[
         (
             with_header(json.dumps({"format": version, "software": "9.9"})),
