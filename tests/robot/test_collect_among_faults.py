@@ -29,7 +29,8 @@ def test_a_collection_among_faults_has_complete_grasps_and_never_leaves_the_jaws
     grasps = read_recording(tmp_path / "r").grasps
     assert len(grasps) >= 10
     assert all(cv2.imread(str(tmp_path / "r" / path)) is not None for each in grasps for path in each.images().values())
-    assert all(" failed 5 time(s), last: " in stop for stop in stops)
+    known = " failed 5 time(s), last: ", "the connection to the gripper at "  # the latter when the rig is closed
+    assert not [stop for stop in stops if not any(part in stop for part in known)]
     assert own_threads() == []
 
 

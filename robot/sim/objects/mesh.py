@@ -93,7 +93,7 @@ class Mesh:
         square = np.maximum(np.einsum("ij,ij->i", cross, cross), 1e-300)
         v = np.einsum("ij,ij->i", np.cross(points - a, c - a), cross) / square
         w = np.einsum("ij,ij->i", np.cross(b - a, points - a), cross) / square
-        return np.clip(np.stack([1 - v - w, v, w], axis=1), 0, 1)
+        return np.asarray(np.clip(np.stack([1 - v - w, v, w], axis=1), 0, 1))
 
 
 class MeshBody(Body):
@@ -162,7 +162,7 @@ class MeshBody(Body):
         points = origins + distance[:, None] * directions
         normals = self.mesh.normals_at(face, points)
         cosine = np.maximum(-np.einsum("ij,ij->i", directions, normals), 0.35)
-        curved = np.einsum("ij,ij->i", self.mesh.curved_offset(face, points), normals) / cosine
+        curved = np.asarray(np.einsum("ij,ij->i", self.mesh.curved_offset(face, points), normals) / cosine)
         if not self.wall:
             return curved
         lift = curved
