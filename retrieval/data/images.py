@@ -211,7 +211,7 @@ def _eight_bit_rgb(image: Image.Image, name: str | Path) -> Samples:
     if image.mode not in _EIGHT_BIT_MODES:
         raise ImageError(name, f"pixel type {image.mode} is not supported; save it as 8 or 16-bit PNG")
     if not image.has_transparency_data:
-        return np.array(image.convert("RGB"))
+        return np.array(image if image.mode == "RGB" else image.convert("RGB"))  # `convert` copies an RGB image, too
     samples = to_float(np.asarray(image.convert("RGBA")))
     return _on_white(samples[..., :3], samples[..., 3:])
 
