@@ -71,22 +71,23 @@ class Mesh:
         low, high = vertices.min(axis=0), vertices.max(axis=0)
         return Mesh(vertices - [*(low + high)[:2] / 2, low[2]], self.faces)
 
-    def normals_at(self, face: Faces, points: Vectors) -> Vectors:
-        """Interpolate the corner normals at points (N, 3) on the faces."""
-        mixed = np.einsum("ij,ijk->ik", self._corner_weights(face, points), self.corner_normals[face])
+    def normals_at(self, face: Faces, weights: Vectors) -> Vectors:
+        """Interpolate the corner normals at points on the faces, given by their `corner_weights` (N, 3)."""
+        mixed = np.einsum("ij,ijk->ik", weights, self.corner_normals[face])
         return np.asarray(mixed / np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-300))
 
-    def curved_offset(self, face: Faces, points: Vectors) -> Vectors:
+    def curved_offset(self, face: Faces, points: Vectors, weights: Vectors) -> Vectors:
         """Return offsets (N, 3) from points on the faces to the curved surface that the corner normals describe.
 
         The mean of the point's projections onto the tangent planes of the corners (Phong tessellation, Boubekeur and
         Alexa 2008), with weight 1/2: on a sphere or cylinder it is exact to second order. It is 0 at a crease.
+        `weights` are the points' `corner_weights` (N, 3).
         """
         corners, normals = self.vertices[self.faces[face]], self.corner_normals[face]
         heights = np.einsum("ijk,ijk->ij", corners - points[:, None, :], normals)
-        return np.asarray(np.einsum("ij,ijk->ik", self._corner_weights(face, points) * heights / 2, normals))
+        return np.asarray(np.einsum("ij,ijk->ik", weights * heights / 2, normals))
 
-    def _corner_weights(self, face: Faces, points: Vectors) -> Vectors:
+    def corner_weights(self, face: Faces, points: Vectors) -> Vectors:
         """Return the barycentric coordinates (N, 3) of points on the faces."""
         a, b, c = self.vertices[self.faces[face]].transpose(1, 0, 2)
         cross = np.cross(b - a, c - a)
@@ -160,9 +161,10 @@ class MeshBody(Body):
     def _lift(self, face: Faces, origins: Vectors, directions: Vectors, distance: Vectors, step_mm: float) -> Vectors:
         """Return how much earlier (or, if engraved, later) rays meet the curved surface with relief than the faces."""
         points = origins + distance[:, None] * directions
-        normals = self.mesh.normals_at(face, points)
+        weights = self.mesh.corner_weights(face, points)
+        normals = self.mesh.normals_at(face, weights)
         cosine = np.maximum(-np.einsum("ij,ij->i", directions, normals), 0.35)
-        curved = np.asarray(np.einsum("ij,ij->i", self.mesh.curved_offset(face, points), normals) / cosine)
+        curved = np.asarray(np.einsum("ij,ij->i", self.mesh.curved_offset(face, points, weights), normals) / cosine)
         if not self.wall:
             return curved
         lift = curved
@@ -215,7 +217,8 @@ class MeshBody(Body):
         depth = reach - distance
         near = np.abs(depth) < reach
         face, hit, depth = face[hit][near], hit[near], depth[near]
-        normals[hit] = self.mesh.normals_at(face, points[hit] + depth[:, None] * normals[hit])
+        weights = self.mesh.corner_weights(face, points[hit] + depth[:, None] * normals[hit])
+        normals[hit] = self.mesh.normals_at(face, weights)
         return normals
 
     def _nearest_sample_normals(self, points: Vectors) -> Vectors:
