@@ -1,5 +1,6 @@
 """Two projections into one metric space, trained by a contrastive loss on fixed tower features."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -70,6 +71,7 @@ class ContrastiveEmbedding(Method):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.settings.seed)  # initial weights and dropout
             owner, generator = torch.from_numpy(train.owner), torch.Generator().manual_seed(self.settings.seed)
+            count, draw = int(owner.max()) + 1, row_sampler(owner, generator)
             module = Projections(touch.shape[1], photo.shape[1], config.matcher.embedding_dim, dropout)
             optimizer = torch.optim.AdamW(  # biases and the temperature need not be small
                 [
@@ -80,10 +82,10 @@ class ContrastiveEmbedding(Method):
             optimizer.register_step_post_hook(lambda *_: module.clamp_scale())
 
             def loss(_: int, __: int) -> Tensor:
-                distinct = torch.randperm(int(owner.max()) + 1, generator=generator)[:OBJECTS_PER_BATCH]
+                distinct = torch.randperm(count, generator=generator)[:OBJECTS_PER_BATCH]
                 objects = distinct.repeat(IMAGES_PER_OBJECT)
-                touches = module(touch[draw_rows(owner, objects, generator)], module.touch)
-                photos = module(photo[draw_rows(owner, objects, generator)], module.photo)
+                touches = module(touch[draw(objects)], module.touch)
+                photos = module(photo[draw(objects)], module.photo)
                 return contrastive_loss(touches, photos, objects, objects, module.log_scale)
 
             @torch.inference_mode()
@@ -123,9 +125,16 @@ def _tensor(standardise: Standardiser, features: NDArray[Any]) -> Tensor:
     return torch.from_numpy(standardise(features)).float()
 
 
-def draw_rows(owner: Tensor, objects: Tensor, generator: torch.Generator) -> Tensor:
-    """Return one row of each of `objects` (any shape), drawn uniformly; `owner` (n,) is the object of each row."""
-    counts = torch.bincount(owner)
+def row_sampler(owner: Tensor, generator: torch.Generator) -> Callable[[Tensor], Tensor]:
+    """Return a function that draws one row of each of its objects (any shape), uniformly.
+
+    `owner` (n,) is the object of each row.
+    """
+    rows, counts = torch.argsort(owner, stable=True), torch.bincount(owner)
     starts = counts.cumsum(0) - counts
-    drawn = torch.rand(objects.shape, generator=generator, dtype=torch.float64)
-    return torch.argsort(owner, stable=True)[starts[objects] + (drawn * counts[objects]).long()]
+
+    def draw(objects: Tensor) -> Tensor:
+        drawn = torch.rand(objects.shape, generator=generator, dtype=torch.float64)
+        return rows[starts[objects] + (drawn * counts[objects]).long()]
+
+    return draw

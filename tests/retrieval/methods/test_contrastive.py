@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from retrieval.methods.contrastive import ContrastiveEmbedding, Projections, draw_rows
+from retrieval.methods.contrastive import ContrastiveEmbedding, Projections, row_sampler
 from retrieval.methods.method import MethodSettings
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from retrieval.model.fusion import LOG_SCALE_MAX
@@ -47,7 +47,7 @@ def test_the_scale_is_clamped_at_a_hundred_and_has_a_gradient_there():
 
 def test_rows_are_drawn_uniformly_from_the_requested_objects():
     owner, objects = torch.tensor([0, 1, 0, 2, 1, 1]), torch.tensor([0, 1, 2]).repeat(3000)
-    drawn = draw_rows(owner, objects, torch.Generator().manual_seed(0))
+    drawn = row_sampler(owner, torch.Generator().manual_seed(0))(objects)
     assert torch.equal(owner[drawn], objects)
     # Four standard deviations of 3,000 draws at 1/2 and at 1/3.
     expected = torch.tensor([1500, 1000, 1500, 3000, 1000, 1000])
