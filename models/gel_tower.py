@@ -38,6 +38,7 @@ from retrieval.errors import JobInterrupted
 from retrieval.model.checkpoint import write_tensors
 from retrieval.model.encode import autocast, default_device
 from retrieval.model.towers.tower import Tower, build_tower
+from retrieval.training.augmentation import sample_affine
 from retrieval.training.loop import RATE, Plan, StateFile, freeze_batch_norm, state_path, train_loop
 from robot.sim.gel.sensor import draw_sensor
 from robot.workers import Work, WorkerPool
@@ -211,8 +212,7 @@ def sample(
     maps[:, 0, 0], maps[:, 0, 1] = scale * np.cos(turn_rad), -scale * np.sin(turn_rad) * flips
     maps[:, 1, 0], maps[:, 1, 1] = scale * np.sin(turn_rad), scale * np.cos(turn_rad) * flips
     maps[:, :, 2] = shift
-    grid = functional.affine_grid(torch.from_numpy(maps), [len(x), 3, TOUCH_PX, TOUCH_PX], align_corners=False)
-    return functional.grid_sample(x.contiguous(), grid, padding_mode="reflection", align_corners=False)
+    return sample_affine(x, torch.from_numpy(maps), TOUCH_PX, TOUCH_PX)
 
 
 def as_batch(images: NDArray[np.uint8]) -> Tensor:

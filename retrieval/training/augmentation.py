@@ -27,8 +27,7 @@ def augment(images: Tensor, kind: str, rng: np.random.Generator, flipped: NDArra
     across, down = (flip, torch.ones(count)) if kind == "photo" else (torch.ones(count), flip)
     cosine, sine, shift = torch.cos(turn) * size, torch.sin(turn) * size, draw(-0.05, 0.05, 2)
     maps = torch.stack([across * cosine, -down * sine, shift[:, 0], across * sine, down * cosine, shift[:, 1]], 1)
-    grid = functional.affine_grid(maps.view(count, 2, 3), list(images.shape), align_corners=False)
-    result = functional.grid_sample(images.contiguous(), grid, padding_mode="reflection", align_corners=False)
+    result = sample_affine(images, maps.view(count, 2, 3), images.shape[2], images.shape[3])
     if kind == "photo":
         grey, towards = result.mean(1, keepdim=True), draw(0.0, 1.0, 1, 1, 1)
         result = torch.lerp(result, grey.expand_as(result), (towards + 0.5).clamp(max=1.0) * (towards > 0.25))
@@ -53,3 +52,9 @@ def augment_photos(photos: Tensor, views: int, flipped: NDArray[np.bool_], rng: 
     each = torch.stack(photos.chunk(views, dim=3), dim=1)
     result = augment(each.flatten(0, 1), "photo", rng, flipped.repeat(views)).view_as(each)
     return torch.cat(list(result.unbind(1)), dim=3).contiguous(memory_format=torch.channels_last)
+
+
+def sample_affine(images: Tensor, maps: Tensor, height: int, width: int) -> Tensor:
+    """Return images (B, 3, height, width), sampled from (B, 3, H, W) by affine maps (B, 2, 3) of coordinates."""
+    grid = functional.affine_grid(maps, [len(images), 3, height, width], align_corners=False)
+    return functional.grid_sample(images.contiguous(), grid, padding_mode="reflection", align_corners=False)
